@@ -1,0 +1,45 @@
+//! The Kannala-Brandt equidistant projection with four coefficients (ROS:
+//! `equidistant`, OpenCV: `fisheye`). The kept crates that offer it each bring
+//! a second nalgebra, and stop inverting at 1e-6 of a focal length or panic on
+//! bad input; it is a page, so it is here.
+
+use nalgebra::{Vector2, Vector3};
+
+/// theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
+fn distorted_angle([k1, k2, k3, k4]: [f64; 4], theta: f64) -> f64 {
+    let t2 = theta * theta;
+    theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+}
+
+fn slope([k1, k2, k3, k4]: [f64; 4], theta: f64) -> f64 {
+    let t2 = theta * theta;
+    1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+}
+
+/// Where a direction (camera frame, any length) falls, in focal lengths from the principal point.
+pub(crate) fn project(k: [f64; 4], direction: &Vector3<f64>) -> Vector2<f64> {
+    let radius = direction.x.hypot(direction.y);
+    let theta = radius.atan2(direction.z);
+    if radius < 1e-15 {
+        return Vector2::zeros();
+    }
+    direction.xy() * (distorted_angle(k, theta) / radius)
+}
+
+/// The direction (not normalised to a plane: any angle up to pi) that falls there; `None` where
+/// the model has no inverse.
+pub(crate) fn unproject(k: [f64; 4], point: Vector2<f64>) -> Option<Vector3<f64>> {
+    let wanted = point.norm();
+    let mut theta = wanted.min(std::f64::consts::PI);
+    for _ in 0..50 {
+        let step = (distorted_angle(k, theta) - wanted) / slope(k, theta);
+        theta = (theta - step).clamp(0.0, std::f64::consts::PI);
+        if step.abs() < 1e-14 {
+            break;
+        }
+    }
+    let found = (distorted_angle(k, theta) - wanted).abs() < 1e-9 && slope(k, theta) > 0.0;
+    let (sin, cos) = theta.sin_cos();
+    let across = if wanted > 1e-15 { point / wanted * sin } else { Vector2::zeros() };
+    found.then(|| Vector3::new(across.x, across.y, cos))
+}

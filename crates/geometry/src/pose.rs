@@ -1,0 +1,89 @@
+use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+
+use crate::GeometryError;
+
+/// How far R'R may be from the identity: what a matrix printed with six digits keeps.
+const ORTHONORMAL_TOLERANCE: f64 = 1e-5;
+
+/// Where a camera is and how it is turned: `world_from_camera`.
+///
+/// The rotation's columns are the camera's axes (x right, y down, z forward) in the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pose {
+    rotation: Rotation3<f64>,
+    position: Point3<f64>,
+}
+
+impl Pose {
+    /// A pose from the matrix `world_from_camera` and the camera's centre in metres.
+    ///
+    /// A matrix within 1e-5 of a rotation is replaced by the nearest rotation.
+    ///
+    /// # Errors
+    /// [`GeometryError`] if a number is not finite or the matrix is not a proper rotation.
+    pub fn new(matrix: Matrix3<f64>, position: Point3<f64>) -> Result<Self, GeometryError> {
+        if !matrix.iter().chain(position.iter()).all(|v| v.is_finite()) {
+            return Err(GeometryError::NotFinite { what: "a pose" });
+        }
+        let deviation = (matrix.transpose() * matrix - Matrix3::identity()).amax();
+        let determinant = matrix.determinant();
+        if deviation > ORTHONORMAL_TOLERANCE || determinant < 0.0 {
+            return Err(GeometryError::NotRotation { deviation, determinant });
+        }
+        // One Newton step towards the polar factor: exact to the square of the deviation.
+        let nearest = matrix * (Matrix3::identity() * 3.0 - matrix.transpose() * matrix) * 0.5;
+        Ok(Self { rotation: Rotation3::from_matrix_unchecked(nearest), position })
+    }
+
+    /// A level camera at `position` whose optical axis goes through `target`.
+    ///
+    /// # Errors
+    /// [`GeometryError::Aim`] if the target is straight above, below or at the camera.
+    pub fn looking_at(position: Point3<f64>, target: Point3<f64>) -> Result<Self, GeometryError> {
+        let forward = (target - position).try_normalize(1e-9).ok_or(GeometryError::Aim)?;
+        let right = forward.cross(&Vector3::z()).try_normalize(1e-9).ok_or(GeometryError::Aim)?;
+        let down = forward.cross(&right);
+        Self::new(Matrix3::from_columns(&[right, down, forward]), position)
+    }
+
+    /// The rotation `world_from_camera`.
+    pub fn rotation(&self) -> &Rotation3<f64> {
+        &self.rotation
+    }
+
+    /// The camera's centre in the world, metres.
+    pub fn position(&self) -> Point3<f64> {
+        self.position
+    }
+
+    /// A world point in the camera's frame.
+    pub fn camera_from_world(&self, point: Point3<f64>) -> Vector3<f64> {
+        self.rotation.inverse_transform_vector(&(point - self.position))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_looking_north_sees_east_on_its_right_and_up_above() {
+        let pose = Pose::looking_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0)).unwrap();
+        let east = pose.camera_from_world(Point3::new(1.0, 10.0, 0.0));
+        let up = pose.camera_from_world(Point3::new(0.0, 10.0, 1.0));
+        assert!(east.x > 0.99 && east.y.abs() < 1e-12);
+        assert!(up.y < -0.99 && up.x.abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_mirror_and_a_shear_are_refused() {
+        let mirror = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
+        assert!(matches!(
+            Pose::new(mirror, Point3::origin()),
+            Err(GeometryError::NotRotation { determinant, .. }) if determinant < 0.0
+        ));
+        let mut shear = Matrix3::identity();
+        shear[(0, 1)] = 0.01;
+        assert!(Pose::new(shear, Point3::origin()).is_err());
+    }
+}

@@ -1,0 +1,182 @@
+use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
+use nalgebra::{Matrix3, Point3};
+use prost::Message;
+use sha2::{Digest, Sha256};
+use thiserror::Error;
+
+use crate::{
+    CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3,
+};
+
+/// A [`CameraCalibration`] that has been read and found possible.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// Whose it is.
+    pub name: CameraName,
+    /// Its model and place.
+    pub camera: Camera,
+    /// It holds from this time on.
+    pub valid_from: Timestamp,
+}
+
+/// Why a [`CameraCalibration`] cannot be used.
+#[derive(Debug, Error)]
+pub enum CalibrationError {
+    /// The camera's name is none.
+    #[error("a calibration's camera has an impossible name")]
+    Name(#[source] NameError),
+    /// The numbers describe no camera.
+    #[error("the calibration of camera `{camera}` is impossible")]
+    Geometry {
+        /// The camera.
+        camera: CameraName,
+        /// What is wrong.
+        #[source]
+        source: GeometryError,
+    },
+    /// A list has the wrong number of elements, or a part is missing.
+    #[error("the calibration of camera `{camera}`: {part} is missing or has the wrong length")]
+    Shape {
+        /// The camera.
+        camera: CameraName,
+        /// The part.
+        part: &'static str,
+    },
+}
+
+impl CameraCalibration {
+    /// The message for a camera; its hash is filled in.
+    pub fn new(name: &CameraName, camera: &Camera, valid_from: Timestamp) -> Self {
+        let intrinsics = camera.model().intrinsics();
+        let (distortion_model, distortion) = match intrinsics.distortion {
+            Distortion::None => (DistortionModel::None, vec![]),
+            Distortion::BrownConrady(k) => (DistortionModel::BrownConrady, k.to_vec()),
+            Distortion::Fisheye(k) => (DistortionModel::Fisheye, k.to_vec()),
+        };
+        let pose = camera.pose();
+        let mut message = Self {
+            camera: name.to_string(),
+            width: intrinsics.size.width,
+            height: intrinsics.size.height,
+            fx: intrinsics.fx,
+            fy: intrinsics.fy,
+            cx: intrinsics.cx,
+            cy: intrinsics.cy,
+            distortion_model: distortion_model.into(),
+            distortion,
+            // nalgebra stores columns first.
+            rotation: pose.rotation().matrix().transpose().as_slice().to_vec(),
+            position: Some(pose.position().into()),
+            valid_from_ns: valid_from.nanos(),
+            ..Default::default()
+        }
+        .stamped();
+        message.hash = message.content_hash();
+        message
+    }
+
+    /// SHA-256 of the message with its hash left empty.
+    pub fn content_hash(&self) -> Vec<u8> {
+        let bare = Self { hash: Vec::new(), ..self.clone() };
+        Sha256::digest(bare.encode_to_vec()).to_vec()
+    }
+
+    /// Reads the message: the camera it describes, or why it describes none.
+    ///
+    /// # Errors
+    /// [`CalibrationError`] naming the camera and the part.
+    pub fn parse(&self) -> Result<Calibration, CalibrationError> {
+        let name: CameraName = self.camera.parse().map_err(CalibrationError::Name)?;
+        let shape = |part| CalibrationError::Shape { camera: name.clone(), part };
+        let geometry = |source| CalibrationError::Geometry { camera: name.clone(), source };
+
+        let distortion = match self.distortion_model() {
+            DistortionModel::Unspecified | DistortionModel::None => Distortion::None,
+            DistortionModel::BrownConrady => Distortion::BrownConrady(
+                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
+            ),
+            DistortionModel::Fisheye => Distortion::Fisheye(
+                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
+            ),
+        };
+        let intrinsics = Intrinsics {
+            size: ImageSize { width: self.width, height: self.height },
+            fx: self.fx,
+            fy: self.fy,
+            cx: self.cx,
+            cy: self.cy,
+            distortion,
+        };
+        let rotation: [f64; 9] =
+            self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
+        let position = self.position.ok_or_else(|| shape("position"))?;
+        let pose = Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
+        let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
+        Ok(Calibration { name, camera, valid_from: Timestamp::from_nanos(self.valid_from_ns) })
+    }
+}
+
+impl From<Point3<f64>> for Vector3 {
+    fn from(p: Point3<f64>) -> Self {
+        Self { x: p.x, y: p.y, z: p.z }
+    }
+}
+
+impl From<Vector3> for Point3<f64> {
+    fn from(v: Vector3) -> Self {
+        Self::new(v.x, v.y, v.z)
+    }
+}
+
+impl From<nalgebra::Vector3<f64>> for Vector3 {
+    fn from(v: nalgebra::Vector3<f64>) -> Self {
+        Self { x: v.x, y: v.y, z: v.z }
+    }
+}
+
+impl From<Vector3> for nalgebra::Vector3<f64> {
+    fn from(v: Vector3) -> Self {
+        Self::new(v.x, v.y, v.z)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message() -> CameraCalibration {
+        let intrinsics = Intrinsics {
+            size: ImageSize { width: 640, height: 480 },
+            fx: 700.0,
+            fy: 701.0,
+            cx: 320.0,
+            cy: 240.0,
+            distortion: Distortion::BrownConrady([-0.1, 0.02, 1e-4, -2e-4, 0.0]),
+        };
+        let pose = Pose::looking_at(Point3::new(10.0, 20.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
+        let camera = Camera::new(intrinsics, pose).unwrap();
+        CameraCalibration::new(&"north".parse().unwrap(), &camera, Timestamp::EPOCH)
+    }
+
+    #[test]
+    fn a_camera_survives_its_message() {
+        let message = message();
+        let parsed = message.parse().unwrap();
+        let again = CameraCalibration::new(&parsed.name, &parsed.camera, parsed.valid_from);
+        assert_eq!(again.fx, message.fx);
+        assert_eq!(again.distortion, message.distortion);
+        for (ours, theirs) in again.rotation.iter().zip(&message.rotation) {
+            assert!((ours - theirs).abs() < 1e-12);
+        }
+        assert_eq!(message.hash, message.content_hash());
+    }
+
+    #[test]
+    fn a_nan_focal_length_and_a_torn_rotation_are_named() {
+        let nan = CameraCalibration { fx: f64::NAN, ..message() };
+        assert!(matches!(nan.parse(), Err(CalibrationError::Geometry { .. })));
+        let mut torn = message();
+        torn.rotation.pop();
+        assert!(matches!(torn.parse(), Err(CalibrationError::Shape { part: "rotation", .. })));
+    }
+}

@@ -1,0 +1,169 @@
+use std::fmt;
+use std::str::FromStr;
+
+use thiserror::Error;
+
+use crate::name::{FUSION, TRUTH};
+use crate::{CameraName, NameError, SiteName};
+
+/// What goes over a key, and so its message type.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Channel {
+    /// `<camera>/bearings`: [`crate::BearingFrame`].
+    Bearings(CameraName),
+    /// `<camera>/calibration`: [`crate::CameraCalibration`], on change and every two seconds.
+    Calibration(CameraName),
+    /// `<camera>/preview`: [`crate::Preview`], a few a second, may be lost.
+    Preview(CameraName),
+    /// `<camera>/health`: [`crate::Health`], once a second.
+    CameraHealth(CameraName),
+    /// `<camera>/alive`: a liveliness token, no message.
+    Alive(CameraName),
+    /// `fusion/tracks`: [`crate::TrackFrame`].
+    Tracks,
+    /// `fusion/events`: [`crate::TrackEvent`].
+    Events,
+    /// `fusion/health`: [`crate::Health`], once a second.
+    FusionHealth,
+    /// `fusion/alive`: a liveliness token, no message.
+    FusionAlive,
+    /// `truth/states`: [`crate::TruthFrame`].
+    Truth,
+}
+
+/// A key expression of Crossfix: `crossfix/<site>/<component>/<kind>`.
+///
+/// ```
+/// use crossfix_message::{Channel, Key};
+/// let key: Key = "crossfix/airfield/north/bearings".parse()?;
+/// assert_eq!(key.channel, Channel::Bearings("north".parse()?));
+/// assert_eq!(key.to_string(), "crossfix/airfield/north/bearings");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Key {
+    /// The site.
+    pub site: SiteName,
+    /// The rest.
+    pub channel: Channel,
+}
+
+/// Why a text is not a key of Crossfix.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum KeyError {
+    /// Not of the form `crossfix/<site>/<component>/<kind>`.
+    #[error("`{0}` is not of the form crossfix/<site>/<component>/<kind>")]
+    Form(String),
+    /// A site or camera that is no name.
+    #[error("`{key}` holds an impossible name")]
+    Name {
+        /// The text.
+        key: String,
+        /// What is wrong with the name.
+        #[source]
+        source: NameError,
+    },
+}
+
+impl Key {
+    /// The key of a channel of a site.
+    pub fn new(site: SiteName, channel: Channel) -> Self {
+        Self { site, channel }
+    }
+
+    /// The key expression that holds everything of a site.
+    pub fn everything_of(site: &SiteName) -> String {
+        format!("crossfix/{site}/**")
+    }
+
+    /// The key expression that holds one kind of channel of all cameras of a site.
+    ///
+    /// `kind` is the last part of a key: `bearings`, `calibration`, `preview`, `health`, `alive`.
+    pub fn of_all_cameras(site: &SiteName, kind: &str) -> String {
+        format!("crossfix/{site}/*/{kind}")
+    }
+}
+
+impl fmt::Display for Key {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "crossfix/{}/", self.site)?;
+        match &self.channel {
+            Channel::Bearings(camera) => write!(f, "{camera}/bearings"),
+            Channel::Calibration(camera) => write!(f, "{camera}/calibration"),
+            Channel::Preview(camera) => write!(f, "{camera}/preview"),
+            Channel::CameraHealth(camera) => write!(f, "{camera}/health"),
+            Channel::Alive(camera) => write!(f, "{camera}/alive"),
+            Channel::Tracks => write!(f, "{FUSION}/tracks"),
+            Channel::Events => write!(f, "{FUSION}/events"),
+            Channel::FusionHealth => write!(f, "{FUSION}/health"),
+            Channel::FusionAlive => write!(f, "{FUSION}/alive"),
+            Channel::Truth => write!(f, "{TRUTH}/states"),
+        }
+    }
+}
+
+impl FromStr for Key {
+    type Err = KeyError;
+
+    fn from_str(text: &str) -> Result<Self, KeyError> {
+        let form = || KeyError::Form(text.to_owned());
+        let name = |source| KeyError::Name { key: text.to_owned(), source };
+        let parts: Vec<&str> = text.split('/').collect();
+        let ["crossfix", site, component, kind] = parts[..] else {
+            return Err(form());
+        };
+        let camera = || component.parse::<CameraName>().map_err(name);
+        let channel = match (component, kind) {
+            (FUSION, "tracks") => Channel::Tracks,
+            (FUSION, "events") => Channel::Events,
+            (FUSION, "health") => Channel::FusionHealth,
+            (FUSION, "alive") => Channel::FusionAlive,
+            (TRUTH, "states") => Channel::Truth,
+            (_, "bearings") => Channel::Bearings(camera()?),
+            (_, "calibration") => Channel::Calibration(camera()?),
+            (_, "preview") => Channel::Preview(camera()?),
+            (_, "health") => Channel::CameraHealth(camera()?),
+            (_, "alive") => Channel::Alive(camera()?),
+            _ => return Err(form()),
+        };
+        Ok(Self { site: site.parse().map_err(name)?, channel })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn channels() -> impl Strategy<Value = Channel> {
+        let camera = "[A-Za-z0-9_-]{1,64}"
+            .prop_filter_map("reserved", |text| text.parse::<CameraName>().ok());
+        prop_oneof![
+            camera.clone().prop_map(Channel::Bearings),
+            camera.clone().prop_map(Channel::Calibration),
+            camera.clone().prop_map(Channel::Preview),
+            camera.clone().prop_map(Channel::CameraHealth),
+            camera.prop_map(Channel::Alive),
+            Just(Channel::Tracks),
+            Just(Channel::Events),
+            Just(Channel::FusionHealth),
+            Just(Channel::FusionAlive),
+            Just(Channel::Truth),
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn a_key_survives_its_text(channel in channels(), site in "[a-z0-9]{1,10}") {
+            let site: SiteName = site.parse()?;
+            let key = Key::new(site, channel);
+            prop_assert_eq!(key.to_string().parse::<Key>()?, key);
+        }
+
+        #[test]
+        fn any_text_is_a_key_or_an_error(text in ".{0,80}") {
+            let _ = text.parse::<Key>();
+        }
+    }
+}

@@ -1,0 +1,38 @@
+//! What Crossfix says on the wire and writes into its recordings.
+//!
+//! The messages are protobuf (`proto/crossfix/v1/messages.proto`); the same
+//! types carry `serde` for JSON. The bytes that go over Zenoh are the bytes
+//! in a recording, so [`encode`] and [`decode`] are the only two ways in and
+//! out. [`decode`] refuses a newer major version; unknown fields of a newer
+//! minor version are skipped.
+//!
+//! ```
+//! use crossfix_message::{BearingFrame, Payload, decode};
+//!
+//! let frame = BearingFrame { camera: "north".into(), sequence: 7, ..Default::default() };
+//! let bytes = frame.encode();
+//! assert_eq!(decode::<BearingFrame>(&bytes)?.sequence, 7);
+//! # Ok::<(), crossfix_message::DecodeError>(())
+//! ```
+
+mod camera;
+mod key;
+mod name;
+mod payload;
+mod time;
+
+pub use camera::{CalibrationError, Calibration};
+pub use key::{Channel, Key, KeyError};
+pub use name::{CameraName, NameError, SiteName};
+pub use payload::{DecodeError, Payload, decode, file_descriptor_set};
+pub use time::Timestamp;
+pub use wire::*;
+
+/// The generated types; their documentation is the definition file's.
+#[allow(missing_docs, clippy::all)]
+mod wire {
+    include!(concat!(env!("OUT_DIR"), "/crossfix.v1.rs"));
+}
+
+/// The version of the message definitions that this build speaks.
+pub const VERSION: Version = Version { major: 1, minor: 0 };

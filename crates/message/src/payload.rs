@@ -1,0 +1,144 @@
+use prost::Message;
+use thiserror::Error;
+
+use crate::{
+    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION,
+    Version,
+};
+
+/// A message that stands alone on the wire and in recordings.
+pub trait Payload: Message + Default + Clone {
+    /// Its full protobuf name, the schema's name in a recording.
+    const SCHEMA: &'static str;
+
+    /// The version its sender was built with, if it says.
+    fn version(&self) -> Option<Version>;
+
+    /// The same message stamped with this build's version.
+    #[must_use]
+    fn stamped(self) -> Self;
+
+    /// The bytes for wire and recording, stamped with this build's version.
+    fn encode(&self) -> Vec<u8> {
+        self.clone().stamped().encode_to_vec()
+    }
+}
+
+macro_rules! payload {
+    ($($type:ident),*) => {$(
+        impl Payload for $type {
+            const SCHEMA: &'static str = concat!("crossfix.v1.", stringify!($type));
+
+            fn version(&self) -> Option<Version> {
+                self.version
+            }
+
+            fn stamped(mut self) -> Self {
+                self.version = Some(VERSION);
+                self
+            }
+        }
+    )*};
+}
+
+payload!(BearingFrame, CameraCalibration, TrackFrame, TrackEvent, Health, Preview, TruthFrame);
+
+/// Why bytes are not a message that this build can read.
+#[derive(Debug, Error)]
+pub enum DecodeError {
+    /// The bytes are no such message.
+    #[error("the bytes are no {schema}")]
+    Malformed {
+        /// The message that was expected.
+        schema: &'static str,
+        /// What the decoder says.
+        #[source]
+        source: prost::DecodeError,
+    },
+    /// The sender speaks a newer major version.
+    #[error("{schema} of version {theirs}, this build reads up to {ours}: update this side")]
+    NewerMajor {
+        /// The message that was expected.
+        schema: &'static str,
+        /// The sender's major version.
+        theirs: u32,
+        /// This build's major version.
+        ours: u32,
+    },
+}
+
+/// Reads a message from the bytes of wire or recording.
+///
+/// # Errors
+/// [`DecodeError`] if the bytes are no such message or of a newer major version.
+pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
+    let message =
+        M::decode(bytes).map_err(|source| DecodeError::Malformed { schema: M::SCHEMA, source })?;
+    match message.version() {
+        Some(version) if version.major > VERSION.major => Err(DecodeError::NewerMajor {
+            schema: M::SCHEMA,
+            theirs: version.major,
+            ours: VERSION.major,
+        }),
+        _ => Ok(message),
+    }
+}
+
+/// The compiled definitions as a `google.protobuf.FileDescriptorSet`: the schema in recordings.
+pub fn file_descriptor_set() -> &'static [u8] {
+    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::{BearingTrack, Vector3};
+
+    fn frame() -> BearingFrame {
+        BearingFrame {
+            camera: "a".into(),
+            sequence: 3,
+            capture_time_ns: -5,
+            tracks: vec![BearingTrack {
+                track_id: 1,
+                bearing: Some(Vector3 { x: 0.0, y: 0.0, z: 1.0 }),
+                ..Default::default()
+            }],
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_newer_major_version_is_refused() {
+        let mut message = frame();
+        message.version = Some(Version { major: VERSION.major + 1, minor: 0 });
+        let refused = decode::<BearingFrame>(&message.encode_to_vec());
+        assert!(matches!(refused, Err(DecodeError::NewerMajor { .. })));
+    }
+
+    #[test]
+    fn an_unknown_field_of_a_newer_minor_version_is_skipped() {
+        let mut bytes = frame().stamped().encode_to_vec();
+        // Field 2000, a varint.
+        bytes.extend([0x80, 0x7d, 0x2a]);
+        assert_eq!(decode::<BearingFrame>(&bytes).unwrap().sequence, 3);
+    }
+
+    #[test]
+    fn json_carries_the_same_message() {
+        let message = frame().stamped();
+        let json = serde_json::to_string(&message).unwrap();
+        assert_eq!(serde_json::from_str::<BearingFrame>(&json).unwrap(), message);
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_a_message_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
+            let _ = decode::<BearingFrame>(&bytes);
+            let _ = decode::<TrackFrame>(&bytes);
+            let _ = decode::<CameraCalibration>(&bytes);
+        }
+    }
+}
