@@ -1,0 +1,46 @@
+//! The fusion centre: time-stamped bearings of three and more unsynchronised
+//! cameras in, 3D tracks with velocity and covariance out.
+//!
+//! [`Fusion`] is a pure state machine. It takes [`BearingFrame`]s in any order
+//! of arrival, puts them into the order of their capture times, and returns
+//! what follows from each; the same frames give the same output, bit for bit.
+//!
+//! Inside: bearings that belong to known tracks update them one exposure at a
+//! time ([`Track`], an iterated extended Kalman filter); the others are
+//! gathered into observation periods, solved for fixes ([`spatial`]), and the
+//! fixes of several periods are grouped into new tracks ([`temporal`]).
+//!
+//! ```
+//! use crossfix_fusion::{Fusion, FusionConfig};
+//! use crossfix_message::BearingFrame;
+//!
+//! let mut fusion = Fusion::new(FusionConfig::default())?;
+//! // A frame of a camera whose calibration nobody gave is counted, not used.
+//! let frame = BearingFrame { camera: "north".into(), ..Default::default() };
+//! let outputs = fusion.ingest(&frame);
+//! assert_eq!(outputs.len(), 1);
+//! assert_eq!(fusion.counters().get("rejected_unknown_camera"), 1);
+//! # Ok::<(), crossfix_fusion::ConfigError>(())
+//! ```
+//!
+//! [`BearingFrame`]: crossfix_message::BearingFrame
+
+mod assignment;
+mod config;
+mod counters;
+mod event_time;
+mod fusion;
+mod ingress;
+mod initiation;
+pub mod spatial;
+pub mod temporal;
+mod track;
+mod tracker;
+
+pub use config::{
+    Bearings, ConfigError, EventTime, FusionConfig, Initiation, SpatialSolver, Tracking, Weighting,
+};
+pub use counters::Counters;
+pub use fusion::{Fusion, Output};
+pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
+pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};

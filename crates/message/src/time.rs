@@ -43,12 +43,12 @@ impl Timestamp {
 
     /// Seconds since the Unix epoch.
     pub fn seconds(self) -> f64 {
-        self.0 as f64 * 1e-9
+        self.0 as f64 / 1e9
     }
 
     /// Seconds from `earlier` to this instant; negative if it is the later one.
     pub fn seconds_since(self, earlier: Self) -> f64 {
-        (i128::from(self.0) - i128::from(earlier.0)) as f64 * 1e-9
+        (i128::from(self.0) - i128::from(earlier.0)) as f64 / 1e9
     }
 
     /// This instant moved by `seconds`, which may be negative; saturates.

@@ -1,0 +1,183 @@
+use nalgebra::{Matrix2, Vector2};
+
+/// A measured position on one axis with its variance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AxisMeasurement {
+    /// Position, in the axis' unit.
+    pub position: f64,
+    /// Its variance, unit^2.
+    pub variance: f64,
+}
+
+/// The difference of a measurement from its prediction, with its variance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Innovation {
+    /// Measured less predicted.
+    pub value: f64,
+    /// H P H' + R.
+    pub variance: f64,
+}
+
+impl Innovation {
+    /// The normalised innovation squared: chi-square with one degree of freedom if all is well.
+    pub fn normalised_squared(&self) -> f64 {
+        self.value * self.value / self.variance
+    }
+}
+
+/// Position and velocity on one axis: the second-order Kalman filter into which the
+/// fourth-order one of 000 (2)-(12) falls apart when the axes' errors are taken as independent.
+///
+/// The motion is constant velocity driven by white acceleration of standard deviation `sigma_a`
+/// that is constant between two updates: `G = [T^2/2, T]'`, `Q = sigma_a^2` (erratum: the texts
+/// have `sigma_a` in both).
+///
+/// ```
+/// use crossfix_filter::{AxisFilter, AxisMeasurement};
+/// let at = |position| AxisMeasurement { position, variance: 0.01 };
+/// let mut filter = AxisFilter::start(at(0.0), at(1.0), 0.5, 1.0);
+/// filter.time_update(0.5);
+/// let innovation = filter.measurement_update(at(2.0));
+/// assert!(innovation.value.abs() < 1e-12);
+/// assert!((filter.velocity() - 2.0).abs() < 1e-12);
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct AxisFilter {
+    state: Vector2<f64>,
+    covariance: Matrix2<f64>,
+    sigma_a: f64,
+}
+
+impl AxisFilter {
+    /// Starts from two measurements `interval` seconds apart (000 (13)-(14); erratum: the
+    /// velocity's variance has `sigma_a^2 T^2 / 4`).
+    pub fn start(first: AxisMeasurement, second: AxisMeasurement, interval: f64, sigma_a: f64) -> Self {
+        let velocity = (second.position - first.position) / interval;
+        let cross = second.variance / interval;
+        let velocity_variance = (second.variance + first.variance) / interval.powi(2)
+            + sigma_a.powi(2) * interval.powi(2) / 4.0;
+        Self {
+            state: Vector2::new(second.position, velocity),
+            covariance: Matrix2::new(second.variance, cross, cross, velocity_variance),
+            sigma_a,
+        }
+    }
+
+    /// Starts from one measurement and a prior standard deviation of the velocity about zero.
+    pub fn start_at_rest(first: AxisMeasurement, velocity_sd: f64, sigma_a: f64) -> Self {
+        Self {
+            state: Vector2::new(first.position, 0.0),
+            covariance: Matrix2::new(first.variance, 0.0, 0.0, velocity_sd.powi(2)),
+            sigma_a,
+        }
+    }
+
+    /// Moves the state `interval` seconds on (000 (8), (10)).
+    pub fn time_update(&mut self, interval: f64) {
+        let f = Matrix2::new(1.0, interval, 0.0, 1.0);
+        let g = Vector2::new(interval * interval / 2.0, interval);
+        self.state = f * self.state;
+        self.covariance = f * self.covariance * f.transpose() + g * self.sigma_a.powi(2) * g.transpose();
+    }
+
+    /// What a measurement would be off by.
+    pub fn innovation(&self, measurement: AxisMeasurement) -> Innovation {
+        Innovation {
+            value: measurement.position - self.state.x,
+            variance: self.covariance.m11 + measurement.variance,
+        }
+    }
+
+    /// Takes a measurement in (000 (9), (11), (12)) and returns its innovation.
+    pub fn measurement_update(&mut self, measurement: AxisMeasurement) -> Innovation {
+        let innovation = self.innovation(measurement);
+        let gain = self.covariance.column(0) / innovation.variance;
+        self.state += gain * innovation.value;
+        // Joseph's form keeps the covariance symmetric and positive.
+        let left = Matrix2::new(1.0 - gain.x, 0.0, -gain.y, 1.0);
+        self.covariance = left * self.covariance * left.transpose()
+            + gain * measurement.variance * gain.transpose();
+        innovation
+    }
+
+    /// Position, in the axis' unit.
+    pub fn position(&self) -> f64 {
+        self.state.x
+    }
+
+    /// Velocity, unit a second.
+    pub fn velocity(&self) -> f64 {
+        self.state.y
+    }
+
+    /// Variance of the position.
+    pub fn position_variance(&self) -> f64 {
+        self.covariance.m11
+    }
+
+    /// Covariance of position and velocity.
+    pub fn covariance(&self) -> &Matrix2<f64> {
+        &self.covariance
+    }
+
+    /// Takes part of the velocity away, keeping its variance: a target that is not seen is not
+    /// believed to go on for ever.
+    pub fn damp_velocity(&mut self, factor: f64) {
+        self.state.y *= factor;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    #[test]
+    fn the_start_is_the_papers_with_its_erratum() {
+        let at = |position, variance| AxisMeasurement { position, variance };
+        let filter = AxisFilter::start(at(1.0, 4.0), at(3.0, 1.0), 0.5, 2.0);
+        assert_eq!(filter.velocity(), 4.0);
+        assert_eq!(*filter.covariance(), Matrix2::new(1.0, 2.0, 2.0, 20.0 + 0.25));
+    }
+
+    /// Mean NEES of `runs` runs of 20 steps of the model itself.
+    fn mean_nees(sigma_a: f64, runs: u32) -> f64 {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+        let mut sum = 0.0;
+        for _ in 0..runs {
+            let (mut position, mut velocity) = (0.0, 10.0);
+            let mut step = |normal: &mut dyn FnMut() -> f64| {
+                let acceleration = sigma_a * normal();
+                position += velocity + acceleration / 2.0;
+                velocity += acceleration;
+                (position, velocity, AxisMeasurement { position: position + normal(), variance: 1.0 })
+            };
+            let first = step(&mut normal).2;
+            let second = step(&mut normal).2;
+            let mut filter = AxisFilter::start(first, second, 1.0, sigma_a);
+            let mut truth = (0.0, 0.0);
+            for _ in 0..18 {
+                let (position, velocity, measurement) = step(&mut normal);
+                filter.time_update(1.0);
+                filter.measurement_update(measurement);
+                truth = (position, velocity);
+            }
+            let error = Vector2::new(truth.0, truth.1) - filter.state;
+            sum += (error.transpose() * filter.covariance.try_inverse().unwrap() * error).x;
+        }
+        sum / f64::from(runs)
+    }
+
+    #[test]
+    fn the_covariance_is_honest_at_every_manoeuvrability() {
+        // NEES is chi-square with 2 degrees of freedom; the mean of 4000 has SD 2/sqrt(4000).
+        for sigma_a in [0.3, 1.0, 3.0] {
+            let nees = mean_nees(sigma_a, 4000);
+            assert!((nees - 2.0).abs() < 3.0 * 2.0 / 4000f64.sqrt(), "sigma_a {sigma_a}: {nees}");
+        }
+    }
+}

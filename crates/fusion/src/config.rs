@@ -1,0 +1,228 @@
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// How the fusion centre works. Every field has a default; the file's keys are the fields' names.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FusionConfig {
+    /// Putting frames into the order of their capture times.
+    pub event_time: EventTime,
+    /// What a bearing's reported covariance is worth.
+    pub bearings: Bearings,
+    /// How new tracks are found.
+    pub initiation: Initiation,
+    /// How tracks are kept up.
+    pub tracking: Tracking,
+}
+
+/// Putting frames into the order of their capture times.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EventTime {
+    /// How long to wait for a camera that is behind the others, s of capture time. Above 0.
+    /// Default 0.5: longer than any network hiccup that a track would not survive anyway.
+    pub lateness_s: f64,
+    /// A frame this far ahead of the second newest camera is from the future and refused, s.
+    /// Default 10.
+    pub max_ahead_s: f64,
+}
+
+impl Default for EventTime {
+    fn default() -> Self {
+        Self { lateness_s: 0.5, max_ahead_s: 10.0 }
+    }
+}
+
+/// Whose covariance counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Weighting {
+    /// Each bearing's own covariance.
+    #[default]
+    Reported,
+    /// The same standard deviation for every bearing, as in the papers.
+    Equal,
+}
+
+/// What a bearing's reported covariance is worth.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Bearings {
+    /// `reported` (default) or `equal`.
+    pub weighting: Weighting,
+    /// The standard deviation with `equal`, rad an axis. Default 0.001, a pixel of a 1000-pixel lens.
+    pub equal_sd_rad: f64,
+    /// What pose and lens leave unmodelled: added in square to each reported standard deviation,
+    /// rad an axis. Default 0: calibrations are taken at their word.
+    pub systematic_sd_rad: f64,
+}
+
+impl Default for Bearings {
+    fn default() -> Self {
+        Self { weighting: Weighting::default(), equal_sd_rad: 1e-3, systematic_sd_rad: 0.0 }
+    }
+}
+
+/// What turns the bearings of one period into fixes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SpatialSolver {
+    /// Two receivers, ranges only (002, the alternative algorithm).
+    Pair,
+    /// Three receivers, ranges and velocity (002, the proposed algorithm).
+    Triple,
+    /// n receivers, ranges and velocity by unweighted least squares.
+    Stacked,
+    /// n receivers, weighted, with a prior on the velocity.
+    #[default]
+    Map,
+}
+
+/// How new tracks are found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Initiation {
+    /// `map` (default), `stacked`, `triple` or `pair`.
+    pub solver: SpatialSolver,
+    /// The shortest observation period, s; a period lasts until every camera that is heard has
+    /// given an exposure. Default 0.05.
+    pub period_s: f64,
+    /// How many periods may make a group of fixes. 2 to 20, default 4; the papers have 5.
+    pub periods: usize,
+    /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
+    pub fixes: usize,
+    /// Standard deviation of the velocity's prior, m/s an axis. Default 15.
+    pub velocity_prior_sd_mps: f64,
+    /// Fixes farther than this from a camera are ghosts, m. Default 2000.
+    pub max_range_m: f64,
+    /// Probability with which a true combination passes the spatial gate, `map` only. Default 0.999.
+    pub spatial_gate_probability: f64,
+    /// The spatial gate of `pair`, `J <= beta`, m^2 (002, below equation 9). Default 16.
+    pub pair_gate_m2: f64,
+    /// The temporal gate of the papers, m. Absent (default): from the covariances.
+    pub temporal_gate_m: Option<f64>,
+    /// How many sight lines two groups may share and both start a track. Default 0.
+    pub shared_lines: usize,
+}
+
+impl Default for Initiation {
+    fn default() -> Self {
+        Self {
+            solver: SpatialSolver::default(),
+            period_s: 0.05,
+            periods: 4,
+            fixes: 2,
+            velocity_prior_sd_mps: 15.0,
+            max_range_m: 2000.0,
+            spatial_gate_probability: 0.999,
+            pair_gate_m2: 16.0,
+            temporal_gate_m: None,
+            shared_lines: 0,
+        }
+    }
+}
+
+/// How tracks are kept up.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tracking {
+    /// Power spectral density of the white acceleration, m^2/s^3. Default 1: a UAV that changes
+    /// its velocity by 1 m/s in a second.
+    pub acceleration_density: f64,
+    /// Probability with which a true bearing passes a track's gate. Default 0.9999.
+    pub gate_probability: f64,
+    /// Probability that a camera reports a target in its field of view. Default 0.9.
+    pub detection_probability: f64,
+    /// Density of false bearings, 1/sr. Default 5.
+    pub clutter_per_sr: f64,
+    /// Log-likelihood ratio (target against clutter) that confirms a track. Default 25.
+    pub confirm_score: f64,
+    /// A confirmed track not updated for this long is coasting, s. Default 1.5.
+    pub coasting_after_s: f64,
+    /// A track not updated for this long is lost, s. Default 4.
+    pub lost_after_s: f64,
+    /// A track whose position is worse than this along any axis is lost, m. Default 20.
+    pub max_position_sd_m: f64,
+}
+
+impl Default for Tracking {
+    fn default() -> Self {
+        Self {
+            acceleration_density: 1.0,
+            gate_probability: 0.9999,
+            detection_probability: 0.9,
+            clutter_per_sr: 5.0,
+            confirm_score: 25.0,
+            coasting_after_s: 1.5,
+            lost_after_s: 4.0,
+            max_position_sd_m: 20.0,
+        }
+    }
+}
+
+/// A number of the configuration that makes no sense.
+#[derive(Clone, Debug, PartialEq, Error)]
+#[error("`{key}` is {value}: it must be {must}")]
+pub struct ConfigError {
+    /// The key, with its section.
+    pub key: &'static str,
+    /// What it is.
+    pub value: f64,
+    /// What it must be.
+    pub must: &'static str,
+}
+
+impl FusionConfig {
+    /// Checks every number against its range.
+    ///
+    /// # Errors
+    /// The first [`ConfigError`].
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let Self { event_time, bearings, initiation, tracking } = self;
+        let positive = [
+            ("event_time.lateness_s", event_time.lateness_s),
+            ("event_time.max_ahead_s", event_time.max_ahead_s),
+            ("bearings.equal_sd_rad", bearings.equal_sd_rad),
+            ("initiation.period_s", initiation.period_s),
+            ("initiation.velocity_prior_sd_mps", initiation.velocity_prior_sd_mps),
+            ("initiation.max_range_m", initiation.max_range_m),
+            ("initiation.pair_gate_m2", initiation.pair_gate_m2),
+            ("initiation.temporal_gate_m", initiation.temporal_gate_m.unwrap_or(1.0)),
+            ("tracking.acceleration_density", tracking.acceleration_density),
+            ("tracking.clutter_per_sr", tracking.clutter_per_sr),
+            ("tracking.confirm_score", tracking.confirm_score),
+            ("tracking.coasting_after_s", tracking.coasting_after_s),
+            ("tracking.lost_after_s", tracking.lost_after_s),
+            ("tracking.max_position_sd_m", tracking.max_position_sd_m),
+        ];
+        for (key, value) in positive {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(ConfigError { key, value, must: "a positive number" });
+            }
+        }
+        let probabilities = [
+            ("initiation.spatial_gate_probability", initiation.spatial_gate_probability),
+            ("tracking.gate_probability", tracking.gate_probability),
+            ("tracking.detection_probability", tracking.detection_probability),
+        ];
+        for (key, value) in probabilities {
+            if !(value > 0.0 && value < 1.0) {
+                return Err(ConfigError { key, value, must: "a probability between 0 and 1" });
+            }
+        }
+        let systematic = bearings.systematic_sd_rad;
+        if !(0.0..0.1).contains(&systematic) {
+            return Err(ConfigError {
+                key: "bearings.systematic_sd_rad",
+                value: systematic,
+                must: "from 0 to 0.1 rad",
+            });
+        }
+        let range = |key, value: usize, low: usize, high: usize, must| {
+            let good = (low..=high).contains(&value);
+            if good { Ok(()) } else { Err(ConfigError { key, value: value as f64, must }) }
+        };
+        range("initiation.periods", initiation.periods, 2, 20, "from 2 to 20")?;
+        range("initiation.fixes", initiation.fixes, 1, initiation.periods, "from 1 to `periods`")
+    }
+}

@@ -1,0 +1,157 @@
+//! From the wire to what the fusion works on: what comes out of here is possible.
+
+use std::fmt;
+
+use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
+use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
+use nalgebra::{Matrix2, Vector2};
+
+use crate::{Bearings, Counters, Weighting};
+
+/// One measured target in one exposure.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sighting {
+    /// The 2D track that measured it.
+    pub image_track: u64,
+    /// Where it is seen.
+    pub line: SightLine,
+}
+
+/// All that one camera measured at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Exposure {
+    /// The camera.
+    pub camera: CameraName,
+    /// Sequence number of the frame.
+    pub sequence: u64,
+    /// Capture time.
+    pub time: Timestamp,
+    /// Standard deviation of the capture time, s.
+    pub time_sd_s: f64,
+    /// The targets, in the frame's order.
+    pub sightings: Vec<Sighting>,
+}
+
+/// Why a frame or a part of it was not used.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RejectionReason {
+    /// No calibration is known for the camera.
+    UnknownCamera,
+    /// Its time lies before what has been handled already.
+    Late {
+        /// By how much, s.
+        by_s: f64,
+    },
+    /// Its time lies too far ahead of the other cameras.
+    Future {
+        /// By how much, s.
+        by_s: f64,
+    },
+    /// A frame of this camera and time has been handled.
+    Duplicate,
+    /// The frame's time or its standard deviation is impossible.
+    Time,
+    /// One bearing is impossible; the others of the frame are used.
+    Bearing(GeometryError),
+}
+
+impl RejectionReason {
+    /// The name under which it is counted.
+    pub fn counter(&self) -> &'static str {
+        match self {
+            Self::UnknownCamera => "rejected_unknown_camera",
+            Self::Late { .. } => "rejected_late",
+            Self::Future { .. } => "rejected_future",
+            Self::Duplicate => "rejected_duplicate",
+            Self::Time => "rejected_time",
+            Self::Bearing(_) => "rejected_bearing",
+        }
+    }
+}
+
+/// Something that was not used, with its source.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rejection {
+    /// The camera as the frame names it.
+    pub camera: String,
+    /// Sequence number of the frame.
+    pub sequence: u64,
+    /// Why.
+    pub reason: RejectionReason,
+}
+
+impl fmt::Display for Rejection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { camera, sequence, reason } = self;
+        write!(f, "frame {sequence} of camera `{camera}`: ")?;
+        match reason {
+            RejectionReason::UnknownCamera => f.write_str("no calibration is known for it"),
+            RejectionReason::Late { by_s } => {
+                write!(f, "{by_s:.3} s too late (see event_time.lateness_s)")
+            }
+            RejectionReason::Future { by_s } => {
+                write!(f, "{by_s:.3} s ahead of the other cameras: check its clock")
+            }
+            RejectionReason::Duplicate => f.write_str("its capture time came before"),
+            RejectionReason::Time => f.write_str("its capture time or its SD is impossible"),
+            RejectionReason::Bearing(error) => write!(f, "a bearing is impossible: {error}"),
+        }
+    }
+}
+
+fn sighting(track: &BearingTrack, camera: &Camera, config: &Bearings) -> Result<Sighting, GeometryError> {
+    let vector = track.bearing.ok_or(GeometryError::NotUnit { length: 0.0 })?;
+    let covariance = match config.weighting {
+        Weighting::Equal => Matrix2::identity() * config.equal_sd_rad.powi(2),
+        Weighting::Reported => {
+            let [xx, xy, yy] = [track.covariance_xx, track.covariance_xy, track.covariance_yy];
+            Matrix2::new(xx, xy, xy, yy) + Matrix2::identity() * config.systematic_sd_rad.powi(2)
+        }
+    };
+    let bearing = Bearing::new(vector.into(), covariance)?;
+    Ok(Sighting { image_track: track.track_id, line: camera.sight_line(&bearing) })
+}
+
+/// Reads a frame: what was measured, and what of it had to be left out.
+pub(crate) fn read(
+    frame: &BearingFrame,
+    name: &CameraName,
+    camera: &Camera,
+    config: &Bearings,
+    counters: &mut Counters,
+) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
+    let sd = frame.capture_time_sd_s;
+    if !(sd.is_finite() && (0.0..10.0).contains(&sd)) {
+        return Err(RejectionReason::Time);
+    }
+    let mut rejected = Vec::new();
+    let mut sightings = Vec::new();
+    for track in &frame.tracks {
+        if track.state() != ImageTrackState::Tracking {
+            counters.count("bearings_predicted_only");
+            continue;
+        }
+        match sighting(track, camera, config) {
+            Ok(sighting) => sightings.push(sighting),
+            Err(error) => rejected.push(RejectionReason::Bearing(error)),
+        }
+    }
+    let exposure = Exposure {
+        camera: name.clone(),
+        sequence: frame.sequence,
+        time: Timestamp::from_nanos(frame.capture_time_ns),
+        time_sd_s: sd,
+        sightings,
+    };
+    Ok((exposure, rejected))
+}
+
+/// A bearing's covariance widened by the uncertainty of its time: a target that moves across the
+/// sight line at `tangent_rate` (rad/s on the tangent plane) is elsewhere a moment later.
+pub(crate) fn with_time_uncertainty(
+    covariance: &Matrix2<f64>,
+    tangent_rate: Vector2<f64>,
+    time_sd_s: f64,
+) -> Matrix2<f64> {
+    covariance + tangent_rate * tangent_rate.transpose() * time_sd_s.powi(2)
+}

@@ -1,0 +1,129 @@
+//! Spatial processing: one sight line of each of several cameras, taken at
+//! different times, becomes a fix.
+//!
+//! | function | unknowns | where it is from |
+//! |---|---|---|
+//! | [`pair`] | two ranges | 002, equations 7-9 |
+//! | [`triple`] | three ranges, velocity | 002, equations 10-11 |
+//! | [`stacked`] | n ranges, velocity | the same for n cameras |
+//! | [`map`] | position, velocity | weighted, with a prior on the velocity |
+//!
+//! All work in the world frame: where the paper turns the axes of receiver k
+//! into those of receiver 1 (`P_k`) and has the base vector `b_k`, here the
+//! sight lines are world vectors and `b_k` is the difference of the cameras'
+//! centres. That is the same system in other axes.
+
+mod map;
+mod observability;
+mod pair;
+mod stacked;
+mod triple;
+
+use crossfix_filter::KinematicState;
+use crossfix_geometry::SightLine;
+use crossfix_message::Timestamp;
+use nalgebra::{Point3, Vector3};
+
+pub use map::{MapSolution, map};
+pub use observability::Observability;
+pub use pair::{PairSolution, pair};
+pub use stacked::stacked;
+pub use triple::triple;
+
+/// A sight line with the time at which it was seen.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TimedLine {
+    /// The sight line, world frame.
+    pub line: SightLine,
+    /// Its capture time.
+    pub time: Timestamp,
+}
+
+/// Ranges and velocity: what the papers' systems solve for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RangeSolution {
+    /// Range from each camera, m, in the order of the lines.
+    pub ranges: Vec<f64>,
+    /// Velocity, m/s.
+    pub velocity: Vector3<f64>,
+    /// The target at the first line's time, refined by the pair solution with the displacement
+    /// removed (002, below equation 11).
+    pub position: Point3<f64>,
+    /// How well the system was conditioned, and whether the pseudo-inverse had to be used.
+    pub observability: Observability,
+}
+
+/// One period's solution: where something was, and how fast.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fix {
+    /// The state's time: that of the newest line.
+    pub time: Timestamp,
+    /// Position and velocity with their covariance.
+    pub state: KinematicState,
+    /// Whether the velocity was solved for, or is only the prior's zero.
+    pub velocity: VelocityKnowledge,
+    /// What made it.
+    pub solver: crossfix_message::Solver,
+    /// How well the system was conditioned.
+    pub observability: Observability,
+}
+
+/// Whether a fix knows its velocity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum VelocityKnowledge {
+    /// It was solved for.
+    Solved,
+    /// The solver does not solve for it.
+    Unknown,
+}
+
+/// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s an axis.
+pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
+
+#[cfg(test)]
+pub(crate) mod tests_support {
+    use crossfix_geometry::{Bearing, tangent_basis};
+    use nalgebra::{Matrix2, Unit, Vector2};
+
+    use super::*;
+
+    /// 0.1 m at 150 m.
+    pub(crate) const SIGMA: f64 = 0.1 / 150.0;
+
+    /// Cameras 150 m from the origin whose lines of sight to it are mutually orthogonal.
+    pub(crate) fn orthogonal_cameras() -> [Point3<f64>; 3] {
+        let elevation = 35.264_389_7_f64.to_radians();
+        [0.0f64, 120.0, 240.0].map(|azimuth| {
+            let azimuth = azimuth.to_radians();
+            let (cos, sin) = (elevation.cos(), elevation.sin());
+            Point3::from(Vector3::new(cos * azimuth.cos(), cos * azimuth.sin(), sin) * -150.0)
+        })
+    }
+
+    /// The exact line from a camera to a target at a time.
+    pub(crate) fn line_at(camera: Point3<f64>, target: Point3<f64>, time_s: f64) -> TimedLine {
+        let direction = Unit::new_normalize(target - camera);
+        let bearing = Bearing::new(*direction, Matrix2::identity() * SIGMA * SIGMA).unwrap();
+        let line = SightLine {
+            origin: camera,
+            direction,
+            basis: tangent_basis(&direction),
+            covariance: *bearing.covariance(),
+        };
+        TimedLine { line, time: Timestamp::from_seconds(time_s) }
+    }
+
+    /// The same with noise of [`SIGMA`] on both tangents.
+    pub(crate) fn noisy_line_at(
+        camera: Point3<f64>,
+        target: Point3<f64>,
+        time_s: f64,
+        normal: &mut impl FnMut() -> f64,
+    ) -> TimedLine {
+        let mut exact = line_at(camera, target, time_s);
+        let noise = exact.line.basis * Vector2::new(normal(), normal()) * SIGMA;
+        exact.line.direction = Unit::new_normalize(exact.line.direction.into_inner() + noise);
+        exact.line.basis = tangent_basis(&exact.line.direction);
+        exact
+    }
+}

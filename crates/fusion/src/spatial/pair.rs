@@ -1,0 +1,58 @@
+use nalgebra::{Matrix3x2, Point3, Vector3};
+
+use super::TimedLine;
+
+/// Two ranges and how badly the lines miss each other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PairSolution {
+    /// Range from the first camera, m.
+    pub first_range: f64,
+    /// Range from the second camera, m.
+    pub second_range: f64,
+    /// The point on the first line, `M_1`.
+    pub position: Point3<f64>,
+    /// `J = |e_2|^2`, m^2 (002, equation 9).
+    pub indicator: f64,
+}
+
+/// The two-receiver algorithm: ranges along two lines by least squares (002, equations 7-9).
+///
+/// `displacement` is how far the target moves between the first line's time and the second's
+/// (zero in the alternative algorithm, `V dt` in the proposed one's second step). `None` if the
+/// lines are parallel.
+///
+/// ```
+/// use crossfix_fusion::spatial::{TimedLine, pair};
+/// # use crossfix_geometry::*;
+/// # use crossfix_message::Timestamp;
+/// # use nalgebra::{Matrix2, Point3, Vector3};
+/// # let line = |origin: Point3<f64>, target: Point3<f64>| {
+/// #     let pose = Pose::looking_at(origin, target).unwrap();
+/// #     let intrinsics = Intrinsics { size: ImageSize { width: 640, height: 480 }, fx: 800.0, fy: 800.0,
+/// #         cx: 319.5, cy: 239.5, distortion: Distortion::None };
+/// #     let camera = Camera::new(intrinsics, pose).unwrap();
+/// #     let bearing = Bearing::new(Vector3::z(), Matrix2::identity() * 1e-6).unwrap();
+/// #     TimedLine { line: camera.sight_line(&bearing), time: Timestamp::EPOCH }
+/// # };
+/// let target = Point3::new(10.0, 20.0, 50.0);
+/// let first = line(Point3::new(100.0, 0.0, 0.0), target);
+/// let second = line(Point3::new(0.0, -100.0, 0.0), target);
+/// let fix = pair(&first, &second, Vector3::zeros()).ok_or("parallel")?;
+/// assert!((fix.position - target).norm() < 1e-9);
+/// # Ok::<(), &str>(())
+/// ```
+pub fn pair(first: &TimedLine, second: &TimedLine, displacement: Vector3<f64>) -> Option<PairSolution> {
+    let a1 = first.line.direction.into_inner();
+    let a2 = second.line.direction.into_inner();
+    // r1 a1 - r2 a2' + dM - b2 = e2 (002, equation 4)
+    let a = Matrix3x2::from_columns(&[a1, -a2]);
+    let b = (second.line.origin - first.line.origin) - displacement;
+    let ranges = (a.transpose() * a).try_inverse()? * a.transpose() * b;
+    let residual = a * ranges - b;
+    Some(PairSolution {
+        first_range: ranges.x,
+        second_range: ranges.y,
+        position: first.line.origin + a1 * ranges.x,
+        indicator: residual.norm_squared(),
+    })
+}

@@ -1,0 +1,115 @@
+use nalgebra::{Matrix6, Vector3, Vector6};
+
+use super::observability::determined;
+use super::{Observability, RangeSolution, TimedLine, pair};
+
+/// The three-receiver algorithm: three ranges and the velocity from three lines of three times
+/// (002, equations 10-11), by the pseudo-inverse where the system cannot carry all six.
+///
+/// The system is regular only if the three times differ and the lines do not lie in a plane
+/// (`det A = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the
+/// lines: unknowns are scaled by the length of the base and by `velocity_scale`, and a singular
+/// direction counts if the noise leaves it better known than its scale. `None` if even the first
+/// two lines are parallel.
+pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSolution> {
+    let [first, second, third] = lines;
+    let [a1, a2, a3] = lines.map(|l| l.line.direction.into_inner());
+    let [b2, b3] = [second, third].map(|l| l.line.origin - first.line.origin);
+    let [dt2, dt3] = [second, third].map(|l| l.time.seconds_since(first.time));
+
+    let mut a = Matrix6::zeros();
+    for (rows, line_column, line, dt) in [(0, 1, a2, dt2), (3, 2, a3, dt3)] {
+        a.fixed_view_mut::<3, 1>(rows, 0).copy_from(&a1);
+        a.fixed_view_mut::<3, 1>(rows, line_column).copy_from(&-line);
+        a.fixed_view_mut::<3, 3>(rows, 3).fill_with_identity();
+        a.fixed_view_mut::<3, 3>(rows, 3).scale_mut(dt);
+    }
+    let b = Vector6::new(b2.x, b2.y, b2.z, b3.x, b3.y, b3.z);
+
+    // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long (benches/solvers).
+    let base = b2.norm().max(b3.norm());
+    let scale = Matrix6::from_diagonal(&Vector6::new(
+        base, base, base, velocity_scale, velocity_scale, velocity_scale,
+    ));
+    let svd = (a * scale).try_svd(true, true, f64::EPSILON, 200)?;
+    let (u, v_t) = (svd.u?, svd.v_t?);
+    let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * base;
+    let values = svd.singular_values;
+    let mut observability = Observability::of_singular_values(values.as_slice(), noise);
+    observability.condition_number = condition_number(&a);
+
+    let x = if observability.is_full() {
+        a.lu().solve(&b)?
+    } else {
+        let largest = values.max();
+        let projected = u.transpose() * b;
+        let kept = Vector6::from_fn(|i, _| {
+            if determined(values[i], noise, largest) { projected[i] / values[i] } else { 0.0 }
+        });
+        scale * v_t.transpose() * kept
+    };
+    let velocity = Vector3::new(x[3], x[4], x[5]);
+    let refined = pair(first, second, velocity * dt2)?;
+    Some(RangeSolution {
+        ranges: vec![x[0], x[1], x[2]],
+        velocity,
+        position: refined.position,
+        observability,
+    })
+}
+
+fn condition_number(a: &Matrix6<f64>) -> f64 {
+    let values = a.singular_values();
+    if values.min() > 0.0 { values.max() / values.min() } else { f64::INFINITY }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::super::tests_support::{line_at, orthogonal_cameras};
+    use super::*;
+
+    #[test]
+    fn exact_lines_give_exact_ranges_and_velocity() {
+        let (position, velocity) = (Point3::new(3.0, -5.0, 2.0), Vector3::new(10.0, -4.0, 1.5));
+        let times = [0.0, 0.1, 0.2];
+        let lines: Vec<_> = orthogonal_cameras()
+            .iter()
+            .zip(times)
+            .map(|(camera, t)| line_at(*camera, position + velocity * t, t))
+            .collect();
+        let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
+        assert!(solution.observability.is_full());
+        assert!((solution.velocity - velocity).norm() < 1e-8);
+        assert!((solution.position - position).norm() < 1e-8);
+        // FUSION.md has 20 for this geometry and these delays.
+        assert!((solution.observability.condition_number - 20.0).abs() < 2.0, "{:?}", solution.observability);
+    }
+
+    #[test]
+    fn simultaneous_lines_fall_back_to_the_pseudo_inverse_and_still_fix() {
+        let position = Point3::new(3.0, -5.0, 2.0);
+        let lines: Vec<_> =
+            orthogonal_cameras().iter().map(|camera| line_at(*camera, position, 0.0)).collect();
+        let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
+        assert_eq!(solution.observability.rank, 3);
+        assert!((solution.position - position).norm() < 1e-6);
+        assert!(solution.velocity.norm() < 1e-6);
+    }
+
+    #[test]
+    fn equal_delays_are_not_full_rank_although_noise_makes_them_look_regular() {
+        let position = Point3::new(3.0, -5.0, 2.0);
+        let nudge = Vector3::new(0.05, -0.08, 0.06);
+        let times = [0.0, 0.2, 0.2];
+        let lines: Vec<_> = orthogonal_cameras()
+            .iter()
+            .zip(times)
+            .enumerate()
+            .map(|(i, (camera, t))| line_at(*camera, position + nudge * i as f64, t))
+            .collect();
+        let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
+        assert!(!solution.observability.is_full(), "{:?}", solution.observability);
+    }
+}
