@@ -1,0 +1,25 @@
+//! Tracks held against truth: root mean squared errors, NEES, OSPA and GOSPA,
+//! completeness, false tracks, changes of identity, latency.
+//!
+//! ```
+//! use crossfix_evaluation::{Estimate, Evaluator, TrueTarget};
+//! use crossfix_message::Timestamp;
+//! use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+//! use crossfix_filter::KinematicState;
+//!
+//! let mut evaluator = Evaluator::new(5.0);
+//! let truth = [TrueTarget { id: 1, position: Point3::new(0.0, 0.0, 50.0), velocity: Vector3::zeros() }];
+//! let state = KinematicState { mean: Vector6::new(0.3, 0.0, 50.4, 0.0, 0.0, 0.0), covariance: Matrix6::identity() };
+//! evaluator.add(&truth, &[Estimate { id: 7, state }]);
+//! let report = evaluator.report();
+//! assert!((report.position_rmse_m.unwrap() - 0.5).abs() < 1e-12);
+//! assert_eq!(report.completeness, 1.0);
+//! ```
+
+mod history;
+mod latency;
+mod metrics;
+
+pub use history::TrackHistory;
+pub use latency::{Latency, LatencyRecorder};
+pub use metrics::{Estimate, Evaluator, Report, TargetReport, TrueTarget};

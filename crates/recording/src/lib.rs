@@ -1,0 +1,57 @@
+//! Recordings: MCAP files of the bytes that went over the wire, chunked,
+//! compressed, indexed, with the schema of every message inside.
+//!
+//! A channel's topic is the Zenoh key. `log_time` is the message's own data
+//! time (the capture time of what it speaks of), `publish_time` the time at
+//! which the recorder received it.
+//!
+//! ```
+//! use crossfix_message::{BearingFrame, Channel, Key, Payload, Timestamp};
+//! use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
+//!
+//! let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("one.mcap");
+//! let key = Key::new("field".parse()?, Channel::Bearings("north".parse()?));
+//! let time = Timestamp::from_seconds(1.5);
+//!
+//! let mut writer = RecordingWriter::create(&path)?;
+//! let data = BearingFrame { camera: "north".into(), ..Default::default() }.encode();
+//! writer.write(&Entry { key: key.clone(), data_time: time, arrival: time, data })?;
+//! writer.finish()?;
+//!
+//! let mut seen = 0;
+//! let report = RecordingReader::open(&path)?.for_each(|entry| {
+//!     assert_eq!(entry.key, key);
+//!     seen += 1;
+//!     Ok::<_, std::convert::Infallible>(())
+//! })?;
+//! assert_eq!(seen, 1);
+//! assert!(report.damage.is_none());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod error;
+mod info;
+mod reader;
+mod schema;
+mod writer;
+
+pub use error::RecordingError;
+pub use info::{ChannelInfo, RecordingInfo};
+pub use reader::{ReadFailure, ReadReport, RecordingReader};
+pub use writer::RecordingWriter;
+
+use crossfix_message::{Key, Timestamp};
+
+/// One message of a recording.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// Where it was published.
+    pub key: Key,
+    /// The time it speaks of.
+    pub data_time: Timestamp,
+    /// When the recorder received it; equal to `data_time` in imported data.
+    pub arrival: Timestamp,
+    /// The bytes of the wire.
+    pub data: Vec<u8>,
+}

@@ -1,0 +1,18 @@
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame,
+    TruthFrame,
+};
+
+/// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.
+pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
+    Some(match channel {
+        Channel::Bearings(_) => BearingFrame::SCHEMA,
+        Channel::Calibration(_) => CameraCalibration::SCHEMA,
+        Channel::Preview(_) => Preview::SCHEMA,
+        Channel::CameraHealth(_) | Channel::FusionHealth => Health::SCHEMA,
+        Channel::Tracks => TrackFrame::SCHEMA,
+        Channel::Events => TrackEvent::SCHEMA,
+        Channel::Truth => TruthFrame::SCHEMA,
+        Channel::Alive(_) | Channel::FusionAlive => return None,
+    })
+}
