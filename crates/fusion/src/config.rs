@@ -85,7 +85,7 @@ pub struct Initiation {
     /// `map` (default), `stacked`, `triple` or `pair`.
     pub solver: SpatialSolver,
     /// The shortest observation period, s; a period lasts until every camera that is heard has
-    /// given an exposure. Default 0.05.
+    /// given an exposure, and these lie as close together as they do. Default 0.05.
     pub period_s: f64,
     /// How many periods may make a group of fixes. 2 to 20, default 4; the papers have 5.
     pub periods: usize,
@@ -126,8 +126,8 @@ impl Default for Initiation {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tracking {
-    /// Power spectral density of the white acceleration, m^2/s^3. Default 1: a UAV that changes
-    /// its velocity by 1 m/s in a second.
+    /// Power spectral density of the white acceleration, m^2/s^3. Default 3, for UAVs that turn and
+    /// stop (1.7 m/s of change in a second); 0.02 for what flies straight.
     pub acceleration_density: f64,
     /// Probability with which a true bearing passes a track's gate. Default 0.9999.
     pub gate_probability: f64,
@@ -148,7 +148,7 @@ pub struct Tracking {
 impl Default for Tracking {
     fn default() -> Self {
         Self {
-            acceleration_density: 1.0,
+            acceleration_density: 3.0,
             gate_probability: 0.9999,
             detection_probability: 0.9,
             clutter_per_sr: 5.0,

@@ -12,6 +12,13 @@ const MAX_HELD: usize = 20_000;
 
 type Order = (Timestamp, CameraName);
 
+/// An exposure that waits, and whether its time has been compared with another camera's.
+#[derive(Debug)]
+struct Held {
+    exposure: Exposure,
+    compared: bool,
+}
+
 /// The buffer that puts exposures into order.
 ///
 /// The time up to which exposures are released follows the *second* newest camera, so that one
@@ -20,8 +27,10 @@ type Order = (Timestamp, CameraName);
 #[derive(Debug)]
 pub(crate) struct EventBuffer {
     config: EventTime,
-    held: BTreeMap<Order, Exposure>,
+    held: BTreeMap<Order, Held>,
     newest: BTreeMap<CameraName, Timestamp>,
+    /// The newest time of each camera that agreed with another camera's.
+    trusted: BTreeMap<CameraName, Timestamp>,
     ended: BTreeSet<CameraName>,
     released: Timestamp,
 }
@@ -32,6 +41,7 @@ impl EventBuffer {
             config,
             held: BTreeMap::new(),
             newest: BTreeMap::new(),
+            trusted: BTreeMap::new(),
             ended: BTreeSet::new(),
             released: Timestamp::MIN,
         }
@@ -43,11 +53,15 @@ impl EventBuffer {
         self.ended.remove(&exposure.camera);
         let previous = self.newest.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
         self.newest.insert(exposure.camera.clone(), previous.max(time));
-        if let Some(reference) = self.second_newest() {
-            let by_s = time.seconds_since(reference) - self.config.max_ahead_s;
-            if by_s > 0.0 {
-                return Err(RejectionReason::Future { by_s: by_s + self.config.max_ahead_s });
+        let reference = self.second_newest();
+        if let Some(reference) = reference {
+            // A camera that goes on by itself, step by step, is not from the future.
+            let trusted = self.trusted.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
+            let by_s = time.seconds_since(reference.max(trusted));
+            if by_s > self.config.max_ahead_s {
+                return Err(RejectionReason::Future { by_s });
             }
+            self.trusted.insert(exposure.camera.clone(), trusted.max(time));
         }
         if time <= self.released {
             return Err(RejectionReason::Late { by_s: self.released.seconds_since(time) });
@@ -56,7 +70,7 @@ impl EventBuffer {
         if self.held.contains_key(&order) {
             return Err(RejectionReason::Duplicate);
         }
-        self.held.insert(order, exposure);
+        self.held.insert(order, Held { exposure, compared: reference.is_some() });
         Ok(())
     }
 
@@ -76,9 +90,9 @@ impl EventBuffer {
 
     /// The next exposure, whatever may still come.
     pub(crate) fn pop(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
-        let (_, exposure) = self.held.pop_first()?;
+        let (_, Held { exposure, compared }) = self.held.pop_first()?;
         // A frame taken in before a second camera was heard may turn out to be from the future.
-        if let Some(reference) = self.second_newest() {
+        if !compared && let Some(reference) = self.second_newest() {
             let ahead = exposure.time.seconds_since(reference);
             if ahead > self.config.max_ahead_s {
                 return Some(Err((exposure, RejectionReason::Future { by_s: ahead })));

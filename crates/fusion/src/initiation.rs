@@ -1,7 +1,7 @@
 //! New tracks: bearings that belong to no track are gathered into observation
 //! periods, solved for fixes, and the fixes are grouped.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, VecDeque};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Solver, Timestamp};
@@ -18,8 +18,10 @@ use crate::{Exposure, Initiation, Sighting, SpatialSolver};
 
 /// A target is not faster than this many standard deviations of the velocity prior.
 const SPEED_SIGMAS: f64 = 4.0;
-/// A camera that has given this many exposures in a period waits no longer for a silent one.
-const PATIENCE_EXPOSURES: usize = 4;
+/// A camera whose newest exposure is older than this many frame intervals of another is silent.
+const SILENT_INTERVALS: f64 = 5.0;
+/// A period is closed where the exposures lie within this factor of as close as they ever do.
+const SPREAD_FACTOR: f64 = 1.2;
 
 /// The squared distance that a true value of `dof` dimensions stays within with probability `p`.
 fn chi_square(p: f64, dof: usize) -> f64 {
@@ -27,27 +29,17 @@ fn chi_square(p: f64, dof: usize) -> f64 {
     ChiSquared::new(dof as f64).map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(p))
 }
 
-/// One camera's newest exposure of the period.
-#[derive(Debug)]
-struct Contribution {
-    exposure: Exposure,
-    exposures: usize,
-}
-
-/// The observation period that is being filled.
-#[derive(Debug)]
-struct Period {
-    start: Timestamp,
-    cameras: BTreeMap<CameraName, Contribution>,
-}
-
 /// Finds new targets among the bearings that no track claims.
 #[derive(Debug)]
 pub(crate) struct Initiator {
     config: Initiation,
     grouping: Grouping,
-    heard: BTreeSet<CameraName>,
-    period: Option<Period>,
+    /// The newest exposure of each camera that no period has used.
+    unused: BTreeMap<CameraName, Exposure>,
+    heard: BTreeMap<CameraName, Timestamp>,
+    /// How far apart the cameras' newest exposures lay, s, at each of the last exposures.
+    spreads: VecDeque<f64>,
+    closed: Option<Timestamp>,
     pair_gate: f64,
 }
 
@@ -68,39 +60,50 @@ impl Initiator {
             shared_lines: config.shared_lines,
         };
         let pair_gate = chi_square(config.spatial_gate_probability, 2);
-        Self { config, grouping: Grouping::new(rules), heard: BTreeSet::new(), period: None, pair_gate }
+        Self {
+            config,
+            grouping: Grouping::new(rules),
+            unused: BTreeMap::new(),
+            heard: BTreeMap::new(),
+            spreads: VecDeque::new(),
+            closed: None,
+            pair_gate,
+        }
     }
 
     /// Takes in what an exposure has left over and returns the groups that are new targets.
+    ///
+    /// A period holds one exposure of each camera that is heard. It is closed where these lie
+    /// closest together, which for cameras that scan in turn is at the end of a scan.
     pub(crate) fn add(&mut self, exposure: Exposure) -> Vec<Group> {
-        self.heard.insert(exposure.camera.clone());
-        let mut found = Vec::new();
-        let (time, shortest) = (exposure.time, self.config.period_s);
-        let long_enough = |period: &Period| time.seconds_since(period.start) >= shortest;
-        let repeats = |period: &Period| period.cameras.get(&exposure.camera).map_or(0, |c| c.exposures);
-
-        let everyone = self.heard.len();
-        let over = self.period.take_if(|period| {
-            let repeats = repeats(period);
-            let waited = period.cameras.len() == everyone || repeats >= PATIENCE_EXPOSURES;
-            repeats > 0 && waited && long_enough(period)
-        });
-        if let Some(period) = over {
-            found = self.close(&period);
+        let now = exposure.time;
+        let previous = self.heard.insert(exposure.camera.clone(), now);
+        self.unused.insert(exposure.camera.clone(), exposure);
+        if let Some(interval) = previous.map(|time| now.seconds_since(time)) {
+            self.heard.retain(|_, time| now.seconds_since(*time) <= SILENT_INTERVALS * interval);
         }
-        let period =
-            self.period.get_or_insert_with(|| Period { start: time, cameras: BTreeMap::new() });
-        let exposures = repeats(period) + 1;
-        period.cameras.insert(exposure.camera.clone(), Contribution { exposure, exposures });
-        let full = self.period.take_if(|p| p.cameras.len() == everyone && long_enough(p));
-        if let Some(period) = full {
-            found.append(&mut self.close(&period));
+        let needed = if self.config.solver == SpatialSolver::Pair { 2 } else { 3 };
+        let spread_of = |oldest: Option<Timestamp>| oldest.map_or(0.0, |time| now.seconds_since(time));
+        if self.heard.len() < needed {
+            return Vec::new();
         }
-        found
-    }
-
-    fn close(&mut self, period: &Period) -> Vec<Group> {
-        let exposures: Vec<&Exposure> = period.cameras.values().map(|c| &c.exposure).collect();
+        self.spreads.push_back(spread_of(self.heard.values().min().copied()));
+        while self.spreads.len() > 2 * self.heard.len() {
+            self.spreads.pop_front();
+        }
+        let closest = self.spreads.iter().copied().fold(f64::INFINITY, f64::min);
+        let (unused, heard) = (&mut self.unused, &self.heard);
+        unused.retain(|camera, _| heard.contains_key(camera));
+        let complete = unused.len() == heard.len();
+        let spread = spread_of(unused.values().map(|exposure| exposure.time).min());
+        let long_enough =
+            self.closed.is_none_or(|closed| now.seconds_since(closed) >= self.config.period_s);
+        if !(complete && long_enough && spread <= closest * SPREAD_FACTOR) {
+            return Vec::new();
+        }
+        self.closed = Some(now);
+        let period = std::mem::take(&mut self.unused);
+        let exposures: Vec<&Exposure> = period.values().collect();
         let fixes = self.fixes(&exposures);
         self.grouping.advance(&fixes)
     }

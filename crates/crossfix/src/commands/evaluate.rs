@@ -1,0 +1,138 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::ensure;
+use crossfix_evaluation::{Evaluator, Latency, LatencyRecorder, Report, TrackHistory, TrueTarget};
+use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame, decode};
+use crossfix_recording::RecordingReader;
+use serde::Serialize;
+
+use crate::output;
+
+/// Hold the tracks of a recording against the truth in it.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix evaluate tracks.mcap --json")]
+pub struct Args {
+    /// The recording (MCAP) with tracks and truth.
+    recording: PathBuf,
+    /// A second recording (MCAP) with the truth, if the first has none.
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// Farther than this from a target a track is not that target's, metres.
+    #[arg(long, default_value_t = 5.0, value_name = "METRES")]
+    cutoff_m: f64,
+    /// Leave out what lies less than this after the first truth, seconds.
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    skip_s: f64,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// The figures of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Evaluation {
+    /// Tracks against truth.
+    #[serde(flatten)]
+    pub report: Report,
+    /// From a bearing to the tracks that follow from it; absent in data without arrival times.
+    pub latency: Option<Latency>,
+}
+
+/// What a recording holds that can be evaluated.
+#[derive(Default)]
+struct Run {
+    truth: Vec<TruthFrame>,
+    tracks: TrackHistory,
+    latency: LatencyRecorder,
+}
+
+impl Run {
+    fn read(&mut self, path: &Path) -> anyhow::Result<()> {
+        RecordingReader::open(path)?.for_each(|entry| {
+            match entry.key.channel {
+                Channel::Truth => self.truth.push(decode(&entry.data)?),
+                Channel::Tracks => {
+                    let frame: TrackFrame = decode(&entry.data)?;
+                    self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
+                    self.tracks.add(&frame);
+                }
+                Channel::Bearings(_) => {
+                    let frame: BearingFrame = decode(&entry.data)?;
+                    self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
+                }
+                _ => {}
+            }
+            Ok::<_, crossfix_message::DecodeError>(())
+        })?;
+        Ok(())
+    }
+}
+
+fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
+    let target = |state: &crossfix_message::TrueState| {
+        Some(TrueTarget { id: state.id, position: state.position?.into(), velocity: state.velocity?.into() })
+    };
+    frame.targets.iter().filter_map(target).collect()
+}
+
+/// Evaluates a recording; `truth` may hold the truth if the recording has none.
+pub fn evaluate(recording: &Path, truth: Option<&Path>, cutoff_m: f64, skip_s: f64) -> anyhow::Result<Evaluation> {
+    let mut run = Run::default();
+    run.read(recording)?;
+    if let Some(path) = truth {
+        let mut other = Run::default();
+        other.read(path)?;
+        run.truth = other.truth;
+    }
+    ensure!(!run.truth.is_empty(), "{} holds no truth: give a recording that does with --truth", recording.display());
+    run.truth.sort_by_key(|frame| frame.time_ns);
+    let start = Timestamp::from_nanos(run.truth[0].time_ns).plus_seconds(skip_s);
+    let mut evaluator = Evaluator::new(cutoff_m);
+    for frame in &run.truth {
+        let time = Timestamp::from_nanos(frame.time_ns);
+        if time >= start {
+            evaluator.add(&targets(frame), &run.tracks.at(time));
+        }
+    }
+    // Imported data arrive when they are made: there is no latency to speak of.
+    let latency = run.latency.latency().filter(|latency| latency.p99_ms > 0.0);
+    Ok(Evaluation { report: evaluator.report(), latency })
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let evaluation = evaluate(&args.recording, args.truth.as_deref(), args.cutoff_m, args.skip_s)?;
+    if args.json {
+        return output::json(&evaluation);
+    }
+    output::line(render(&evaluation));
+    Ok(())
+}
+
+/// The figures as people read them.
+pub fn render(evaluation: &Evaluation) -> String {
+    let Evaluation { report, latency } = evaluation;
+    let head = ["target", "detected", "tracked", "position RMSE [m]", "velocity RMSE [m/s]", "NEES (6)"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    rows.extend(report.targets.iter().map(|target| {
+        vec![
+            target.target.to_string(),
+            if target.detected { "yes" } else { "no" }.to_owned(),
+            format!("{:.1} %", 100.0 * target.share_tracked),
+            output::number(target.position_rmse_m, 3),
+            output::number(target.velocity_rmse_mps, 3),
+            output::number(target.mean_nees, 2),
+        ]
+    }));
+    let latency = latency.map_or_else(String::new, |latency| {
+        format!("\nbearing to track: p50 {:.1} ms, p99 {:.1} ms", latency.p50_ms, latency.p99_ms)
+    });
+    format!(
+        "{}\n\n{} instants, {} false tracks, {} changes of identity, OSPA {:.3} m, GOSPA {:.3} m{latency}",
+        output::table(&rows),
+        report.instants,
+        report.false_tracks,
+        report.id_switches,
+        report.ospa_m,
+        report.gospa_m,
+    )
+}

@@ -1,0 +1,73 @@
+use std::path::PathBuf;
+
+use anyhow::Context;
+use crossfix_evaluation::{Estimate, TrackHistory};
+use crossfix_message::{Channel, Timestamp, TrackFrame, decode};
+use crossfix_recording::RecordingReader;
+use serde::Deserialize;
+
+use crate::output;
+
+/// Write the confirmed tracks of a recording as a table.
+///
+/// Columns t,track_id,x,y,z,vx,vy,vz: seconds since the Unix epoch, metres, metres a second. With
+/// --times, the state of each track at those times from its last frame at or before them,
+/// extrapolated with its velocity.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv")]
+pub struct Args {
+    /// The recording (MCAP) with tracks.
+    recording: PathBuf,
+    /// The table to write (CSV).
+    #[arg(long, value_name = "FILE")]
+    csv: PathBuf,
+    /// A table (CSV) with a column `t`: the times to answer, seconds since the Unix epoch.
+    #[arg(long, value_name = "FILE")]
+    times: Option<PathBuf>,
+}
+
+#[derive(Debug, Deserialize)]
+struct TimeRow {
+    t: f64,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let mut history = TrackHistory::default();
+    RecordingReader::open(&args.recording)?.for_each(|entry| {
+        if entry.key.channel == Channel::Tracks {
+            history.add(&decode::<TrackFrame>(&entry.data)?);
+        }
+        Ok::<_, crossfix_message::DecodeError>(())
+    })?;
+    let mut writer = csv::Writer::from_path(&args.csv)
+        .with_context(|| format!("cannot write {}", args.csv.display()))?;
+    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz"])?;
+    let mut rows = 0_u64;
+    let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
+        for Estimate { id, state } in estimates {
+            let mut record = vec![format!("{time:.9}"), id.to_string()];
+            record.extend(state.mean.iter().map(|value| format!("{value:.6}")));
+            writer.write_record(&record)?;
+            rows += 1;
+        }
+        Ok(())
+    };
+    match &args.times {
+        Some(path) => {
+            let mut reader = csv::Reader::from_path(path)
+                .with_context(|| format!("cannot read {}", path.display()))?;
+            for row in reader.deserialize() {
+                let TimeRow { t } = row.with_context(|| format!("{} needs a column `t`", path.display()))?;
+                write(t, &history.at(Timestamp::from_seconds(t)))?;
+            }
+        }
+        None => {
+            for (time, estimates) in history.frames() {
+                write(time.seconds(), estimates)?;
+            }
+        }
+    }
+    writer.flush().with_context(|| format!("cannot write {}", args.csv.display()))?;
+    output::line(format!("{rows} rows written to {}", args.csv.display()));
+    Ok(())
+}

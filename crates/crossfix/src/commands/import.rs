@@ -1,0 +1,78 @@
+use std::path::PathBuf;
+
+use anyhow::Context;
+use crossfix_recording::{Entry, RecordingWriter};
+
+use crate::import::{drone_tracking, scenario};
+use crate::output;
+
+/// Turn published data sets into recordings.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  crossfix import scenario DIR -o scenario.mcap"
+)]
+pub struct Args {
+    #[command(subcommand)]
+    source: Source,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Source {
+    /// The drone-tracking-datasets of ETH Zurich: labels of several cameras, RTK truth.
+    ///
+    /// Data times are RTK seconds from the Unix epoch. Only the split's test part is imported.
+    #[command(after_help = "Example:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap")]
+    DroneTrackingDatasets {
+        /// The folder with calibration/, poses.json and datasetN/.
+        dir: PathBuf,
+        /// Number of the data set.
+        #[arg(long, value_name = "N")]
+        dataset: u32,
+        /// Names of the cameras, separated by commas.
+        #[arg(long, value_delimiter = ',', value_name = "NAMES", required = true)]
+        cameras: Vec<String>,
+        /// Which poses and which test part of poses.json.
+        #[arg(long, default_value = "half", value_name = "NAME")]
+        split: String,
+        /// The recording to write (MCAP).
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+    /// A scenario folder of the format passive-bearings/1: bearings of many cameras, with truth.
+    #[command(after_help = "Example:\n  crossfix import scenario DIR -o scenario.mcap")]
+    Scenario {
+        /// The folder with scenario.json, exposures.csv, detections.csv and truth.csv.
+        dir: PathBuf,
+        /// The recording to write (MCAP).
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let (mut entries, path) = match &args.source {
+        Source::DroneTrackingDatasets { dir, dataset, cameras, split, output } => {
+            let selection = drone_tracking::Selection { dataset: *dataset, cameras, split };
+            (drone_tracking::read(dir, &selection)?, output)
+        }
+        Source::Scenario { dir, output } => (scenario::read(dir)?, output),
+    };
+    entries.sort_by_key(|entry| entry.data_time);
+    let mut writer = RecordingWriter::create(path)?;
+    for entry in &entries {
+        writer.write(entry)?;
+    }
+    let messages = writer.finish()?;
+    output::line(format!("{messages} messages written to {}", path.display()));
+    Ok(())
+}
+
+/// An entry of imported data: it arrived when it was made.
+pub fn imported(key: crossfix_message::Key, time: crossfix_message::Timestamp, data: Vec<u8>) -> Entry {
+    Entry { key, data_time: time, arrival: time, data }
+}
+
+/// Reads a whole text file of a data set.
+pub fn read_text(path: &std::path::Path) -> anyhow::Result<String> {
+    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+}

@@ -1,0 +1,250 @@
+//! The drone-tracking-datasets (ETH Zurich): labels of the drone's centre in
+//! several unsynchronised cameras, with RTK truth, and poses and clocks fitted
+//! to a calibration part.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
+use crossfix_message::{
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
+    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
+};
+use crossfix_recording::Entry;
+use nalgebra::{Matrix2, Matrix3, Point3};
+use serde::Deserialize;
+
+use crate::commands::import::{imported, read_text};
+
+/// Frame rate to which the published synchronisation refers, Hz.
+const SYNC_RATE: f64 = 59.94006;
+/// Rate of the RTK samples, Hz.
+const RTK_RATE: f64 = 5.0;
+
+/// What to read.
+pub struct Selection<'a> {
+    pub dataset: u32,
+    pub cameras: &'a [String],
+    pub split: &'a str,
+}
+
+#[derive(Debug, Deserialize)]
+struct Split {
+    test_rtk_index_ranges: Vec<[f64; 2]>,
+    cameras: BTreeMap<String, FittedCamera>,
+}
+
+#[derive(Debug, Deserialize)]
+#[allow(non_snake_case)]
+struct FittedCamera {
+    name: String,
+    R_world_to_cam: [[f64; 3]; 3],
+    centre_enu_m: [f64; 3],
+    clock_offset_s: f64,
+    clock_rate: f64,
+    readout_fraction_of_frame: f64,
+    residual_sigma_rad: f64,
+    sync_alpha: Option<f64>,
+    sync_beta: Option<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct LensFile {
+    #[serde(rename = "K-matrix")]
+    k: [[f64; 3]; 3],
+    #[serde(rename = "distCoeff")]
+    distortion: Vec<f64>,
+    fps: f64,
+    resolution: [u32; 2],
+}
+
+/// One row of a label file: a frame, and where the drone is in it, if it is.
+struct Label {
+    frame: u64,
+    pixel: Option<Pixel>,
+}
+
+impl FittedCamera {
+    /// RTK seconds of a frame whose target lies at a fraction of the image's height.
+    fn rtk_seconds(&self, frame: u64, height_fraction: f64, fps: f64) -> f64 {
+        let own = match (self.sync_alpha, self.sync_beta) {
+            (Some(alpha), Some(beta)) => (frame as f64 - beta) / alpha / SYNC_RATE,
+            _ => frame as f64 / fps,
+        };
+        let readout = self.readout_fraction_of_frame * height_fraction / fps;
+        (own - self.clock_offset_s + readout) * (1.0 + self.clock_rate)
+    }
+
+    fn camera(&self, lens: &LensFile) -> anyhow::Result<Camera> {
+        let mut coefficients = lens.distortion.clone();
+        coefficients.resize(5, 0.0);
+        let [k1, k2, p1, p2, k3] = coefficients[..] else {
+            bail!("distCoeff has more than five coefficients");
+        };
+        let intrinsics = Intrinsics {
+            size: ImageSize { width: lens.resolution[0], height: lens.resolution[1] },
+            fx: lens.k[0][0],
+            fy: lens.k[1][1],
+            cx: lens.k[0][2],
+            cy: lens.k[1][2],
+            distortion: Distortion::BrownConrady([k1, k2, p1, p2, k3]),
+        };
+        let camera_from_world = Matrix3::from(self.R_world_to_cam).transpose();
+        let pose = Pose::new(camera_from_world.transpose(), Point3::from(self.centre_enu_m))?;
+        Ok(Camera::new(intrinsics, pose)?)
+    }
+}
+
+/// The lens file of a camera: two cameras were used with two settings.
+fn lens_path(dir: &Path, name: &str, dataset: u32) -> PathBuf {
+    let file = match (name, dataset) {
+        ("sonyG", 1 | 2) => "sonyG_1",
+        ("sonyG", _) => "sonyG_2",
+        ("mate10", 3) => "mate10_1",
+        ("mate10", _) => "mate10_2",
+        _ => name,
+    };
+    dir.join("calibration").join(name).join(format!("{file}.json"))
+}
+
+fn parse_json<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+    serde_json::from_str(&read_text(path)?).with_context(|| format!("{} is not as expected", path.display()))
+}
+
+/// Reads the test part of a split: calibrations, bearings of every frame, truth.
+pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>> {
+    let site: SiteName = format!("drone-tracking-{}", selection.dataset).parse()?;
+    let poses = dir.join("poses.json");
+    let mut all: BTreeMap<String, serde_json::Value> = parse_json(&poses)?;
+    let mut dataset = all
+        .remove(&selection.dataset.to_string())
+        .with_context(|| format!("{} has no data set {}", poses.display(), selection.dataset))?;
+    let masked: Vec<f64> = serde_json::from_value(dataset["rtk_masked_indices"].take())?;
+    let split: Split = serde_json::from_value(dataset[selection.split].take())
+        .with_context(|| format!("{} has no split `{}` of the expected form", poses.display(), selection.split))?;
+
+    let folder = dir.join(format!("dataset{}", selection.dataset));
+    let mut entries = truth(&folder, &site, &split, &masked)?;
+    for wanted in selection.cameras {
+        let found = split.cameras.iter().find(|(_, camera)| camera.name == *wanted);
+        let Some((key, fitted)) = found else {
+            let known: Vec<&str> = split.cameras.values().map(|c| c.name.as_str()).collect();
+            bail!("no camera `{wanted}` in data set {}: there are {}", selection.dataset, known.join(", "));
+        };
+        let lens: LensFile = parse_json(&lens_path(dir, wanted, selection.dataset))?;
+        let labels = read_labels(&folder.join("detections").join(format!("{key}.txt")))?;
+        entries.extend(camera_entries(&site, fitted, &lens, &labels, &split)?);
+    }
+    Ok(entries)
+}
+
+fn in_test_part(split: &Split, rtk_seconds: f64) -> bool {
+    let index = rtk_seconds * RTK_RATE;
+    split.test_rtk_index_ranges.iter().any(|[low, high]| (*low..*high).contains(&index))
+}
+
+fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
+    let text = read_text(path)?;
+    let starts_with_digit = |line: &&str| line.starts_with(|c: char| c.is_ascii_digit());
+    text.lines()
+        .map(str::trim)
+        .filter(starts_with_digit)
+        .map(|line| {
+            let numbers: Vec<f64> = line.split_whitespace().map_while(|word| word.parse().ok()).collect();
+            let [frame, x, y, ..] = numbers[..] else {
+                bail!("{}: `{line}` is not `frame x y`", path.display());
+            };
+            let visible = x != 0.0 || y != 0.0;
+            Ok(Label { frame: frame as u64, pixel: visible.then(|| Pixel::new(x, y)) })
+        })
+        .collect()
+}
+
+fn camera_entries(
+    site: &SiteName,
+    fitted: &FittedCamera,
+    lens: &LensFile,
+    labels: &[Label],
+    split: &Split,
+) -> anyhow::Result<Vec<Entry>> {
+    let name: CameraName = fitted.name.parse()?;
+    let camera = fitted.camera(lens).with_context(|| format!("camera `{name}`"))?;
+    let height = f64::from(lens.resolution[1]);
+    let bearings = Key::new(site.clone(), Channel::Bearings(name.clone()));
+    let mut entries = Vec::new();
+    for label in labels {
+        let fraction = label.pixel.map_or(0.5, |pixel| pixel.y() / height);
+        let seconds = fitted.rtk_seconds(label.frame, fraction, lens.fps);
+        if !in_test_part(split, seconds) {
+            continue;
+        }
+        let time = Timestamp::from_seconds(seconds);
+        let track = label.pixel.map(|pixel| bearing_track(&camera, pixel, fitted.residual_sigma_rad));
+        let frame = BearingFrame {
+            camera: name.to_string(),
+            sequence: label.frame,
+            capture_time_ns: time.nanos(),
+            clock_source: ClockSource::FrameCount.into(),
+            tracks: track.transpose()?.into_iter().collect(),
+            ..Default::default()
+        };
+        entries.push(imported(bearings.clone(), time, frame.encode()));
+    }
+    let start = entries.iter().map(|entry| entry.data_time).min().unwrap_or_default();
+    let calibration = CameraCalibration::new(&name, &camera, start);
+    let key = Key::new(site.clone(), Channel::Calibration(name));
+    entries.insert(0, imported(key, Timestamp::EPOCH, calibration.encode()));
+    Ok(entries)
+}
+
+fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> anyhow::Result<BearingTrack> {
+    let direction = camera.model().direction(pixel)?;
+    let bearing = Bearing::new(direction.into_inner(), Matrix2::identity() * sigma.powi(2))?;
+    Ok(BearingTrack {
+        track_id: 1,
+        bearing: Some(bearing.direction().into_inner().into()),
+        covariance_xx: bearing.covariance().m11,
+        covariance_xy: bearing.covariance().m12,
+        covariance_yy: bearing.covariance().m22,
+        pixel_x: pixel.x(),
+        pixel_y: pixel.y(),
+        score: 1.0,
+        state: ImageTrackState::Tracking.into(),
+        ..Default::default()
+    })
+}
+
+/// The RTK samples of the test part, without the masked ones; velocities by central differences.
+fn truth(folder: &Path, site: &SiteName, split: &Split, masked: &[f64]) -> anyhow::Result<Vec<Entry>> {
+    let path = folder.join("trajectory").join("rtk.txt");
+    let rows: Vec<Vec<f64>> = read_text(&path)?
+        .lines()
+        .map(|line| line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>())
+        .filter(|row| row.len() >= 3)
+        .collect();
+    let key = Key::new(site.clone(), Channel::Truth);
+    let position = |row: &[f64]| {
+        // Four columns: an index first.
+        let offset = usize::from(row.len() > 3);
+        Point3::new(row[offset], row[offset + 1], row[offset + 2])
+    };
+    let mut entries = Vec::new();
+    for (index, window) in rows.windows(3).enumerate() {
+        let k = index + 1;
+        let seconds = k as f64 / RTK_RATE;
+        if masked.contains(&(k as f64)) || !in_test_part(split, seconds) {
+            continue;
+        }
+        let velocity = (position(&window[2]) - position(&window[0])) * (RTK_RATE / 2.0);
+        let time = Timestamp::from_seconds(seconds);
+        let state = TrueState {
+            id: 1,
+            position: Some(position(&window[1]).into()),
+            velocity: Some(velocity.into()),
+        };
+        let frame = TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
+        entries.push(imported(key.clone(), time, frame.encode()));
+    }
+    Ok(entries)
+}

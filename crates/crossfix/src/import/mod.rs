@@ -1,0 +1,4 @@
+//! Readers of published data sets.
+
+pub mod drone_tracking;
+pub mod scenario;

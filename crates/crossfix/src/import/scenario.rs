@@ -1,0 +1,171 @@
+//! Scenario folders of the format `passive-bearings/1`: time-stamped bearings
+//! of many cameras with clutter and missed detections, with truth.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
+use crossfix_message::{
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
+    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame, Vector3 as WireVector,
+};
+use crossfix_recording::Entry;
+use nalgebra::{Matrix3, Point3, Vector3};
+use serde::Deserialize;
+
+use crate::commands::import::{imported, read_text};
+
+#[derive(Debug, Deserialize)]
+struct Scenario {
+    format: String,
+    epochs_s: Vec<f64>,
+    cameras: Vec<ScenarioCamera>,
+}
+
+#[derive(Debug, Deserialize)]
+#[allow(non_snake_case)]
+struct ScenarioCamera {
+    id: u32,
+    pos: [f64; 3],
+    R_world_from_cam: [[f64; 3]; 3],
+}
+
+#[derive(Debug, Deserialize)]
+struct ExposureRow {
+    t: f64,
+    cam: u32,
+    scan: u64,
+}
+
+#[derive(Debug, Deserialize)]
+struct DetectionRow {
+    cam: u32,
+    scan: u64,
+    det: u64,
+    ux: f64,
+    uy: f64,
+    uz: f64,
+    sigma_rad: f64,
+}
+
+#[derive(Debug, Deserialize)]
+struct TruthRow {
+    t: f64,
+    id: u64,
+    x: f64,
+    y: f64,
+    z: f64,
+    vx: f64,
+    vy: f64,
+    vz: f64,
+}
+
+fn read_csv<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<Vec<T>> {
+    csv::Reader::from_path(path)
+        .and_then(|mut reader| reader.deserialize().collect())
+        .with_context(|| format!("cannot read {}", path.display()))
+}
+
+/// The format's camera axes are x left, y up, z forward; ours are x right, y down, z forward.
+fn turned(v: Vector3<f64>) -> Vector3<f64> {
+    Vector3::new(-v.x, -v.y, v.z)
+}
+
+fn name_of(id: u32) -> anyhow::Result<CameraName> {
+    Ok(format!("cam{id}").parse()?)
+}
+
+/// Reads a scenario: calibrations, bearings of every exposure, truth at the scoring times.
+pub fn read(dir: &Path) -> anyhow::Result<Vec<Entry>> {
+    let description = dir.join("scenario.json");
+    let scenario: Scenario = serde_json::from_str(&read_text(&description)?)
+        .with_context(|| format!("{} is no scenario", description.display()))?;
+    ensure!(
+        scenario.format == "passive-bearings/1",
+        "{}: format `{}` is not `passive-bearings/1`",
+        description.display(),
+        scenario.format
+    );
+    let site: SiteName = "scenario".parse()?;
+    let mut entries = Vec::new();
+    for camera in &scenario.cameras {
+        entries.push(calibration(&site, camera)?);
+    }
+    entries.extend(bearings(dir, &site)?);
+    entries.extend(truth(dir, &site, &scenario)?);
+    Ok(entries)
+}
+
+/// The format has no lens: one that sees everything the camera reports, 1000 pixels a radian.
+fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry> {
+    let name = name_of(camera.id)?;
+    let rows = Matrix3::from(camera.R_world_from_cam).transpose();
+    let axes = rows * Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0));
+    let pose = Pose::new(axes, Point3::from(camera.pos)).with_context(|| format!("camera {}", camera.id))?;
+    let intrinsics = Intrinsics {
+        size: ImageSize { width: 4000, height: 3000 },
+        fx: 1000.0,
+        fy: 1000.0,
+        cx: 1999.5,
+        cy: 1499.5,
+        distortion: Distortion::None,
+    };
+    let message = CameraCalibration::new(&name, &Camera::new(intrinsics, pose)?, Timestamp::EPOCH);
+    Ok(imported(Key::new(site.clone(), Channel::Calibration(name)), Timestamp::EPOCH, message.encode()))
+}
+
+fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
+    let mut tracks: BTreeMap<(u32, u64), Vec<BearingTrack>> = BTreeMap::new();
+    for row in read_csv::<DetectionRow>(&dir.join("detections.csv"))? {
+        let direction: WireVector = turned(Vector3::new(row.ux, row.uy, row.uz)).into();
+        tracks.entry((row.cam, row.scan)).or_default().push(BearingTrack {
+            // The detections of a scan are not tracks: their numbers mean nothing in the next.
+            track_id: row.scan * 1000 + row.det,
+            bearing: Some(direction),
+            covariance_xx: row.sigma_rad.powi(2),
+            covariance_yy: row.sigma_rad.powi(2),
+            score: 1.0,
+            state: ImageTrackState::Tracking.into(),
+            ..Default::default()
+        });
+    }
+    read_csv::<ExposureRow>(&dir.join("exposures.csv"))?
+        .into_iter()
+        .map(|row| {
+            let name = name_of(row.cam)?;
+            let time = Timestamp::from_seconds(row.t);
+            let frame = BearingFrame {
+                camera: name.to_string(),
+                sequence: row.scan,
+                capture_time_ns: time.nanos(),
+                clock_source: ClockSource::Simulated.into(),
+                tracks: tracks.remove(&(row.cam, row.scan)).unwrap_or_default(),
+                ..Default::default()
+            };
+            let key = Key::new(site.clone(), Channel::Bearings(name));
+            Ok(imported(key, time, frame.encode()))
+        })
+        .collect()
+}
+
+fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec<Entry>> {
+    let epochs: Vec<Timestamp> = scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
+    let mut frames: BTreeMap<Timestamp, Vec<TrueState>> = BTreeMap::new();
+    for row in read_csv::<TruthRow>(&dir.join("truth.csv"))? {
+        let time = Timestamp::from_seconds(row.t);
+        if epochs.contains(&time) {
+            frames.entry(time).or_default().push(TrueState {
+                id: row.id,
+                position: Some(WireVector { x: row.x, y: row.y, z: row.z }),
+                velocity: Some(WireVector { x: row.vx, y: row.vy, z: row.vz }),
+            });
+        }
+    }
+    let key = Key::new(site.clone(), Channel::Truth);
+    let entry = |(time, targets): (Timestamp, Vec<TrueState>)| {
+        let frame = TruthFrame { time_ns: time.nanos(), targets, ..Default::default() };
+        imported(key.clone(), time, frame.encode())
+    };
+    Ok(frames.into_iter().map(entry).collect())
+}

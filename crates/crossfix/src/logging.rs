@@ -1,0 +1,46 @@
+//! Logs go to stderr; results go to stdout.
+
+use clap::{Args, ValueEnum};
+use tracing_subscriber::EnvFilter;
+
+/// How logs look.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For people.
+    #[default]
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// The options that every command has.
+#[derive(Debug, Args)]
+pub struct LoggingArgs {
+    /// More logs on stderr: -v details, -vv everything.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    verbose: u8,
+    /// Fewer logs: errors only.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    quiet: bool,
+    /// Form of the logs on stderr.
+    #[arg(long, global = true, value_enum, default_value_t, value_name = "FORMAT")]
+    log_format: LogFormat,
+}
+
+/// Starts logging for the process. `RUST_LOG` overrides the options.
+pub fn start(args: &LoggingArgs) {
+    let level = match (args.quiet, args.verbose) {
+        (true, _) => "error",
+        (_, 0) => "warn,crossfix=info",
+        (_, 1) => "info,crossfix=debug",
+        _ => "debug",
+    };
+    // Zenoh warns about what we chose on purpose (no gossip) and about peers that are not up yet.
+    let filter = format!("{level},zenoh=error,zenoh_transport=error,zenoh_link_tcp=error");
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(filter));
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match args.log_format {
+        LogFormat::Text => builder.with_target(false).init(),
+        LogFormat::Json => builder.json().init(),
+    }
+}
