@@ -1,0 +1,76 @@
+//! Frames with their capture times, from files: PNG and JPEG sequences, Y4M,
+//! MP4 with H.264. Nothing but cargo dependencies.
+//!
+//! The seam is [`FrameSource`]. [`open`] finds the right one for a path.
+
+mod error;
+mod frame;
+mod mp4;
+mod sequence;
+mod still;
+mod y4m_file;
+
+use std::path::Path;
+
+pub use error::VideoError;
+pub use frame::{CaptureTime, Frame, Pixels};
+pub use mp4::Mp4Source;
+pub use sequence::SequenceSource;
+pub use still::decode_still;
+pub use y4m_file::Y4mSource;
+
+use crossfix_message::Timestamp;
+
+/// Images larger than this are refused: a damaged header must not take all memory.
+pub const MAX_PIXELS: u64 = 1 << 26;
+
+/// A source of frames in the order of their capture.
+///
+/// The caller asks until the answer is `Ok(None)`, the end. An error that
+/// [`VideoError::is_one_frame`] says is one frame's was counted in the frames'
+/// numbers, and the next call goes on with the frame after it; any other error
+/// is the end too.
+pub trait FrameSource: Send {
+    /// The next frame, or `None` at the end.
+    ///
+    /// # Errors
+    /// [`VideoError`] naming the file and the frame.
+    fn next_frame(&mut self) -> Result<Option<Frame>, VideoError>;
+}
+
+/// When the frames of a file were captured, for files that do not say.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameClock {
+    /// Capture time of the first frame.
+    pub start: Timestamp,
+    /// Frames a second, for files that have no rate of their own.
+    pub fallback_rate_hz: f64,
+    /// Standard deviation of the capture times, s.
+    pub sd_s: f64,
+}
+
+impl Default for FrameClock {
+    fn default() -> Self {
+        Self { start: Timestamp::EPOCH, fallback_rate_hz: 30.0, sd_s: 1e-3 }
+    }
+}
+
+impl FrameClock {
+    fn at(&self, seconds: f64) -> CaptureTime {
+        CaptureTime { time: self.start.plus_seconds(seconds), sd_s: self.sd_s }
+    }
+}
+
+/// Opens a folder of images, a `.y4m` or a `.mp4` file.
+///
+/// # Errors
+/// [`VideoError`] if it is not there, of another kind, or damaged from the start.
+pub fn open(path: &Path, clock: FrameClock) -> Result<Box<dyn FrameSource>, VideoError> {
+    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+    match extension.as_deref() {
+        _ if path.is_dir() => Ok(Box::new(SequenceSource::open(path, clock)?)),
+        Some("y4m") => Ok(Box::new(Y4mSource::open(path, clock)?)),
+        Some("mp4" | "m4v" | "mov") => Ok(Box::new(Mp4Source::open(path, clock)?)),
+        _ => Err(VideoError::UnknownKind { path: path.to_owned() }),
+    }
+}

@@ -1,0 +1,54 @@
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+/// What can go wrong with a video.
+#[derive(Debug, Error)]
+pub enum VideoError {
+    /// The file or folder cannot be opened.
+    #[error("cannot open {}", path.display())]
+    Open {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        #[source]
+        source: std::io::Error,
+    },
+    /// Neither a folder of images nor a file of a known kind.
+    #[error("{} is neither a folder of PNG or JPEG images nor a .y4m or .mp4 file", path.display())]
+    UnknownKind {
+        /// The path.
+        path: PathBuf,
+    },
+    /// A folder without a single image.
+    #[error("{} holds no PNG or JPEG image", path.display())]
+    Empty {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The file as a whole cannot be read.
+    #[error("{} cannot be read: {what}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// One frame cannot be decoded; the ones after it can.
+    #[error("frame {index} of {} cannot be decoded: {what}", path.display())]
+    Frame {
+        /// The file.
+        path: PathBuf,
+        /// Number of the frame, from 0.
+        index: u64,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+impl VideoError {
+    /// Whether only one frame is lost and the source goes on.
+    pub fn is_one_frame(&self) -> bool {
+        matches!(self, Self::Frame { .. })
+    }
+}

@@ -1,0 +1,88 @@
+use crossfix_message::Timestamp;
+
+/// Red, green and blue's part in brightness (BT.601).
+const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
+/// What a 16-bit level is in 8-bit levels.
+const SIXTEEN_TO_EIGHT: f32 = 1.0 / 257.0;
+
+/// When a frame was captured: mid-exposure.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CaptureTime {
+    /// The instant.
+    pub time: Timestamp,
+    /// Its standard deviation, s.
+    pub sd_s: f64,
+}
+
+/// The samples of an image, row by row, colours interleaved.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Pixels {
+    /// One sample of 8 bits a pixel.
+    Gray8(Vec<u8>),
+    /// One sample of 16 bits a pixel.
+    Gray16(Vec<u16>),
+    /// Red, green, blue of 8 bits.
+    Rgb8(Vec<u8>),
+    /// Red, green, blue of 16 bits.
+    Rgb16(Vec<u16>),
+}
+
+/// One image with its number and capture time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Number of the frame in its source, from 0.
+    pub index: u64,
+    /// When it was captured.
+    pub capture: CaptureTime,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `width * height` pixels.
+    pub pixels: Pixels,
+}
+
+fn weighted<T: Copy>(samples: &[T], scale: f32, as_f32: impl Fn(T) -> f32) -> Vec<f32> {
+    let brightness = |p: &[T]| {
+        (LUMA[0] * as_f32(p[0]) + LUMA[1] * as_f32(p[1]) + LUMA[2] * as_f32(p[2])) * scale
+    };
+    samples.chunks_exact(3).map(brightness).collect()
+}
+
+impl Frame {
+    /// Brightness of every pixel in 8-bit levels (0 to 255, with fractions), row by row.
+    pub fn brightness(&self) -> Vec<f32> {
+        match &self.pixels {
+            Pixels::Gray8(samples) => samples.iter().map(|&s| f32::from(s)).collect(),
+            Pixels::Gray16(samples) => {
+                samples.iter().map(|&s| f32::from(s) * SIXTEEN_TO_EIGHT).collect()
+            }
+            Pixels::Rgb8(samples) => weighted(samples, 1.0, f32::from),
+            Pixels::Rgb16(samples) => weighted(samples, SIXTEEN_TO_EIGHT, f32::from),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn white_is_255_in_every_format() {
+        let of = |pixels| Frame {
+            index: 0,
+            capture: CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 },
+            width: 1,
+            height: 1,
+            pixels,
+        };
+        for pixels in [
+            Pixels::Gray8(vec![255]),
+            Pixels::Gray16(vec![65535]),
+            Pixels::Rgb8(vec![255; 3]),
+            Pixels::Rgb16(vec![65535; 3]),
+        ] {
+            assert!((of(pixels).brightness()[0] - 255.0).abs() < 1e-3);
+        }
+    }
+}

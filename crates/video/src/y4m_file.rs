@@ -1,0 +1,84 @@
+use std::fs::File;
+use std::io::{BufRead, BufReader, Chain, Cursor, Read};
+use std::path::{Path, PathBuf};
+
+use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
+
+/// The longest header line that is read.
+const MAX_HEADER: u64 = 4096;
+
+type Input = Chain<Cursor<Vec<u8>>, BufReader<File>>;
+
+/// A YUV4MPEG2 file; the brightness plane is used, 8 to 16 bits.
+pub struct Y4mSource {
+    decoder: y4m::Decoder<Input>,
+    path: PathBuf,
+    next: u64,
+    rate_hz: f64,
+    /// Multiplies a sample of more than 8 bits to fill 16.
+    shift: u32,
+    clock: FrameClock,
+}
+
+impl Y4mSource {
+    /// Opens a file and reads its header.
+    ///
+    /// # Errors
+    /// [`VideoError`] if it cannot be opened or its header makes no sense.
+    pub fn open(path: &Path, clock: FrameClock) -> Result<Self, VideoError> {
+        let open = |source| VideoError::Open { path: path.to_owned(), source };
+        let damaged = |what: String| VideoError::Damaged { path: path.to_owned(), what };
+        let mut file = BufReader::new(File::open(path).map_err(open)?);
+        let mut header = Vec::new();
+        file.by_ref().take(MAX_HEADER).read_until(b'\n', &mut header).map_err(open)?;
+        let text = String::from_utf8_lossy(&header).into_owned();
+        let side = |letter: char| {
+            let token = text.split_whitespace().find_map(|token| token.strip_prefix(letter));
+            token.and_then(|digits| digits.parse::<u64>().ok()).unwrap_or(0)
+        };
+        let (width, height) = (side('W'), side('H'));
+        if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
+            return Err(damaged(format!("its size is {width}x{height}")));
+        }
+        // The library has no mono16, which is laid out as mono12.
+        let sixteen = text.contains("Cmono16");
+        let header = text.replace("Cmono16", "Cmono12").into_bytes();
+        let limits = y4m::Limits { bytes: 8 * MAX_PIXELS as usize };
+        let decoder = y4m::Decoder::new_with_limits(Cursor::new(header).chain(file), limits)
+            .map_err(|error| damaged(error.to_string()))?;
+        let rate = decoder.get_framerate();
+        let rate_hz = if rate.num > 0 && rate.den > 0 {
+            rate.num as f64 / rate.den as f64
+        } else {
+            clock.fallback_rate_hz
+        };
+        let bits = if sixteen { 16 } else { decoder.get_bit_depth() as u32 };
+        let path = path.to_owned();
+        Ok(Self { decoder, path, next: 0, rate_hz, shift: 16_u32.saturating_sub(bits), clock })
+    }
+}
+
+impl FrameSource for Y4mSource {
+    fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        let (width, height) = (self.decoder.get_width(), self.decoder.get_height());
+        let wide = self.decoder.get_bytes_per_sample() == 2;
+        let frame = match self.decoder.read_frame() {
+            Ok(frame) => frame,
+            Err(y4m::Error::EOF) => return Ok(None),
+            Err(error) => {
+                return Err(VideoError::Damaged { path: self.path.clone(), what: error.to_string() });
+            }
+        };
+        let plane = frame.get_y_plane();
+        let pixels = if wide {
+            let sample = |b: &[u8]| u16::from_le_bytes([b[0], b[1]]) << self.shift;
+            Pixels::Gray16(plane.chunks_exact(2).map(sample).collect())
+        } else {
+            Pixels::Gray8(plane.to_vec())
+        };
+        let index = self.next;
+        self.next += 1;
+        let capture = self.clock.at(index as f64 / self.rate_hz);
+        Ok(Some(Frame { index, capture, width, height, pixels }))
+    }
+}

@@ -1,0 +1,150 @@
+//! Every kind of source, whole and damaged.
+
+use std::fs;
+use std::path::Path;
+
+use crossfix_video::{Frame, FrameClock, Pixels, VideoError, decode_still, open};
+use proptest::prelude::*;
+
+fn png(width: u32, height: u32, color: png::ColorType, depth: png::BitDepth, samples: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(color);
+    encoder.set_depth(depth);
+    encoder.write_header().unwrap().write_image_data(samples).unwrap();
+    bytes
+}
+
+fn gray(value: u8) -> Vec<u8> {
+    png(4, 2, png::ColorType::Grayscale, png::BitDepth::Eight, &[value; 8])
+}
+
+/// All frames and all errors of a source.
+fn read(path: &Path) -> (Vec<Frame>, Vec<VideoError>) {
+    let mut source = open(path, FrameClock { fallback_rate_hz: 10.0, ..FrameClock::default() }).unwrap();
+    let (mut frames, mut errors) = (Vec::new(), Vec::new());
+    loop {
+        match source.next_frame() {
+            Ok(Some(frame)) => frames.push(frame),
+            Ok(None) => return (frames, errors),
+            Err(error) => {
+                let goes_on = error.is_one_frame();
+                errors.push(error);
+                if !goes_on {
+                    return (frames, errors);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_sequence_comes_in_the_order_of_its_numbers_with_times() {
+    let folder = tempfile::tempdir().unwrap();
+    for number in [10, 9, 8] {
+        fs::write(folder.path().join(format!("f{number}.png")), gray(number)).unwrap();
+    }
+    let (frames, errors) = read(folder.path());
+    assert!(errors.is_empty());
+    let values: Vec<f32> = frames.iter().map(|frame| frame.brightness()[0]).collect();
+    assert_eq!(values, [8.0, 9.0, 10.0]);
+    assert_eq!(frames[2].capture.time.seconds(), 0.2);
+}
+
+#[test]
+fn a_corrupt_png_costs_one_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("1.png"), gray(1)).unwrap();
+    let whole = gray(2);
+    fs::write(folder.path().join("2.png"), &whole[..whole.len() / 2]).unwrap();
+    fs::write(folder.path().join("3.png"), gray(3)).unwrap();
+    let (frames, errors) = read(folder.path());
+    assert_eq!(frames.iter().map(|frame| frame.index).collect::<Vec<_>>(), [0, 2]);
+    assert!(matches!(&errors[..], [VideoError::Frame { index: 1, .. }]), "{errors:?}");
+}
+
+#[test]
+fn sixteen_bits_and_colour_are_kept() {
+    let deep = png(1, 1, png::ColorType::Grayscale, png::BitDepth::Sixteen, &[0x12, 0x34]);
+    assert_eq!(decode_still(&deep).unwrap(), (1, 1, Pixels::Gray16(vec![0x1234])));
+    let colour = png(1, 1, png::ColorType::Rgba, png::BitDepth::Eight, &[1, 2, 3, 255]);
+    assert_eq!(decode_still(&colour).unwrap(), (1, 1, Pixels::Rgb8(vec![1, 2, 3])));
+}
+
+#[test]
+fn a_y4m_file_has_its_own_rate_and_may_be_torn() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.y4m");
+    let mut bytes = b"YUV4MPEG2 W2 H2 F50:1 Cmono\n".to_vec();
+    for value in [1_u8, 2, 3] {
+        bytes.extend(b"FRAME\n");
+        bytes.extend([value; 4]);
+    }
+    fs::write(&path, &bytes).unwrap();
+    let (frames, _) = read(&path);
+    assert_eq!(frames.len(), 3);
+    assert_eq!(frames[2].capture.time.seconds(), 0.04);
+    fs::write(&path, &bytes[..bytes.len() - 2]).unwrap();
+    assert_eq!(read(&path).0.len(), 2);
+}
+
+#[test]
+fn a_y4m_file_of_sixteen_bits_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.y4m");
+    let mut bytes = b"YUV4MPEG2 W1 H1 F25:1 Cmono16\nFRAME\n".to_vec();
+    bytes.extend(0x1234_u16.to_le_bytes());
+    fs::write(&path, &bytes).unwrap();
+    assert_eq!(read(&path).0[0].pixels, Pixels::Gray16(vec![0x1234]));
+}
+
+#[test]
+fn what_is_no_video_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = folder.path().join("notes.txt");
+    fs::write(&text, "hello").unwrap();
+    let kind = |path: &Path| open(path, FrameClock::default()).err().unwrap();
+    assert!(matches!(kind(&text), VideoError::UnknownKind { .. }));
+    assert!(matches!(kind(folder.path()), VideoError::Empty { .. }));
+    assert!(matches!(kind(&folder.path().join("gone.mp4")), VideoError::Open { .. }));
+    let mp4 = folder.path().join("a.mp4");
+    fs::write(&mp4, [0_u8; 64]).unwrap();
+    assert!(matches!(kind(&mp4), VideoError::Damaged { .. }));
+}
+
+#[test]
+fn real_mp4_files_have_all_their_frames_and_survive_a_tear() {
+    let Some(data) = std::env::var_os("CROSSFIX_DATA") else {
+        eprintln!("SKIPPED: set CROSSFIX_DATA to the folder of real data");
+        return;
+    };
+    let clip = Path::new(&data).join("svanstrom-drone-video/IR_DRONE_030.mp4");
+    let (frames, errors) = read(&clip);
+    assert!(errors.is_empty(), "{errors:?}");
+    assert_eq!(frames.len(), 302);
+    assert!(frames.is_sorted_by_key(|frame| frame.capture.time));
+    assert_eq!((frames[0].width, frames[0].height), (320, 256));
+
+    // The index first, the pictures after it: cut off in the middle of the pictures.
+    let folder = tempfile::tempdir().unwrap();
+    let torn = folder.path().join("torn.mp4");
+    let bytes = fs::read(&clip).unwrap();
+    fs::write(&torn, &bytes[..bytes.len() / 2]).unwrap();
+    match open(&torn, FrameClock::default()) {
+        Ok(_) => {
+            let (frames, errors) = read(&torn);
+            assert!(!frames.is_empty() && !errors.is_empty());
+        }
+        Err(error) => assert!(matches!(error, VideoError::Damaged { .. }), "{error}"),
+    }
+}
+
+proptest! {
+    #[test]
+    fn any_damage_to_a_still_is_survived(at in any::<prop::sample::Index>(), value in any::<u8>()) {
+        let mut bytes = gray(7);
+        let index = at.index(bytes.len());
+        bytes[index] ^= value;
+        let _ = decode_still(&bytes);
+    }
+}
