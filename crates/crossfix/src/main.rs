@@ -2,6 +2,7 @@
 
 mod commands;
 mod config;
+mod eye;
 mod import;
 mod logging;
 mod output;
@@ -10,7 +11,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::commands::{evaluate, export, import as import_command, info, replay};
+use crate::commands::{evaluate, export, import as import_command, info, replay, track};
 
 /// Where in the air a small thing is, with nothing but cameras.
 ///
@@ -27,6 +28,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Track(track::Args),
     Replay(replay::Args),
     Info(info::Args),
     Import(import_command::Args),
@@ -36,6 +38,7 @@ enum Command {
 
 fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
+        Command::Track(args) => track::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Import(args) => import_command::run(&args),

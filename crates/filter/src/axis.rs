@@ -120,6 +120,11 @@ impl AxisFilter {
         &self.covariance
     }
 
+    /// Puts the state at rest at a position, keeping its covariance.
+    pub fn hold_at(&mut self, position: f64) {
+        self.state = Vector2::new(position, 0.0);
+    }
+
     /// Takes part of the velocity away, keeping its variance: a target that is not seen is not
     /// believed to go on for ever.
     pub fn damp_velocity(&mut self, factor: f64) {

@@ -1,0 +1,74 @@
+//! The agent's eye: finds small targets in one image stream and follows them
+//! by correlation, with a Kalman filter on each image axis (000, 001).
+//!
+//! [`ImageTracker`] is a pure state machine: images with their times go in,
+//! the tracks of each image come out.
+//!
+//! ```
+//! use crossfix_correlation::Plane;
+//! use crossfix_message::Timestamp;
+//! use crossfix_vision::{ImageTracker, PixelBox, TrackerConfig};
+//!
+//! // A bright blob that moves 2 px a frame to the right.
+//! let image = |x: f32| Plane::from_fn(160, 120, |column, row| {
+//!     let (dx, dy) = (column as f32 - x, row as f32 - 60.0);
+//!     40.0 + 150.0 * (-(dx * dx + dy * dy) / 8.0).exp()
+//! });
+//! let mut tracker = ImageTracker::new(TrackerConfig::default())?;
+//! tracker.take_up(PixelBox { x: 25.0, y: 56.0, width: 10.0, height: 8.0 });
+//! for frame in 0..20 {
+//!     let time = Timestamp::from_seconds(f64::from(frame) / 30.0);
+//!     let tracks = tracker.step(&image(30.0 + 2.0 * frame as f32), time);
+//!     let error = tracks[0].position.x - (30.0 + 2.0 * f64::from(frame));
+//!     assert!(error.abs() < 0.6, "frame {frame}: {error}");
+//! }
+//! # Ok::<(), crossfix_vision::ConfigError>(())
+//! ```
+
+mod config;
+mod detector;
+mod target;
+mod tracker;
+
+pub use config::{ConfigError, DetectorConfig, TrackerConfig};
+pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, TrackPhase};
+
+/// A place in the image, pixels; (0, 0) is the middle of the top left pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImagePoint {
+    /// Column.
+    pub x: f64,
+    /// Row.
+    pub y: f64,
+}
+
+/// A rectangle of the image, pixels: the top left corner of its top left pixel, and its sides.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PixelBox {
+    /// Left edge; 0 is the left edge of the first column.
+    pub x: f64,
+    /// Upper edge.
+    pub y: f64,
+    /// Columns.
+    pub width: f64,
+    /// Rows.
+    pub height: f64,
+}
+
+impl PixelBox {
+    /// The middle, as a place: the box of one pixel at (0, 0) has its middle at (0, 0).
+    pub fn centre(&self) -> ImagePoint {
+        ImagePoint { x: self.x + (self.width - 1.0) / 2.0, y: self.y + (self.height - 1.0) / 2.0 }
+    }
+
+    /// The box of given sides about a place.
+    pub fn about(centre: ImagePoint, width: f64, height: f64) -> Self {
+        Self { x: centre.x - (width - 1.0) / 2.0, y: centre.y - (height - 1.0) / 2.0, width, height }
+    }
+
+    /// Whether the numbers describe a box that a target can have.
+    pub fn is_possible(&self) -> bool {
+        let finite = [self.x, self.y, self.width, self.height].iter().all(|v| v.is_finite());
+        finite && (1.0..=1000.0).contains(&self.width) && (1.0..=1000.0).contains(&self.height)
+    }
+}

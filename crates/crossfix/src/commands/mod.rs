@@ -6,3 +6,4 @@ pub mod import;
 pub mod info;
 pub mod rejections;
 pub mod replay;
+pub mod track;

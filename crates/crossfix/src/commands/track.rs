@@ -1,0 +1,118 @@
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::time::Instant;
+
+use anyhow::{Context, bail};
+use crossfix_video::{FrameClock, VideoError};
+use crossfix_vision::{DetectorConfig, ImageTrack, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
+
+use crate::output;
+use crate::{config, eye};
+
+/// Follow a target in a video, without a network.
+///
+/// The table has the columns frame,x,y,w,h,ok,us: frames from 0, top left corner and size of the
+/// box in pixels, ok 1 while the target is measured or shortly predicted, microseconds of tracking.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv")]
+pub struct Args {
+    /// The video: .mp4 (H.264), .y4m, or a folder of PNG or JPEG images.
+    video: PathBuf,
+    /// The target in the first frame: left,top,width,height in pixels. Without, the detector finds it.
+    #[arg(long = "box", value_name = "X,Y,W,H")]
+    place: Option<BoxArg>,
+    /// The table to write (CSV); stdout without.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// The tracker's configuration (TOML, the keys of a camera file's [tracker]); its defaults without.
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of the configuration, e.g. margin_px=3.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    sets: Vec<String>,
+    /// Frame rate of image folders, frames a second.
+    #[arg(long, default_value_t = 30.0, value_name = "HZ")]
+    rate_hz: f64,
+}
+
+/// A box as an operator writes it.
+#[derive(Clone, Copy, Debug)]
+pub struct BoxArg(PixelBox);
+
+impl FromStr for BoxArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
+        let [x, y, width, height] = numbers[..] else {
+            return Err(format!("`{text}` is not left,top,width,height"));
+        };
+        let place = PixelBox { x, y, width, height };
+        if place.is_possible() { Ok(Self(place)) } else { Err("a box has sides of 1 to 1000 pixels".to_owned()) }
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let mut tracker_config: TrackerConfig = match &args.config {
+        Some(path) => config::load(path, &args.sets)?,
+        None => config::parse("", &args.sets)?,
+    };
+    if args.place.is_none() && tracker_config.detector.is_none() {
+        tracker_config.detector = Some(DetectorConfig::default());
+    }
+    let mut tracker = ImageTracker::new(tracker_config)?;
+    if let Some(BoxArg(place)) = args.place {
+        tracker.take_up(place);
+    }
+    let clock = FrameClock { fallback_rate_hz: args.rate_hz, ..FrameClock::default() };
+    let mut source = crossfix_video::open(&args.video, clock)?;
+    let sink: Box<dyn std::io::Write> = match &args.csv {
+        Some(path) => {
+            Box::new(std::fs::File::create(path).with_context(|| format!("cannot write {}", path.display()))?)
+        }
+        None => Box::new(std::io::stdout().lock()),
+    };
+    let mut writer = csv::Writer::from_writer(sink);
+    writer.write_record(["frame", "x", "y", "w", "h", "ok", "us"])?;
+    let mut frames = 0_u64;
+    loop {
+        let frame = match source.next_frame() {
+            Ok(Some(frame)) => frame,
+            Ok(None) => break,
+            Err(error @ VideoError::Frame { index, .. }) => {
+                tracing::warn!("{error}; going on");
+                writer.write_record([&index.to_string(), "", "", "", "", "0", "0"])?;
+                continue;
+            }
+            Err(error) => bail!(error),
+        };
+        let Some(image) = eye::brightness(&frame) else {
+            continue;
+        };
+        let begun = Instant::now();
+        let tracks = tracker.step(&image, frame.capture.time);
+        let microseconds = begun.elapsed().as_secs_f64() * 1e6;
+        frames += 1;
+        writer.write_record(row(frame.index, tracks.first(), microseconds))?;
+    }
+    writer.flush().context("cannot write the table")?;
+    drop(writer);
+    if let Some(path) = &args.csv {
+        output::line(format!("{frames} frames tracked, boxes written to {}", path.display()));
+    }
+    Ok(())
+}
+
+/// One line of the table.
+fn row(frame: u64, track: Option<&ImageTrack>, microseconds: f64) -> Vec<String> {
+    let Some(track) = track else {
+        let empty = String::new;
+        return vec![frame.to_string(), empty(), empty(), empty(), empty(), "0".to_owned(), format!("{microseconds:.1}")];
+    };
+    let place = PixelBox::about(track.position, track.width, track.height);
+    let ok = u8::from(track.phase != TrackPhase::Searching);
+    let mut row = vec![frame.to_string()];
+    row.extend([place.x, place.y, place.width, place.height].map(|value| format!("{value:.3}")));
+    row.extend([ok.to_string(), format!("{microseconds:.1}")]);
+    row
+}
