@@ -1,0 +1,21 @@
+//! Intrinsics from the calibration files that OpenCV and ROS write.
+//!
+//! ```
+//! use crossfix_calibration::intrinsics_from_yaml;
+//! use crossfix_geometry::Distortion;
+//!
+//! let intrinsics = intrinsics_from_yaml(
+//!     "image_width: 640\n\
+//!      image_height: 480\n\
+//!      camera_matrix: {rows: 3, cols: 3, data: [700.0, 0.0, 319.5, 0.0, 701.0, 239.5, 0.0, 0.0, 1.0]}\n\
+//!      distortion_model: plumb_bob\n\
+//!      distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.0, 0.0, 0.0]}\n",
+//! )?;
+//! assert_eq!(intrinsics.fy, 701.0);
+//! assert!(matches!(intrinsics.distortion, Distortion::BrownConrady(_)));
+//! # Ok::<(), crossfix_calibration::IntrinsicsError>(())
+//! ```
+
+mod intrinsics;
+
+pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};

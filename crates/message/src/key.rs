@@ -3,7 +3,7 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
-use crate::name::{FUSION, TRUTH};
+use crate::name::{FUSION, RECORDER, TRUTH};
 use crate::{CameraName, NameError, SiteName};
 
 /// What goes over a key, and so its message type.
@@ -29,6 +29,8 @@ pub enum Channel {
     FusionAlive,
     /// `truth/states`: [`crate::TruthFrame`].
     Truth,
+    /// `recorder/alive`: a liveliness token, no message.
+    RecorderAlive,
 }
 
 /// A key expression of Crossfix: `crossfix/<site>/<component>/<kind>`.
@@ -98,6 +100,7 @@ impl fmt::Display for Key {
             Channel::FusionHealth => write!(f, "{FUSION}/health"),
             Channel::FusionAlive => write!(f, "{FUSION}/alive"),
             Channel::Truth => write!(f, "{TRUTH}/states"),
+            Channel::RecorderAlive => write!(f, "{RECORDER}/alive"),
         }
     }
 }
@@ -119,6 +122,7 @@ impl FromStr for Key {
             (FUSION, "health") => Channel::FusionHealth,
             (FUSION, "alive") => Channel::FusionAlive,
             (TRUTH, "states") => Channel::Truth,
+            (RECORDER, "alive") => Channel::RecorderAlive,
             (_, "bearings") => Channel::Bearings(camera()?),
             (_, "calibration") => Channel::Calibration(camera()?),
             (_, "preview") => Channel::Preview(camera()?),
@@ -150,6 +154,7 @@ mod tests {
             Just(Channel::FusionHealth),
             Just(Channel::FusionAlive),
             Just(Channel::Truth),
+            Just(Channel::RecorderAlive),
         ]
     }
 

@@ -8,6 +8,8 @@ use thiserror::Error;
 pub(crate) const FUSION: &str = "fusion";
 /// The name under which truth is published.
 pub(crate) const TRUTH: &str = "truth";
+/// The name that stands for the recorder.
+pub(crate) const RECORDER: &str = "recorder";
 
 /// Why a text is not a name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -98,7 +100,7 @@ name_type!(
     /// assert!("fusion".parse::<CameraName>().is_err());
     /// ```
     CameraName,
-    [FUSION, TRUTH]
+    [FUSION, RECORDER, TRUTH]
 );
 name_type!(
     /// The name of a site: one fusion centre and its cameras.

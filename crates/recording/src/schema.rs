@@ -13,6 +13,6 @@ pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
         Channel::Tracks => TrackFrame::SCHEMA,
         Channel::Events => TrackEvent::SCHEMA,
         Channel::Truth => TruthFrame::SCHEMA,
-        Channel::Alive(_) | Channel::FusionAlive => return None,
+        Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return None,
     })
 }

@@ -1,0 +1,28 @@
+//! Scenes with flying targets and cameras that look at them: truth, rendered
+//! images, clocks with offset and drift. A scene and its seed give the same
+//! images bit for bit.
+//!
+//! ```
+//! use crossfix_simulation::Scene;
+//!
+//! let scene: Scene = toml::from_str(include_str!("../../../configs/demo/scene.toml"))?;
+//! let world = scene.build()?;
+//! let truth = world.truth(3.0);
+//! assert_eq!(truth.len(), 2);
+//! let frame = world.camera("north").ok_or("no such camera")?.frame(30);
+//! assert_eq!(frame.brightness.len(), 640 * 480);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod clock;
+mod path;
+mod render;
+mod scene;
+mod sky;
+mod world;
+
+pub use clock::SimulatedClock;
+pub use path::FlightPath;
+pub use render::RenderedFrame;
+pub use scene::{Scene, SceneCamera, SceneError, SceneTarget};
+pub use world::{SimulatedCamera, TargetState, World};

@@ -1,0 +1,119 @@
+//! Drawing a target into an image: a dark silhouette with soft edges, smeared
+//! along its motion during the exposure.
+
+/// How much darker than the sky a target is, 8-bit levels.
+const DARKNESS: f32 = 85.0;
+/// Copies that make up the smear of motion.
+const SMEAR_STEPS: usize = 3;
+/// Sub-samples a pixel and axis.
+const SUPERSAMPLING: usize = 4;
+
+/// A frame as a camera of the scene delivers it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RenderedFrame {
+    /// Number of the frame, from 0.
+    pub index: u64,
+    /// True time of its mid-exposure, s from the scene's start.
+    pub true_s: f64,
+    /// What the camera's clock shows then, s.
+    pub own_s: f64,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// 8-bit brightness, row by row.
+    pub brightness: Vec<u8>,
+}
+
+/// A target as it appears in an image.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Appearance {
+    /// Where its centre is at the start and the end of the exposure, px.
+    pub(crate) from: [f64; 2],
+    pub(crate) to: [f64; 2],
+    /// Its span in the image, px.
+    pub(crate) span: f64,
+    /// Standard deviation of the blur, px.
+    pub(crate) blur: f64,
+}
+
+/// Share of the light that a silhouette takes at a place in units of half its span: a body, two
+/// arms and four rotors seen from the side, symmetric about its centre.
+fn silhouette(u: f64, v: f64) -> bool {
+    let body = (u / 0.34).powi(2) + (v / 0.30).powi(2) < 1.0;
+    let arms = v.abs() < 0.08 && u.abs() < 0.9;
+    let rotors = ((u.abs() - 0.72) / 0.28).powi(2) + (v / 0.16).powi(2) < 1.0;
+    body || arms || rotors
+}
+
+/// Darkens an image where a target is.
+pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appearance) {
+    let half = target.span / 2.0;
+    let soft = target.blur.max(0.3);
+    let reach = half + 3.0 * soft + 1.0;
+    let [low_x, high_x] = [target.from[0].min(target.to[0]) - reach, target.from[0].max(target.to[0]) + reach];
+    let [low_y, high_y] = [target.from[1].min(target.to[1]) - reach, target.from[1].max(target.to[1]) + reach];
+    if high_x < 0.0 || high_y < 0.0 || low_x > width as f64 || low_y > height as f64 {
+        return;
+    }
+    let columns = low_x.max(0.0) as usize..(high_x.min(width as f64 - 1.0) as usize + 1);
+    let rows = low_y.max(0.0) as usize..(high_y.min(height as f64 - 1.0) as usize + 1);
+    for y in rows {
+        for x in columns.clone() {
+            image[y * width + x] -= DARKNESS * cover(x, y, half, soft, target) as f32;
+        }
+    }
+}
+
+/// How much of a pixel the smeared, blurred silhouette covers.
+fn cover(x: usize, y: usize, half: f64, soft: f64, target: &Appearance) -> f64 {
+    // The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma.
+    const NODES: [(f64, f64); 3] = [(-1.732_050_8, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_8, 1.0 / 6.0)];
+    let mut sum = 0.0;
+    for step in 0..SMEAR_STEPS {
+        let along = (step as f64 + 0.5) / SMEAR_STEPS as f64;
+        let cx = target.from[0] + (target.to[0] - target.from[0]) * along;
+        let cy = target.from[1] + (target.to[1] - target.from[1]) * along;
+        for (nx, wx) in NODES {
+            for (ny, wy) in NODES {
+                let mut inside = 0;
+                for sub in 0..SUPERSAMPLING * SUPERSAMPLING {
+                    let offset = |i: usize| (i as f64 + 0.5) / SUPERSAMPLING as f64 - 0.5;
+                    let px = x as f64 + offset(sub % SUPERSAMPLING) + nx * soft - cx;
+                    let py = y as f64 + offset(sub / SUPERSAMPLING) + ny * soft - cy;
+                    inside += usize::from(silhouette(px / half, py / half));
+                }
+                sum += wx * wy * inside as f64;
+            }
+        }
+    }
+    sum / (SMEAR_STEPS * SUPERSAMPLING * SUPERSAMPLING) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_targets_centre_of_darkness_is_its_centre() {
+        let (width, height) = (60, 50);
+        let mut image = vec![200.0_f32; width * height];
+        let target = Appearance { from: [30.3, 24.6], to: [30.3, 24.6], span: 14.0, blur: 0.7 };
+        draw(&mut image, width, height, &target);
+        let (mut sum, mut x, mut y) = (0.0, 0.0, 0.0);
+        for (index, value) in image.iter().enumerate() {
+            let dark = f64::from(200.0 - value);
+            sum += dark;
+            x += dark * (index % width) as f64;
+            y += dark * (index / width) as f64;
+        }
+        assert!((x / sum - 30.3).abs() < 0.03 && (y / sum - 24.6).abs() < 0.03, "{} {}", x / sum, y / sum);
+    }
+
+    #[test]
+    fn a_target_outside_the_image_changes_nothing() {
+        let mut image = vec![100.0_f32; 400];
+        draw(&mut image, 20, 20, &Appearance { from: [-50.0, 5.0], to: [-50.0, 5.0], span: 10.0, blur: 1.0 });
+        assert!(image.iter().all(|v| *v == 100.0));
+    }
+}

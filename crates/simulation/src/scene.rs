@@ -1,0 +1,177 @@
+use std::collections::BTreeSet;
+
+use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
+use crossfix_message::CameraName;
+use nalgebra::Point3;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::{FlightPath, SimulatedClock, World};
+
+/// A scene as it is written in a file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scene {
+    /// Seed of everything random: sky, noise.
+    #[serde(default)]
+    pub seed: u64,
+    /// How long it lasts, s.
+    pub duration_s: f64,
+    /// What flies.
+    pub targets: Vec<SceneTarget>,
+    /// What looks.
+    pub cameras: Vec<SceneCamera>,
+}
+
+/// A target of a scene.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneTarget {
+    /// Its number.
+    pub id: u64,
+    /// Its span, m.
+    pub span_m: f64,
+    /// When it comes into being, s from the start.
+    #[serde(default)]
+    pub appears_s: f64,
+    /// How it flies.
+    pub path: FlightPath,
+}
+
+/// A camera of a scene.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneCamera {
+    /// Its name.
+    pub name: CameraName,
+    /// Its centre, m.
+    pub position_m: [f64; 3],
+    /// The point that its optical axis goes through, m.
+    pub look_at_m: [f64; 3],
+    /// Columns and rows.
+    pub size_px: [u32; 2],
+    /// Focal length, pixels.
+    pub focal_px: f64,
+    /// Brown-Conrady coefficients k1 k2 p1 p2 k3.
+    #[serde(default)]
+    pub distortion: [f64; 5],
+    /// Frames a second.
+    pub rate_hz: f64,
+    /// True time of the first frame, s.
+    #[serde(default)]
+    pub phase_s: f64,
+    /// How long the shutter is open, s.
+    pub exposure_s: f64,
+    /// Standard deviation of the image's noise, 8-bit levels.
+    pub noise_levels: f64,
+    /// Standard deviation of the lens' blur, pixels.
+    pub blur_px: f64,
+    /// Its clock.
+    #[serde(default)]
+    pub clock: SimulatedClock,
+}
+
+/// What is wrong with a scene.
+#[derive(Debug, Error)]
+pub enum SceneError {
+    /// A number that makes no sense.
+    #[error("{what} is {value}: it must be {must}")]
+    Number {
+        /// Whose and which.
+        what: String,
+        /// What it is.
+        value: f64,
+        /// What it must be.
+        must: &'static str,
+    },
+    /// A path with impossible numbers.
+    #[error("the path of target {target} has a number that is not finite, or a period of zero")]
+    Path {
+        /// The target.
+        target: u64,
+    },
+    /// Two cameras of one name or two targets of one number.
+    #[error("`{name}` is there twice")]
+    Twice {
+        /// The name or number.
+        name: String,
+    },
+    /// A camera that cannot be.
+    #[error("camera `{camera}` of the scene is impossible")]
+    Camera {
+        /// The camera.
+        camera: CameraName,
+        /// What is wrong.
+        #[source]
+        source: GeometryError,
+    },
+}
+
+impl SceneCamera {
+    /// Its model and place.
+    ///
+    /// # Errors
+    /// [`GeometryError`] if the numbers are no camera's.
+    pub fn camera(&self) -> Result<Camera, GeometryError> {
+        let [width, height] = self.size_px;
+        let straight = self.distortion.iter().all(|k| *k == 0.0);
+        let intrinsics = Intrinsics {
+            size: ImageSize { width, height },
+            fx: self.focal_px,
+            fy: self.focal_px,
+            cx: (f64::from(width) - 1.0) / 2.0,
+            cy: (f64::from(height) - 1.0) / 2.0,
+            distortion: if straight { Distortion::None } else { Distortion::BrownConrady(self.distortion) },
+        };
+        let pose = Pose::looking_at(Point3::from(self.position_m), Point3::from(self.look_at_m))?;
+        Camera::new(intrinsics, pose)
+    }
+}
+
+impl Scene {
+    /// The scene ready to be looked at.
+    ///
+    /// # Errors
+    /// [`SceneError`] naming what is wrong.
+    pub fn build(&self) -> Result<World, SceneError> {
+        self.check()?;
+        World::new(self)
+    }
+
+    fn check(&self) -> Result<(), SceneError> {
+        let number = |what: String, value: f64, good: bool, must| {
+            if good { Ok(()) } else { Err(SceneError::Number { what, value, must }) }
+        };
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        let lasts = self.duration_s;
+        number("duration_s".into(), lasts, positive(lasts) && lasts < 1e5, "from 0 to 100000 s")?;
+        let mut seen = BTreeSet::new();
+        for target in &self.targets {
+            let whose = |key: &str| format!("{key} of target {}", target.id);
+            number(whose("span_m"), target.span_m, positive(target.span_m), "a positive number of metres")?;
+            if !target.path.is_possible() {
+                return Err(SceneError::Path { target: target.id });
+            }
+            if !seen.insert(format!("target {}", target.id)) {
+                return Err(SceneError::Twice { name: format!("target {}", target.id) });
+            }
+        }
+        for camera in &self.cameras {
+            let whose = |key: &str| format!("{key} of camera {}", camera.name);
+            let rate = camera.rate_hz;
+            number(whose("rate_hz"), rate, (0.01..=1000.0).contains(&rate), "from 0.01 to 1000 frames a second")?;
+            let noise = camera.noise_levels;
+            number(whose("noise_levels"), noise, (0.0..=100.0).contains(&noise), "from 0 to 100 levels")?;
+            let blur = camera.blur_px;
+            number(whose("blur_px"), blur, (0.0..=20.0).contains(&blur), "from 0 to 20 px")?;
+            let exposure = camera.exposure_s;
+            number(whose("exposure_s"), exposure, (0.0..=1.0).contains(&exposure), "from 0 to 1 s")?;
+            let most = camera.size_px.iter().copied().max().unwrap_or(0);
+            number(whose("size_px"), f64::from(most), most <= 8192, "at most 8192 px")?;
+            if !seen.insert(camera.name.to_string()) {
+                return Err(SceneError::Twice { name: camera.name.to_string() });
+            }
+        }
+        Ok(())
+    }
+}

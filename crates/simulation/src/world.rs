@@ -1,0 +1,203 @@
+use crossfix_geometry::Camera;
+use crossfix_message::CameraName;
+use nalgebra::{Point3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::render::{Appearance, draw};
+use crate::sky::sky;
+use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget};
+
+/// Where a target is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TargetState {
+    /// Its number.
+    pub id: u64,
+    /// Metres, world.
+    pub position: Point3<f64>,
+    /// Metres a second, world.
+    pub velocity: Vector3<f64>,
+}
+
+/// A scene that can be looked at.
+#[derive(Clone, Debug)]
+pub struct World {
+    targets: Vec<SceneTarget>,
+    cameras: Vec<SimulatedCamera>,
+    duration_s: f64,
+}
+
+/// A camera of a scene.
+#[derive(Clone, Debug)]
+pub struct SimulatedCamera {
+    description: SceneCamera,
+    camera: Camera,
+    sky: Vec<f32>,
+    seed: u64,
+    targets: Vec<SceneTarget>,
+    duration_s: f64,
+}
+
+impl World {
+    pub(crate) fn new(scene: &Scene) -> Result<Self, SceneError> {
+        let camera = |(index, description): (usize, &SceneCamera)| {
+            let camera = description
+                .camera()
+                .map_err(|source| SceneError::Camera { camera: description.name.clone(), source })?;
+            // Each camera its own random numbers, from the one seed.
+            let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
+            let [width, height] = description.size_px.map(|side| side as usize);
+            Ok(SimulatedCamera {
+                description: description.clone(),
+                camera,
+                sky: sky(width, height, seed),
+                seed,
+                targets: scene.targets.clone(),
+                duration_s: scene.duration_s,
+            })
+        };
+        let cameras = scene.cameras.iter().enumerate().map(camera).collect::<Result<_, _>>()?;
+        Ok(Self { targets: scene.targets.clone(), cameras, duration_s: scene.duration_s })
+    }
+
+    /// The cameras, in the scene's order.
+    pub fn cameras(&self) -> &[SimulatedCamera] {
+        &self.cameras
+    }
+
+    /// The camera of a name.
+    pub fn camera(&self, name: &str) -> Option<&SimulatedCamera> {
+        self.cameras.iter().find(|camera| camera.name().as_str() == name)
+    }
+
+    /// How long the scene lasts, s.
+    pub fn duration_s(&self) -> f64 {
+        self.duration_s
+    }
+
+    /// Where every target is at a true time; those that have not appeared are not there.
+    pub fn truth(&self, t: f64) -> Vec<TargetState> {
+        self.targets.iter().filter(|target| t >= target.appears_s).map(|target| state(target, t)).collect()
+    }
+}
+
+fn state(target: &SceneTarget, t: f64) -> TargetState {
+    let (position, velocity) = target.path.state(t);
+    TargetState { id: target.id, position, velocity }
+}
+
+impl SimulatedCamera {
+    /// Its name.
+    pub fn name(&self) -> &CameraName {
+        &self.description.name
+    }
+
+    /// Its model and place.
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// What the scene says of it.
+    pub fn description(&self) -> &SceneCamera {
+        &self.description
+    }
+
+    /// How many frames it takes in the scene.
+    pub fn frames(&self) -> u64 {
+        let SceneCamera { phase_s, rate_hz, .. } = self.description;
+        ((self.duration_s - phase_s) * rate_hz).ceil().max(0.0) as u64
+    }
+
+    /// True time of a frame's mid-exposure, s from the scene's start.
+    pub fn true_time(&self, index: u64) -> f64 {
+        self.description.phase_s + index as f64 / self.description.rate_hz
+    }
+
+    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise.
+    pub fn frame(&self, index: u64) -> RenderedFrame {
+        let [width, height] = self.description.size_px.map(|side| side as usize);
+        let true_s = self.true_time(index);
+        let mut image = self.sky.clone();
+        for target in &self.targets {
+            if let Some(appearance) = self.appearance(target, true_s) {
+                draw(&mut image, width, height, &appearance);
+            }
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(index + 1);
+        let noise = self.description.noise_levels as f32;
+        let brightness = image
+            .iter()
+            .map(|level| {
+                let deviation: f32 = StandardNormal.sample(&mut rng);
+                (level + noise * deviation).round().clamp(0.0, 255.0) as u8
+            })
+            .collect();
+        let own_s = self.description.clock.own(true_s);
+        RenderedFrame { index, true_s, own_s, width, height, brightness }
+    }
+
+    /// How a target appears at a time; `None` before it has come or behind the camera.
+    fn appearance(&self, target: &SceneTarget, t: f64) -> Option<Appearance> {
+        if t < target.appears_s {
+            return None;
+        }
+        let half = self.description.exposure_s / 2.0;
+        let place = |t: f64| {
+            let pixel = self.camera.project(target.path.state(t).0)?;
+            Some([pixel.x(), pixel.y()])
+        };
+        let range = (target.path.state(t).0 - self.camera.pose().position()).norm();
+        Some(Appearance {
+            from: place(t - half)?,
+            to: place(t + half)?,
+            span: target.span_m * self.description.focal_px / range,
+            blur: self.description.blur_px,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn world() -> World {
+        let scene: Scene = toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        scene.build().unwrap()
+    }
+
+    #[test]
+    fn a_frame_is_the_same_whenever_it_is_rendered() {
+        let (one, other) = (world(), world());
+        let camera = one.camera("north").unwrap();
+        assert_eq!(camera.frame(17), other.camera("north").unwrap().frame(17));
+        assert_ne!(camera.frame(17).brightness, camera.frame(18).brightness);
+    }
+
+    #[test]
+    fn a_target_is_darker_than_the_sky_where_it_is() {
+        let world = world();
+        let camera = world.camera("north").unwrap();
+        let frame = camera.frame(100);
+        for target in world.truth(frame.true_s) {
+            let Some(pixel) = camera.camera().project(target.position) else { continue };
+            if !camera.camera().sees(target.position) {
+                continue;
+            }
+            let index = pixel.y().round() as usize * frame.width + pixel.x().round() as usize;
+            let sky = camera.sky[index];
+            assert!(f32::from(frame.brightness[index]) < sky - 30.0, "target {}", target.id);
+        }
+    }
+
+    #[test]
+    fn a_scene_with_two_cameras_of_one_name_is_refused() {
+        let mut scene: Scene = toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        scene.cameras[1].name = scene.cameras[0].name.clone();
+        assert!(matches!(scene.build(), Err(SceneError::Twice { .. })));
+        scene.cameras.clear();
+        scene.duration_s = f64::NAN;
+        assert!(matches!(scene.build(), Err(SceneError::Number { .. })));
+    }
+}
