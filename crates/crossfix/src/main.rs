@@ -6,12 +6,16 @@ mod eye;
 mod import;
 mod logging;
 mod output;
+mod shutdown;
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::commands::{evaluate, export, import as import_command, info, replay, track};
+use crate::commands::{
+    agent, check, evaluate, export, fuse, import as import_command, info, record, replay, simulate,
+    track, view,
+};
 
 /// Where in the air a small thing is, with nothing but cameras.
 ///
@@ -28,22 +32,34 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Agent(agent::Args),
     Track(track::Args),
+    Fuse(fuse::Args),
+    Record(record::Args),
     Replay(replay::Args),
+    View(view::Args),
     Info(info::Args),
+    Simulate(simulate::Args),
     Import(import_command::Args),
     Export(export::Args),
     Evaluate(evaluate::Args),
+    Check(check::Args),
 }
 
 fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
+        Command::Agent(args) => agent::run(&args),
         Command::Track(args) => track::run(&args),
+        Command::Fuse(args) => fuse::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Info(args) => info::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
         Command::Import(args) => import_command::run(&args),
         Command::Export(args) => export::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Check(args) => check::run(&args),
     }
 }
 

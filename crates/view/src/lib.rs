@@ -1,0 +1,17 @@
+//! The picture of a site in Rerun: cameras with their frustums and images,
+//! sight lines, 3D tracks with trails, velocities and covariances, residuals
+//! and latency, on the timeline of capture time.
+//!
+//! One [`Picture`] draws live messages and recorded ones alike: it is given
+//! the bytes of the wire. What it draws a second is bounded, so that a viewer
+//! left open does not fill the memory.
+
+mod blueprint;
+mod colour;
+mod draw;
+mod limiter;
+mod picture;
+mod sink;
+
+pub use picture::Picture;
+pub use sink::{ViewError, connect, save, spawn_viewer};

@@ -1,9 +1,15 @@
 //! The subcommands, a module each, each thin.
 
+pub mod agent;
+pub mod check;
 pub mod evaluate;
 pub mod export;
+pub mod fuse;
 pub mod import;
 pub mod info;
+pub mod record;
 pub mod rejections;
 pub mod replay;
+pub mod simulate;
 pub mod track;
+pub mod view;

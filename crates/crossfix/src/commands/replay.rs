@@ -1,13 +1,13 @@
 use std::path::{Path, PathBuf};
 
-use crossfix_fusion::{Fusion, FusionConfig, Output};
+use crossfix_fusion::{Fusion, Output};
 use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, Health, Key, Payload, SiteName, Timestamp, decode,
 };
 use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
 
 use crate::commands::rejections::RejectionLog;
-use crate::config;
+use crate::config::FusionFile;
 use crate::output;
 
 /// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
@@ -83,12 +83,9 @@ struct OfflineFusion {
 }
 
 fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
-    let fusion_config: FusionConfig = match &args.config {
-        Some(path) => config::load(path, &args.sets)?,
-        None => config::parse("", &args.sets)?,
-    };
+    let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
     let mut run = OfflineFusion {
-        fusion: Fusion::new(fusion_config)?,
+        fusion: Fusion::new(file.fusion())?,
         writer: RecordingWriter::create(output)?,
         rejections: RejectionLog::default(),
         frames: 0,

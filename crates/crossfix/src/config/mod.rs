@@ -1,5 +1,11 @@
 //! Configuration files: read, checked and explained before anything starts.
 
+mod camera;
 mod file;
+mod fusion;
+mod site;
 
+pub use camera::{CameraFile, ClockConfig, SourceConfig};
 pub use file::{load, parse};
+pub use fusion::FusionFile;
+pub use site::{Site, load_network};

@@ -1,0 +1,149 @@
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_geometry::{Pixel, PixelCovariance};
+use crossfix_message::{
+    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key,
+    Payload, SiteName, Timestamp,
+};
+use crossfix_recording::{Entry, RecordingWriter};
+use crossfix_simulation::{Scene, SimulatedCamera, World};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::commands::agent::truth_frame;
+use crate::commands::import::imported;
+use crate::config;
+use crate::output;
+
+/// Turn a scene into a recording of bearings with truth, or into video files.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos"
+)]
+pub struct Args {
+    /// The scene (TOML).
+    scene: PathBuf,
+    /// The recording (MCAP) to write: bearings as cameras would measure them, calibrations, truth.
+    #[arg(short, long, value_name = "FILE", required_unless_present = "video")]
+    output: Option<PathBuf>,
+    /// The folder to write a rendered video (Y4M) of each camera to.
+    #[arg(long, value_name = "DIR")]
+    video: Option<PathBuf>,
+    /// Standard deviation of a bearing in the recording, pixels an axis.
+    #[arg(long, default_value_t = 0.3, value_name = "PIXELS")]
+    noise_px: f64,
+    /// Override a key of the scene, e.g. duration_s=10.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    sets: Vec<String>,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let scene: Scene = config::load(&args.scene, &args.sets)?;
+    let world = scene.build().with_context(|| format!("the scene {} has an error", args.scene.display()))?;
+    let noise = args.noise_px;
+    ensure!((0.01..100.0).contains(&noise), "--noise-px is {noise}: it must be from 0.01 to 100 px");
+    if let Some(path) = &args.output {
+        let messages = record(&world, path, noise, scene.seed)?;
+        output::line(format!("{messages} messages written to {}", path.display()));
+    }
+    if let Some(folder) = &args.video {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+        for camera in world.cameras() {
+            let path = folder.join(format!("{}.y4m", camera.name()));
+            film(camera, &path).with_context(|| format!("cannot write {}", path.display()))?;
+            output::line(format!("{} frames written to {}", camera.frames(), path.display()));
+        }
+    }
+    Ok(())
+}
+
+fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Result<u64> {
+    let site: SiteName = "simulation".parse()?;
+    let mut entries = Vec::new();
+    for (index, camera) in world.cameras().iter().enumerate() {
+        let calibration = CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH);
+        let key = Key::new(site.clone(), Channel::Calibration(camera.name().clone()));
+        entries.push(imported(key, Timestamp::EPOCH, calibration.encode()));
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(index as u64);
+        for frame in 0..camera.frames() {
+            entries.push(exposure(world, camera, frame, noise_px, &site, &mut rng)?);
+        }
+    }
+    for step in 0..(world.duration_s() * 10.0) as u32 {
+        let t = f64::from(step) / 10.0;
+        let key = Key::new(site.clone(), Channel::Truth);
+        entries.push(imported(key, Timestamp::from_seconds(t), truth_frame(world, t, 0.0).encode()));
+    }
+    entries.sort_by_key(|entry| entry.data_time);
+    let mut writer = RecordingWriter::create(path)?;
+    for entry in &entries {
+        writer.write(entry)?;
+    }
+    Ok(writer.finish()?)
+}
+
+/// What a camera with perfect clock and tracker but noisy pixels would publish of one frame.
+fn exposure(
+    world: &World,
+    camera: &SimulatedCamera,
+    frame: u64,
+    noise_px: f64,
+    site: &SiteName,
+    rng: &mut ChaCha8Rng,
+) -> anyhow::Result<Entry> {
+    let t = camera.true_time(frame);
+    let mut tracks = Vec::new();
+    for target in world.truth(t) {
+        let Some(exact) = camera.camera().project(target.position) else { continue };
+        if !camera.camera().sees(target.position) {
+            continue;
+        }
+        let mut normal = || -> f64 { StandardNormal.sample(rng) };
+        let pixel = Pixel::new(exact.x() + noise_px * normal(), exact.y() + noise_px * normal());
+        let bearing = camera.camera().model().bearing(pixel, PixelCovariance::isotropic(noise_px))?;
+        tracks.push(BearingTrack {
+            track_id: target.id,
+            bearing: Some(bearing.direction().into_inner().into()),
+            covariance_xx: bearing.covariance().m11,
+            covariance_xy: bearing.covariance().m12,
+            covariance_yy: bearing.covariance().m22,
+            pixel_x: pixel.x(),
+            pixel_y: pixel.y(),
+            score: 1.0,
+            state: ImageTrackState::Tracking.into(),
+            ..Default::default()
+        });
+    }
+    let time = Timestamp::from_seconds(t);
+    let message = BearingFrame {
+        camera: camera.name().to_string(),
+        sequence: frame,
+        capture_time_ns: time.nanos(),
+        clock_source: ClockSource::Simulated.into(),
+        exposure_s: camera.description().exposure_s,
+        tracks,
+        ..Default::default()
+    };
+    let key = Key::new(site.clone(), Channel::Bearings(camera.name().clone()));
+    Ok(imported(key, time, message.encode()))
+}
+
+/// A camera's rendered frames as Y4M, brightness only.
+fn film(camera: &SimulatedCamera, path: &Path) -> anyhow::Result<()> {
+    let mut file = BufWriter::new(std::fs::File::create(path)?);
+    let description = camera.description();
+    let [width, height] = description.size_px;
+    // Y4M's rate is a fraction.
+    let millihertz = (description.rate_hz * 1000.0).round() as u64;
+    writeln!(file, "YUV4MPEG2 W{width} H{height} F{millihertz}:1000 Ip A1:1 Cmono")?;
+    for index in 0..camera.frames() {
+        writeln!(file, "FRAME")?;
+        file.write_all(&camera.frame(index).brightness)?;
+    }
+    file.flush()?;
+    Ok(())
+}

@@ -1,0 +1,241 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::intrinsics_from_yaml;
+use crossfix_geometry::{Camera, Pose};
+use crossfix_message::{CameraName, ClockSource};
+use crossfix_vision::{PixelBox, TrackerConfig};
+use nalgebra::{Matrix3, Point3};
+use serde::{Deserialize, Serialize};
+
+/// One camera: what it is, where it stands, where its pictures come from, how it follows targets.
+/// Paths are relative to the file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraFile {
+    /// The camera's name, unique in the site.
+    pub name: CameraName,
+    /// The network's file (TOML).
+    pub network: PathBuf,
+    /// Intrinsics (YAML of OpenCV or ROS).
+    pub intrinsics: PathBuf,
+    /// Where it stands and looks.
+    pub pose: PoseConfig,
+    /// Where its pictures come from.
+    pub source: SourceConfig,
+    /// What its capture times are worth.
+    #[serde(default)]
+    pub clock: ClockConfig,
+    /// Small pictures for people.
+    #[serde(default)]
+    pub preview: PreviewConfig,
+    /// Targets that are taken up in the first image: left, top, width, height in pixels.
+    #[serde(default)]
+    pub boxes: Vec<[f64; 4]>,
+    /// How targets are found and followed.
+    #[serde(default)]
+    pub tracker: TrackerConfig,
+}
+
+/// Where a camera stands and how it is turned.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseConfig {
+    /// The camera's centre, local ENU, m.
+    pub position_m: [f64; 3],
+    /// A level camera whose axis goes through this point, m. Either this or `rotation`.
+    pub look_at_m: Option<[f64; 3]>,
+    /// The rotation world_from_camera, row by row: its columns are the camera's axes (x right,
+    /// y down, z forward) in the world.
+    pub rotation: Option<[[f64; 3]; 3]>,
+}
+
+/// Where pictures, or bearings made elsewhere, come from.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum SourceConfig {
+    /// A video file or a folder of images.
+    Video {
+        /// .mp4 (H.264), .y4m, or a folder of PNG or JPEG images.
+        path: PathBuf,
+        /// Capture time of the first frame, s since the Unix epoch. Default 0.
+        #[serde(default)]
+        start_s: f64,
+        /// Frame rate of image folders, 1/s. Default 30.
+        #[serde(default = "thirty")]
+        rate_hz: f64,
+        /// How much faster than in life it is played; 0 is as fast as it goes. Default 1.
+        #[serde(default = "one")]
+        speed: f64,
+    },
+    /// A simulated camera of a scene, in real time.
+    Simulation {
+        /// The scene (TOML).
+        scene: PathBuf,
+        /// Whether this agent publishes the truth as well. Default false.
+        #[serde(default)]
+        publish_truth: bool,
+    },
+    /// The recorded bearings of this camera.
+    Recording {
+        /// The recording (MCAP).
+        path: PathBuf,
+        /// How much faster than in life it is played; 0 is as fast as it goes. Default 1.
+        #[serde(default = "one")]
+        speed: f64,
+    },
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+fn thirty() -> f64 {
+    30.0
+}
+
+/// What capture times are worth, and how they are corrected.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ClockConfig {
+    /// `frame-count` (default), `host`, `ntp`, `ptp`, `gnss` or `simulated`.
+    pub source: ClockSourceName,
+    /// What the camera's clock shows too much at the start, s.
+    pub offset_s: f64,
+    /// How much too fast it runs, millionths.
+    pub drift_ppm: f64,
+    /// Standard deviation of a corrected capture time, s. Default 0.001.
+    pub sd_s: f64,
+}
+
+impl Default for ClockConfig {
+    fn default() -> Self {
+        Self { source: ClockSourceName::FrameCount, offset_s: 0.0, drift_ppm: 0.0, sd_s: 1e-3 }
+    }
+}
+
+/// A clock's source as people write it.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ClockSourceName {
+    FrameCount,
+    Host,
+    Ntp,
+    Ptp,
+    Gnss,
+    Simulated,
+}
+
+impl From<ClockSourceName> for ClockSource {
+    fn from(name: ClockSourceName) -> Self {
+        match name {
+            ClockSourceName::FrameCount => Self::FrameCount,
+            ClockSourceName::Host => Self::Host,
+            ClockSourceName::Ntp => Self::Ntp,
+            ClockSourceName::Ptp => Self::Ptp,
+            ClockSourceName::Gnss => Self::Gnss,
+            ClockSourceName::Simulated => Self::Simulated,
+        }
+    }
+}
+
+/// Small pictures for people.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PreviewConfig {
+    /// Pictures a second; 0 is none. Default 4.
+    pub rate_hz: f64,
+    /// The picture's sides as a fraction of the camera's, 1/n. Default 2, half.
+    pub divisor: u32,
+}
+
+impl Default for PreviewConfig {
+    fn default() -> Self {
+        Self { rate_hz: 4.0, divisor: 2 }
+    }
+}
+
+impl CameraFile {
+    /// Reads the file and makes its paths absolute or relative to where we are.
+    pub fn load(path: &Path, sets: &[String]) -> anyhow::Result<Self> {
+        let mut file: Self = super::load(path, sets)?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        file.network = folder.join(&file.network);
+        file.intrinsics = folder.join(&file.intrinsics);
+        match &mut file.source {
+            SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
+                *path = folder.join(&*path);
+            }
+            SourceConfig::Simulation { scene, .. } => *scene = folder.join(&*scene),
+        }
+        Ok(file)
+    }
+
+    /// Checks everything that can be checked without starting, and returns the camera.
+    pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
+        let wrong = || format!("the configuration file {} has an error", path.display());
+        self.check().with_context(wrong)?;
+        let text = std::fs::read_to_string(&self.intrinsics)
+            .with_context(|| format!("key `intrinsics`: cannot read {}", self.intrinsics.display()))
+            .with_context(wrong)?;
+        let intrinsics = intrinsics_from_yaml(&text)
+            .with_context(|| format!("the intrinsics file {} has an error", self.intrinsics.display()))?;
+        let pose = self.pose.pose().context("section [pose]").with_context(wrong)?;
+        Ok(Camera::new(intrinsics, pose)?)
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        self.tracker.validate().context("section [tracker]")?;
+        let clock = &self.clock;
+        ensure!((0.0..10.0).contains(&clock.sd_s), "key `clock.sd_s` is {}: it must be from 0 to 10 s", clock.sd_s);
+        ensure!(
+            clock.offset_s.is_finite() && clock.drift_ppm.abs() < 1e5,
+            "keys `clock.offset_s`, `clock.drift_ppm`: {} s and {} ppm are no clock's",
+            clock.offset_s,
+            clock.drift_ppm
+        );
+        let preview = &self.preview;
+        ensure!((0.0..=30.0).contains(&preview.rate_hz), "key `preview.rate_hz` is {}: it must be from 0 to 30", preview.rate_hz);
+        ensure!((1..=64).contains(&preview.divisor), "key `preview.divisor` is {}: it must be from 1 to 64", preview.divisor);
+        for place in self.boxes() {
+            ensure!(place.is_possible(), "key `boxes`: a box must have sides of 1 to 1000 pixels, not {place:?}");
+        }
+        let (key, file) = match &self.source {
+            SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => ("source.path", path),
+            SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
+        };
+        ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
+        Ok(())
+    }
+
+    /// The boxes of targets to take up.
+    pub fn boxes(&self) -> impl Iterator<Item = PixelBox> {
+        self.boxes.iter().map(|&[x, y, width, height]| PixelBox { x, y, width, height })
+    }
+}
+
+impl PoseConfig {
+    /// A pose by its rotation.
+    pub fn of(pose: &Pose) -> Self {
+        let m = pose.rotation().matrix();
+        let row = |r: usize| [m[(r, 0)], m[(r, 1)], m[(r, 2)]];
+        let p = pose.position();
+        Self { position_m: [p.x, p.y, p.z], look_at_m: None, rotation: Some([row(0), row(1), row(2)]) }
+    }
+
+    fn pose(&self) -> anyhow::Result<Pose> {
+        let position = Point3::from(self.position_m);
+        match (self.look_at_m, self.rotation) {
+            (Some(target), None) => {
+                Pose::looking_at(position, Point3::from(target)).context("key `look_at_m`")
+            }
+            (None, Some(rows)) => {
+                // nalgebra takes columns.
+                Pose::new(Matrix3::from(rows).transpose(), position).context(
+                    "key `rotation` (rows of world_from_camera; its columns are the camera's x right, y down, z forward)",
+                )
+            }
+            _ => anyhow::bail!("give either `look_at_m` or `rotation`, and not both"),
+        }
+    }
+}

@@ -1,0 +1,48 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use crossfix_fusion::{Bearings, EventTime, FusionConfig, Initiation, Tracking};
+use crossfix_message::CameraName;
+use serde::{Deserialize, Serialize};
+
+/// The fusion centre's file: its network, whom it listens to, and how it fuses.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FusionFile {
+    /// The network's file (TOML), relative to this one. Needed by `fuse`, not by `replay --fuse`.
+    pub network: Option<PathBuf>,
+    /// The cameras that are listened to. Absent: all of the network's.
+    pub cameras: Option<Vec<CameraName>>,
+    /// See the fusion's documentation; every key has a default.
+    pub event_time: EventTime,
+    /// What a bearing's covariance is worth.
+    pub bearings: Bearings,
+    /// How new tracks are found.
+    pub initiation: Initiation,
+    /// How tracks are kept up.
+    pub tracking: Tracking,
+}
+
+impl FusionFile {
+    /// Reads a file, or takes the defaults, with overrides.
+    pub fn load(path: Option<&Path>, sets: &[String]) -> anyhow::Result<Self> {
+        let Some(path) = path else {
+            return super::parse("", sets);
+        };
+        let mut file: Self = super::load(path, sets)?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        file.network = file.network.map(|network| folder.join(network));
+        file.fusion().validate().with_context(|| format!("the configuration file {} has an error", path.display()))?;
+        Ok(file)
+    }
+
+    /// The part that the fusion itself takes.
+    pub fn fusion(&self) -> FusionConfig {
+        FusionConfig {
+            event_time: self.event_time.clone(),
+            bearings: self.bearings.clone(),
+            initiation: self.initiation.clone(),
+            tracking: self.tracking.clone(),
+        }
+    }
+}

@@ -1,0 +1,239 @@
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use crossfix_geometry::Camera;
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, DecodeError, Preview, Timestamp, TrackEvent,
+    TrackFrame, TrackState, TruthFrame, decode,
+};
+use nalgebra::Point3;
+use rerun::components::MediaType;
+use rerun::{
+    Clear, Color, EncodedImage, Points3D, Radius, RecordingStream, Scalars, TextLog, ViewCoordinates,
+};
+
+use crate::limiter::Limiter;
+use crate::{ViewError, blueprint, draw};
+
+/// The timeline of capture time.
+pub(crate) const TIMELINE: &str = "capture_time";
+/// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
+const PREVIEW_RATE_HZ: f64 = 5.0;
+const LINE_RATE_HZ: f64 = 10.0;
+const TRACK_RATE_HZ: f64 = 15.0;
+/// Points of a trail, at the rate of the tracks: ten seconds.
+const TRAIL_POINTS: usize = 150;
+/// Sight lines reach this far where no track says how far, m.
+const DEFAULT_REACH_M: f64 = 150.0;
+/// Bearings remembered for the latency plot.
+const MAX_ARRIVALS: usize = 10_000;
+
+/// The place of a camera's image.
+pub(crate) fn image_path(name: &str) -> String {
+    format!("world/cameras/{name}/image")
+}
+
+struct CameraView {
+    index: u64,
+    camera: Camera,
+    scale: f64,
+}
+
+/// Draws what goes over the wire.
+pub struct Picture {
+    stream: RecordingStream,
+    cameras: BTreeMap<String, CameraView>,
+    trails: BTreeMap<u64, VecDeque<[f32; 3]>>,
+    drawn: BTreeSet<u64>,
+    places: Vec<Point3<f64>>,
+    limiter: Limiter,
+    arrivals: BTreeMap<(String, u64), Timestamp>,
+}
+
+impl Picture {
+    /// An empty picture on a stream of [`crate::save`] or [`crate::connect`].
+    ///
+    /// # Errors
+    /// [`ViewError`] if the stream does not take it.
+    pub fn new(stream: RecordingStream) -> Result<Self, ViewError> {
+        stream.set_log_time_enabled(false);
+        stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Z_UP())?;
+        Ok(Self {
+            stream,
+            cameras: BTreeMap::new(),
+            trails: BTreeMap::new(),
+            drawn: BTreeSet::new(),
+            places: Vec::new(),
+            limiter: Limiter::default(),
+            arrivals: BTreeMap::new(),
+        })
+    }
+
+    /// Draws a message that arrived at `arrival`; what cannot be read is left out and said.
+    ///
+    /// # Errors
+    /// [`ViewError`] if the stream does not take it.
+    pub fn show(&mut self, channel: &Channel, arrival: Timestamp, data: &[u8]) -> Result<Option<DecodeError>, ViewError> {
+        let read = match channel {
+            Channel::Calibration(_) => decode(data).map(|m| self.calibration(&m)),
+            Channel::Preview(_) => decode(data).map(|m| self.preview(&m)),
+            Channel::Bearings(_) => decode(data).map(|m| self.bearings(&m, arrival)),
+            Channel::Tracks => decode(data).map(|m| self.tracks(&m, arrival)),
+            Channel::Events => decode(data).map(|m| self.event(&m)),
+            Channel::Truth => decode(data).map(|m| self.truth(&m)),
+            _ => return Ok(None),
+        };
+        match read {
+            Ok(drawn) => drawn.map(|()| None),
+            Err(error) => Ok(Some(error)),
+        }
+    }
+
+    /// Waits until everything is drawn.
+    ///
+    /// # Errors
+    /// [`ViewError::Flush`].
+    pub fn finish(self) -> Result<(), ViewError> {
+        self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
+    }
+
+    fn at(&self, time_ns: i64) -> Timestamp {
+        self.stream.set_timestamp_nanos_since_epoch(TIMELINE, time_ns);
+        Timestamp::from_nanos(time_ns)
+    }
+
+    fn calibration(&mut self, message: &CameraCalibration) -> Result<(), ViewError> {
+        // An impossible one is the fusion's to report.
+        let Ok(parsed) = message.parse() else {
+            return Ok(());
+        };
+        let name = parsed.name.to_string();
+        let known = self.cameras.len() as u64;
+        let new = !self.cameras.contains_key(&name);
+        let view = self
+            .cameras
+            .entry(name.clone())
+            .or_insert(CameraView { index: known, camera: parsed.camera.clone(), scale: 1.0 });
+        view.camera = parsed.camera;
+        if new {
+            draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
+            let names: Vec<String> = self.cameras.keys().cloned().collect();
+            blueprint::send(&self.stream, &names)?;
+        }
+        Ok(())
+    }
+
+    fn preview(&mut self, preview: &Preview) -> Result<(), ViewError> {
+        let time = self.at(preview.capture_time_ns);
+        let path = image_path(&preview.camera);
+        if !self.limiter.allows(&path, time, PREVIEW_RATE_HZ) {
+            return Ok(());
+        }
+        if let Some(view) = self.cameras.get_mut(&preview.camera)
+            && preview.scale > 0.0
+            && view.scale != preview.scale
+        {
+            view.scale = preview.scale;
+            draw::camera(&self.stream, &preview.camera, view.index, &view.camera, view.scale)?;
+        }
+        let image = EncodedImage::new(preview.data.clone()).with_media_type(MediaType::jpeg());
+        Ok(self.stream.log(path, &image)?)
+    }
+
+    fn bearings(&mut self, frame: &BearingFrame, arrival: Timestamp) -> Result<(), ViewError> {
+        self.arrivals.insert((frame.camera.clone(), frame.sequence), arrival);
+        while self.arrivals.len() > MAX_ARRIVALS {
+            self.arrivals.pop_first();
+        }
+        let time = self.at(frame.capture_time_ns);
+        let Some(view) = self.cameras.get(&frame.camera) else {
+            return Ok(());
+        };
+        if !self.limiter.allows(&format!("lines/{}", frame.camera), time, LINE_RATE_HZ) {
+            return Ok(());
+        }
+        // As far as the farthest track, so that the crossings are seen.
+        let origin = view.camera.pose().position();
+        let farthest = self.places.iter().map(|place| (place - origin).norm()).fold(0.0, f64::max);
+        let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
+        draw::bearings(&self.stream, frame, view.index, &view.camera, reach, view.scale)
+    }
+
+    fn tracks(&mut self, frame: &TrackFrame, arrival: Timestamp) -> Result<(), ViewError> {
+        let time = self.at(frame.time_ns);
+        self.plots(frame, arrival, time)?;
+        let ended: Vec<u64> = frame
+            .tracks
+            .iter()
+            .filter(|track| track.state() == TrackState::Lost)
+            .map(|track| track.id)
+            .collect();
+        for id in ended {
+            self.trails.remove(&id);
+            if self.drawn.remove(&id) {
+                self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
+            }
+        }
+        if !self.limiter.allows("tracks", time, TRACK_RATE_HZ) {
+            return Ok(());
+        }
+        self.places.clear();
+        for track in frame.tracks.iter().filter(|track| track.state() != TrackState::Lost) {
+            let Some(position) = track.position else {
+                continue;
+            };
+            let trail = self.trails.entry(track.id).or_default();
+            trail.push_back([position.x as f32, position.y as f32, position.z as f32]);
+            while trail.len() > TRAIL_POINTS {
+                trail.pop_front();
+            }
+            self.drawn.insert(track.id);
+            self.places.push(position.into());
+            draw::track(&self.stream, track, trail.make_contiguous())?;
+        }
+        Ok(())
+    }
+
+    fn plots(&mut self, frame: &TrackFrame, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
+        if let Some(bearing) = self.arrivals.remove(&(frame.camera.clone(), frame.camera_sequence)) {
+            let latency = arrival.seconds_since(bearing) * 1e3;
+            if latency > 0.0 && self.limiter.allows("latency", time, LINE_RATE_HZ) {
+                self.stream.log("plots/latency", &Scalars::single(latency))?;
+            }
+        }
+        if !self.limiter.allows(&format!("residual/{}", frame.camera), time, LINE_RATE_HZ) {
+            return Ok(());
+        }
+        let residuals = frame.tracks.iter().flat_map(|track| &track.residuals);
+        let angle = residuals
+            .filter(|residual| residual.camera == frame.camera && residual.time_ns == frame.time_ns)
+            .map(|residual| residual.angle_rad * 1e3)
+            .fold(None, |most: Option<f64>, angle| Some(most.map_or(angle, |m| m.max(angle))));
+        if let Some(angle) = angle {
+            self.stream.log(format!("plots/residual/{}", frame.camera), &Scalars::single(angle))?;
+        }
+        Ok(())
+    }
+
+    fn event(&mut self, event: &TrackEvent) -> Result<(), ViewError> {
+        self.at(event.time_ns);
+        let what = event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_").to_lowercase();
+        let text = match event.other_id {
+            0 => format!("track {} {what}", event.track_id),
+            other => format!("track {} {what} into {other}", event.track_id),
+        };
+        Ok(self.stream.log("events", &TextLog::new(text))?)
+    }
+
+    fn truth(&mut self, frame: &TruthFrame) -> Result<(), ViewError> {
+        let time = self.at(frame.time_ns);
+        if !self.limiter.allows("truth", time, LINE_RATE_HZ) {
+            return Ok(());
+        }
+        let places = frame.targets.iter().filter_map(|target| target.position);
+        let points: Vec<[f32; 3]> = places.map(|p| [p.x as f32, p.y as f32, p.z as f32]).collect();
+        let truth = Points3D::new(points)
+            .with_colors([Color::from_rgb(255, 255, 255)])
+            .with_radii([Radius::new_ui_points(2.5)]);
+        Ok(self.stream.log("world/truth", &truth)?)
+    }
+}
