@@ -13,7 +13,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use crate::commands::{
-    agent, check, evaluate, export, fuse, import as import_command, info, record, replay, simulate,
+    agent, check, demo, evaluate, export, fuse, import as import_command, info, record, replay, simulate,
     track, view,
 };
 
@@ -32,6 +32,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Demo(demo::Args),
     Agent(agent::Args),
     Track(track::Args),
     Fuse(fuse::Args),
@@ -48,6 +49,7 @@ enum Command {
 
 fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
+        Command::Demo(args) => demo::run(&args),
         Command::Agent(args) => agent::run(&args),
         Command::Track(args) => track::run(&args),
         Command::Fuse(args) => fuse::run(&args),

@@ -2,6 +2,7 @@
 
 pub mod agent;
 pub mod check;
+pub mod demo;
 pub mod evaluate;
 pub mod export;
 pub mod fuse;

@@ -5,7 +5,7 @@ mod file;
 mod fusion;
 mod site;
 
-pub use camera::{CameraFile, ClockConfig, SourceConfig};
+pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
 pub use file::{load, parse};
 pub use fusion::FusionFile;
 pub use site::{Site, load_network};

@@ -1,0 +1,318 @@
+use std::collections::BTreeMap;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, bail, ensure};
+use crossfix_calibration::intrinsics_to_yaml;
+use crossfix_message::{CameraName, Channel, Key, TrackFrame, TrackState, decode};
+use crossfix_simulation::{Scene, World};
+use crossfix_transport::{Link, NetworkConfig, Role};
+use crossfix_vision::{DetectorConfig, TrackerConfig};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::commands::evaluate::{evaluate, render};
+use crate::commands::view::save_recording;
+use crate::config::{self, CameraFile, ClockConfig, FusionFile, PoseConfig, SourceConfig};
+use crate::output;
+use crate::shutdown::Shutdown;
+
+/// The scene that the demo plays, as in `configs/demo`.
+const SCENE: &str = include_str!("../../../../configs/demo/scene.toml");
+/// How long children may take to come up, and to stop.
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Time between the last component's coming up and the first frame, s.
+const RUN_UP_S: f64 = 1.0;
+/// Time that the tracks need to be found: not counted against them, s after the targets appear.
+const SETTLING_S: f64 = 1.5;
+
+/// See it work: a simulated site, real processes, Zenoh, fusion, a recording, and the error.
+///
+/// Renders what three cameras see of two UAVs, runs an agent a camera, the fusion centre and the
+/// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix demo --duration 20 --output demo-output")]
+pub struct Args {
+    /// Seed of sky and noise.
+    #[arg(long, default_value_t = 1, value_name = "N")]
+    seed: u64,
+    /// How long the scene lasts, seconds.
+    #[arg(long, default_value_t = 25.0, value_name = "SECONDS")]
+    duration: f64,
+    /// The folder to write recording, picture, configurations and logs to.
+    #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
+    output: PathBuf,
+    /// Open the live viewer (Rerun), where one is installed.
+    #[arg(long)]
+    view: bool,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// A process of the demo; it is stopped when this is dropped.
+struct Component {
+    name: String,
+    child: Child,
+}
+
+impl Component {
+    /// Starts this program with a subcommand; its logs go to a file.
+    fn start(name: &str, folder: &Path, arguments: &[String]) -> anyhow::Result<Self> {
+        let program = std::env::current_exe().context("cannot find this program's own file")?;
+        let log = folder.join("logs").join(format!("{name}.log"));
+        let log = std::fs::File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+        let child = Command::new(program)
+            .args(arguments)
+            .arg("--stop-with-stdin")
+            .stdin(Stdio::piped())
+            .stdout(log.try_clone()?)
+            .stderr(log)
+            .spawn()
+            .with_context(|| format!("cannot start `{name}`"))?;
+        Ok(Self { name: name.to_owned(), child })
+    }
+
+    /// Whether it still runs; an error if it failed.
+    fn runs(&mut self, folder: &Path) -> anyhow::Result<bool> {
+        match self.child.try_wait()? {
+            None => Ok(true),
+            Some(status) if status.success() => Ok(false),
+            Some(status) => {
+                let log = folder.join("logs").join(format!("{}.log", self.name));
+                let text = std::fs::read_to_string(&log).unwrap_or_default();
+                let last = text.lines().rev().take(3).collect::<Vec<_>>().into_iter().rev();
+                bail!("`{}` failed ({status}):\n{}", self.name, last.collect::<Vec<_>>().join("\n"))
+            }
+        }
+    }
+
+    /// Asks it to stop by the end of its stdin, and waits.
+    fn stop(mut self) -> anyhow::Result<()> {
+        drop(self.child.stdin.take());
+        let deadline = Instant::now() + PATIENCE;
+        while Instant::now() < deadline {
+            if let Some(status) = self.child.try_wait()? {
+                ensure!(status.success(), "`{}` ended with {status}; see its log", self.name);
+                return Ok(());
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        bail!("`{}` does not stop", self.name)
+    }
+}
+
+impl Drop for Component {
+    fn drop(&mut self) {
+        // After `stop` there is nothing left to end; on an error this is the last resort.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The demo's files.
+struct Files {
+    folder: PathBuf,
+    network: PathBuf,
+    fusion: PathBuf,
+    cameras: BTreeMap<CameraName, PathBuf>,
+    recording: PathBuf,
+    picture: PathBuf,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let begun = Instant::now();
+    ensure!((5.0..=3600.0).contains(&args.duration), "--duration is {}: it must be from 5 to 3600 s", args.duration);
+    let shutdown = Shutdown::listen();
+    let mut scene: Scene = config::parse(SCENE, &[])?;
+    scene.seed = args.seed;
+    scene.duration_s = args.duration;
+    let world = scene.build()?;
+    let network = free_network(&world)?;
+    let files = write_files(&args.output, &scene, &world, &network)?;
+    let state = play(args, &files, &network, &shutdown)?;
+    tracing::info!("drawing the picture");
+    save_recording(&files.recording, &files.picture)?;
+    if state == Ending::Interrupted {
+        output::line(format!("stopped early; the recording is readable: {}", files.recording.display()));
+        return Ok(());
+    }
+    let evaluation = evaluate(&files.recording, None, 5.0, 1.0 + SETTLING_S)?;
+    if args.json {
+        return output::json(&evaluation);
+    }
+    output::line(format!("\n{}\n", render(&evaluation)));
+    output::line(format!("recording       {}", files.recording.display()));
+    output::line(format!("picture         {}", files.picture.display()));
+    output::line(format!("configurations  {}", files.folder.display()));
+    output::line(format!(
+        "look at it      rerun {}    (pip install rerun-sdk==0.36.3)",
+        files.picture.display()
+    ));
+    output::line(format!("took            {:.0} s", begun.elapsed().as_secs_f64()));
+    Ok(())
+}
+
+/// How the play ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    Complete,
+    Interrupted,
+}
+
+/// Starts everything, follows it to its end, stops it.
+fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown) -> anyhow::Result<Ending> {
+    let text = |path: &Path| path.display().to_string();
+    let start = |name: &str, arguments: &[&str]| {
+        let arguments: Vec<String> = arguments.iter().map(|a| (*a).to_owned()).collect();
+        Component::start(name, &files.folder, &arguments)
+    };
+    let recorder = start("recorder", &["record", "-c", &text(&files.network), "-o", &text(&files.recording)])?;
+    let fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
+    let viewer = if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };
+
+    let link = Link::open(network, &Role::Observer)?;
+    let subscription = link.subscribe(&[Key::new(network.site.clone(), Channel::Tracks).to_string()])?;
+    let go_on = || !shutdown.requested();
+    link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on).context("the fusion centre did not come up")?;
+    let start_at = wall_seconds() + RUN_UP_S;
+    let mut agents = Vec::new();
+    for (name, file) in &files.cameras {
+        let begin = format!("{start_at:.6}");
+        let arguments = ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
+        agents.push(start(name.as_str(), &arguments)?);
+    }
+
+    let bar = progress_bar(args.duration);
+    let mut interrupted = false;
+    while !agents.is_empty() {
+        let mut running = Vec::new();
+        for mut agent in agents {
+            if agent.runs(&files.folder)? {
+                running.push(agent);
+            }
+        }
+        agents = running;
+        if shutdown.requested() {
+            interrupted = true;
+            break;
+        }
+        let elapsed = (wall_seconds() - start_at).clamp(0.0, args.duration);
+        bar.set_position((elapsed * 10.0) as u64);
+        if let Some(message) = newest(&subscription) {
+            bar.set_message(message);
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    bar.finish_and_clear();
+    for agent in agents {
+        agent.stop()?;
+    }
+    fusion.stop()?;
+    recorder.stop()?;
+    if let Some(viewer) = viewer {
+        viewer.stop()?;
+    }
+    drop(subscription);
+    link.close()?;
+    Ok(if interrupted { Ending::Interrupted } else { Ending::Complete })
+}
+
+fn wall_seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
+
+fn progress_bar(duration: f64) -> ProgressBar {
+    let bar = ProgressBar::new((duration * 10.0) as u64);
+    let style = ProgressStyle::with_template("{elapsed:>4} [{bar:30}] {msg}").map(|s| s.progress_chars("=> "));
+    if let Ok(style) = style {
+        bar.set_style(style);
+    }
+    bar.set_message("starting three agents, the fusion centre and the recorder");
+    bar
+}
+
+/// The newest track frame as a line of the progress bar.
+fn newest(subscription: &crossfix_transport::Subscription) -> Option<String> {
+    let mut last = None;
+    while let Some(received) = subscription.next(Duration::ZERO) {
+        last = Some(received);
+    }
+    let frame: TrackFrame = decode(&last?.data).ok()?;
+    let confirmed: Vec<String> = frame
+        .tracks
+        .iter()
+        .filter(|track| track.state() == TrackState::Confirmed)
+        .filter_map(|track| {
+            let p = track.position?;
+            Some(format!("#{} ({:.0}, {:.0}, {:.0}) m", track.id, p.x, p.y, p.z))
+        })
+        .collect();
+    Some(format!("{} tracks  {}", confirmed.len(), confirmed.join("  ")))
+}
+
+/// A network on this machine's own ports that nobody uses now.
+fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
+    // All are held until all are known, so that none is given twice.
+    let mut held = Vec::new();
+    let mut endpoint = || -> anyhow::Result<String> {
+        let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
+        let port = listener.local_addr()?.port();
+        held.push(listener);
+        Ok(format!("tcp/127.0.0.1:{port}"))
+    };
+    let fusion = endpoint()?;
+    let mut cameras = BTreeMap::new();
+    for camera in world.cameras() {
+        cameras.insert(camera.name().clone(), endpoint()?);
+    }
+    Ok(NetworkConfig { site: "demo".parse()?, mode: Default::default(), routers: Vec::new(), fusion, cameras })
+}
+
+fn write(path: &Path, text: &str) -> anyhow::Result<()> {
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes the site's files, as a person would.
+fn write_files(folder: &Path, scene: &Scene, world: &World, network: &NetworkConfig) -> anyhow::Result<Files> {
+    std::fs::create_dir_all(folder.join("logs")).with_context(|| format!("cannot make {}", folder.display()))?;
+    let mut files = Files {
+        folder: folder.to_owned(),
+        network: folder.join("network.toml"),
+        fusion: folder.join("fusion.toml"),
+        cameras: BTreeMap::new(),
+        recording: folder.join("demo.mcap"),
+        picture: folder.join("demo.rrd"),
+    };
+    write(&folder.join("scene.toml"), &toml::to_string(scene)?)?;
+    write(&files.network, &toml::to_string(network)?)?;
+    let fusion = FusionFile { network: Some("network.toml".into()), ..FusionFile::default() };
+    write(&files.fusion, &toml::to_string(&fusion)?)?;
+    for (index, camera) in world.cameras().iter().enumerate() {
+        let name = camera.name().clone();
+        let lens = camera.camera().model().intrinsics();
+        write(&folder.join(format!("{name}.yaml")), &intrinsics_to_yaml(name.as_str(), lens))?;
+        let clock = &camera.description().clock;
+        let file = CameraFile {
+            name: name.clone(),
+            network: "network.toml".into(),
+            intrinsics: format!("{name}.yaml").into(),
+            pose: PoseConfig::of(camera.camera().pose()),
+            source: SourceConfig::Simulation { scene: "scene.toml".into(), publish_truth: index == 0 },
+            clock: ClockConfig {
+                source: config::ClockSourceName::Simulated,
+                offset_s: clock.offset_s,
+                drift_ppm: clock.drift_ppm,
+                sd_s: 1e-4,
+            },
+            preview: Default::default(),
+            boxes: Vec::new(),
+            tracker: TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() },
+        };
+        let path = folder.join(format!("{name}.toml"));
+        write(&path, &toml::to_string(&file)?)?;
+        files.cameras.insert(name, path);
+    }
+    Ok(files)
+}
