@@ -62,11 +62,8 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
     })?;
     let coefficients = &file.distortion_coefficients.data;
     let model = file.distortion_model.as_deref().unwrap_or("plumb_bob");
-    let shape = |wanted| IntrinsicsError::Shape {
-        key: "distortion_coefficients",
-        wanted,
-        found: coefficients.len(),
-    };
+    let shape =
+        |wanted| IntrinsicsError::Shape { key: "distortion_coefficients", wanted, found: coefficients.len() };
     let distortion = match model {
         "plumb_bob" | "pinhole" | "radtan" => match coefficients[..] {
             [] => Distortion::None,
@@ -128,7 +125,10 @@ mod tests {
 
     #[test]
     fn what_is_written_is_read() {
-        for distortion in [Distortion::BrownConrady([0.1, 0.2, 0.01, 0.02, 0.3]), Distortion::Fisheye([0.1, 0.0, 0.0, 0.01])] {
+        for distortion in [
+            Distortion::BrownConrady([0.1, 0.2, 0.01, 0.02, 0.3]),
+            Distortion::Fisheye([0.1, 0.0, 0.0, 0.01]),
+        ] {
             let intrinsics = Intrinsics { distortion, ..intrinsics_from_yaml(OPENCV).unwrap() };
             assert_eq!(intrinsics_from_yaml(&intrinsics_to_yaml("a", &intrinsics)).unwrap(), intrinsics);
         }
@@ -137,10 +137,14 @@ mod tests {
     #[test]
     fn impossible_files_are_named() {
         let short = OPENCV.replace("0., 0., 1. ]", "0. ]");
-        assert!(matches!(intrinsics_from_yaml(&short), Err(IntrinsicsError::Shape { key: "camera_matrix", .. })));
+        assert!(matches!(
+            intrinsics_from_yaml(&short),
+            Err(IntrinsicsError::Shape { key: "camera_matrix", .. })
+        ));
         let negative = OPENCV.replace("[ 1400.", "[ -1400.");
         assert!(matches!(intrinsics_from_yaml(&negative), Err(IntrinsicsError::Numbers(_))));
-        let model = OPENCV.replace("distortion_coefficients", "distortion_model: rational\ndistortion_coefficients");
+        let model =
+            OPENCV.replace("distortion_coefficients", "distortion_model: rational\ndistortion_coefficients");
         assert!(matches!(intrinsics_from_yaml(&model), Err(IntrinsicsError::Model(_))));
         assert!(matches!(intrinsics_from_yaml("hello"), Err(IntrinsicsError::Yaml(_))));
     }

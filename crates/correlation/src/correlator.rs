@@ -16,9 +16,8 @@ impl Window {
     /// A Gaussian about the middle, with a standard deviation of a share of each side: the target in
     /// the middle counts, the background at the border little.
     pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
-        let distance = |index: usize, side: usize| {
-            (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64)
-        };
+        let distance =
+            |index: usize, side: usize| (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
         Self::normalised(Plane::from_fn(width, height, |x, y| {
             (-0.5 * (distance(x, width).powi(2) + distance(y, height).powi(2))).exp() as f32
         }))
@@ -154,8 +153,7 @@ mod tests {
             let part = gate.crop(x as isize, y as isize, w, h);
             let weights = reference.window.0.samples();
             let mean: f32 = weights.iter().zip(part.samples()).map(|(w, s)| w * s).sum();
-            let variance: f32 =
-                weights.iter().zip(part.samples()).map(|(w, s)| w * (s - mean).powi(2)).sum();
+            let variance: f32 = weights.iter().zip(part.samples()).map(|(w, s)| w * (s - mean).powi(2)).sum();
             let cross: f32 = reference.kernel.samples().iter().zip(part.samples()).map(|(k, s)| k * s).sum();
             cross / ((reference.variance + floor * floor) * (variance + floor * floor)).sqrt()
         })

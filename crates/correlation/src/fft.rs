@@ -30,10 +30,7 @@ pub(crate) struct Size {
 impl Size {
     /// The least good size that holds a plane: multiples of 16 are twice as fast as awkward sides.
     pub(crate) fn holding(plane: &Plane) -> Self {
-        Self {
-            width: plane.width().next_multiple_of(16),
-            height: plane.height().next_multiple_of(16),
-        }
+        Self { width: plane.width().next_multiple_of(16), height: plane.height().next_multiple_of(16) }
     }
 }
 

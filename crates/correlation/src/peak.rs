@@ -68,9 +68,8 @@ mod tests {
 
     #[test]
     fn a_parabola_is_found_exactly_and_a_border_peak_stays() {
-        let scores = Plane::from_fn(9, 7, |x, y| {
-            1.0 - 0.01 * ((x as f32 - 4.3).powi(2) + (y as f32 - 2.8).powi(2))
-        });
+        let scores =
+            Plane::from_fn(9, 7, |x, y| 1.0 - 0.01 * ((x as f32 - 4.3).powi(2) + (y as f32 - 2.8).powi(2)));
         let peak = scores.peak().refined(&scores);
         assert!((peak.x - 4.3).abs() < 1e-4 && (peak.y - 2.8).abs() < 1e-4);
         let slope = Plane::from_fn(5, 5, |x, _| x as f32);

@@ -6,6 +6,7 @@ mod eye;
 mod import;
 mod logging;
 mod output;
+mod pace;
 mod shutdown;
 
 use std::process::ExitCode;

@@ -33,9 +33,10 @@ impl LatencyRecorder {
 
     /// The latency, if any pair has been seen.
     pub fn latency(&self) -> Option<Latency> {
-        let pairs = self.tracks.iter().filter_map(|(key, arrival)| {
-            Some(arrival.seconds_since(*self.bearings.get(key)?) * 1e3)
-        });
+        let pairs = self
+            .tracks
+            .iter()
+            .filter_map(|(key, arrival)| Some(arrival.seconds_since(*self.bearings.get(key)?) * 1e3));
         let mut milliseconds: Vec<f64> = pairs.collect();
         milliseconds.sort_by(f64::total_cmp);
         let last = milliseconds.len().checked_sub(1)?;

@@ -182,9 +182,8 @@ impl Evaluator {
         if truth.is_empty() {
             return Vec::new();
         }
-        let distance = |row: usize, column: usize| {
-            (estimates[column].state.position() - truth[row].position).norm()
-        };
+        let distance =
+            |row: usize, column: usize| (estimates[column].state.position() - truth[row].position).norm();
         let columns = estimates.len() + truth.len();
         let weights = Matrix::from_fn(truth.len(), columns, |(row, column)| {
             let relative = if column < estimates.len() { distance(row, column) / self.cutoff } else { 1.0 };
@@ -207,7 +206,11 @@ impl Evaluator {
             position_rmse_m: self.all.root_mean(self.all.position),
             velocity_rmse_mps: self.all.root_mean(self.all.velocity),
             mean_nees: self.all.mean(self.all.nees),
-            completeness: if target_instants > 0 { self.all.pairs as f64 / target_instants as f64 } else { 1.0 },
+            completeness: if target_instants > 0 {
+                self.all.pairs as f64 / target_instants as f64
+            } else {
+                1.0
+            },
             false_tracks_per_instant: self.false_instants as f64 / instants,
             false_tracks: self.tracks.difference(&self.true_tracks).count() as u64,
             id_switches: self.targets.values().map(|target| target.switches).sum(),

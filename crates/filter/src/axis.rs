@@ -54,8 +54,8 @@ impl AxisFilter {
     pub fn start(first: AxisMeasurement, second: AxisMeasurement, interval: f64, sigma_a: f64) -> Self {
         let velocity = (second.position - first.position) / interval;
         let cross = second.variance / interval;
-        let velocity_variance = (second.variance + first.variance) / interval.powi(2)
-            + sigma_a.powi(2) * interval.powi(2) / 4.0;
+        let velocity_variance =
+            (second.variance + first.variance) / interval.powi(2) + sigma_a.powi(2) * interval.powi(2) / 4.0;
         Self {
             state: Vector2::new(second.position, velocity),
             covariance: Matrix2::new(second.variance, cross, cross, velocity_variance),
@@ -95,8 +95,8 @@ impl AxisFilter {
         self.state += gain * innovation.value;
         // Joseph's form keeps the covariance symmetric and positive.
         let left = Matrix2::new(1.0 - gain.x, 0.0, -gain.y, 1.0);
-        self.covariance = left * self.covariance * left.transpose()
-            + gain * measurement.variance * gain.transpose();
+        self.covariance =
+            left * self.covariance * left.transpose() + gain * measurement.variance * gain.transpose();
         innovation
     }
 

@@ -167,10 +167,7 @@ mod tests {
         }
         let released = drain(&mut buffer);
         assert!(*released.last().unwrap() > 1.3, "{released:?}");
-        assert!(matches!(
-            buffer.insert(exposure("c", 0.5)),
-            Err(RejectionReason::Late { .. })
-        ));
+        assert!(matches!(buffer.insert(exposure("c", 0.5)), Err(RejectionReason::Late { .. })));
     }
 
     #[test]
@@ -184,10 +181,7 @@ mod tests {
         }
         // Ten of `a` and nine of `b`: the tenth of `b` waits for `a`.
         assert_eq!(drain(&mut buffer).len(), 19);
-        assert!(matches!(
-            buffer.insert(exposure("liar", 1e6 + 1.0)),
-            Err(RejectionReason::Future { .. })
-        ));
+        assert!(matches!(buffer.insert(exposure("liar", 1e6 + 1.0)), Err(RejectionReason::Future { .. })));
     }
 
     #[test]

@@ -2,8 +2,8 @@ use std::collections::BTreeMap;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload,
-    TrackEvent, TrackFrame, TrackState,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload, TrackEvent,
+    TrackFrame, TrackState,
 };
 
 use crate::event_time::EventBuffer;

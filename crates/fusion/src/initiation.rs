@@ -10,8 +10,8 @@ use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 use crate::config::Tracking;
 use crate::spatial::{
-    Fix, MapSolution, RangeSolution, TimedLine, VAGUE_VELOCITY_SD, VelocityKnowledge, map, pair,
-    stacked, triple,
+    Fix, MapSolution, RangeSolution, TimedLine, VAGUE_VELOCITY_SD, VelocityKnowledge, map, pair, stacked,
+    triple,
 };
 use crate::temporal::{Group, Grouping, GroupingRules, LineId, PeriodFix, TemporalGate};
 use crate::{Exposure, Initiation, Sighting, SpatialSolver};
@@ -96,8 +96,7 @@ impl Initiator {
         unused.retain(|camera, _| heard.contains_key(camera));
         let complete = unused.len() == heard.len();
         let spread = spread_of(unused.values().map(|exposure| exposure.time).min());
-        let long_enough =
-            self.closed.is_none_or(|closed| now.seconds_since(closed) >= self.config.period_s);
+        let long_enough = self.closed.is_none_or(|closed| now.seconds_since(closed) >= self.config.period_s);
         if !(complete && long_enough && spread <= closest * SPREAD_FACTOR) {
             return Vec::new();
         }
@@ -140,7 +139,9 @@ impl Initiator {
                     continue;
                 }
                 let lines = vec![one.clone(), two];
-                if let Some(mut fix) = self.fix_at(&lines, one.1.time, Solver::Pair, VelocityKnowledge::Unknown) {
+                if let Some(mut fix) =
+                    self.fix_at(&lines, one.1.time, Solver::Pair, VelocityKnowledge::Unknown)
+                {
                     fix.state.mean.fixed_rows_mut::<3>(0).copy_from(&solution.position.coords);
                     fix.state.mean.fixed_rows_mut::<3>(3).fill(0.0);
                     fixes.push(PeriodFix { fix, lines });
@@ -177,7 +178,12 @@ impl Initiator {
     }
 
     /// The fix of a solution for ranges and velocity, if it is possible.
-    fn range_fix(&self, lines: Vec<(LineId, TimedLine)>, solution: &RangeSolution, solver: Solver) -> Option<PeriodFix> {
+    fn range_fix(
+        &self,
+        lines: Vec<(LineId, TimedLine)>,
+        solution: &RangeSolution,
+        solver: Solver,
+    ) -> Option<PeriodFix> {
         let max_speed = SPEED_SIGMAS * self.config.velocity_prior_sd_mps;
         if !self.in_range(&solution.ranges) || solution.velocity.norm() > max_speed {
             return None;
@@ -217,7 +223,8 @@ impl Initiator {
             return None;
         }
         let MapSolution { state, observability, .. } = solution;
-        let fix = Fix { time, state, velocity: VelocityKnowledge::Solved, solver: Solver::Map, observability };
+        let fix =
+            Fix { time, state, velocity: VelocityKnowledge::Solved, solver: Solver::Map, observability };
         Some(PeriodFix { fix, lines })
     }
 
@@ -229,14 +236,20 @@ impl Initiator {
     /// other closely enough, with every line of a later camera in its gate, and then the best line
     /// of each camera after that.
     fn combinations(&self, exposures: &[&Exposure]) -> Vec<Vec<(LineId, TimedLine)>> {
-        let cameras: Vec<Vec<(LineId, TimedLine)>> = exposures.iter().map(|e| lines_of(e).collect()).collect();
+        let cameras: Vec<Vec<(LineId, TimedLine)>> =
+            exposures.iter().map(|e| lines_of(e).collect()).collect();
         let mut sets = Vec::new();
         for (a, first_camera) in cameras.iter().enumerate() {
             for (b, second_camera) in cameras.iter().enumerate().skip(a + 1) {
                 for first in first_camera {
                     for second in second_camera {
                         if let Some(seed) = self.seed(first, second) {
-                            self.extend_seed(&[first.clone(), second.clone()], &seed, &cameras[b + 1..], &mut sets);
+                            self.extend_seed(
+                                &[first.clone(), second.clone()],
+                                &seed,
+                                &cameras[b + 1..],
+                                &mut sets,
+                            );
                         }
                     }
                 }
@@ -246,7 +259,11 @@ impl Initiator {
     }
 
     /// The solution of two lines, if they pass each other as closely as one target's may.
-    fn seed(&self, (_, first): &(LineId, TimedLine), (_, second): &(LineId, TimedLine)) -> Option<MapSolution> {
+    fn seed(
+        &self,
+        (_, first): &(LineId, TimedLine),
+        (_, second): &(LineId, TimedLine),
+    ) -> Option<MapSolution> {
         let solution = pair(first, second, nalgebra::Vector3::zeros())?;
         let ranges = [solution.first_range, solution.second_range];
         let noise = first.line.standard_deviation() * ranges[0].abs()

@@ -94,7 +94,8 @@ impl Group {
         let mean_time = times.iter().sum::<f64>() / times.len() as f64;
         let spread: f64 = times.iter().map(|t| (t - mean_time).powi(2)).sum();
         (spread > 0.0).then(|| {
-            let weighted = self.fixes.iter().zip(&times).map(|(f, t)| f.fix.state.position().coords * (t - mean_time));
+            let weighted =
+                self.fixes.iter().zip(&times).map(|(f, t)| f.fix.state.position().coords * (t - mean_time));
             weighted.sum::<Vector3<f64>>() / spread
         })
     }
@@ -139,9 +140,8 @@ impl Grouping {
         }));
         // A group without a fix in this period stays open for the next.
         self.groups.append(&mut grown);
-        self.groups.sort_by(|a, b| {
-            b.fixes.len().cmp(&a.fixes.len()).then(a.indicator.total_cmp(&b.indicator))
-        });
+        self.groups
+            .sort_by(|a, b| b.fixes.len().cmp(&a.fixes.len()).then(a.indicator.total_cmp(&b.indicator)));
         self.groups.truncate(MAX_GROUPS);
         self.select()
     }
@@ -178,9 +178,7 @@ impl Grouping {
     fn select(&mut self) -> Vec<Group> {
         let mut good: Vec<&Group> =
             self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes).collect();
-        good.sort_by(|a, b| {
-            a.indicator.total_cmp(&b.indicator).then_with(|| a.lines().cmp(&b.lines()))
-        });
+        good.sort_by(|a, b| a.indicator.total_cmp(&b.indicator).then_with(|| a.lines().cmp(&b.lines())));
         let mut taken: BTreeSet<LineId> = BTreeSet::new();
         let mut selected = Vec::new();
         for group in good {

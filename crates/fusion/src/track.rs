@@ -102,7 +102,13 @@ fn predicted_offset(state: &KinematicState, line: &SightLine) -> Option<(Vector2
 
 impl Track {
     /// A tentative track at a state.
-    pub(crate) fn start(id: TrackId, state: KinematicState, time: Timestamp, solver: Solver, observability: Observability) -> Self {
+    pub(crate) fn start(
+        id: TrackId,
+        state: KinematicState,
+        time: Timestamp,
+        solver: Solver,
+        observability: Observability,
+    ) -> Self {
         Self {
             id,
             status: TrackStatus::Tentative,
@@ -177,8 +183,11 @@ impl Track {
             MeasurementResidual { time: self.time, angle: innovation.value.norm(), nis: innovation.nis };
         self.residuals.insert(camera.clone(), residual);
         if let Some(information) = self.state.covariance.try_inverse() {
-            self.observability =
-                Observability::of_information(&information, config.max_position_sd_m, crate::spatial::VAGUE_VELOCITY_SD);
+            self.observability = Observability::of_information(
+                &information,
+                config.max_position_sd_m,
+                crate::spatial::VAGUE_VELOCITY_SD,
+            );
         }
         Some(innovation)
     }

@@ -70,7 +70,13 @@ impl Tracker {
         (free.into_iter().flatten().cloned().collect(), happenings)
     }
 
-    fn associate(&mut self, exposure: &Exposure, camera: &Camera, free: &mut [Option<&Sighting>], sure: bool) {
+    fn associate(
+        &mut self,
+        exposure: &Exposure,
+        camera: &Camera,
+        free: &mut [Option<&Sighting>],
+        sure: bool,
+    ) {
         let ids: Vec<TrackId> =
             self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
         let innovations: Vec<Vec<Option<f64>>> = ids
@@ -142,9 +148,10 @@ impl Tracker {
         let coasting = self.tracks.values().filter(|t| t.status == TrackStatus::Coasting);
         let merged: Vec<(TrackId, TrackId)> = coasting
             .filter_map(|old| {
-                let live = self.tracks.values().find(|new| {
-                    new.status == TrackStatus::Confirmed && same_target(old, new)
-                })?;
+                let live = self
+                    .tracks
+                    .values()
+                    .find(|new| new.status == TrackStatus::Confirmed && same_target(old, new))?;
                 Some((old.id, live.id))
             })
             .collect();

@@ -119,8 +119,7 @@ impl CameraModel {
         for &k in coefficients {
             check("a distortion coefficient", k, k.is_finite(), "it must be a finite number")?;
         }
-        let brown_conrady =
-            RosOpenCvIntrinsics::from_params_with_distortion(fx, 0.0, fy, cx, cy, opencv);
+        let brown_conrady = RosOpenCvIntrinsics::from_params_with_distortion(fx, 0.0, fy, cx, cy, opencv);
         Ok(Self { intrinsics, brown_conrady })
     }
 
@@ -193,10 +192,8 @@ impl CameraModel {
     pub fn bearing(&self, pixel: Pixel, covariance: PixelCovariance) -> Result<Bearing, GeometryError> {
         let direction = self.direction(pixel)?;
         let no_inverse = || GeometryError::NoInverse { x: pixel.x(), y: pixel.y() };
-        let tangent_per_pixel = self
-            .pixels_per_radian(&direction)
-            .and_then(|j| j.try_inverse())
-            .ok_or_else(no_inverse)?;
+        let tangent_per_pixel =
+            self.pixels_per_radian(&direction).and_then(|j| j.try_inverse()).ok_or_else(no_inverse)?;
         let tangent = tangent_per_pixel * covariance.0 * tangent_per_pixel.transpose();
         Bearing::new(direction.into_inner(), tangent)
     }
@@ -341,8 +338,9 @@ mod tests {
 
     #[test]
     fn a_pixel_of_standard_deviation_one_is_one_over_the_focal_length() {
-        let bearing =
-            model(Distortion::None).bearing(Pixel::new(955.0, 545.0), PixelCovariance::isotropic(1.0)).unwrap();
+        let bearing = model(Distortion::None)
+            .bearing(Pixel::new(955.0, 545.0), PixelCovariance::isotropic(1.0))
+            .unwrap();
         assert!((bearing.covariance().m11.sqrt() - 1.0 / 1400.0).abs() < 1e-9);
         assert!((bearing.covariance().m22.sqrt() - 1.0 / 1405.0).abs() < 1e-9);
     }

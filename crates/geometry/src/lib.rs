@@ -31,9 +31,7 @@ mod pose;
 mod scanning;
 
 pub use bearing::{Bearing, SightLine, tangent_basis};
-pub use camera::{
-    Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance,
-};
+pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
 pub use pose::Pose;
 pub use scanning::{ScanAngles, optical_bearing};

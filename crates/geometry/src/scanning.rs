@@ -38,10 +38,7 @@ impl ScanAngles {
     /// The angles of a direction (002, equation 3; erratum: without the factor mu in the azimuth,
     /// and with the quadrant).
     pub fn of(bearing: &Unit<Vector3<f64>>) -> Self {
-        Self {
-            azimuth: bearing.x.atan2(bearing.z),
-            elevation: bearing.y.clamp(-1.0, 1.0).asin(),
-        }
+        Self { azimuth: bearing.x.atan2(bearing.z), elevation: bearing.y.clamp(-1.0, 1.0).asin() }
     }
 
     /// The angles to which an image point cues the scanning receiver beside its optical one

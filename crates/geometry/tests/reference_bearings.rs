@@ -57,13 +57,22 @@ fn real_labels_become_the_reference_bearings() {
     let mut unconverged = BTreeMap::<String, usize>::new();
     let mut rows = csv::Reader::from_path(data.join("reference_bearings.csv")).unwrap();
     for row in rows.deserialize() {
-        let (dataset, camera, _, x, y, u_norm, v_norm, _, e, n, u): (u32, String, u32, f64, f64, f64, f64, f64, f64, f64, f64) =
-            row.unwrap();
+        let (dataset, camera, _, x, y, u_norm, v_norm, _, e, n, u): (
+            u32,
+            String,
+            u32,
+            f64,
+            f64,
+            f64,
+            f64,
+            f64,
+            f64,
+            f64,
+            f64,
+        ) = row.unwrap();
         let description = &poses[dataset.to_string()]["half"]["cameras"][&camera];
         let name = description["name"].as_str().unwrap();
-        let model = models
-            .entry((dataset, camera.clone()))
-            .or_insert_with(|| model(&data, name, dataset));
+        let model = models.entry((dataset, camera.clone())).or_insert_with(|| model(&data, name, dataset));
         // The file was made with five fixed-point steps of the inverse. Where those do not converge
         // (the corners of the wide lens) its direction does not fall back on its own pixel.
         let theirs = model.project(&Vector3::new(u_norm, v_norm, 1.0)).unwrap();

@@ -4,9 +4,7 @@ use prost::Message;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::{
-    CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3,
-};
+use crate::{CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3};
 
 /// A [`CameraCalibration`] that has been read and found possible.
 #[derive(Clone, Debug)]
@@ -95,9 +93,9 @@ impl CameraCalibration {
             DistortionModel::BrownConrady => Distortion::BrownConrady(
                 self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
             ),
-            DistortionModel::Fisheye => Distortion::Fisheye(
-                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
-            ),
+            DistortionModel::Fisheye => {
+                Distortion::Fisheye(self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?)
+            }
         };
         let intrinsics = Intrinsics {
             size: ImageSize { width: self.width, height: self.height },
@@ -107,8 +105,7 @@ impl CameraCalibration {
             cy: self.cy,
             distortion,
         };
-        let rotation: [f64; 9] =
-            self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
+        let rotation: [f64; 9] = self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
         let position = self.position.ok_or_else(|| shape("position"))?;
         let pose = Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;

@@ -21,7 +21,7 @@ mod name;
 mod payload;
 mod time;
 
-pub use camera::{CalibrationError, Calibration};
+pub use camera::{Calibration, CalibrationError};
 pub use key::{Channel, Key, KeyError};
 pub use name::{CameraName, NameError, SiteName};
 pub use payload::{DecodeError, Payload, decode, file_descriptor_set};

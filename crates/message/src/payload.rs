@@ -2,8 +2,7 @@ use prost::Message;
 use thiserror::Error;
 
 use crate::{
-    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION,
-    Version,
+    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION, Version,
 };
 
 /// A message that stands alone on the wire and in recordings.
@@ -72,14 +71,11 @@ pub enum DecodeError {
 /// # Errors
 /// [`DecodeError`] if the bytes are no such message or of a newer major version.
 pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
-    let message =
-        M::decode(bytes).map_err(|source| DecodeError::Malformed { schema: M::SCHEMA, source })?;
+    let message = M::decode(bytes).map_err(|source| DecodeError::Malformed { schema: M::SCHEMA, source })?;
     match message.version() {
-        Some(version) if version.major > VERSION.major => Err(DecodeError::NewerMajor {
-            schema: M::SCHEMA,
-            theirs: version.major,
-            ours: VERSION.major,
-        }),
+        Some(version) if version.major > VERSION.major => {
+            Err(DecodeError::NewerMajor { schema: M::SCHEMA, theirs: version.major, ours: VERSION.major })
+        }
         _ => Ok(message),
     }
 }

@@ -97,7 +97,8 @@ impl<R: Read> RecordingReader<R> {
                 }
                 Ok(Record::Message { header, data }) => match topics.get(&header.channel_id) {
                     Some(Some(key)) => {
-                        let time = |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
+                        let time =
+                            |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
                         let entry = Entry {
                             key: key.clone(),
                             data_time: time(header.log_time),

@@ -1,6 +1,5 @@
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame,
-    TruthFrame,
+    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame, TruthFrame,
 };
 
 /// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.

@@ -62,7 +62,9 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 let writer = &mut self.writer;
                 let channel = writer
                     .add_schema(name, "protobuf", file_descriptor_set())
-                    .and_then(|id| writer.add_channel(id, &entry.key.to_string(), "protobuf", &BTreeMap::new()))
+                    .and_then(|id| {
+                        writer.add_channel(id, &entry.key.to_string(), "protobuf", &BTreeMap::new())
+                    })
                     .map_err(RecordingError::Write)?;
                 (channel, 0)
             }

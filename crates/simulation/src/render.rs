@@ -51,8 +51,10 @@ pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appe
     let half = target.span / 2.0;
     let soft = target.blur.max(0.3);
     let reach = half + 3.0 * soft + 1.0;
-    let [low_x, high_x] = [target.from[0].min(target.to[0]) - reach, target.from[0].max(target.to[0]) + reach];
-    let [low_y, high_y] = [target.from[1].min(target.to[1]) - reach, target.from[1].max(target.to[1]) + reach];
+    let [low_x, high_x] =
+        [target.from[0].min(target.to[0]) - reach, target.from[0].max(target.to[0]) + reach];
+    let [low_y, high_y] =
+        [target.from[1].min(target.to[1]) - reach, target.from[1].max(target.to[1]) + reach];
     if high_x < 0.0 || high_y < 0.0 || low_x > width as f64 || low_y > height as f64 {
         return;
     }

@@ -159,7 +159,12 @@ impl Scene {
         for camera in &self.cameras {
             let whose = |key: &str| format!("{key} of camera {}", camera.name);
             let rate = camera.rate_hz;
-            number(whose("rate_hz"), rate, (0.01..=1000.0).contains(&rate), "from 0.01 to 1000 frames a second")?;
+            number(
+                whose("rate_hz"),
+                rate,
+                (0.01..=1000.0).contains(&rate),
+                "from 0.01 to 1000 frames a second",
+            )?;
             let noise = camera.noise_levels;
             number(whose("noise_levels"), noise, (0.0..=100.0).contains(&noise), "from 0 to 100 levels")?;
             let blur = camera.blur_px;

@@ -84,7 +84,10 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
         ("connect/endpoints", format!("{connect:?}")),
         ("connect/timeout_ms", "-1".to_owned()),
         ("connect/exit_on_failure", "false".to_owned()),
-        ("connect/retry", "{period_init_ms: 200, period_max_ms: 1000, period_increase_factor: 1.5}".to_owned()),
+        (
+            "connect/retry",
+            "{period_init_ms: 200, period_max_ms: 1000, period_increase_factor: 1.5}".to_owned(),
+        ),
         ("transport/unicast/open_timeout", "2000".to_owned()),
         ("transport/link/tx/lease", "3000".to_owned()),
         ("transport/link/tx/queue/size/data", "8".to_owned()),
@@ -217,7 +220,12 @@ impl Link {
     ///
     /// # Errors
     /// [`LinkError::NotAlive`] naming the first that did not come in time.
-    pub fn wait_for(&self, channels: &[Channel], patience: Duration, mut go_on: impl FnMut() -> bool) -> Result<(), LinkError> {
+    pub fn wait_for(
+        &self,
+        channels: &[Channel],
+        patience: Duration,
+        mut go_on: impl FnMut() -> bool,
+    ) -> Result<(), LinkError> {
         let deadline = Instant::now() + patience;
         for channel in channels {
             while !self.is_alive(channel)? {

@@ -51,8 +51,7 @@ fn decode_png(bytes: &[u8]) -> Result<Still, String> {
         png::ColorType::Indexed => return Err("its palette was not resolved".to_owned()),
     };
     let pixels = if info.bit_depth == png::BitDepth::Sixteen {
-        let samples: Vec<u16> =
-            buffer.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect();
+        let samples: Vec<u16> = buffer.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect();
         let samples = drop_alpha(&samples, channels, kept);
         if kept == 1 { Pixels::Gray16(samples) } else { Pixels::Rgb16(samples) }
     } else {

@@ -1,19 +1,33 @@
-use rerun::RecordingStream;
-use rerun::blueprint::components::{PanelState, PlayState};
+use nalgebra::{Point3, Vector3};
+use rerun::blueprint::components::{BackgroundKind, Eye3DKind, PanelState, PlayState};
 use rerun::blueprint::{
     Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
     Spatial2DView, Spatial3DView, TextLogView, TimePanel, TimeSeriesView, Vertical,
 };
+use rerun::external::re_log_types::BlueprintActivationCommand;
+use rerun::external::re_sdk_types::blueprint::archetypes::{Background, EyeControls3D};
+use rerun::log::LogMsg;
+use rerun::{AsComponents, Color, EntityPath, RecordingStream, RecordingStreamBuilder};
 
 use crate::ViewError;
 use crate::picture::{TIMELINE, image_path};
 
+/// Where targets are likely to be above the cameras, m.
+const AIR_M: f64 = 25.0;
+
+/// A camera's name and place.
+pub(crate) type NamedPlace = (String, Point3<f64>);
+
 /// Lays the picture out: the site on the left, cameras, plots and events on the right.
-pub(crate) fn send(stream: &RecordingStream, cameras: &[String]) -> Result<(), ViewError> {
+pub(crate) fn send(stream: &RecordingStream, cameras: &[NamedPlace]) -> Result<(), ViewError> {
     let site: ContainerLike = Spatial3DView::new("site").with_origin("/world").into();
+    let site_path = match &site {
+        ContainerLike::View(view) => Some(view.blueprint_path()),
+        _ => None,
+    };
     let images: Vec<ContainerLike> = cameras
         .iter()
-        .map(|name| Spatial2DView::new(name.clone()).with_origin(image_path(name)).into())
+        .map(|(name, _)| Spatial2DView::new(name.clone()).with_origin(image_path(name)).into())
         .collect();
     let plots: Vec<ContainerLike> = vec![
         TimeSeriesView::new("residuals [mrad]").with_origin("/plots/residual").into(),
@@ -37,6 +51,62 @@ pub(crate) fn send(stream: &RecordingStream, cameras: &[String]) -> Result<(), V
                 .with_timeline(TIMELINE)
                 .with_play_state(PlayState::Following),
         );
-    blueprint.send(stream, BlueprintActivation { make_active: true, make_default: true })?;
+    let (eye, background) = (eye_on(cameras), Background::new(BackgroundKind::SolidColor));
+    let background = background.with_color(Color::from_rgb(18, 20, 28));
+    let part = |name: &str| site_path.as_ref().map(|path| EntityPath::from(format!("{path}/{name}")));
+    let mut properties: Vec<(EntityPath, &dyn AsComponents)> = Vec::new();
+    properties.extend(part("EyeControls3D").map(|path| (path, &eye as &dyn AsComponents)));
+    properties.extend(part("Background").map(|path| (path, &background as &dyn AsComponents)));
+    send_with(stream, &blueprint, &properties)
+}
+
+/// An eye that has all cameras and the air above them in view.
+fn eye_on(cameras: &[NamedPlace]) -> EyeControls3D {
+    let count = cameras.len().max(1) as f64;
+    let sum = cameras.iter().map(|(_, place)| place.coords).sum::<Vector3<f64>>();
+    let middle = sum / count + Vector3::z() * AIR_M;
+    let reach = cameras.iter().map(|(_, place)| (place.coords - middle).norm()).fold(50.0, f64::max);
+    let eye = middle + Vector3::new(-0.6, -1.05, 1.0) * reach;
+    let f32s = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
+    EyeControls3D::new()
+        .with_kind(Eye3DKind::Orbital)
+        .with_position(f32s(eye))
+        .with_look_target(f32s(middle))
+        .with_eye_up([0.0_f32, 0.0, 1.0])
+}
+
+/// Sends a blueprint with properties of views, for which this version of Rerun has no setters in
+/// Rust: they are written into the blueprint's own store, as its Python code does.
+fn send_with(
+    stream: &RecordingStream,
+    blueprint: &Blueprint,
+    properties: &[(EntityPath, &dyn AsComponents)],
+) -> Result<(), ViewError> {
+    let Some(info) = stream.store_info() else {
+        return Ok(());
+    };
+    let application = info.application_id().clone();
+    let (store, memory) = RecordingStreamBuilder::new(application).enabled(true).memory()?;
+    blueprint.send(&store, BlueprintActivation::default())?;
+    let mut messages: Vec<LogMsg> = memory
+        .take()
+        .into_iter()
+        .filter(|m| m.store_id().is_blueprint() && !matches!(m, LogMsg::BlueprintActivationCommand(_)))
+        .collect();
+    store.disconnect();
+    let Some(id) = messages.first().map(|m| m.store_id().clone()) else {
+        return Ok(());
+    };
+    let (store, memory) =
+        RecordingStreamBuilder::from_store_id(&id).send_properties(false).enabled(true).memory()?;
+    store.set_log_time_enabled(false);
+    store.set_time_sequence("blueprint", 0_i64);
+    for (path, property) in properties {
+        store.log(path.clone(), *property)?;
+    }
+    messages.extend(memory.take().into_iter().filter(|m| matches!(m, LogMsg::ArrowMsg(..))));
+    store.disconnect();
+    let activation = BlueprintActivationCommand { blueprint_id: id, make_active: true, make_default: true };
+    stream.send_blueprint(messages, activation);
     Ok(())
 }

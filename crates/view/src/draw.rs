@@ -4,8 +4,8 @@ use crossfix_geometry::{Camera, ImageSize};
 use crossfix_message::{BearingFrame, BearingTrack, Track, TrackState};
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 use rerun::{
-    Arrows3D, Boxes2D, Color, Ellipsoids3D, FillMode, LineStrips3D, Pinhole, Points3D, Quaternion,
-    Radius, RecordingStream, Transform3D,
+    Arrows3D, Boxes2D, Color, Ellipsoids3D, FillMode, LineStrips3D, Pinhole, Points3D, Quaternion, Radius,
+    RecordingStream, SeriesLines, Transform3D,
 };
 
 use crate::picture::image_path;
@@ -25,7 +25,13 @@ fn f32s(v: &Vector3<f64>) -> [f32; 3] {
 }
 
 /// A camera: its pose, and a frustum whose image has sides scaled by `scale`.
-pub(crate) fn camera(stream: &RecordingStream, name: &str, index: u64, camera: &Camera, scale: f64) -> Result<(), ViewError> {
+pub(crate) fn camera(
+    stream: &RecordingStream,
+    name: &str,
+    index: u64,
+    camera: &Camera,
+    scale: f64,
+) -> Result<(), ViewError> {
     let matrix = camera.pose().rotation().matrix();
     let column = |i: usize| [matrix[(0, i)] as f32, matrix[(1, i)] as f32, matrix[(2, i)] as f32];
     let columns = [column(0), column(1), column(2)];
@@ -33,6 +39,18 @@ pub(crate) fn camera(stream: &RecordingStream, name: &str, index: u64, camera: &
     stream.log_static(
         format!("world/cameras/{name}"),
         &Transform3D::from_translation_mat3x3(position, columns),
+    )?;
+    stream.log_static(
+        format!("world/names/{name}"),
+        &Points3D::new([position])
+            .with_labels([name])
+            .with_show_labels(true)
+            .with_colors([colour::of(index)])
+            .with_radii([Radius::new_ui_points(3.0)]),
+    )?;
+    stream.log_static(
+        format!("plots/residual/{name}"),
+        &SeriesLines::new().with_names([name]).with_colors([colour::of(index)]),
     )?;
     let lens = camera.model().intrinsics();
     let ImageSize { width, height } = lens.size;
@@ -88,8 +106,10 @@ pub(crate) fn bearings(
         format!("{}/targets", image_path(&frame.camera)),
         &Boxes2D::from_centers_and_sizes(centres, sizes)
             .with_labels(boxes.iter().map(|t| t.track_id.to_string()))
+            // Labels would hide targets of a few pixels.
+            .with_show_labels(false)
             .with_colors([colour::of(index)])
-            .with_radii([Radius::new_ui_points(1.0)]),
+            .with_radii([Radius::new_ui_points(1.5)]),
     )?;
     Ok(())
 }

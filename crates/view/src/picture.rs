@@ -2,8 +2,8 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Preview, Timestamp, TrackEvent,
-    TrackFrame, TrackState, TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, DecodeError, Preview, Timestamp, TrackEvent, TrackFrame,
+    TrackState, TruthFrame, decode,
 };
 use nalgebra::Point3;
 use rerun::components::MediaType;
@@ -72,7 +72,12 @@ impl Picture {
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
-    pub fn show(&mut self, channel: &Channel, arrival: Timestamp, data: &[u8]) -> Result<Option<DecodeError>, ViewError> {
+    pub fn show(
+        &mut self,
+        channel: &Channel,
+        arrival: Timestamp,
+        data: &[u8],
+    ) -> Result<Option<DecodeError>, ViewError> {
         let read = match channel {
             Channel::Calibration(_) => decode(data).map(|m| self.calibration(&m)),
             Channel::Preview(_) => decode(data).map(|m| self.preview(&m)),
@@ -109,15 +114,17 @@ impl Picture {
         let name = parsed.name.to_string();
         let known = self.cameras.len() as u64;
         let new = !self.cameras.contains_key(&name);
-        let view = self
-            .cameras
-            .entry(name.clone())
-            .or_insert(CameraView { index: known, camera: parsed.camera.clone(), scale: 1.0 });
+        let view = self.cameras.entry(name.clone()).or_insert(CameraView {
+            index: known,
+            camera: parsed.camera.clone(),
+            scale: 1.0,
+        });
         view.camera = parsed.camera;
         if new {
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
-            let names: Vec<String> = self.cameras.keys().cloned().collect();
-            blueprint::send(&self.stream, &names)?;
+            let place = |(name, view): (&String, &CameraView)| (name.clone(), view.camera.pose().position());
+            let cameras: Vec<blueprint::NamedPlace> = self.cameras.iter().map(place).collect();
+            blueprint::send(&self.stream, &cameras)?;
         }
         Ok(())
     }

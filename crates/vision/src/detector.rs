@@ -210,6 +210,9 @@ mod tests {
             }
         }
         assert_eq!(found.len(), 1);
-        assert!((found[0].centre().x - 36.0).abs() < 1.5 && (found[0].centre().y - 40.0).abs() < 1.0, "{found:?}");
+        assert!(
+            (found[0].centre().x - 36.0).abs() < 1.5 && (found[0].centre().y - 40.0).abs() < 1.0,
+            "{found:?}"
+        );
     }
 }

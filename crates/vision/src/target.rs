@@ -97,7 +97,13 @@ impl Target {
     }
 
     /// Follows the target into the next image, `interval` seconds later.
-    pub(crate) fn step(&mut self, image: &Plane, interval: f64, correlator: &mut Correlator, config: &TrackerConfig) -> Step {
+    pub(crate) fn step(
+        &mut self,
+        image: &Plane,
+        interval: f64,
+        correlator: &mut Correlator,
+        config: &TrackerConfig,
+    ) -> Step {
         match self.motion.clone() {
             Motion::Still(first) => self.second_measurement(first, image, interval, correlator, config),
             Motion::Moving { x, y } => {
@@ -115,7 +121,13 @@ impl Target {
         }
     }
 
-    fn predicted(&self, mut axis: AxisFilter, interval: f64, side: usize, config: &TrackerConfig) -> AxisFilter {
+    fn predicted(
+        &self,
+        mut axis: AxisFilter,
+        interval: f64,
+        side: usize,
+        config: &TrackerConfig,
+    ) -> AxisFilter {
         axis.time_update(interval);
         if self.missed > 0 {
             axis.damp_velocity(config.coasting_velocity.powf(interval / COASTING_INTERVAL));
@@ -143,10 +155,7 @@ impl Target {
             let at = |position| AxisMeasurement { position, variance };
             AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px)
         };
-        self.motion = Motion::Moving {
-            x: start(first.x, found.place.x),
-            y: start(first.y, found.place.y),
-        };
+        self.motion = Motion::Moving { x: start(first.x, found.place.x), y: start(first.y, found.place.y) };
         self.adapt(image, found, config);
         Step { measured: Some((found.place, variance)), score: found.score }
     }
@@ -248,9 +257,8 @@ impl Target {
             if !(0.0..=edge_x).contains(&x) || !(0.0..=edge_y).contains(&y) {
                 return f32::NEG_INFINITY;
             }
-            let from_prediction = prior.map_or(0.0, |[vx, vy]| {
-                penalty(x - centre.x, vx) + penalty(y - centre.y, vy)
-            });
+            let from_prediction =
+                prior.map_or(0.0, |[vx, vy]| penalty(x - centre.x, vx) + penalty(y - centre.y, vy));
             weight * scores.row(row)[column] - from_prediction
         });
         let best = posterior.peak();

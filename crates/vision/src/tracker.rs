@@ -158,7 +158,8 @@ impl ImageTracker {
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
-            let doubled = rest[0].origin == Origin::Detected && older.iter().any(|o| same(&o.target, &rest[0].target));
+            let doubled =
+                rest[0].origin == Origin::Detected && older.iter().any(|o| same(&o.target, &rest[0].target));
             if doubled {
                 self.followed.remove(index);
             } else {
@@ -208,7 +209,12 @@ fn same(one: &Target, other: &Target) -> bool {
         && (a.y - b.y).abs() < one.height.max(other.height) / 2.0
 }
 
-fn describe(followed: &Followed, phase: TrackPhase, measured: Option<(ImagePoint, f64)>, score: f64) -> ImageTrack {
+fn describe(
+    followed: &Followed,
+    phase: TrackPhase,
+    measured: Option<(ImagePoint, f64)>,
+    score: f64,
+) -> ImageTrack {
     let target = &followed.target;
     ImageTrack {
         id: followed.id,
@@ -250,7 +256,8 @@ mod tests {
         let mut last = Vec::new();
         for frame in 0..60 {
             let t = frame as f32;
-            let image = if frame < 12 { spots(&[]) } else { spots(&[(20.0 + t, 30.0), (140.0 - 1.5 * t, 90.0)]) };
+            let image =
+                if frame < 12 { spots(&[]) } else { spots(&[(20.0 + t, 30.0), (140.0 - 1.5 * t, 90.0)]) };
             last = tracker.step(&image, at(frame));
         }
         assert_eq!(last.len(), 2, "{last:?}");

@@ -1,10 +1,10 @@
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Counter, Health, Payload, Timestamp, TrueState,
-    TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, Counter, Health, Payload, Timestamp, TrueState, TruthFrame,
+    decode,
 };
 use crossfix_recording::RecordingReader;
 use crossfix_simulation::{Scene, SimulatedCamera, World};
@@ -15,6 +15,7 @@ use crossfix_vision::ImageTracker;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
 use crate::output;
+use crate::pace::{Pace, wall_seconds};
 use crate::shutdown::Shutdown;
 
 /// How often the calibration is said again, for those who came late.
@@ -125,34 +126,6 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     agent.finish()
 }
 
-fn wall_seconds() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
-}
-
-/// When to handle what: data time runs `speed` times as fast as the wall's from `start` on.
-#[derive(Clone, Copy, Debug)]
-struct Pace {
-    start: f64,
-    speed: f64,
-}
-
-impl Pace {
-    /// Waits until it is time for what lies `data_s` after the data's beginning. Says whether to go on.
-    fn wait(&self, data_s: f64, shutdown: &Shutdown) -> bool {
-        if self.speed > 0.0 {
-            let due = self.start + data_s / self.speed;
-            while !shutdown.requested() {
-                let left = due - wall_seconds();
-                if left <= 0.0 {
-                    break;
-                }
-                std::thread::sleep(Duration::from_secs_f64(left.min(0.05)));
-            }
-        }
-        !shutdown.requested()
-    }
-}
-
 /// The image time corrected by what is known of the camera's clock: `own = t (1 + drift) + offset`
 /// from the source's start on.
 fn corrected(own: CaptureTime, start: Timestamp, clock: &ClockConfig) -> CaptureTime {
@@ -216,7 +189,13 @@ impl Agent {
     }
 
     /// Follows targets in a source's frames until its end.
-    fn watch(&mut self, file: &CameraFile, source: &mut dyn FrameSource, pace: Pace, start: Timestamp) -> anyhow::Result<()> {
+    fn watch(
+        &mut self,
+        file: &CameraFile,
+        source: &mut dyn FrameSource,
+        pace: Pace,
+        start: Timestamp,
+    ) -> anyhow::Result<()> {
         let mut tracker = ImageTracker::new(file.tracker.clone())?;
         for place in file.boxes() {
             tracker.take_up(place);

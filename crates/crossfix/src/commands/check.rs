@@ -7,7 +7,9 @@ use crate::output;
 
 /// Check configuration files before anything starts, and print what they resolve to.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  crossfix check -c configs/site\n  crossfix check -c configs/site/north.toml")]
+#[command(
+    after_help = "Examples:\n  crossfix check -c configs/site\n  crossfix check -c configs/site/north.toml"
+)]
 pub struct Args {
     /// A site's folder, a camera's file or the fusion centre's file (TOML).
     #[arg(short, long, value_name = "PATH")]

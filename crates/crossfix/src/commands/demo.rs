@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use crossfix_calibration::intrinsics_to_yaml;
@@ -16,6 +16,7 @@ use crate::commands::evaluate::{evaluate, render};
 use crate::commands::view::save_recording;
 use crate::config::{self, CameraFile, ClockConfig, FusionFile, PoseConfig, SourceConfig};
 use crate::output;
+use crate::pace::wall_seconds;
 use crate::shutdown::Shutdown;
 
 /// The scene that the demo plays, as in `configs/demo`.
@@ -123,7 +124,11 @@ struct Files {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let begun = Instant::now();
-    ensure!((5.0..=3600.0).contains(&args.duration), "--duration is {}: it must be from 5 to 3600 s", args.duration);
+    ensure!(
+        (5.0..=3600.0).contains(&args.duration),
+        "--duration is {}: it must be from 5 to 3600 s",
+        args.duration
+    );
     let shutdown = Shutdown::listen();
     let mut scene: Scene = config::parse(SCENE, &[])?;
     scene.seed = args.seed;
@@ -168,9 +173,11 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         let arguments: Vec<String> = arguments.iter().map(|a| (*a).to_owned()).collect();
         Component::start(name, &files.folder, &arguments)
     };
-    let recorder = start("recorder", &["record", "-c", &text(&files.network), "-o", &text(&files.recording)])?;
+    let recorder =
+        start("recorder", &["record", "-c", &text(&files.network), "-o", &text(&files.recording)])?;
     let fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
-    let viewer = if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };
+    let viewer =
+        if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };
 
     let link = Link::open(network, &Role::Observer)?;
     let subscription = link.subscribe(&[Key::new(network.site.clone(), Channel::Tracks).to_string()])?;
@@ -219,13 +226,10 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
     Ok(if interrupted { Ending::Interrupted } else { Ending::Complete })
 }
 
-fn wall_seconds() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
-}
-
 fn progress_bar(duration: f64) -> ProgressBar {
     let bar = ProgressBar::new((duration * 10.0) as u64);
-    let style = ProgressStyle::with_template("{elapsed:>4} [{bar:30}] {msg}").map(|s| s.progress_chars("=> "));
+    let style =
+        ProgressStyle::with_template("{elapsed:>4} [{bar:30}] {msg}").map(|s| s.progress_chars("=> "));
     if let Ok(style) = style {
         bar.set_style(style);
     }
@@ -267,7 +271,13 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     for camera in world.cameras() {
         cameras.insert(camera.name().clone(), endpoint()?);
     }
-    Ok(NetworkConfig { site: "demo".parse()?, mode: Default::default(), routers: Vec::new(), fusion, cameras })
+    Ok(NetworkConfig {
+        site: "demo".parse()?,
+        mode: Default::default(),
+        routers: Vec::new(),
+        fusion,
+        cameras,
+    })
 }
 
 fn write(path: &Path, text: &str) -> anyhow::Result<()> {
@@ -275,8 +285,14 @@ fn write(path: &Path, text: &str) -> anyhow::Result<()> {
 }
 
 /// Writes the site's files, as a person would.
-fn write_files(folder: &Path, scene: &Scene, world: &World, network: &NetworkConfig) -> anyhow::Result<Files> {
-    std::fs::create_dir_all(folder.join("logs")).with_context(|| format!("cannot make {}", folder.display()))?;
+fn write_files(
+    folder: &Path,
+    scene: &Scene,
+    world: &World,
+    network: &NetworkConfig,
+) -> anyhow::Result<Files> {
+    std::fs::create_dir_all(folder.join("logs"))
+        .with_context(|| format!("cannot make {}", folder.display()))?;
     let mut files = Files {
         folder: folder.to_owned(),
         network: folder.join("network.toml"),

@@ -76,7 +76,12 @@ fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
 }
 
 /// Evaluates a recording; `truth` may hold the truth if the recording has none.
-pub fn evaluate(recording: &Path, truth: Option<&Path>, cutoff_m: f64, skip_s: f64) -> anyhow::Result<Evaluation> {
+pub fn evaluate(
+    recording: &Path,
+    truth: Option<&Path>,
+    cutoff_m: f64,
+    skip_s: f64,
+) -> anyhow::Result<Evaluation> {
     let mut run = Run::default();
     run.read(recording)?;
     if let Some(path) = truth {
@@ -84,7 +89,11 @@ pub fn evaluate(recording: &Path, truth: Option<&Path>, cutoff_m: f64, skip_s: f
         other.read(path)?;
         run.truth = other.truth;
     }
-    ensure!(!run.truth.is_empty(), "{} holds no truth: give a recording that does with --truth", recording.display());
+    ensure!(
+        !run.truth.is_empty(),
+        "{} holds no truth: give a recording that does with --truth",
+        recording.display()
+    );
     run.truth.sort_by_key(|frame| frame.time_ns);
     let start = Timestamp::from_nanos(run.truth[0].time_ns).plus_seconds(skip_s);
     let mut evaluator = Evaluator::new(cutoff_m);

@@ -39,8 +39,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         Ok::<_, crossfix_message::DecodeError>(())
     })?;
-    let mut writer = csv::Writer::from_path(&args.csv)
-        .with_context(|| format!("cannot write {}", args.csv.display()))?;
+    let mut writer =
+        csv::Writer::from_path(&args.csv).with_context(|| format!("cannot write {}", args.csv.display()))?;
     writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz"])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
@@ -54,8 +54,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     match &args.times {
         Some(path) => {
-            let mut reader = csv::Reader::from_path(path)
-                .with_context(|| format!("cannot read {}", path.display()))?;
+            let mut reader =
+                csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?;
             for row in reader.deserialize() {
                 let TimeRow { t } = row.with_context(|| format!("{} needs a column `t`", path.display()))?;
                 write(t, &history.at(Timestamp::from_seconds(t)))?;

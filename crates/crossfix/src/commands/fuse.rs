@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use crossfix_fusion::{Fusion, Output};
 use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraName, Channel, Counter, DecodeError, Health, Key,
-    Payload, Timestamp, decode,
+    BearingFrame, CameraCalibration, CameraName, Channel, Counter, DecodeError, Health, Key, Payload,
+    Timestamp, decode,
 };
 use crossfix_transport::{Delivery, GapCounter, Link, LinkPublisher, Received, Role};
 
@@ -107,7 +107,9 @@ impl Centre {
                 if !self.cameras.contains(camera) =>
             {
                 if self.foreign == 0 {
-                    tracing::warn!("camera `{camera}` is not configured here: not used, and counted from now on");
+                    tracing::warn!(
+                        "camera `{camera}` is not configured here: not used, and counted from now on"
+                    );
                 }
                 self.foreign += 1;
                 return Ok(());
@@ -126,7 +128,10 @@ impl Centre {
                 };
                 let missing = self.gaps.see(camera.as_str(), frame.sequence);
                 if missing > 0 {
-                    tracing::warn!("{missing} frames of camera `{camera}` are missing before {}", frame.sequence);
+                    tracing::warn!(
+                        "{missing} frames of camera `{camera}` are missing before {}",
+                        frame.sequence
+                    );
                 }
                 self.fusion.ingest(&frame)
             }

@@ -21,7 +21,9 @@ enum Source {
     /// The drone-tracking-datasets of ETH Zurich: labels of several cameras, RTK truth.
     ///
     /// Data times are RTK seconds from the Unix epoch. Only the split's test part is imported.
-    #[command(after_help = "Example:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap")]
+    #[command(
+        after_help = "Example:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap"
+    )]
     DroneTrackingDatasets {
         /// The folder with calibration/, poses.json and datasetN/.
         dir: PathBuf,

@@ -1,16 +1,17 @@
 use std::path::PathBuf;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Key, Preview, Timestamp, TrackEvent,
-    TrackFrame, TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, Health, Key, Preview, Timestamp, TrackEvent, TrackFrame,
+    TruthFrame, decode,
 };
 use crossfix_recording::{Entry, RecordingWriter};
 use crossfix_transport::{Link, Received, Role};
 
 use crate::config;
 use crate::output;
+use crate::pace::wall_seconds;
 use crate::shutdown::Shutdown;
 
 /// What was flushed survives a crash of the machine's programs.
@@ -50,7 +51,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         if let Some(received) = received {
             match entry(received) {
-                Some(entry) => writer.write(&entry).context("recording has stopped; the rest of the site goes on")?,
+                Some(entry) => {
+                    writer.write(&entry).context("recording has stopped; the rest of the site goes on")?
+                }
                 None => unread += 1,
             }
         }
@@ -64,7 +67,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let messages = writer.finish()?;
     link.close()?;
     if unread + dropped > 0 {
-        tracing::warn!("{unread} messages could not be read and {dropped} came too fast; they are not recorded");
+        tracing::warn!(
+            "{unread} messages could not be read and {dropped} came too fast; they are not recorded"
+        );
     }
     output::line(format!("{messages} messages recorded to {}", args.output.display()));
     Ok(())
@@ -83,11 +88,10 @@ fn entry(received: Received) -> Option<Entry> {
         Channel::Truth => decode::<TruthFrame>(&data).ok()?.time_ns,
         Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return None,
     };
-    let arrival = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
     Some(Entry {
         key,
         data_time: Timestamp::from_nanos(nanos),
-        arrival: Timestamp::from_seconds(arrival),
+        arrival: Timestamp::from_seconds(wall_seconds()),
         data,
     })
 }

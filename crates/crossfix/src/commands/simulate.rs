@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use crossfix_geometry::{Pixel, PixelCovariance};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key,
-    Payload, SiteName, Timestamp,
+    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key, Payload,
+    SiteName, Timestamp,
 };
 use crossfix_recording::{Entry, RecordingWriter};
 use crossfix_simulation::{Scene, SimulatedCamera, World};

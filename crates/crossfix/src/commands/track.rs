@@ -48,7 +48,11 @@ impl FromStr for BoxArg {
             return Err(format!("`{text}` is not left,top,width,height"));
         };
         let place = PixelBox { x, y, width, height };
-        if place.is_possible() { Ok(Self(place)) } else { Err("a box has sides of 1 to 1000 pixels".to_owned()) }
+        if place.is_possible() {
+            Ok(Self(place))
+        } else {
+            Err("a box has sides of 1 to 1000 pixels".to_owned())
+        }
     }
 }
 
@@ -107,7 +111,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 fn row(frame: u64, track: Option<&ImageTrack>, microseconds: f64) -> Vec<String> {
     let Some(track) = track else {
         let empty = String::new;
-        return vec![frame.to_string(), empty(), empty(), empty(), empty(), "0".to_owned(), format!("{microseconds:.1}")];
+        return vec![
+            frame.to_string(),
+            empty(),
+            empty(),
+            empty(),
+            empty(),
+            "0".to_owned(),
+            format!("{microseconds:.1}"),
+        ];
     };
     let place = PixelBox::about(track.position, track.width, track.height);
     let ok = u8::from(track.phase != TrackPhase::Searching);

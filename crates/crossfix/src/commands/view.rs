@@ -1,6 +1,6 @@
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use crossfix_message::{Key, Timestamp};
@@ -10,6 +10,7 @@ use crossfix_view::{Picture, ViewError};
 
 use crate::config;
 use crate::output;
+use crate::pace::wall_seconds;
 use crate::shutdown::Shutdown;
 
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
@@ -48,7 +49,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         (None, None) => bail!("give a recording, or a network file with -c"),
     }
     if let Some(path) = &args.save {
-        output::line(format!("picture written to {}; look at it with: rerun {}", path.display(), path.display()));
+        output::line(format!(
+            "picture written to {}; look at it with: rerun {}",
+            path.display(),
+            path.display()
+        ));
     }
     Ok(())
 }
@@ -83,11 +88,10 @@ fn draw_live(mut picture: Picture, network: &Path, stop_with_stdin: bool) -> any
         let Some(received) = subscription.next(Duration::from_millis(50)) else {
             continue;
         };
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
-        picture.show(&received.key.channel, Timestamp::from_seconds(now), &received.data)?;
+        let now = Timestamp::from_seconds(wall_seconds());
+        picture.show(&received.key.channel, now, &received.data)?;
     }
     drop(subscription);
     link.close()?;
     picture.finish().context("the picture is not complete")
 }
-

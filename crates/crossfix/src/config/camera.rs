@@ -187,7 +187,11 @@ impl CameraFile {
     fn check(&self) -> anyhow::Result<()> {
         self.tracker.validate().context("section [tracker]")?;
         let clock = &self.clock;
-        ensure!((0.0..10.0).contains(&clock.sd_s), "key `clock.sd_s` is {}: it must be from 0 to 10 s", clock.sd_s);
+        ensure!(
+            (0.0..10.0).contains(&clock.sd_s),
+            "key `clock.sd_s` is {}: it must be from 0 to 10 s",
+            clock.sd_s
+        );
         ensure!(
             clock.offset_s.is_finite() && clock.drift_ppm.abs() < 1e5,
             "keys `clock.offset_s`, `clock.drift_ppm`: {} s and {} ppm are no clock's",
@@ -195,10 +199,21 @@ impl CameraFile {
             clock.drift_ppm
         );
         let preview = &self.preview;
-        ensure!((0.0..=30.0).contains(&preview.rate_hz), "key `preview.rate_hz` is {}: it must be from 0 to 30", preview.rate_hz);
-        ensure!((1..=64).contains(&preview.divisor), "key `preview.divisor` is {}: it must be from 1 to 64", preview.divisor);
+        ensure!(
+            (0.0..=30.0).contains(&preview.rate_hz),
+            "key `preview.rate_hz` is {}: it must be from 0 to 30",
+            preview.rate_hz
+        );
+        ensure!(
+            (1..=64).contains(&preview.divisor),
+            "key `preview.divisor` is {}: it must be from 1 to 64",
+            preview.divisor
+        );
         for place in self.boxes() {
-            ensure!(place.is_possible(), "key `boxes`: a box must have sides of 1 to 1000 pixels, not {place:?}");
+            ensure!(
+                place.is_possible(),
+                "key `boxes`: a box must have sides of 1 to 1000 pixels, not {place:?}"
+            );
         }
         let (key, file) = match &self.source {
             SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => ("source.path", path),

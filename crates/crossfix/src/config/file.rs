@@ -28,9 +28,8 @@ pub fn parse<T: DeserializeOwned>(text: &str, sets: &[String]) -> anyhow::Result
 }
 
 fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
-    let (key, value) = set
-        .split_once('=')
-        .ok_or_else(|| anyhow!("`--set {set}` is not of the form key=value"))?;
+    let (key, value) =
+        set.split_once('=').ok_or_else(|| anyhow!("`--set {set}` is not of the form key=value"))?;
     // A value that is no TOML is taken as text, so that nobody has to quote twice.
     let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
         .ok()
@@ -54,9 +53,7 @@ fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
 fn explain(error: &toml::de::Error) -> anyhow::Error {
     let message = error.to_string();
     let quoted: Vec<&str> = error.message().split('`').skip(1).step_by(2).collect();
-    if !error.message().starts_with("unknown field")
-        && !error.message().starts_with("unknown variant")
-    {
+    if !error.message().starts_with("unknown field") && !error.message().starts_with("unknown variant") {
         return anyhow!("{}", message.trim_end());
     }
     let nearest = quoted.split_first().and_then(|(unknown, known)| {

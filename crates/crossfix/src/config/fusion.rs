@@ -32,7 +32,9 @@ impl FusionFile {
         let mut file: Self = super::load(path, sets)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = file.network.map(|network| folder.join(network));
-        file.fusion().validate().with_context(|| format!("the configuration file {} has an error", path.display()))?;
+        file.fusion()
+            .validate()
+            .with_context(|| format!("the configuration file {} has an error", path.display()))?;
         Ok(file)
     }
 

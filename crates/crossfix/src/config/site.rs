@@ -31,8 +31,10 @@ impl Site {
             .collect();
         files.sort();
         for path in files {
-            let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-            let keys: toml::Table = toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
+            let text =
+                std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+            let keys: toml::Table =
+                toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
             if keys.contains_key("intrinsics") || keys.contains_key("pose") {
                 site.add_camera(&path)?;
             } else if keys.contains_key("fusion") {

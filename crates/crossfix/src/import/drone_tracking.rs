@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
-    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource, ImageTrackState, Key,
+    Payload, SiteName, Timestamp, TrueState, TruthFrame,
 };
 use crossfix_recording::Entry;
 use nalgebra::{Matrix2, Matrix3, Point3};
@@ -121,8 +121,9 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>>
         .remove(&selection.dataset.to_string())
         .with_context(|| format!("{} has no data set {}", poses.display(), selection.dataset))?;
     let masked: Vec<f64> = serde_json::from_value(dataset["rtk_masked_indices"].take())?;
-    let split: Split = serde_json::from_value(dataset[selection.split].take())
-        .with_context(|| format!("{} has no split `{}` of the expected form", poses.display(), selection.split))?;
+    let split: Split = serde_json::from_value(dataset[selection.split].take()).with_context(|| {
+        format!("{} has no split `{}` of the expected form", poses.display(), selection.split)
+    })?;
 
     let folder = dir.join(format!("dataset{}", selection.dataset));
     let mut entries = truth(&folder, &site, &split, &masked)?;
@@ -238,11 +239,8 @@ fn truth(folder: &Path, site: &SiteName, split: &Split, masked: &[f64]) -> anyho
         }
         let velocity = (position(&window[2]) - position(&window[0])) * (RTK_RATE / 2.0);
         let time = Timestamp::from_seconds(seconds);
-        let state = TrueState {
-            id: 1,
-            position: Some(position(&window[1]).into()),
-            velocity: Some(velocity.into()),
-        };
+        let state =
+            TrueState { id: 1, position: Some(position(&window[1]).into()), velocity: Some(velocity.into()) };
         let frame = TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
         entries.push(imported(key.clone(), time, frame.encode()));
     }

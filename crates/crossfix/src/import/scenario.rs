@@ -7,8 +7,8 @@ use std::path::Path;
 use anyhow::{Context, ensure};
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
-    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame, Vector3 as WireVector,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource, ImageTrackState, Key,
+    Payload, SiteName, Timestamp, TrueState, TruthFrame, Vector3 as WireVector,
 };
 use crossfix_recording::Entry;
 use nalgebra::{Matrix3, Point3, Vector3};

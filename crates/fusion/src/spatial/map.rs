@@ -24,7 +24,11 @@ pub struct MapSolution {
 /// Where the papers' system is regular this is its solution, weighted by what each line is worth;
 /// where it is not, the prior stands in for what cannot be seen. `None` for fewer than two lines,
 /// or if they do not meet in front of the cameras.
-pub fn map(lines: &[TimedLine], reference: crossfix_message::Timestamp, velocity_sd: f64) -> Option<MapSolution> {
+pub fn map(
+    lines: &[TimedLine],
+    reference: crossfix_message::Timestamp,
+    velocity_sd: f64,
+) -> Option<MapSolution> {
     if lines.len() < 2 {
         return None;
     }
@@ -71,7 +75,8 @@ pub fn map(lines: &[TimedLine], reference: crossfix_message::Timestamp, velocity
         let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
         (position - line.origin).dot(&line.direction) > 0.0
     });
-    let scale = lines.iter().map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm()).fold(0.0, f64::max);
+    let scale =
+        lines.iter().map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm()).fold(0.0, f64::max);
     in_front.then_some(())?;
     Some(MapSolution {
         state: KinematicState { mean, covariance: (data + prior).try_inverse()? },
@@ -106,7 +111,10 @@ mod tests {
                 .collect();
             let found = map(&lines, Timestamp::EPOCH, 15.6).unwrap();
             let error = Vector6::from_iterator(
-                (found.state.position() - position).iter().chain((found.state.velocity() - velocity).iter()).copied(),
+                (found.state.position() - position)
+                    .iter()
+                    .chain((found.state.velocity() - velocity).iter())
+                    .copied(),
             );
             position_square += error.fixed_rows::<3>(0).norm_squared();
             velocity_square += error.fixed_rows::<3>(3).norm_squared();

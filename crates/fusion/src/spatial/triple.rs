@@ -29,7 +29,12 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long (benches/solvers).
     let base = b2.norm().max(b3.norm());
     let scale = Matrix6::from_diagonal(&Vector6::new(
-        base, base, base, velocity_scale, velocity_scale, velocity_scale,
+        base,
+        base,
+        base,
+        velocity_scale,
+        velocity_scale,
+        velocity_scale,
     ));
     let svd = (a * scale).try_svd(true, true, f64::EPSILON, 200)?;
     let (u, v_t) = (svd.u?, svd.v_t?);

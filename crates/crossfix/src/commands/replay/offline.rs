@@ -1,4 +1,6 @@
-use std::path::{Path, PathBuf};
+//! Into the fusion, as fast as it goes.
+
+use std::path::Path;
 
 use crossfix_fusion::{Fusion, Output};
 use crossfix_message::{
@@ -6,72 +8,10 @@ use crossfix_message::{
 };
 use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
 
+use super::{Args, Range};
 use crate::commands::rejections::RejectionLog;
 use crate::config::FusionFile;
 use crate::output;
-
-/// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
-#[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  crossfix replay recordings/two-uavs.mcap --fuse -o tracks.mcap\n  crossfix replay recordings/two-uavs.mcap --speed 2 --from 5 --to 20"
-)]
-pub struct Args {
-    /// The recording (MCAP).
-    recording: PathBuf,
-    /// Fuse the recorded bearings, as fast as it goes, without a network.
-    #[arg(long, requires = "output")]
-    fuse: bool,
-    /// The fusion's configuration (TOML); its defaults without.
-    #[arg(short, long, value_name = "FILE", requires = "fuse")]
-    config: Option<PathBuf>,
-    /// Override a key of the configuration, e.g. tracking.acceleration_density=2.
-    #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
-    sets: Vec<String>,
-    /// The recording (MCAP) to write: calibrations, truth and the new tracks.
-    #[arg(short, long, value_name = "FILE", requires = "fuse")]
-    output: Option<PathBuf>,
-    /// Start this long after the first message, seconds of data time.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
-    from: f64,
-    /// End this long after the first message, seconds of data time.
-    #[arg(long, default_value_t = f64::INFINITY, value_name = "SECONDS", hide_default_value = true)]
-    to: f64,
-}
-
-pub fn run(args: &Args) -> anyhow::Result<()> {
-    let range = Range::of(&args.recording, args.from, args.to)?;
-    match &args.output {
-        Some(output) => fuse(args, output, range),
-        None => anyhow::bail!("not yet"),
-    }
-}
-
-/// A range of data time.
-#[derive(Clone, Copy, Debug)]
-pub struct Range {
-    from: Timestamp,
-    to: Timestamp,
-}
-
-impl Range {
-    /// The range between two offsets, in seconds, from the first bearing or track of a recording.
-    pub fn of(recording: &Path, from_s: f64, to_s: f64) -> anyhow::Result<Self> {
-        let mut start: Option<Timestamp> = None;
-        RecordingReader::open(recording)?.for_each(|entry| {
-            if matches!(entry.key.channel, Channel::Bearings(_) | Channel::Tracks) {
-                start = Some(start.map_or(entry.data_time, |s| s.min(entry.data_time)));
-            }
-            Ok::<_, std::convert::Infallible>(())
-        })?;
-        let start = start.unwrap_or_default();
-        Ok(Self { from: start.plus_seconds(from_s), to: start.plus_seconds(to_s) })
-    }
-
-    /// Whether an entry is to be played: calibrations always are.
-    pub fn holds(&self, entry: &Entry) -> bool {
-        matches!(entry.key.channel, Channel::Calibration(_)) || (self.from..=self.to).contains(&entry.data_time)
-    }
-}
 
 /// What fusing a recording needs and makes.
 struct OfflineFusion {
@@ -82,7 +22,8 @@ struct OfflineFusion {
     tracks: u64,
 }
 
-fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
+/// Fuses a recording's bearings and writes calibrations, bearings, truth and tracks.
+pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
     let mut run = OfflineFusion {
         fusion: Fusion::new(file.fusion())?,
@@ -118,7 +59,10 @@ fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     for (name, value) in fusion.counters().iter() {
         tracing::info!("{name} {value}");
     }
-    output::line(format!("{frames} bearing frames fused, {tracks} track frames written to {}", output.display()));
+    output::line(format!(
+        "{frames} bearing frames fused, {tracks} track frames written to {}",
+        output.display()
+    ));
     Ok(())
 }
 
