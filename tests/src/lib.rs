@@ -1,1 +1,227 @@
+//! A site in a temporary folder: its files, its processes, and an ear on its network.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot set itself up has failed")]
+
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crossfix_calibration::intrinsics_to_yaml;
+use crossfix_message::Channel;
+use crossfix_recording::{Entry, RecordingReader};
+use crossfix_simulation::{Scene, World};
+use crossfix_transport::{Link, NetworkConfig, Role};
+use tempfile::TempDir;
+
+/// How long a test waits for what must come.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// The program under test, which `cargo test --workspace` builds beside the tests.
+pub fn program() -> PathBuf {
+    let tests = std::env::current_exe().unwrap();
+    // target/<profile>/deps/<test> -> target/<profile>/crossfix
+    let program = tests.parent().and_then(Path::parent).unwrap().join("crossfix");
+    assert!(program.exists(), "{} is not built: run `cargo test --workspace`", program.display());
+    program
+}
+
+/// Runs the program to its end.
+pub fn crossfix(arguments: &[&str]) -> Output {
+    Command::new(program()).args(arguments).output().unwrap()
+}
+
+/// Runs the program and wants it to succeed; returns its stdout.
+pub fn succeed(arguments: &[&str]) -> String {
+    let output = crossfix(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "crossfix {}: {stderr}", arguments.join(" "));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Seconds since the Unix epoch.
+pub fn now_seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
+}
+
+/// The folder of real data, or `None` and a clear word that the test is skipped.
+pub fn real_data() -> Option<PathBuf> {
+    let data = std::env::var_os("CROSSFIX_DATA").map(PathBuf::from);
+    if data.is_none() {
+        eprintln!("SKIPPED: set CROSSFIX_DATA to the folder of real data");
+    }
+    data
+}
+
+/// All messages of a recording on one channel.
+pub fn messages(recording: &Path, wanted: impl Fn(&Channel) -> bool) -> Vec<Entry> {
+    let mut entries = Vec::new();
+    RecordingReader::open(recording)
+        .unwrap()
+        .for_each(|entry| {
+            if wanted(&entry.key.channel) {
+                entries.push(entry);
+            }
+            Ok::<_, std::convert::Infallible>(())
+        })
+        .unwrap();
+    entries
+}
+
+/// A running part of a site; it is ended when this is dropped.
+pub struct Process(Child);
+
+impl Process {
+    /// Asks it to stop and waits; says whether it ended well.
+    pub fn stop(mut self) -> bool {
+        drop(self.0.stdin.take());
+        self.wait()
+    }
+
+    /// Waits until it ends by itself; says whether it ended well.
+    pub fn wait(&mut self) -> bool {
+        let deadline = Instant::now() + PATIENCE;
+        while Instant::now() < deadline {
+            if let Some(status) = self.0.try_wait().unwrap() {
+                return status.success();
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        panic!("the process does not end");
+    }
+
+    /// Ends it at once, as a crash does.
+    pub fn crash(mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A site whose cameras play a simulated recording.
+pub struct Site {
+    folder: TempDir,
+    network: NetworkConfig,
+    world: World,
+}
+
+impl Site {
+    /// The demo's scene for so many seconds.
+    pub fn new(duration_s: f64) -> Self {
+        let mut scene: Scene = toml::from_str(include_str!("../../configs/demo/scene.toml")).unwrap();
+        scene.duration_s = duration_s;
+        let world = scene.build().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let network = free_network(&world);
+        let site = Self { folder, network, world };
+        site.write("network.toml", &toml::to_string(&site.network).unwrap());
+        site.write("scene.toml", &toml::to_string(&scene).unwrap());
+        site.write("fusion.toml", "network = \"network.toml\"\n[event_time]\nlateness_s = 3.0\n");
+        succeed(&["simulate", &site.path("scene.toml"), "-o", &site.path("source.mcap")]);
+        for camera in site.world.cameras() {
+            let name = camera.name().as_str();
+            let lens = camera.camera().model().intrinsics();
+            site.write(&format!("{name}.yaml"), &intrinsics_to_yaml(name, lens));
+            site.write_camera(name, "kind = \"recording\"\npath = \"source.mcap\"\nspeed = 2.0", "");
+        }
+        site
+    }
+
+    /// Writes a camera's file with a source and more.
+    pub fn write_camera(&self, name: &str, source: &str, more: &str) {
+        let description = self.world.camera(name).unwrap().description().clone();
+        self.write(
+            &format!("{name}.toml"),
+            &format!(
+                "name = \"{name}\"\nnetwork = \"network.toml\"\nintrinsics = \"{name}.yaml\"\n{more}\n\
+                 [pose]\nposition_m = {:?}\nlook_at_m = {:?}\n[source]\n{source}\n",
+                description.position_m, description.look_at_m
+            ),
+        );
+    }
+
+    /// A file of the site.
+    pub fn path(&self, name: &str) -> String {
+        self.folder.path().join(name).display().to_string()
+    }
+
+    /// Writes a file of the site.
+    pub fn write(&self, name: &str, text: &str) {
+        std::fs::write(self.folder.path().join(name), text).unwrap();
+    }
+
+    /// The site's network.
+    pub fn network(&self) -> &NetworkConfig {
+        &self.network
+    }
+
+    /// The scene that its cameras play.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// Starts the program; its logs go to the test's stderr.
+    pub fn start(&self, arguments: &[&str]) -> Process {
+        let child = Command::new(program())
+            .args(arguments)
+            .arg("--stop-with-stdin")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        Process(child)
+    }
+
+    /// Starts the fusion centre.
+    pub fn start_fusion(&self) -> Process {
+        self.start(&["fuse", "-c", &self.path("fusion.toml")])
+    }
+
+    /// Starts the recorder.
+    pub fn start_recorder(&self, file: &str) -> Process {
+        self.start(&["record", "-c", &self.path("network.toml"), "-o", &self.path(file)])
+    }
+
+    /// Starts all agents, to begin together at a time.
+    pub fn start_agents(&self, start_at: f64, options: &[&str]) -> Vec<Process> {
+        let begin = format!("{start_at:.3}");
+        let start = |camera: &crossfix_simulation::SimulatedCamera| {
+            let file = self.path(&format!("{}.toml", camera.name()));
+            let mut arguments = vec!["agent", "-c", &file, "--start-at", &begin];
+            arguments.extend(options);
+            self.start(&arguments)
+        };
+        self.world.cameras().iter().map(start).collect()
+    }
+
+    /// A session that hears everything.
+    pub fn ear(&self) -> Link {
+        Link::open(&self.network, &Role::Observer).unwrap()
+    }
+}
+
+/// Endpoints on this machine that nobody uses now.
+fn free_network(world: &World) -> NetworkConfig {
+    let mut held = Vec::new();
+    let mut endpoint = || {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        held.push(listener);
+        format!("tcp/127.0.0.1:{port}")
+    };
+    let fusion = endpoint();
+    let cameras = world.cameras().iter().map(|camera| (camera.name().clone(), endpoint())).collect();
+    NetworkConfig {
+        site: "test".parse().unwrap(),
+        mode: crossfix_transport::Mode::Peer,
+        routers: Vec::new(),
+        fusion,
+        cameras,
+    }
+}

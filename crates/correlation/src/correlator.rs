@@ -188,7 +188,7 @@ mod tests {
         fn brightness_and_contrast_change_nothing(gain in 0.5f32..2.0, offset in -50.0f32..50.0) {
             let gate = noise(30, 24, 5);
             let reference = Reference::new(gate.crop(9, 7, 8, 6), &Window::uniform(8, 6));
-            let mut other = gate.clone();
+            let mut other = gate;
             other.samples_mut().iter_mut().for_each(|s| *s = *s * gain + offset);
             let scores = Correlator::default().scores(&other, &reference, 0.01);
             let peak = scores.peak();

@@ -87,7 +87,7 @@ impl Plan {
             }
             // A real row's first and middle terms are real up to rounding; realfft wants exactly.
             row_in[0].im = 0.0;
-            if self.size.width % 2 == 0 {
+            if self.size.width.is_multiple_of(2) {
                 row_in[half - 1].im = 0.0;
             }
             let _ = self.row_inverse.process(&mut row_in, &mut row_out);

@@ -1,4 +1,5 @@
 //! Torn files, foreign files and full disks.
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::convert::Infallible;
 use std::io::{self, Cursor, Seek, SeekFrom, Write};

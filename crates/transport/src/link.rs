@@ -1,7 +1,7 @@
 use std::error::Error;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::{Duration, Instant};
 
 use crossfix_message::{Channel, Key, SiteName};
@@ -285,10 +285,7 @@ pub struct Subscription {
 impl Subscription {
     /// The next message, if one comes in time.
     pub fn next(&self, patience: Duration) -> Option<Received> {
-        match self.receiver.recv_timeout(patience) {
-            Ok(received) => Some(received),
-            Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => None,
-        }
+        self.receiver.recv_timeout(patience).ok()
     }
 
     /// Messages that were dropped as this program was too slow.

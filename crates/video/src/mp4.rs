@@ -63,7 +63,7 @@ impl Mp4Source {
         let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
         let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
             .map_err(|error| damaged(error.to_string()))?;
-        let samples: VecDeque<Sample> = track.samples.iter().cloned().collect();
+        let samples: VecDeque<Sample> = track.samples.iter().copied().collect();
         let timescale = samples.front().map_or(1.0, |sample| (sample.timescale as f64).max(1.0));
         Ok(Self {
             file,

@@ -1,4 +1,5 @@
 //! Every kind of source, whole and damaged.
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::fs;
 use std::path::Path;

@@ -232,7 +232,7 @@ impl Target {
         let half_x = half(width, spread[0], image.width());
         let half_y = half(height, spread[1], image.height());
         // A reference of even sides has its middle between two pixels.
-        let offset = |side: usize| if side % 2 == 0 { 0.5 } else { 0.0 };
+        let offset = |side: usize| if side.is_multiple_of(2) { 0.5 } else { 0.0 };
         let left = centre.x.round() as isize - half_x;
         let top = centre.y.round() as isize - half_y;
         let gate = image.crop(

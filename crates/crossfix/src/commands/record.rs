@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         if let Some(received) = received {
             match entry(received) {
                 Some(entry) => {
-                    writer.write(&entry).context("recording has stopped; the rest of the site goes on")?
+                    writer.write(&entry).context("recording has stopped; the rest of the site goes on")?;
                 }
                 None => unread += 1,
             }

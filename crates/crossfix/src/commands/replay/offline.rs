@@ -43,7 +43,7 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     let report = RecordingReader::open(&args.recording)?.for_each(|entry| {
         if range.holds(&entry) {
             site.get_or_insert_with(|| entry.key.site.clone());
-            run.take(entry)?;
+            run.take(&entry)?;
         }
         Ok::<_, FuseError>(())
     })?;
@@ -76,19 +76,19 @@ enum FuseError {
 }
 
 impl OfflineFusion {
-    fn take(&mut self, entry: Entry) -> Result<(), FuseError> {
+    fn take(&mut self, entry: &Entry) -> Result<(), FuseError> {
         let outputs = match &entry.key.channel {
             Channel::Calibration(_) => {
                 let message: CameraCalibration = decode(&entry.data)?;
                 if let Err(error) = self.fusion.calibrate(&message) {
                     tracing::warn!("a calibration was not used: {error}");
                 }
-                self.writer.write(&entry)?;
+                self.writer.write(entry)?;
                 return Ok(());
             }
             Channel::Bearings(_) => {
                 self.frames += 1;
-                self.writer.write(&entry)?;
+                self.writer.write(entry)?;
                 self.fusion.ingest(&decode::<BearingFrame>(&entry.data)?)
             }
             Channel::CameraHealth(camera) => {
@@ -96,7 +96,7 @@ impl OfflineFusion {
                 if health.ended { self.fusion.camera_ended(camera) } else { Vec::new() }
             }
             Channel::Truth => {
-                self.writer.write(&entry)?;
+                self.writer.write(entry)?;
                 return Ok(());
             }
             _ => return Ok(()),

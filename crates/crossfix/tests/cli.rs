@@ -1,0 +1,57 @@
+//! What a person meets at the command line.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use assert_cmd::Command;
+
+const COMMANDS: [&str; 13] = [
+    "demo", "agent", "track", "fuse", "record", "replay", "view", "info", "simulate", "import", "export",
+    "evaluate", "check",
+];
+
+fn crossfix() -> Command {
+    Command::new(assert_cmd::cargo::cargo_bin!("crossfix"))
+}
+
+#[test]
+fn every_command_has_a_purpose_and_an_example() {
+    let help = String::from_utf8(crossfix().arg("--help").output().unwrap().stdout).unwrap();
+    for command in COMMANDS {
+        assert!(help.contains(&format!("\n  {command} ")), "{command} is missing in:\n{help}");
+        let output = crossfix().args([command, "--help"]).output().unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        assert!(text.contains("Example"), "{command} has no example:\n{text}");
+        assert!(text.contains(&format!("crossfix {command}")), "{command}:\n{text}");
+    }
+}
+
+#[test]
+fn misuse_ends_with_2_and_failure_with_1() {
+    crossfix().arg("fly").assert().code(2);
+    crossfix().args(["info", "no-such-file.mcap"]).assert().code(1);
+}
+
+#[test]
+fn an_error_is_a_line_and_its_causes() {
+    let output = crossfix().args(["info", "no-such-file.mcap"]).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(stderr.starts_with("error: cannot open no-such-file.mcap\n  because: "), "{stderr}");
+}
+
+#[test]
+fn results_are_json_where_it_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("a.mcap");
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/demo/scene.toml");
+    let path = recording.to_str().unwrap();
+    crossfix().args(["simulate", scene, "--set", "duration_s=2", "-o", path]).assert().success();
+    let output = crossfix().args(["info", path, "--json"]).output().unwrap();
+    let info: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(info["channels"].as_array().unwrap().len() >= 7, "{info}");
+}
+
+#[test]
+fn the_site_to_copy_is_good() {
+    let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/site");
+    crossfix().args(["check", "-c", site]).assert().success();
+}

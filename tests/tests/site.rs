@@ -1,0 +1,121 @@
+//! Real processes joined by Zenoh over loopback.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use crossfix_message::{Channel, Key, TrackFrame, TrackState, decode};
+use crossfix_recording::Entry;
+use crossfix_tests::{PATIENCE, Site, messages, now_seconds, succeed};
+
+fn tracks(recording: &str) -> Vec<Entry> {
+    messages(Path::new(recording), |channel| *channel == Channel::Tracks)
+}
+
+fn bytes(entries: &[Entry]) -> Vec<&[u8]> {
+    entries.iter().map(|entry| &entry.data[..]).collect()
+}
+
+#[test]
+fn live_and_offline_fusion_give_the_same_bytes() {
+    let site = Site::new(6.0);
+    let recorder = site.start_recorder("live.mcap");
+    let fusion = site.start_fusion();
+    let mut agents = site.start_agents(now_seconds() + 3.0, &["--wait-for-recorder"]);
+    assert!(agents.iter_mut().all(|agent| agent.wait()));
+    assert!(fusion.stop());
+    assert!(recorder.stop());
+
+    let is_bearing = |channel: &Channel| matches!(channel, Channel::Bearings(_));
+    let sent = messages(Path::new(&site.path("source.mcap")), is_bearing);
+    let mut recorded = messages(Path::new(&site.path("live.mcap")), is_bearing);
+    recorded.sort_by_key(|entry| (entry.data_time, entry.key.clone()));
+    assert_eq!(recorded.len(), sent.len(), "nothing is lost on the way");
+
+    let replay = |output: &str| {
+        let (live, fusion) = (site.path("live.mcap"), site.path("fusion.toml"));
+        succeed(&["-q", "replay", &live, "--fuse", "-c", &fusion, "-o", &site.path(output)]);
+        tracks(&site.path(output))
+    };
+    let live = tracks(&site.path("live.mcap"));
+    let (once, twice) = (replay("once.mcap"), replay("twice.mcap"));
+    assert!(live.len() > 200, "{} track frames", live.len());
+    assert_eq!(bytes(&once), bytes(&twice), "offline twice");
+    assert_eq!(bytes(&live), bytes(&once), "live and offline");
+}
+
+#[test]
+fn agents_wait_for_the_fusion_centre_and_a_new_one_picks_them_up() {
+    let site = Site::new(40.0);
+    let ear = site.ear();
+    let keys = [Key::new(ear.site().clone(), Channel::Tracks).to_string()];
+    let subscription = ear.subscribe(&keys).unwrap();
+    // The agents are up first.
+    let _agents = site.start_agents(now_seconds() + 2.0, &[]);
+    std::thread::sleep(Duration::from_secs(1));
+    let confirmed_within = |patience: Duration| {
+        let deadline = Instant::now() + patience;
+        while Instant::now() < deadline {
+            let Some(received) = subscription.next(Duration::from_millis(50)) else { continue };
+            let frame: TrackFrame = decode(&received.data).unwrap();
+            if frame.tracks.iter().any(|track| track.state() == TrackState::Confirmed) {
+                return true;
+            }
+        }
+        false
+    };
+    let first = site.start_fusion();
+    assert!(confirmed_within(PATIENCE), "the first fusion centre has tracks");
+    first.crash();
+    while subscription.next(Duration::from_millis(200)).is_some() {}
+    let second = site.start_fusion();
+    assert!(confirmed_within(Duration::from_secs(5)), "the second has tracks within 5 s");
+    assert!(second.stop());
+}
+
+#[test]
+fn the_agent_follows_what_the_track_command_follows() {
+    let site = Site::new(4.0);
+    succeed(&["simulate", &site.path("scene.toml"), "--video", &site.path("video")]);
+    let place = "300,200,20,14";
+    let source = "kind = \"video\"\npath = \"video/north.y4m\"\nspeed = 0.0\n[preview]\nrate_hz = 0.0";
+    site.write_camera("north", source, "boxes = [[300.0, 200.0, 20.0, 14.0]]");
+    let recorder = site.start_recorder("live.mcap");
+    let fusion = site.start_fusion();
+    let mut agent = site.start(&["agent", "-c", &site.path("north.toml"), "--wait-for-recorder"]);
+    assert!(agent.wait());
+    assert!(fusion.stop() && recorder.stop());
+    let (video, table) = (site.path("video/north.y4m"), site.path("north.csv"));
+    succeed(&["track", &video, "--box", place, "--csv", &table]);
+
+    let mut rows = csv::Reader::from_path(table).unwrap();
+    let frames = messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
+    assert_eq!(frames.len(), 120);
+    let mut compared = 0;
+    for (entry, row) in frames.iter().zip(rows.deserialize::<(u64, f64, f64, f64, f64, u8, f64)>()) {
+        let frame: crossfix_message::BearingFrame = decode(&entry.data).unwrap();
+        let (index, x, y, w, h, ..) = row.unwrap();
+        assert_eq!(frame.sequence, index);
+        let track = &frame.tracks[0];
+        // The table has the filter's estimate, the wire the measurement: they agree to a measurement's noise.
+        let (cx, cy) = (x + (w - 1.0) / 2.0, y + (h - 1.0) / 2.0);
+        assert!((track.pixel_x - cx).hypot(track.pixel_y - cy) < 3.0, "frame {index}");
+        compared += 1;
+    }
+    assert_eq!(compared, 120);
+}
+
+#[test]
+fn the_demo_finds_both_targets() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().display().to_string();
+    let report = succeed(&["-q", "demo", "--duration", "8", "--json", "--output", &output]);
+    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+    for target in report["targets"].as_array().unwrap() {
+        assert_eq!(target["detected"], true, "{report}");
+        assert!(target["position_rmse_m"].as_f64().unwrap() < 0.5, "{report}");
+    }
+    assert_eq!(report["false_tracks"], 0, "{report}");
+    assert!(folder.path().join("demo.rrd").metadata().unwrap().len() > 10_000);
+}
