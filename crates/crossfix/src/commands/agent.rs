@@ -3,8 +3,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Counter, Health, Payload, Timestamp, TrueState, TruthFrame,
-    decode,
+    BearingFrame, Channel, Counter, Health, Payload, Timestamp, TrueState, TruthFrame, decode,
 };
 use crossfix_recording::RecordingReader;
 use crossfix_simulation::{Scene, SimulatedCamera, World};
@@ -70,7 +69,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let file = CameraFile::load(&args.config, &args.sets)?;
     let camera = file.camera(&args.config)?;
     let network = config::load_network(&file.network)?;
-    let calibration = CameraCalibration::new(&file.name, &camera, Timestamp::EPOCH).encode();
+    let calibration = file.calibration(&camera)?.encode();
     let identity = CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
 
     let link = Link::open(&network, &Role::Camera(file.name.clone()))?;

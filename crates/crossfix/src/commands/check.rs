@@ -1,8 +1,6 @@
 use std::path::PathBuf;
 
-use anyhow::Context;
-
-use crate::config::{CameraFile, FusionFile, Site, load_network};
+use crate::config::{self, CameraFile, FusionFile, Site, load_network};
 use crate::output;
 
 /// Check configuration files before anything starts, and print what they resolve to.
@@ -30,9 +28,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         return Ok(());
     }
-    let text = std::fs::read_to_string(&args.config)
-        .with_context(|| format!("cannot read the configuration file {}", args.config.display()))?;
-    let is_camera = text.lines().any(|line| line.starts_with("intrinsics"));
+    let keys: toml::Table = config::load(&args.config, &[])?;
+    let is_camera = keys.contains_key("source") || keys.contains_key("name");
     let resolved = if is_camera {
         let file = CameraFile::load(&args.config, &args.sets)?;
         file.camera(&args.config)?;

@@ -313,8 +313,8 @@ fn write_files(
         let file = CameraFile {
             name: name.clone(),
             network: "network.toml".into(),
-            intrinsics: format!("{name}.yaml").into(),
-            pose: PoseConfig::of(camera.camera().pose()),
+            intrinsics: Some(format!("{name}.yaml").into()),
+            pose: Some(PoseConfig::of(camera.camera().pose())),
             source: SourceConfig::Simulation { scene: "scene.toml".into(), publish_truth: index == 0 },
             clock: ClockConfig {
                 source: config::ClockSourceName::Simulated,

@@ -1,9 +1,10 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use crossfix_calibration::intrinsics_from_yaml;
 use crossfix_geometry::{Camera, Pose};
-use crossfix_message::{CameraName, ClockSource};
+use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
+use crossfix_recording::RecordingReader;
 use crossfix_vision::{PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
@@ -17,10 +18,11 @@ pub struct CameraFile {
     pub name: CameraName,
     /// The network's file (TOML).
     pub network: PathBuf,
-    /// Intrinsics (YAML of OpenCV or ROS).
-    pub intrinsics: PathBuf,
+    /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if both
+    /// this and `pose` are there, they replace the recorded calibration.
+    pub intrinsics: Option<PathBuf>,
     /// Where it stands and looks.
-    pub pose: PoseConfig,
+    pub pose: Option<PoseConfig>,
     /// Where its pictures come from.
     pub source: SourceConfig,
     /// What its capture times are worth.
@@ -161,7 +163,7 @@ impl CameraFile {
         let mut file: Self = super::load(path, sets)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = folder.join(&file.network);
-        file.intrinsics = folder.join(&file.intrinsics);
+        file.intrinsics = file.intrinsics.map(|intrinsics| folder.join(intrinsics));
         match &mut file.source {
             SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
                 *path = folder.join(&*path);
@@ -175,13 +177,22 @@ impl CameraFile {
     pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         self.check().with_context(wrong)?;
-        let text = std::fs::read_to_string(&self.intrinsics)
-            .with_context(|| format!("key `intrinsics`: cannot read {}", self.intrinsics.display()))
-            .with_context(wrong)?;
-        let intrinsics = intrinsics_from_yaml(&text)
-            .with_context(|| format!("the intrinsics file {} has an error", self.intrinsics.display()))?;
-        let pose = self.pose.pose().context("section [pose]").with_context(wrong)?;
-        Ok(Camera::new(intrinsics, pose)?)
+        match (&self.intrinsics, &self.pose, &self.source) {
+            (Some(intrinsics), Some(pose), _) => {
+                let text = std::fs::read_to_string(intrinsics)
+                    .with_context(|| format!("key `intrinsics`: cannot read {}", intrinsics.display()))
+                    .with_context(wrong)?;
+                let intrinsics = intrinsics_from_yaml(&text)
+                    .with_context(|| format!("the intrinsics file {} has an error", intrinsics.display()))?;
+                let pose = pose.pose().context("section [pose]").with_context(wrong)?;
+                Ok(Camera::new(intrinsics, pose)?)
+            }
+            (None, None, SourceConfig::Recording { path, .. }) => {
+                let calibration = recorded_calibration(path, &self.name).with_context(wrong)?;
+                Ok(calibration.parse()?.camera)
+            }
+            _ => Err(anyhow!("give both `intrinsics` and [pose]")).with_context(wrong),
+        }
     }
 
     fn check(&self) -> anyhow::Result<()> {
@@ -223,10 +234,34 @@ impl CameraFile {
         Ok(())
     }
 
+    /// The message that describes the camera: the recorded one as it is, where it is replayed with
+    /// its own, so that the same bytes give the same tracks.
+    pub fn calibration(&self, camera: &Camera) -> anyhow::Result<CameraCalibration> {
+        match &self.source {
+            SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
+                recorded_calibration(path, &self.name)
+            }
+            _ => Ok(CameraCalibration::new(&self.name, camera, Timestamp::EPOCH)),
+        }
+    }
+
     /// The boxes of targets to take up.
     pub fn boxes(&self) -> impl Iterator<Item = PixelBox> {
         self.boxes.iter().map(|&[x, y, width, height]| PixelBox { x, y, width, height })
     }
+}
+
+/// The first calibration of a camera in a recording.
+fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<CameraCalibration> {
+    let channel = Channel::Calibration(name.clone());
+    let mut first: Option<CameraCalibration> = None;
+    RecordingReader::open(recording)?.for_each(|entry| {
+        if first.is_none() && entry.key.channel == channel {
+            first = Some(decode(&entry.data)?);
+        }
+        Ok::<_, crossfix_message::DecodeError>(())
+    })?;
+    first.with_context(|| format!("{} has no calibration of camera `{name}`", recording.display()))
 }
 
 impl PoseConfig {

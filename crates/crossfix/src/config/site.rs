@@ -35,7 +35,7 @@ impl Site {
                 std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
             let keys: toml::Table =
                 toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
-            if keys.contains_key("intrinsics") || keys.contains_key("pose") {
+            if keys.contains_key("source") {
                 site.add_camera(&path)?;
             } else if keys.contains_key("fusion") {
                 load_network(&path)?;
