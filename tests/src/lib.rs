@@ -1,6 +1,11 @@
 //! A site in a temporary folder: its files, its processes, and an ear on its network.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot set itself up has failed")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::print_stderr,
+    reason = "a test that cannot set itself up has failed, and one that is skipped says so"
+)]
 
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};

@@ -66,7 +66,7 @@ fn eye_on(cameras: &[NamedPlace]) -> EyeControls3D {
     let sum = cameras.iter().map(|(_, place)| place.coords).sum::<Vector3<f64>>();
     let middle = sum / count + Vector3::z() * AIR_M;
     let reach = cameras.iter().map(|(_, place)| (place.coords - middle).norm()).fold(50.0, f64::max);
-    let eye = middle + Vector3::new(-0.6, -1.05, 1.0) * reach;
+    let eye = middle + Vector3::new(-0.75, -1.5, 1.05) * reach;
     let f32s = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
     EyeControls3D::new()
         .with_kind(Eye3DKind::Orbital)
