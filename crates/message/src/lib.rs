@@ -2,7 +2,7 @@
 //!
 //! The messages are protobuf (`proto/crossfix/v1/messages.proto`); the same
 //! types carry `serde` for JSON. The bytes that go over Zenoh are the bytes
-//! in a recording, so [`encode`] and [`decode`] are the only two ways in and
+//! in a recording, so [`Payload::encode`] and [`decode`] are the only two ways in and
 //! out. [`decode`] refuses a newer major version; unknown fields of a newer
 //! minor version are skipped.
 //!

@@ -24,7 +24,7 @@ pub struct Args {
     /// The table to write (CSV); stdout without.
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// The tracker's configuration (TOML, the keys of a camera file's [tracker]); its defaults without.
+    /// The tracker's configuration (TOML, the keys of a camera file's section `tracker`); its defaults without.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Override a key of the configuration, e.g. margin_px=3.
