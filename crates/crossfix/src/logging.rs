@@ -1,5 +1,7 @@
 //! Logs go to stderr; results go to stdout.
 
+use std::io::IsTerminal;
+
 use clap::{Args, ValueEnum};
 use tracing_subscriber::EnvFilter;
 
@@ -38,7 +40,10 @@ pub fn start(args: &LoggingArgs) {
     // Zenoh warns about what we chose on purpose (no gossip) and about peers that are not up yet.
     let filter = format!("{level},zenoh=error,zenoh_transport=error,zenoh_link_tcp=error");
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(filter));
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let builder = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr);
     match args.log_format {
         LogFormat::Text => builder.with_target(false).init(),
         LogFormat::Json => builder.json().init(),

@@ -218,8 +218,10 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
     }
     fusion.stop()?;
     recorder.stop()?;
-    if let Some(viewer) = viewer {
-        viewer.stop()?;
+    if let Some(viewer) = viewer
+        && let Err(error) = viewer.stop()
+    {
+        tracing::warn!("no live view: {error}");
     }
     drop(subscription);
     link.close()?;
