@@ -10,7 +10,7 @@ use rerun::log::LogMsg;
 use rerun::{AsComponents, Color, EntityPath, RecordingStream, RecordingStreamBuilder};
 
 use crate::ViewError;
-use crate::picture::{TIMELINE, image_path};
+use crate::paths::{TIMELINE, image_path};
 
 /// Where targets are likely to be above the cameras, m.
 const AIR_M: f64 = 25.0;

@@ -8,7 +8,7 @@ use rerun::{
     RecordingStream, SeriesLines, Transform3D,
 };
 
-use crate::picture::image_path;
+use crate::paths::image_path;
 use crate::{ViewError, colour};
 
 /// Length of the frustums, m: large enough to be seen in a site of 100 m.

@@ -10,6 +10,7 @@ mod blueprint;
 mod colour;
 mod draw;
 mod limiter;
+mod paths;
 mod picture;
 mod sink;
 

@@ -12,10 +12,9 @@ use rerun::{
 };
 
 use crate::limiter::Limiter;
+use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, blueprint, draw};
 
-/// The timeline of capture time.
-pub(crate) const TIMELINE: &str = "capture_time";
 /// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
 const PREVIEW_RATE_HZ: f64 = 5.0;
 const LINE_RATE_HZ: f64 = 10.0;
@@ -26,11 +25,6 @@ const TRAIL_POINTS: usize = 150;
 const DEFAULT_REACH_M: f64 = 150.0;
 /// Bearings remembered for the latency plot.
 const MAX_ARRIVALS: usize = 10_000;
-
-/// The place of a camera's image.
-pub(crate) fn image_path(name: &str) -> String {
-    format!("world/cameras/{name}/image")
-}
 
 struct CameraView {
     index: u64,

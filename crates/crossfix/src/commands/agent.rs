@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_message::{
     BearingFrame, Channel, Counter, Health, Payload, Timestamp, TrueState, TruthFrame, decode,
 };
@@ -218,6 +218,7 @@ impl Agent {
                     return Ok(());
                 }
             };
+            self.check_size(&frame)?;
             let capture = corrected(frame.capture, start, &file.clock);
             if !pace.wait(capture.time.seconds_since(start), &self.shutdown) {
                 return Ok(());
@@ -238,6 +239,22 @@ impl Agent {
                 }
             }
         }
+    }
+
+    /// Pixels of another size than the intrinsics' would become wrong bearings without a word.
+    fn check_size(&self, frame: &Frame) -> anyhow::Result<()> {
+        let size = self.identity.camera.model().intrinsics().size;
+        let (width, height) = (size.width as usize, size.height as usize);
+        ensure!(
+            (frame.width, frame.height) == (width, height),
+            "frame {} of camera `{}` has {}x{} pixels, its intrinsics are for {width}x{height}: \
+             calibrate at the size of the video",
+            frame.index,
+            self.identity.name,
+            frame.width,
+            frame.height,
+        );
+        Ok(())
     }
 
     /// Publishes the recorded bearings of this camera.

@@ -1,7 +1,6 @@
 use std::path::PathBuf;
 
-use anyhow::Context;
-use crossfix_recording::{Entry, RecordingWriter};
+use crossfix_recording::RecordingWriter;
 
 use crate::import::{drone_tracking, scenario};
 use crate::output;
@@ -67,14 +66,4 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let messages = writer.finish()?;
     output::line(format!("{messages} messages written to {}", path.display()));
     Ok(())
-}
-
-/// An entry of imported data: it arrived when it was made.
-pub fn imported(key: crossfix_message::Key, time: crossfix_message::Timestamp, data: Vec<u8>) -> Entry {
-    Entry { key, data_time: time, arrival: time, data }
-}
-
-/// Reads a whole text file of a data set.
-pub fn read_text(path: &std::path::Path) -> anyhow::Result<String> {
-    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }

@@ -14,8 +14,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::commands::agent::truth_frame;
-use crate::commands::import::imported;
 use crate::config;
+use crate::import::imported;
 use crate::output;
 
 /// Turn a scene into a recording of bearings with truth, or into video files.

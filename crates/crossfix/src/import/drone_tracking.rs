@@ -15,7 +15,7 @@ use crossfix_recording::Entry;
 use nalgebra::{Matrix2, Matrix3, Point3};
 use serde::Deserialize;
 
-use crate::commands::import::{imported, read_text};
+use crate::import::{imported, read_text};
 
 /// Frame rate to which the published synchronisation refers, Hz.
 const SYNC_RATE: f64 = 59.94006;

@@ -14,7 +14,7 @@ use crossfix_recording::Entry;
 use nalgebra::{Matrix3, Point3, Vector3};
 use serde::Deserialize;
 
-use crate::commands::import::{imported, read_text};
+use crate::import::{imported, read_text};
 
 #[derive(Debug, Deserialize)]
 struct Scenario {
