@@ -19,6 +19,15 @@ struct Held {
     compared: bool,
 }
 
+/// How an exposure arrived.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrival {
+    /// After all others of its camera.
+    InOrder,
+    /// After a newer one of its camera, in time all the same.
+    OutOfOrder,
+}
+
 /// The buffer that puts exposures into order.
 ///
 /// The time up to which exposures are released follows the *second* newest camera, so that one
@@ -48,7 +57,7 @@ impl EventBuffer {
     }
 
     /// Takes an exposure in; nothing comes out before [`Self::release`] says so.
-    pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<(), RejectionReason> {
+    pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<Arrival, RejectionReason> {
         let time = exposure.time;
         self.ended.remove(&exposure.camera);
         let previous = self.newest.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
@@ -71,7 +80,7 @@ impl EventBuffer {
             return Err(RejectionReason::Duplicate);
         }
         self.held.insert(order, Held { exposure, compared: reference.is_some() });
-        Ok(())
+        Ok(if time < previous { Arrival::OutOfOrder } else { Arrival::InOrder })
     }
 
     /// Marks a camera as come to its end: nobody waits for it any more.
@@ -155,6 +164,17 @@ mod tests {
         assert_eq!(drain(&mut buffer), [1.0, 1.1]);
         buffer.insert(exposure("b", 1.3)).unwrap();
         assert_eq!(drain(&mut buffer), [1.2]);
+    }
+
+    #[test]
+    fn frames_out_of_order_are_told_and_put_into_order() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(Arrival::InOrder));
+        assert_eq!(buffer.insert(exposure("a", 1.0)), Ok(Arrival::OutOfOrder));
+        assert_eq!(buffer.insert(exposure("a", 1.1)), Err(RejectionReason::Duplicate));
+        buffer.insert(exposure("b", 2.0)).unwrap();
+        buffer.insert(exposure("a", 2.0)).unwrap();
+        assert_eq!(drain(&mut buffer), [1.0, 1.1, 2.0, 2.0]);
     }
 
     #[test]

@@ -6,7 +6,7 @@ use crossfix_message::{
     TrackFrame, TrackState,
 };
 
-use crate::event_time::EventBuffer;
+use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::track::{Track, TrackStatus};
@@ -73,8 +73,10 @@ impl Fusion {
                 for reason in left_out {
                     outputs.push(self.reject(frame, reason));
                 }
-                if let Err(reason) = self.buffer.insert(exposure) {
-                    outputs.push(self.reject(frame, reason));
+                match self.buffer.insert(exposure) {
+                    Ok(Arrival::InOrder) => {}
+                    Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
+                    Err(reason) => outputs.push(self.reject(frame, reason)),
                 }
             }
             Err(reason) => outputs.push(self.reject(frame, reason)),
