@@ -4,7 +4,7 @@ use std::fmt;
 use crossfix_filter::KinematicState;
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Solver, Timestamp};
-use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Vector2};
 
 use crate::Tracking;
 use crate::ingress::with_time_uncertainty;
@@ -196,16 +196,11 @@ impl Track {
     pub fn is_confirmed(&self) -> bool {
         matches!(self.status, TrackStatus::Confirmed | TrackStatus::Coasting)
     }
-
-    /// Where it will be `seconds` from the time of its state.
-    pub fn position_after(&self, seconds: f64) -> Point3<f64> {
-        self.state.position() + self.state.velocity() * seconds
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Vector3, Vector6};
+    use nalgebra::{Point3, Vector3, Vector6};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};

@@ -79,11 +79,6 @@ impl SightLine {
         if along < 0.0 { offset.norm() } else { (offset - self.direction.into_inner() * along).norm() }
     }
 
-    /// The angle between the ray and the direction to a point, rad.
-    pub fn angle_to(&self, point: Point3<f64>) -> f64 {
-        self.direction.angle(&(point - self.origin))
-    }
-
     /// The direction to a point as an offset from this ray on its tangent plane, rad.
     ///
     /// `None` if the point lies at or behind the origin.

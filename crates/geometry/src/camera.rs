@@ -1,5 +1,5 @@
 use cam_geom::{Pixels, Points};
-use nalgebra::{Matrix2, Matrix3, Point3, RowVector2, RowVector3, Unit, Vector2, Vector3, Vector5};
+use nalgebra::{Matrix2, Point3, RowVector2, RowVector3, Unit, Vector2, Vector3, Vector5};
 use opencv_ros_camera::{Distortion as OpenCvDistortion, RosOpenCvIntrinsics, TermCriteria};
 
 use crate::{Bearing, GeometryError, Pose, SightLine, fisheye, tangent_basis};
@@ -218,12 +218,6 @@ impl CameraModel {
             Some((ahead.0 - behind.0) / (2.0 * STEP))
         };
         Some(Matrix2::from_columns(&[column(Vector2::x())?, column(Vector2::y())?]))
-    }
-
-    /// The camera matrix `K`, pixels.
-    pub fn matrix(&self) -> Matrix3<f64> {
-        let Intrinsics { fx, fy, cx, cy, .. } = self.intrinsics;
-        Matrix3::new(fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
     }
 }
 

@@ -1,5 +1,4 @@
 use std::fmt;
-use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -56,12 +55,6 @@ impl Timestamp {
     pub fn plus_seconds(self, seconds: f64) -> Self {
         Self(self.0.saturating_add((seconds * 1e9).round() as i64))
     }
-
-    /// This instant moved back by `duration`; saturates.
-    #[must_use]
-    pub fn minus(self, duration: Duration) -> Self {
-        Self(self.0.saturating_sub(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)))
-    }
 }
 
 impl fmt::Display for Timestamp {
@@ -86,7 +79,7 @@ mod tests {
         let first = Timestamp::MIN;
         let last = Timestamp::from_nanos(i64::MAX);
         assert!(last.seconds_since(first) > 1.8e10);
-        assert_eq!(first.minus(Duration::from_secs(1)), first);
+        assert_eq!(first.plus_seconds(-1.0), first);
         assert_eq!(last.plus_seconds(1e300), last);
     }
 }
