@@ -1,23 +1,59 @@
-//! One zero-mean normalised cross-correlation of a gate of three template sides.
+//! One zero-mean normalised cross-correlation of a gate of three template sides, with its sub-pixel
+//! peak and covariance; the same over a whole picture; and where the two routes cross.
 //!
 //! `cargo bench -p crossfix-correlation`
 
-use crossfix_correlation::{Correlator, Plane, Reference, Window};
+use crossfix_correlation::{
+    Correlator, Extent, FitOptions, Fitter, Plane, Reference, Route, Similarity, Window,
+};
 use divan::{Bencher, black_box};
 
 fn main() {
     divan::main();
 }
 
-#[divan::bench(args = [(10, 6), (25, 15), (50, 30), (100, 60)])]
-fn gate_of_three_sides(bencher: Bencher, (width, height): (usize, usize)) {
-    let texture = |x: usize, y: usize| ((x * 7919 + y * 104_729) % 251) as f32;
-    let gate = Plane::from_fn(3 * width, 3 * height, texture);
-    let crop = gate.crop(width as isize, height as isize, width, height);
-    let reference = Reference::new(crop, &Window::uniform(width, height));
-    let mut correlator = Correlator::default();
+const TEMPLATES: [(usize, usize); 4] = [(10, 6), (25, 15), (50, 30), (100, 60)];
+
+fn texture(x: usize, y: usize) -> f32 {
+    (((x * 7919 + y * 104_729) ^ (x * y * 31)) % 251) as f32
+}
+
+fn search(
+    bencher: Bencher,
+    gate: (usize, usize),
+    (width, height): (usize, usize),
+    mut correlator: Correlator,
+) {
+    let gate = Plane::from_fn(gate.0, gate.1, texture);
+    let (left, top) = ((gate.width() - width) / 2, (gate.height() - height) / 2);
+    let crop = gate.crop(left as isize, top as isize, width, height);
+    let reference = Reference::new(crop, Window::uniform(width, height));
+    let (mut scores, mut fitter) = (Plane::default(), Fitter::default());
     bencher.bench_local(|| {
-        let scores = correlator.scores(black_box(&gate), &reference, 1.0);
-        scores.peak().refined(&scores)
+        let measure = Similarity::ZeroMeanNormalised;
+        correlator.similarity(black_box(&gate), &reference, measure, Extent::Linear, 1.0, &mut scores);
+        let peak = scores.peak();
+        let fit = fitter.fit(&gate, &reference, peak.column as f64, peak.row as f64, FitOptions::default());
+        fit.covariance(fit.residual_variance)
     });
+}
+
+#[divan::bench(args = TEMPLATES)]
+fn gate_of_three_sides(bencher: Bencher, (width, height): (usize, usize)) {
+    search(bencher, (3 * width, 3 * height), (width, height), Correlator::default());
+}
+
+#[divan::bench]
+fn picture_of_720p_25x15(bencher: Bencher) {
+    search(bencher, (1280, 720), (25, 15), Correlator::default());
+}
+
+#[divan::bench(args = TEMPLATES)]
+fn directly(bencher: Bencher, (width, height): (usize, usize)) {
+    search(bencher, (3 * width, 3 * height), (width, height), Correlator::with_route(Route::Direct));
+}
+
+#[divan::bench(args = TEMPLATES)]
+fn by_transforms(bencher: Bencher, (width, height): (usize, usize)) {
+    search(bencher, (3 * width, 3 * height), (width, height), Correlator::with_route(Route::Spectral));
 }

@@ -1,142 +1,360 @@
 use std::fmt;
 
-use crate::Plane;
-use crate::fft::{Plans, Size};
+use rustfft::num_complex::Complex;
 
-/// How much each pixel of a reference counts; sums to 1.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Window(Plane);
+use crate::direct::{AbsoluteDifference, LargestDifference, Product, Slide};
+use crate::fft::{Size, Spectrum, Transforms};
+use crate::moments::Moments;
+use crate::{Extent, Plane, Reference, Similarity, SpectralWeight};
 
-impl Window {
-    /// Every pixel alike: the plain zero-mean normalised cross-correlation.
-    pub fn uniform(width: usize, height: usize) -> Self {
-        Self::normalised(Plane::from_fn(width, height, |_, _| 1.0))
-    }
-
-    /// A Gaussian about the middle, with a standard deviation of a share of each side: the target in
-    /// the middle counts, the background at the border little.
-    pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
-        let distance =
-            |index: usize, side: usize| (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
-        Self::normalised(Plane::from_fn(width, height, |x, y| {
-            (-0.5 * (distance(x, width).powi(2) + distance(y, height).powi(2))).exp() as f32
-        }))
-    }
-
-    fn normalised(mut plane: Plane) -> Self {
-        let sum = plane.mean() * plane.samples().len() as f32;
-        plane.samples_mut().iter_mut().for_each(|weight| *weight /= sum);
-        Self(plane)
-    }
+/// How products are summed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Route {
+    /// Sample by sample.
+    Direct,
+    /// By Fourier transforms (001, 3.6).
+    Spectral,
 }
 
-/// A reference image, ready to be correlated: its window, and its weighted deviation from its
-/// weighted mean.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Reference {
-    image: Plane,
-    window: Window,
-    kernel: Plane,
-    variance: f32,
-}
+/// Nanoseconds of a product and sum on the direct route, and of a sample and doubling of a
+/// transform's size on the spectral one. Measured by `cargo bench -p crossfix-correlation`; only
+/// their ratio counts, and near the crossing either route does.
+const DIRECT_NS: f64 = 0.027;
+const SPECTRAL_NS: f64 = 0.30;
 
-impl Reference {
-    /// A reference of an image and a window of the same size.
-    ///
-    /// # Panics
-    /// If the sizes differ.
-    pub fn new(image: Plane, window: &Window) -> Self {
-        let weights = window.0.samples();
-        assert_eq!(weights.len(), image.samples().len(), "window and image differ in size");
-        let mean: f32 = weights.iter().zip(image.samples()).map(|(w, s)| w * s).sum();
-        let mut kernel = image.clone();
-        let mut variance = 0.0;
-        for (value, weight) in kernel.samples_mut().iter_mut().zip(weights) {
-            let deviation = *value - mean;
-            variance += weight * deviation * deviation;
-            *value = weight * deviation;
-        }
-        Self { image, window: window.clone(), kernel, variance }
-    }
+/// Sides of the pieces into which the spectral route cuts a large gate: these transforms stay in the
+/// cache.
+const PIECE: Size = Size { width: 256, height: 128 };
 
-    /// The image.
-    pub fn image(&self) -> &Plane {
-        &self.image
-    }
-
-    /// The reference after exponential smoothing: `keep` of the old image and the rest of a new one
-    /// (003; erratum: the weight of 0.9 to 0.95 is the old image's).
-    #[must_use]
-    pub fn adapted(&self, new: &Plane, keep: f32) -> Self {
-        let mut image = self.image.clone();
-        for (old, new) in image.samples_mut().iter_mut().zip(new.samples()) {
-            *old = keep * *old + (1.0 - keep) * new;
-        }
-        Self::new(image, &self.window)
-    }
-}
-
-/// Correlates references with gates; keeps the FFT plans it has made.
+/// Correlates references with gates; keeps its plans and its memory, so that a second gate of the
+/// same size allocates nothing.
 #[derive(Default)]
 pub struct Correlator {
-    plans: Plans,
+    route: Option<Route>,
+    transforms: Transforms,
+    gate_spectrum: Spectrum,
+    kernel_spectrum: Spectrum,
+    /// What `kernel_spectrum` is the spectrum of: the same kernel is not transformed twice.
+    kernel: Option<(Size, Plane)>,
+    moments: Moments,
+    centred: Plane,
+    wrapped: Plane,
+    piece: Plane,
 }
 
 impl fmt::Debug for Correlator {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Correlator").finish_non_exhaustive()
+        f.debug_struct("Correlator").field("route", &self.route).finish_non_exhaustive()
     }
 }
 
+/// What the placements of a reference inside a gate are like: the parts of the zero-mean measure.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Statistics {
+    /// Weighted covariance of the gate with the reference.
+    pub covariance: Plane,
+    /// Weighted variance of the gate.
+    pub variance: Plane,
+}
+
 impl Correlator {
-    /// The zero-mean normalised cross-correlation (001, equation 3.3; erratum: the means are
-    /// removed, else it cannot be negative) at every placement of the reference inside the gate, by
-    /// FFT (3.6; erratum: the conjugate is the reference's, so that a peak at (x, y) is the
-    /// reference placed with its top left sample there).
-    ///
-    /// Between -1 and 1. `floor` is the noise's standard deviation, added in square to both
-    /// variances: a flat gate correlates with nothing. The gate must be at least as large as the
-    /// reference; what hangs over is cut off.
-    pub fn scores(&mut self, gate: &Plane, reference: &Reference, floor: f32) -> Plane {
-        self.mixed_scores(gate, &[(reference, 1.0)], floor)
+    /// One that always takes the same route, where the measure leaves a choice.
+    pub fn with_route(route: Route) -> Self {
+        Self { route: Some(route), ..Self::default() }
     }
 
-    /// The weighted sum of the scores of several references of one size and window.
+    /// The similarity of a reference with a gate at every placement; larger is more alike.
     ///
-    /// # Panics
-    /// If there is no reference.
-    pub fn mixed_scores(&mut self, gate: &Plane, references: &[(&Reference, f32)], floor: f32) -> Plane {
-        let window = &references[0].0.window.0;
-        let plan = self.plans.of(Size::holding(gate));
-        let width = (gate.width() + 1).saturating_sub(window.width()).max(1);
-        let height = (gate.height() + 1).saturating_sub(window.height()).max(1);
-        let window = window.crop(0, 0, window.width().min(gate.width()), window.height().min(gate.height()));
+    /// `floor` is the noise's standard deviation, added in square to both variances of the zero-mean
+    /// measure: a flat gate correlates with nothing. What of the reference is larger than the gate is
+    /// cut off.
+    pub fn similarity(
+        &mut self,
+        gate: &Plane,
+        reference: &Reference,
+        measure: Similarity,
+        extent: Extent,
+        floor: f32,
+        scores: &mut Plane,
+    ) {
+        let fitting = fitting(gate, reference);
+        let reference = fitting.as_ref().unwrap_or(reference);
+        match measure {
+            Similarity::CrossCorrelation => {
+                self.products(gate, reference.image(), extent, scores);
+            }
+            Similarity::Normalised => self.normalised(gate, reference, extent, scores),
+            Similarity::ZeroMeanNormalised => self.zero_mean(gate, reference, extent, floor, scores),
+            Similarity::Phase => {
+                let weight = SpectralWeight { whitening: 1.0, band: f32::INFINITY };
+                self.cross_spectrum(gate, reference, weight, extent, scores);
+            }
+            Similarity::CrossSpectrum(weight) => {
+                self.cross_spectrum(gate, reference, weight, extent, scores);
+            }
+            Similarity::AbsoluteDifferences => {
+                self.slide(AbsoluteDifference, gate, reference.image(), extent, scores);
+                scores.samples_mut().iter_mut().for_each(|s| *s = -*s);
+            }
+            Similarity::MaximumDifference => {
+                self.slide(LargestDifference, gate, reference.image(), extent, scores);
+                scores.samples_mut().iter_mut().for_each(|s| *s = -*s);
+            }
+            Similarity::SquaredDifferences => self.squared_differences(gate, reference, extent, scores),
+        }
+    }
 
-        // Without its mean the gate loses fewer digits in the squares.
+    /// The weighted covariance with the reference, and the weighted variance, of the gate at every
+    /// placement inside it. What of the reference is larger than the gate is cut off.
+    pub fn statistics(&mut self, gate: &Plane, reference: &Reference, out: &mut Statistics) {
+        let fitting = fitting(gate, reference);
+        let reference = fitting.as_ref().unwrap_or(reference);
+        self.centre(gate);
+        let centred = std::mem::take(&mut self.centred);
+        self.moments.fill(&centred, reference.window());
+        self.products(&centred, reference.kernel(), Extent::Linear, &mut out.covariance);
+        self.centred = centred;
+        out.variance.copy_from(&self.moments.square);
+        let (mean, variance) = (self.moments.mean.samples(), out.variance.samples_mut());
+        pulp::Arch::new().dispatch(|| {
+            for (variance, mean) in variance.iter_mut().zip(mean) {
+                *variance = (*variance - mean * mean).max(0.0);
+            }
+        });
+    }
+
+    /// The gate without its mean, which costs the squares fewer digits.
+    fn centre(&mut self, gate: &Plane) {
+        self.centred.copy_from(gate);
         let mean = gate.mean();
-        let mut centred = gate.clone();
-        centred.samples_mut().iter_mut().for_each(|s| *s -= mean);
-        let mut squared = centred.clone();
-        squared.samples_mut().iter_mut().for_each(|s| *s *= *s);
+        self.centred.samples_mut().iter_mut().for_each(|s| *s -= mean);
+    }
 
-        let gate_spectrum = plan.forward(&centred);
-        let window_spectrum = plan.forward(&window);
-        let local_mean = plan.inverse(gate_spectrum.times_conjugate(&window_spectrum), width, height);
-        let local_square =
-            plan.inverse(plan.forward(&squared).times_conjugate(&window_spectrum), width, height);
-        let mut total = Plane::from_fn(width, height, |_, _| 0.0);
-        for (reference, share) in references {
-            let kernel = reference.kernel.crop(0, 0, window.width(), window.height());
-            let product = gate_spectrum.times_conjugate(&plan.forward(&kernel));
-            let correlation = plan.inverse(product, width, height);
-            let reference_deviation = (reference.variance + floor * floor).sqrt();
-            for (i, sum) in total.samples_mut().iter_mut().enumerate() {
-                let variance = (local_square.samples()[i] - local_mean.samples()[i].powi(2)).max(0.0);
-                let deviation = (variance + floor * floor).sqrt();
-                *sum += share * correlation.samples()[i] / (reference_deviation * deviation);
+    /// The gate continued periodically, so that every placement lies inside it.
+    fn wrap(&mut self, gate: &Plane, kernel: &Plane) {
+        let (width, height) = (gate.width(), gate.height());
+        self.wrapped.reshape(width + kernel.width() - 1, height + kernel.height() - 1);
+        for y in 0..self.wrapped.height() {
+            let from = gate.row(y % height);
+            for (x, sample) in self.wrapped.row_mut(y).iter_mut().enumerate() {
+                *sample = from[x % width];
             }
         }
-        total
+    }
+
+    fn slide<T: crate::direct::Term>(
+        &mut self,
+        term: T,
+        gate: &Plane,
+        kernel: &Plane,
+        extent: Extent,
+        out: &mut Plane,
+    ) {
+        match extent {
+            Extent::Linear => Slide { term, gate, kernel, out }.run(),
+            Extent::Circular => {
+                self.wrap(gate, kernel);
+                Slide { term, gate: &self.wrapped, kernel, out }.run();
+            }
+        }
+    }
+
+    /// Which route is the shorter one.
+    fn route(&self, gate: &Plane, kernel: &Plane, extent: Extent) -> Route {
+        if let Some(route) = self.route {
+            return route;
+        }
+        let (placements, size) = match extent {
+            Extent::Linear => (
+                (gate.width() + 1 - kernel.width()) * (gate.height() + 1 - kernel.height()),
+                Size::holding(gate.width(), gate.height()),
+            ),
+            Extent::Circular => (gate.samples().len(), Size::of(gate)),
+        };
+        let direct = DIRECT_NS * (placements * kernel.samples().len()) as f64;
+        let spectral = SPECTRAL_NS * size.area() as f64 * (size.area() as f64).log2();
+        if direct <= spectral { Route::Direct } else { Route::Spectral }
+    }
+
+    /// The sums of products of a kernel with a gate.
+    fn products(&mut self, gate: &Plane, kernel: &Plane, extent: Extent, out: &mut Plane) {
+        match (self.route(gate, kernel, extent), extent) {
+            (Route::Direct, _) => self.slide(Product, gate, kernel, extent, out),
+            (Route::Spectral, Extent::Circular) => {
+                self.transform_kernel(kernel, Size::of(gate));
+                let transform = self.transforms.of(Size::of(gate));
+                transform.forward(gate, &mut self.gate_spectrum);
+                self.gate_spectrum.multiply_conjugate(&self.kernel_spectrum);
+                transform.inverse(&mut self.gate_spectrum, gate.width(), gate.height(), out);
+            }
+            (Route::Spectral, Extent::Linear) => self.linear_spectral(gate, kernel, out),
+        }
+    }
+
+    fn transform_kernel(&mut self, kernel: &Plane, size: Size) {
+        if self.kernel.as_ref().is_some_and(|(of, known)| (*of, known) == (size, kernel)) {
+            return;
+        }
+        self.transforms.of(size).forward(kernel, &mut self.kernel_spectrum);
+        let (of, known) = self.kernel.get_or_insert_with(|| (size, Plane::default()));
+        *of = size;
+        known.copy_from(kernel);
+    }
+
+    /// The placements inside the gate by transforms, a large gate piece by piece (overlap-save).
+    fn linear_spectral(&mut self, gate: &Plane, kernel: &Plane, out: &mut Plane) {
+        let (width, height) = (gate.width() + 1 - kernel.width(), gate.height() + 1 - kernel.height());
+        out.reshape(width, height);
+        // A piece holds at least three kernels: else most of it would be overlap.
+        let side = |piece: usize, kernel: usize, gate: usize| piece.max(4 * kernel).min(gate);
+        let (wide, tall) = (
+            side(PIECE.width, kernel.width(), gate.width()),
+            side(PIECE.height, kernel.height(), gate.height()),
+        );
+        let size = Size::holding(wide, tall);
+        self.transform_kernel(kernel, size);
+        let transform = self.transforms.of(size);
+        let (step_x, step_y) = (wide + 1 - kernel.width(), tall + 1 - kernel.height());
+        for top in (0..height).step_by(step_y) {
+            for left in (0..width).step_by(step_x) {
+                let (part_x, part_y) = (step_x.min(width - left), step_y.min(height - top));
+                let (from_x, from_y) = (part_x + kernel.width() - 1, part_y + kernel.height() - 1);
+                if (from_x, from_y) == (gate.width(), gate.height()) {
+                    transform.forward(gate, &mut self.gate_spectrum);
+                } else {
+                    gate.crop_into(left as isize, top as isize, from_x, from_y, &mut self.piece);
+                    transform.forward(&self.piece, &mut self.gate_spectrum);
+                }
+                self.gate_spectrum.multiply_conjugate(&self.kernel_spectrum);
+                transform.inverse(&mut self.gate_spectrum, part_x, part_y, &mut self.piece);
+                for y in 0..part_y {
+                    out.row_mut(top + y)[left..left + part_x].copy_from_slice(self.piece.row(y));
+                }
+            }
+        }
+    }
+
+    fn fill_moments(&mut self, gate: &Plane, reference: &Reference, extent: Extent) {
+        match extent {
+            Extent::Linear => self.moments.fill(gate, reference.window()),
+            Extent::Circular => {
+                self.wrap(gate, reference.image());
+                self.moments.fill(&self.wrapped, reference.window());
+            }
+        }
+    }
+
+    fn normalised(&mut self, gate: &Plane, reference: &Reference, extent: Extent, scores: &mut Plane) {
+        let plain = Reference::new(
+            reference.image().clone(),
+            crate::Window::uniform(reference.image().width(), reference.image().height()),
+        );
+        self.fill_moments(gate, &plain, extent);
+        self.products(gate, reference.image(), extent, scores);
+        let count = reference.image().samples().len() as f32;
+        let energy: f32 = reference.image().samples().iter().map(|g| g * g).sum();
+        for (score, square) in scores.samples_mut().iter_mut().zip(self.moments.square.samples()) {
+            let both = energy * square * count;
+            *score = if both > 0.0 { *score / both.sqrt() } else { 0.0 };
+        }
+    }
+
+    fn zero_mean(
+        &mut self,
+        gate: &Plane,
+        reference: &Reference,
+        extent: Extent,
+        floor: f32,
+        scores: &mut Plane,
+    ) {
+        self.centre(gate);
+        let centred = std::mem::take(&mut self.centred);
+        self.fill_moments(&centred, reference, extent);
+        self.products(&centred, reference.kernel(), extent, scores);
+        self.centred = centred;
+        let noise = floor * floor;
+        let own = (reference.variance() + noise).max(f32::MIN_POSITIVE);
+        let (mean, square) = (self.moments.mean.samples(), self.moments.square.samples());
+        pulp::Arch::new().dispatch(|| {
+            for ((score, mean), square) in scores.samples_mut().iter_mut().zip(mean).zip(square) {
+                let variance = (square - mean * mean).max(0.0) + noise;
+                *score /= (own * variance).sqrt().max(f32::MIN_POSITIVE);
+            }
+        });
+    }
+
+    fn cross_spectrum(
+        &mut self,
+        gate: &Plane,
+        reference: &Reference,
+        weight: SpectralWeight,
+        extent: Extent,
+        scores: &mut Plane,
+    ) {
+        self.centre(gate);
+        let size = Size::of(gate);
+        self.transform_kernel(reference.kernel(), size);
+        let transform = self.transforms.of(size);
+        transform.forward(&self.centred, &mut self.gate_spectrum);
+        self.gate_spectrum.multiply_conjugate(&self.kernel_spectrum);
+        weigh(&mut self.gate_spectrum, size, weight);
+        let (width, height) = match extent {
+            Extent::Circular => (size.width, size.height),
+            Extent::Linear => {
+                (size.width + 1 - reference.image().width(), size.height + 1 - reference.image().height())
+            }
+        };
+        transform.inverse(&mut self.gate_spectrum, width, height, scores);
+    }
+
+    fn squared_differences(
+        &mut self,
+        gate: &Plane,
+        reference: &Reference,
+        extent: Extent,
+        scores: &mut Plane,
+    ) {
+        let image = reference.image();
+        let (width, height) = (image.width(), image.height());
+        // The same level is taken from both: the squares keep their digits.
+        let level = gate.mean();
+        self.centre(gate);
+        let centred = std::mem::take(&mut self.centred);
+        let lowered = Plane::from_fn(width, height, |x, y| image.row(y)[x] - level);
+        let energy: f32 = lowered.samples().iter().map(|g| g * g).sum();
+        let plain = Reference::new(lowered, crate::Window::uniform(width, height));
+        self.fill_moments(&centred, &plain, extent);
+        self.products(&centred, plain.image(), extent, scores);
+        self.centred = centred;
+        let count = (width * height) as f32;
+        for (score, square) in scores.samples_mut().iter_mut().zip(self.moments.square.samples()) {
+            *score = -(square * count - 2.0 * *score + energy).max(0.0).sqrt();
+        }
+    }
+}
+
+/// The reference cut to the gate, if it is larger.
+fn fitting(gate: &Plane, reference: &Reference) -> Option<Reference> {
+    let image = reference.image();
+    let (width, height) = (image.width().min(gate.width()), image.height().min(gate.height()));
+    let cut = (width, height) != (image.width(), image.height());
+    cut.then(|| Reference::new(image.crop(0, 0, width, height), crate::Window::uniform(width, height)))
+}
+
+/// Multiplies a cross-spectrum by a weight (001, 3.7).
+fn weigh(spectrum: &mut Spectrum, size: Size, weight: SpectralWeight) {
+    let largest = spectrum.0.iter().map(|value| value.norm()).fold(0.0, f32::max);
+    // What is below the rounding of the largest term has no phase.
+    let least = largest * 1e-6;
+    let frequency = |index: usize, side: usize| index.min(side - index) as f32 / side as f32;
+    for (x, column) in spectrum.0.chunks_exact_mut(size.height).enumerate() {
+        for (y, value) in column.iter_mut().enumerate() {
+            let square = frequency(x, size.width).powi(2) + frequency(y, size.height).powi(2);
+            let band = (-0.5 * square / weight.band.powi(2)).exp();
+            let norm = value.norm();
+            let factor = if norm > least { band * norm.powf(-weight.whitening) } else { 0.0 };
+            *value *= Complex::new(factor, 0.0);
+        }
     }
 }
 
@@ -145,19 +363,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-
-    /// The definition, sample by sample.
-    fn direct(gate: &Plane, reference: &Reference, floor: f32) -> Plane {
-        let (w, h) = (reference.image.width(), reference.image.height());
-        Plane::from_fn(gate.width() - w + 1, gate.height() - h + 1, |x, y| {
-            let part = gate.crop(x as isize, y as isize, w, h);
-            let weights = reference.window.0.samples();
-            let mean: f32 = weights.iter().zip(part.samples()).map(|(w, s)| w * s).sum();
-            let variance: f32 = weights.iter().zip(part.samples()).map(|(w, s)| w * (s - mean).powi(2)).sum();
-            let cross: f32 = reference.kernel.samples().iter().zip(part.samples()).map(|(k, s)| k * s).sum();
-            cross / ((reference.variance + floor * floor) * (variance + floor * floor)).sqrt()
-        })
-    }
+    use crate::Window;
 
     fn noise(width: usize, height: usize, seed: u32) -> Plane {
         let mut state = seed.wrapping_mul(2_654_435_761).max(1);
@@ -169,46 +375,153 @@ mod tests {
         })
     }
 
+    const ALL: [Similarity; 8] = [
+        Similarity::CrossCorrelation,
+        Similarity::Normalised,
+        Similarity::ZeroMeanNormalised,
+        Similarity::Phase,
+        Similarity::CrossSpectrum(SpectralWeight { whitening: 0.5, band: 0.3 }),
+        Similarity::AbsoluteDifferences,
+        Similarity::SquaredDifferences,
+        Similarity::MaximumDifference,
+    ];
+
+    fn scores(
+        route: Route,
+        gate: &Plane,
+        reference: &Reference,
+        measure: Similarity,
+        extent: Extent,
+    ) -> Plane {
+        let mut scores = Plane::default();
+        Correlator::with_route(route).similarity(gate, reference, measure, extent, 1.0, &mut scores);
+        scores
+    }
+
+    /// The definitions of 001, sample by sample, of the measures that have one in samples.
+    fn defined(gate: &Plane, reference: &Reference, measure: Similarity, extent: Extent) -> Plane {
+        let (w, h) = (reference.image().width(), reference.image().height());
+        let (width, height) = match extent {
+            Extent::Linear => (gate.width() + 1 - w, gate.height() + 1 - h),
+            Extent::Circular => (gate.width(), gate.height()),
+        };
+        Plane::from_fn(width, height, |x, y| {
+            let part = |i: usize, j: usize| gate.row((y + j) % gate.height())[(x + i) % gate.width()];
+            let places = || (0..h).flat_map(move |j| (0..w).map(move |i| (i, j)));
+            let sum = |term: &dyn Fn(f32, f32, f32) -> f32| -> f32 {
+                places()
+                    .map(|(i, j)| {
+                        term(part(i, j), reference.image().row(j)[i], reference.window().weight(i, j))
+                    })
+                    .sum()
+            };
+            match measure {
+                Similarity::CrossCorrelation => sum(&|a, b, _| a * b),
+                Similarity::Normalised => {
+                    sum(&|a, b, _| a * b) / (sum(&|a, _, _| a * a) * sum(&|_, b, _| b * b)).sqrt()
+                }
+                Similarity::ZeroMeanNormalised => {
+                    let (a0, b0) = (sum(&|a, _, w| w * a), sum(&|_, b, w| w * b));
+                    let cross = sum(&|a, b, w| w * (a - a0) * (b - b0));
+                    let (va, vb) =
+                        (sum(&|a, _, w| w * (a - a0).powi(2)), sum(&|_, b, w| w * (b - b0).powi(2)));
+                    cross / ((va + 1.0) * (vb + 1.0)).sqrt()
+                }
+                Similarity::AbsoluteDifferences => -sum(&|a, b, _| (a - b).abs()),
+                Similarity::SquaredDifferences => -sum(&|a, b, _| (a - b).powi(2)).sqrt(),
+                Similarity::MaximumDifference => -places()
+                    .map(|(i, j)| (part(i, j) - reference.image().row(j)[i]).abs())
+                    .fold(0.0, f32::max),
+                Similarity::Phase | Similarity::CrossSpectrum(_) => 0.0,
+            }
+        })
+    }
+
     proptest! {
         #[test]
-        fn the_fft_gives_what_the_definition_gives(
-            w in 1usize..9, h in 1usize..9, dx in 0usize..20, dy in 0usize..20, seed in 1u32..1000, share in 0.2..1.0f64,
+        fn both_routes_give_what_the_definitions_give(
+            w in 1usize..9, h in 1usize..9, dx in 0usize..20, dy in 0usize..20, seed in 1u32..1000,
+            share in prop::option::of(0.2..1.0f64), circular: bool,
         ) {
             let gate = noise(w + dx, h + dy, seed);
-            let reference = Reference::new(noise(w, h, seed + 1), &Window::gaussian(w, h, share));
-            let fast = Correlator::default().scores(&gate, &reference, 1.0);
-            let slow = direct(&gate, &reference, 1.0);
-            for (a, b) in fast.samples().iter().zip(slow.samples()) {
-                prop_assert!((a - b).abs() < 2e-3, "{a} {b}");
-                prop_assert!(a.abs() <= 1.0 + 2e-3);
+            let window = share.map_or(Window::uniform(w, h), |share| Window::gaussian(w, h, share));
+            let reference = Reference::new(noise(w, h, seed + 1), window);
+            let extent = if circular { Extent::Circular } else { Extent::Linear };
+            for measure in ALL {
+                let direct = scores(Route::Direct, &gate, &reference, measure, extent);
+                let spectral = scores(Route::Spectral, &gate, &reference, measure, extent);
+                let expected = defined(&gate, &reference, measure, extent);
+                prop_assert_eq!((direct.width(), direct.height()), (expected.width(), expected.height()));
+                let scale = 1.0 + expected.samples().iter().fold(0.0f32, |m, v| m.max(v.abs()));
+                for ((a, b), c) in direct.samples().iter().zip(spectral.samples()).zip(expected.samples()) {
+                    prop_assert!((a - b).abs() < 2e-3 * scale, "{measure:?} routes: {a} {b}");
+                    if !matches!(measure, Similarity::Phase | Similarity::CrossSpectrum(_)) {
+                        prop_assert!((a - c).abs() < 2e-3 * scale, "{measure:?}: {a} {c}");
+                    }
+                }
             }
         }
+    }
 
-        #[test]
-        fn brightness_and_contrast_change_nothing(gain in 0.5f32..2.0, offset in -50.0f32..50.0) {
-            let gate = noise(30, 24, 5);
-            let reference = Reference::new(gate.crop(9, 7, 8, 6), &Window::uniform(8, 6));
-            let mut other = gate;
+    #[test]
+    fn every_measure_finds_a_known_shift_on_each_axis() {
+        let gate = noise(40, 30, 9);
+        for (x, y) in [(3, 0), (0, 5), (11, 7), (25, 19)] {
+            let reference = Reference::new(gate.crop(x, y, 12, 9), Window::uniform(12, 9));
+            for measure in ALL.into_iter().filter(|m| *m != Similarity::CrossCorrelation) {
+                for extent in [Extent::Linear, Extent::Circular] {
+                    let peak = scores(Route::Direct, &gate, &reference, measure, extent).peak();
+                    assert_eq!((peak.column, peak.row), (x as usize, y as usize), "{measure:?} {extent:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn brightness_and_contrast_change_nothing() {
+        let gate = noise(30, 24, 5);
+        let reference = Reference::new(gate.crop(9, 7, 8, 6), Window::uniform(8, 6));
+        for (gain, offset) in [(0.5, 20.0), (2.0, -50.0)] {
+            let mut other = gate.clone();
             other.samples_mut().iter_mut().for_each(|s| *s = *s * gain + offset);
-            let scores = Correlator::default().scores(&other, &reference, 0.01);
-            let peak = scores.peak();
-            prop_assert_eq!((peak.column, peak.row), (9, 7));
-            prop_assert!((peak.score - 1.0).abs() < 1e-2);
+            let measure = Similarity::ZeroMeanNormalised;
+            let peak = scores(Route::Direct, &other, &reference, measure, Extent::Linear).peak();
+            assert_eq!((peak.column, peak.row), (9, 7));
+            assert!((peak.score - 1.0).abs() < 1e-2);
+        }
+    }
+
+    #[test]
+    fn pieces_of_a_large_gate_fit_together() {
+        let gate = noise(700, 300, 3);
+        let reference = Reference::new(noise(25, 15, 4), Window::uniform(25, 15));
+        let measure = Similarity::ZeroMeanNormalised;
+        let whole = scores(Route::Direct, &gate, &reference, measure, Extent::Linear);
+        let pieces = scores(Route::Spectral, &gate, &reference, measure, Extent::Linear);
+        for (a, b) in whole.samples().iter().zip(pieces.samples()) {
+            assert!((a - b).abs() < 1e-3, "{a} {b}");
         }
     }
 
     #[test]
     fn a_flat_gate_correlates_with_nothing_and_is_finite() {
-        let reference = Reference::new(noise(5, 5, 3), &Window::uniform(5, 5));
+        let reference = Reference::new(noise(5, 5, 3), Window::uniform(5, 5));
         let flat = Plane::from_fn(15, 15, |_, _| 200.0);
-        let scores = Correlator::default().scores(&flat, &reference, 1.0);
-        assert!(scores.samples().iter().all(|s| s.abs() < 1e-2));
+        for measure in ALL {
+            let scores = scores(Route::Spectral, &flat, &reference, measure, Extent::Linear);
+            assert!(scores.samples().iter().all(|s| s.is_finite()), "{measure:?}");
+            if measure == Similarity::ZeroMeanNormalised {
+                assert!(scores.samples().iter().all(|s| s.abs() < 1e-2));
+            }
+        }
     }
 
     #[test]
     fn a_gate_smaller_than_the_reference_is_answered() {
-        let reference = Reference::new(noise(9, 9, 3), &Window::uniform(9, 9));
-        let scores = Correlator::default().scores(&noise(4, 12, 1), &reference, 1.0);
-        assert_eq!((scores.width(), scores.height()), (1, 4));
+        let reference = Reference::new(noise(9, 9, 3), Window::uniform(9, 9));
+        for measure in ALL {
+            let scores = scores(Route::Direct, &noise(4, 12, 1), &reference, measure, Extent::Linear);
+            assert_eq!((scores.width(), scores.height()), (1, 4));
+        }
     }
 }

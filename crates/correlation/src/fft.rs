@@ -1,4 +1,4 @@
-//! Two-dimensional real FFTs: rows by realfft, columns by rustfft.
+//! Two-dimensional real FFTs: rows by realfft, columns by rustfft, memory kept between calls.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,14 +9,19 @@ use rustfft::{Fft, FftPlanner};
 
 use crate::Plane;
 
-/// The spectrum of a real plane: `height` columns of `width / 2 + 1`, stored column by column.
-#[derive(Clone, Debug)]
-pub(crate) struct Spectrum(Vec<Complex<f32>>);
+/// Rows that are transposed together: a cache line of complex samples.
+const ROWS_AT_ONCE: usize = 8;
+
+/// The spectrum of a real plane: `width / 2 + 1` columns of `height`, stored column by column.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Spectrum(pub(crate) Vec<Complex<f32>>);
 
 impl Spectrum {
-    /// The product with the conjugate of another: the spectrum of the cross-correlation.
-    pub(crate) fn times_conjugate(&self, other: &Self) -> Self {
-        Self(self.0.iter().zip(&other.0).map(|(a, b)| a * b.conj()).collect())
+    /// Becomes its product with the conjugate of another: the spectrum of a cross-correlation.
+    pub(crate) fn multiply_conjugate(&mut self, kernel: &Self) {
+        for (value, kernel) in self.0.iter_mut().zip(&kernel.0) {
+            *value *= kernel.conj();
+        }
     }
 }
 
@@ -28,100 +33,152 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    /// The least good size that holds a plane: multiples of 16 are twice as fast as awkward sides.
-    pub(crate) fn holding(plane: &Plane) -> Self {
-        Self { width: plane.width().next_multiple_of(16), height: plane.height().next_multiple_of(16) }
+    /// The size of a plane itself: what wraps round, wraps round at its sides.
+    pub(crate) fn of(plane: &Plane) -> Self {
+        Self { width: plane.width(), height: plane.height() }
+    }
+
+    /// The least good size that holds so many columns and rows: multiples of 16 with no prime factor
+    /// above 5 are twice as fast as awkward sides.
+    pub(crate) fn holding(width: usize, height: usize) -> Self {
+        let good = |side: usize| {
+            let mut side = side.next_multiple_of(16);
+            while !is_smooth(side) {
+                side += 16;
+            }
+            side
+        };
+        Self { width: good(width), height: good(height) }
+    }
+
+    pub(crate) fn area(self) -> usize {
+        self.width * self.height
     }
 }
 
-/// A plan for one size.
-#[derive(Clone)]
-pub(crate) struct Plan {
+/// Whether a number has no prime factor above 5.
+fn is_smooth(mut number: usize) -> bool {
+    for prime in [2, 3, 5] {
+        while number.is_multiple_of(prime) {
+            number /= prime;
+        }
+    }
+    number == 1
+}
+
+/// The transform of one size, with its memory.
+pub(crate) struct Transform {
     size: Size,
     row_forward: Arc<dyn RealToComplex<f32>>,
     row_inverse: Arc<dyn ComplexToReal<f32>>,
     column_forward: Arc<dyn Fft<f32>>,
     column_inverse: Arc<dyn Fft<f32>>,
+    row: Vec<f32>,
+    rows: Vec<Complex<f32>>,
+    scratch: Vec<Complex<f32>>,
 }
 
-impl Plan {
+impl Transform {
     fn half(&self) -> usize {
         self.size.width / 2 + 1
     }
 
     /// The spectrum of a plane, padded with zeros.
-    pub(crate) fn forward(&self, plane: &Plane) -> Spectrum {
-        let Size { width, height } = self.size;
-        let half = self.half();
-        let mut columns = vec![Complex::default(); half * height];
-        let mut row_in = vec![0.0; width];
-        let mut row_out = vec![Complex::default(); half];
-        for y in 0..plane.height() {
-            row_in[..plane.width()].copy_from_slice(plane.row(y));
-            row_in[plane.width()..].fill(0.0);
-            // The lengths are the plan's own: it cannot refuse them.
-            let _ = self.row_forward.process(&mut row_in, &mut row_out);
-            for (x, value) in row_out.iter().enumerate() {
-                columns[x * height + y] = *value;
+    pub(crate) fn forward(&mut self, plane: &Plane, spectrum: &mut Spectrum) {
+        let (half, height) = (self.half(), self.size.height);
+        spectrum.0.resize(half * height, Complex::default());
+        spectrum.0.fill(Complex::default());
+        for first in (0..plane.height()).step_by(ROWS_AT_ONCE) {
+            let count = ROWS_AT_ONCE.min(plane.height() - first);
+            for (y, out) in self.rows.chunks_exact_mut(half).take(count).enumerate() {
+                let (used, rest) = self.row.split_at_mut(plane.width());
+                used.copy_from_slice(plane.row(first + y));
+                rest.fill(0.0);
+                // The lengths are the plan's own: it cannot refuse them.
+                let _ = self.row_forward.process_with_scratch(&mut self.row, out, &mut self.scratch);
+            }
+            for x in 0..half {
+                let column = &mut spectrum.0[x * height + first..x * height + first + count];
+                for (y, value) in column.iter_mut().enumerate() {
+                    *value = self.rows[y * half + x];
+                }
             }
         }
-        for column in columns.chunks_exact_mut(height) {
-            self.column_forward.process(column);
-        }
-        Spectrum(columns)
+        self.column_forward.process_with_scratch(&mut spectrum.0, &mut self.scratch);
     }
 
-    /// The top left `width` by `height` of the plane of a spectrum.
-    pub(crate) fn inverse(&self, mut spectrum: Spectrum, width: usize, height: usize) -> Plane {
-        let (rows, half) = (self.size.height, self.half());
-        for column in spectrum.0.chunks_exact_mut(rows) {
-            self.column_inverse.process(column);
-        }
-        let scale = 1.0 / (self.size.width * self.size.height) as f32;
-        let mut row_in = vec![Complex::default(); half];
-        let mut row_out = vec![0.0; self.size.width];
-        let mut samples = Vec::with_capacity(width * height);
-        for y in 0..height {
-            for (x, value) in row_in.iter_mut().enumerate() {
-                *value = spectrum.0[x * rows + y];
+    /// The top left `width` by `height` of the plane of a spectrum, which is used up.
+    pub(crate) fn inverse(
+        &mut self,
+        spectrum: &mut Spectrum,
+        width: usize,
+        height: usize,
+        plane: &mut Plane,
+    ) {
+        let (half, tall) = (self.half(), self.size.height);
+        self.column_inverse.process_with_scratch(&mut spectrum.0, &mut self.scratch);
+        plane.reshape(width, height);
+        let scale = 1.0 / self.size.area() as f32;
+        for first in (0..height).step_by(ROWS_AT_ONCE) {
+            let count = ROWS_AT_ONCE.min(height - first);
+            for x in 0..half {
+                let column = &spectrum.0[x * tall + first..x * tall + first + count];
+                for (y, value) in column.iter().enumerate() {
+                    self.rows[y * half + x] = *value;
+                }
             }
-            // A real row's first and middle terms are real up to rounding; realfft wants exactly.
-            row_in[0].im = 0.0;
-            if self.size.width.is_multiple_of(2) {
-                row_in[half - 1].im = 0.0;
+            for (y, row) in self.rows.chunks_exact_mut(half).take(count).enumerate() {
+                // A real row's first and middle terms are real up to rounding; realfft wants exactly.
+                row[0].im = 0.0;
+                if self.size.width.is_multiple_of(2) {
+                    row[half - 1].im = 0.0;
+                }
+                let _ = self.row_inverse.process_with_scratch(row, &mut self.row, &mut self.scratch);
+                for (out, value) in plane.row_mut(first + y).iter_mut().zip(&self.row) {
+                    *out = value * scale;
+                }
             }
-            let _ = self.row_inverse.process(&mut row_in, &mut row_out);
-            samples.extend(row_out[..width].iter().map(|value| value * scale));
         }
-        let mut samples = samples.into_iter();
-        Plane::from_fn(width, height, |_, _| samples.next().unwrap_or_default())
     }
 }
 
-/// Plans that have been made, by size.
-pub(crate) struct Plans {
+/// Transforms that have been made, by size.
+pub(crate) struct Transforms {
     real: RealFftPlanner<f32>,
     complex: FftPlanner<f32>,
-    made: BTreeMap<Size, Plan>,
+    made: BTreeMap<Size, Transform>,
 }
 
-impl Default for Plans {
+impl Default for Transforms {
     fn default() -> Self {
         Self { real: RealFftPlanner::new(), complex: FftPlanner::new(), made: BTreeMap::new() }
     }
 }
 
-impl Plans {
-    pub(crate) fn of(&mut self, size: Size) -> Plan {
+impl Transforms {
+    pub(crate) fn of(&mut self, size: Size) -> &mut Transform {
         let Self { real, complex, made } = self;
-        made.entry(size)
-            .or_insert_with(|| Plan {
+        made.entry(size).or_insert_with(|| {
+            let row_forward = real.plan_fft_forward(size.width);
+            let row_inverse = real.plan_fft_inverse(size.width);
+            let column_forward = complex.plan_fft_forward(size.height);
+            let column_inverse = complex.plan_fft_inverse(size.height);
+            let scratch = [
+                row_forward.get_scratch_len(),
+                row_inverse.get_scratch_len(),
+                column_forward.get_inplace_scratch_len(),
+                column_inverse.get_inplace_scratch_len(),
+            ];
+            Transform {
                 size,
-                row_forward: real.plan_fft_forward(size.width),
-                row_inverse: real.plan_fft_inverse(size.width),
-                column_forward: complex.plan_fft_forward(size.height),
-                column_inverse: complex.plan_fft_inverse(size.height),
-            })
-            .clone()
+                row: vec![0.0; size.width],
+                rows: vec![Complex::default(); ROWS_AT_ONCE * (size.width / 2 + 1)],
+                scratch: vec![Complex::default(); scratch.into_iter().max().unwrap_or(0)],
+                row_forward,
+                row_inverse,
+                column_forward,
+                column_inverse,
+            }
+        })
     }
 }

@@ -46,6 +46,11 @@ fn vertex(before: f32, here: f32, after: f32) -> f64 {
 }
 
 impl Peak {
+    /// The peak at its sample.
+    pub fn whole(self) -> SubPixelPeak {
+        SubPixelPeak { x: self.column as f64, y: self.row as f64, score: self.score }
+    }
+
     /// The peak between the samples of `scores`: a parabola an axis. At the border it stays.
     pub fn refined(self, scores: &Plane) -> SubPixelPeak {
         let Self { column, row, score } = self;

@@ -1,23 +1,57 @@
+/// Samples behind the last one that may be read and written without meaning: a vector of columns
+/// then needs no care at the end of a row.
+pub(crate) const PADDING: usize = 16;
+
 /// A plane of samples, row by row: an image's brightness, a reference, a map of scores.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Plane {
     width: usize,
     height: usize,
+    /// `width * height` samples, and [`PADDING`].
     samples: Vec<f32>,
+}
+
+impl PartialEq for Plane {
+    fn eq(&self, other: &Self) -> bool {
+        (self.width, self.height) == (other.width, other.height) && self.samples() == other.samples()
+    }
+}
+
+impl Default for Plane {
+    /// One sample of zero: a plane to be written into.
+    fn default() -> Self {
+        Self { width: 1, height: 1, samples: vec![0.0; 1 + PADDING] }
+    }
 }
 
 impl Plane {
     /// A plane from its samples; `None` if there are not `width * height`, or none.
-    pub fn new(width: usize, height: usize, samples: Vec<f32>) -> Option<Self> {
+    pub fn new(width: usize, height: usize, mut samples: Vec<f32>) -> Option<Self> {
         let fits = width > 0 && height > 0 && width.checked_mul(height) == Some(samples.len());
+        samples.resize(samples.len() + PADDING, 0.0);
         fits.then_some(Self { width, height, samples })
     }
 
     /// A plane of what a function says of column and row. Sides of zero are taken as one.
     pub fn from_fn(width: usize, height: usize, mut sample: impl FnMut(usize, usize) -> f32) -> Self {
         let (width, height) = (width.max(1), height.max(1));
-        let samples = (0..width * height).map(|i| sample(i % width, i / width)).collect();
-        Self { width, height, samples }
+        let mut plane = Self { width, height, samples: vec![0.0; width * height + PADDING] };
+        for (i, value) in plane.samples_mut().iter_mut().enumerate() {
+            *value = sample(i % width, i / width);
+        }
+        plane
+    }
+
+    /// Takes another size, keeping its memory; what the samples are then is not said.
+    pub fn reshape(&mut self, width: usize, height: usize) {
+        (self.width, self.height) = (width.max(1), height.max(1));
+        self.samples.resize(self.width * self.height + PADDING, 0.0);
+    }
+
+    /// Becomes a copy of another plane, keeping its memory.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.reshape(other.width, other.height);
+        self.samples_mut().copy_from_slice(other.samples());
     }
 
     /// Columns.
@@ -32,17 +66,32 @@ impl Plane {
 
     /// All samples, row by row.
     pub fn samples(&self) -> &[f32] {
-        &self.samples
+        &self.samples[..self.width * self.height]
     }
 
     /// All samples, to be changed.
     pub fn samples_mut(&mut self) -> &mut [f32] {
-        &mut self.samples
+        &mut self.samples[..self.width * self.height]
+    }
+
+    /// The samples from a place on, and the padding.
+    pub(crate) fn padded_from(&self, column: usize, row: usize) -> &[f32] {
+        &self.samples[row * self.width + column..]
+    }
+
+    /// The samples from a place on, and the padding, to be changed.
+    pub(crate) fn padded_from_mut(&mut self, column: usize, row: usize) -> &mut [f32] {
+        &mut self.samples[row * self.width + column..]
     }
 
     /// One row.
     pub fn row(&self, row: usize) -> &[f32] {
         &self.samples[row * self.width..(row + 1) * self.width]
+    }
+
+    /// One row, to be changed.
+    pub fn row_mut(&mut self, row: usize) -> &mut [f32] {
+        &mut self.samples[row * self.width..(row + 1) * self.width]
     }
 
     /// The sample at a place; outside the plane, the nearest one inside.
@@ -54,25 +103,43 @@ impl Plane {
 
     /// The part whose top left sample is at (`left`, `top`); beyond the border, the border goes on.
     pub fn crop(&self, left: isize, top: isize, width: usize, height: usize) -> Self {
-        Self::from_fn(width, height, |x, y| self.clamped(left + x as isize, top + y as isize))
+        let mut part = Self::default();
+        self.crop_into(left, top, width, height, &mut part);
+        part
     }
 
-    /// The part centred on a sub-pixel place, interpolated bilinearly.
-    pub fn crop_centred(&self, x: f64, y: f64, width: usize, height: usize) -> Self {
-        let left = x - (width as f64 - 1.0) / 2.0;
-        let top = y - (height as f64 - 1.0) / 2.0;
-        let (fx, fy) = ((left - left.floor()) as f32, (top - top.floor()) as f32);
-        let whole = self.crop(left.floor() as isize, top.floor() as isize, width + 1, height + 1);
-        Self::from_fn(width, height, |column, row| {
-            let (above, below) = (whole.row(row), whole.row(row + 1));
-            let upper = above[column] * (1.0 - fx) + above[column + 1] * fx;
-            let lower = below[column] * (1.0 - fx) + below[column + 1] * fx;
-            upper * (1.0 - fy) + lower * fy
-        })
+    /// As [`crop`](Self::crop), into a plane that is there already.
+    pub fn crop_into(&self, left: isize, top: isize, width: usize, height: usize, part: &mut Self) {
+        part.reshape(width, height);
+        let inside = left >= 0 && left as usize + part.width <= self.width;
+        for y in 0..part.height {
+            let row = (top + y as isize).clamp(0, self.height as isize - 1) as usize;
+            let (from, width) = (self.row(row), part.width);
+            let to = &mut part.samples[y * width..(y + 1) * width];
+            if inside {
+                to.copy_from_slice(&from[left as usize..left as usize + width]);
+            } else {
+                for (x, sample) in to.iter_mut().enumerate() {
+                    *sample = from[(left + x as isize).clamp(0, from.len() as isize - 1) as usize];
+                }
+            }
+        }
     }
 
     /// The mean of all samples.
     pub fn mean(&self) -> f32 {
-        (self.samples.iter().map(|&s| f64::from(s)).sum::<f64>() / self.samples.len() as f64) as f32
+        // Lanes of single precision a row, double precision over the rows.
+        let mut sum = 0.0_f64;
+        for row in self.samples().chunks(self.width) {
+            let mut lanes = [0.0_f32; 8];
+            let (whole, rest) = row.as_chunks::<8>();
+            for samples in whole {
+                for (lane, sample) in lanes.iter_mut().zip(samples) {
+                    *lane += sample;
+                }
+            }
+            sum += f64::from(lanes.iter().sum::<f32>() + rest.iter().sum::<f32>());
+        }
+        (sum / self.samples().len() as f64) as f32
     }
 }

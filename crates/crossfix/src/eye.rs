@@ -7,7 +7,7 @@ use crossfix_message::{
     BearingFrame, BearingTrack, CameraName, ClockSource, ImageTrackState, Payload, Preview,
 };
 use crossfix_video::{CaptureTime, Frame};
-use crossfix_vision::{ImageTrack, TrackPhase};
+use crossfix_vision::{ImageTrack, Measurement, TrackPhase};
 use nalgebra::Matrix2;
 
 /// Quality of preview pictures, 1 to 100.
@@ -44,9 +44,10 @@ impl CameraIdentity {
     /// marked as such. The fusion wants measurements that are independent of each other, so it gets
     /// the place in this image and not the image filter's estimate.
     fn bearing_track(&self, track: &ImageTrack) -> Result<BearingTrack, GeometryError> {
-        let (place, variance) = track.measured.unwrap_or((track.position, 1.0));
+        let predicted = Measurement { place: track.position, covariance: Matrix2::identity() };
+        let Measurement { place, covariance } = track.measured.unwrap_or(predicted);
         let pixel = Pixel::new(place.x, place.y);
-        let covariance = PixelCovariance(Matrix2::identity() * variance);
+        let covariance = PixelCovariance(covariance);
         let bearing = self.camera.model().bearing(pixel, covariance)?;
         let state = match track.phase {
             TrackPhase::Tentative => ImageTrackState::Tentative,

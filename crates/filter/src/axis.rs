@@ -1,4 +1,4 @@
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::Matrix2;
 
 /// A measured position on one axis with its variance.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,97 +43,129 @@ impl Innovation {
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct AxisFilter {
-    state: Vector2<f64>,
-    covariance: Matrix2<f64>,
-    sigma_a: f64,
+    position: f64,
+    velocity: f64,
+    /// The covariance, P11, P12 and P22.
+    position_variance: f64,
+    cross: f64,
+    velocity_variance: f64,
+    /// `sigma_a^2`.
+    acceleration_variance: f64,
 }
 
 impl AxisFilter {
     /// Starts from two measurements `interval` seconds apart (000 (13)-(14); erratum: the
     /// velocity's variance has `sigma_a^2 T^2 / 4`).
     pub fn start(first: AxisMeasurement, second: AxisMeasurement, interval: f64, sigma_a: f64) -> Self {
-        let velocity = (second.position - first.position) / interval;
-        let cross = second.variance / interval;
-        let velocity_variance =
-            (second.variance + first.variance) / interval.powi(2) + sigma_a.powi(2) * interval.powi(2) / 4.0;
         Self {
-            state: Vector2::new(second.position, velocity),
-            covariance: Matrix2::new(second.variance, cross, cross, velocity_variance),
-            sigma_a,
+            position: second.position,
+            velocity: (second.position - first.position) / interval,
+            position_variance: second.variance,
+            cross: second.variance / interval,
+            velocity_variance: (second.variance + first.variance) / interval.powi(2)
+                + sigma_a.powi(2) * interval.powi(2) / 4.0,
+            acceleration_variance: sigma_a.powi(2),
         }
     }
 
     /// Starts from one measurement and a prior standard deviation of the velocity about zero.
     pub fn start_at_rest(first: AxisMeasurement, velocity_sd: f64, sigma_a: f64) -> Self {
         Self {
-            state: Vector2::new(first.position, 0.0),
-            covariance: Matrix2::new(first.variance, 0.0, 0.0, velocity_sd.powi(2)),
-            sigma_a,
+            position: first.position,
+            velocity: 0.0,
+            position_variance: first.variance,
+            cross: 0.0,
+            velocity_variance: velocity_sd.powi(2),
+            acceleration_variance: sigma_a.powi(2),
         }
     }
 
     /// Moves the state `interval` seconds on (000 (8), (10)).
+    #[inline]
     pub fn time_update(&mut self, interval: f64) {
-        let f = Matrix2::new(1.0, interval, 0.0, 1.0);
-        let g = Vector2::new(interval * interval / 2.0, interval);
-        self.state = f * self.state;
-        self.covariance = f * self.covariance * f.transpose() + g * self.sigma_a.powi(2) * g.transpose();
+        self.position += interval * self.velocity;
+        // F P F' + G Q G', written out: this runs for every axis of every target in every frame.
+        let (noise, half) = (self.acceleration_variance * interval * interval, interval / 2.0);
+        let cross = self.cross + interval * self.velocity_variance;
+        self.position_variance += interval * (self.cross + cross) + noise * half * half;
+        self.cross = cross + noise * half;
+        self.velocity_variance += noise;
     }
 
     /// What a measurement would be off by.
+    #[inline]
     pub fn innovation(&self, measurement: AxisMeasurement) -> Innovation {
         Innovation {
-            value: measurement.position - self.state.x,
-            variance: self.covariance.m11 + measurement.variance,
+            value: measurement.position - self.position,
+            variance: self.position_variance + measurement.variance,
         }
     }
 
     /// Takes a measurement in (000 (9), (11), (12)) and returns its innovation.
+    #[inline]
     pub fn measurement_update(&mut self, measurement: AxisMeasurement) -> Innovation {
         let innovation = self.innovation(measurement);
-        let gain = self.covariance.column(0) / innovation.variance;
-        self.state += gain * innovation.value;
-        // Joseph's form keeps the covariance symmetric and positive.
-        let left = Matrix2::new(1.0 - gain.x, 0.0, -gain.y, 1.0);
-        self.covariance =
-            left * self.covariance * left.transpose() + gain * measurement.variance * gain.transpose();
+        let share = 1.0 / innovation.variance;
+        let (gain, velocity_gain) = (self.position_variance * share, self.cross * share);
+        self.position += gain * innovation.value;
+        self.velocity += velocity_gain * innovation.value;
+        // (I - K H) P with 1 - K_1 = R / S: no difference of nearly equal numbers on the position.
+        self.velocity_variance -= velocity_gain * self.cross;
+        self.position_variance = gain * measurement.variance;
+        self.cross = velocity_gain * measurement.variance;
         innovation
+    }
+
+    /// Replaces what is known of the position by `posterior`; the velocity follows by regression,
+    /// `x+ = x + P_xp / P_pp (m - p)`, `P+ = P - P_xp P_px / P_pp^2 (P_pp - c)`.
+    ///
+    /// A measurement's update (000 (9)-(12)) is this with the product of prior and likelihood.
+    pub fn condition(&mut self, posterior: AxisMeasurement) {
+        let slope = self.cross / self.position_variance;
+        self.velocity += slope * (posterior.position - self.position);
+        self.position = posterior.position;
+        let rest = (self.velocity_variance - slope * self.cross).max(0.0);
+        self.position_variance = posterior.variance;
+        self.cross = slope * posterior.variance;
+        self.velocity_variance = rest + slope * self.cross;
+    }
+
+    /// Multiplies the covariance: less is known than the filter believes.
+    pub fn inflate(&mut self, factor: f64) {
+        self.position_variance *= factor;
+        self.cross *= factor;
+        self.velocity_variance *= factor;
     }
 
     /// Position, in the axis' unit.
     pub fn position(&self) -> f64 {
-        self.state.x
+        self.position
     }
 
     /// Velocity, unit a second.
     pub fn velocity(&self) -> f64 {
-        self.state.y
+        self.velocity
     }
 
     /// Variance of the position.
     pub fn position_variance(&self) -> f64 {
-        self.covariance.m11
+        self.position_variance
     }
 
     /// Covariance of position and velocity.
-    pub fn covariance(&self) -> &Matrix2<f64> {
-        &self.covariance
+    pub fn covariance(&self) -> Matrix2<f64> {
+        Matrix2::new(self.position_variance, self.cross, self.cross, self.velocity_variance)
     }
 
     /// Puts the state at rest at a position, keeping its covariance.
     pub fn hold_at(&mut self, position: f64) {
-        self.state = Vector2::new(position, 0.0);
-    }
-
-    /// Takes part of the velocity away, keeping its variance: a target that is not seen is not
-    /// believed to go on for ever.
-    pub fn damp_velocity(&mut self, factor: f64) {
-        self.state.y *= factor;
+        (self.position, self.velocity) = (position, 0.0);
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector2;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
@@ -145,7 +177,7 @@ mod tests {
         let at = |position, variance| AxisMeasurement { position, variance };
         let filter = AxisFilter::start(at(1.0, 4.0), at(3.0, 1.0), 0.5, 2.0);
         assert_eq!(filter.velocity(), 4.0);
-        assert_eq!(*filter.covariance(), Matrix2::new(1.0, 2.0, 2.0, 20.0 + 0.25));
+        assert_eq!(filter.covariance(), Matrix2::new(1.0, 2.0, 2.0, 20.0 + 0.25));
     }
 
     /// Mean NEES of `runs` runs of 20 steps of the model itself.
@@ -171,8 +203,8 @@ mod tests {
                 filter.measurement_update(measurement);
                 truth = (position, velocity);
             }
-            let error = Vector2::new(truth.0, truth.1) - filter.state;
-            sum += (error.transpose() * filter.covariance.try_inverse().unwrap() * error).x;
+            let error = Vector2::new(truth.0 - filter.position(), truth.1 - filter.velocity());
+            sum += (error.transpose() * filter.covariance().try_inverse().unwrap() * error).x;
         }
         sum / f64::from(runs)
     }

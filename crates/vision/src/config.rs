@@ -1,80 +1,160 @@
+use crossfix_correlation::{Extent, Similarity};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// How targets are followed. Lengths in pixels, brightness in 8-bit levels, times in seconds.
+use crate::ReferenceStrategy;
+
+/// How targets are followed. Lengths in pixels, brightness in the image's own unit, times in seconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackerConfig {
-    /// Pixels added to each side of the target's box to make the reference. Default 2.
+    /// Which algorithm. Default [`Algorithm::Posterior`].
+    pub algorithm: Algorithm,
+    /// How the reference follows the target's appearance. Default: the mean of its images.
+    pub reference: ReferenceStrategy,
+    /// The region that is searched. Default: four standard deviations of the prediction, and at least
+    /// the papers' three sides.
+    pub gate: GateRule,
+    /// Whether the reference follows the target's size and direction. Default true.
+    pub follow_shape: bool,
+    /// Pixels added to each side of the target's box to make the reference. Default 2: the target's
+    /// edge is most of what is known of its place.
     pub margin_px: f64,
-    /// Standard deviation of the reference's Gaussian window as a share of its sides; the larger,
-    /// the more the background counts. Default 0.28.
-    pub window_share: f64,
-    /// Standard deviation of the image's noise, levels: a floor under local contrast. Default 1.
+    /// Least standard deviation of the image's noise. Default 1, a level of 8 bits; the noise above it
+    /// is measured in every image.
     pub noise_floor: f64,
-    /// Weight of the correlation against the prediction's log density. Default 25.
-    pub score_weight: f64,
-    /// Floor of the prediction's standard deviation in that density, px. Default 2.
-    pub prediction_floor_px: f64,
     /// Standard deviation of the target's white acceleration, px/s^2 (000, equation 4: the largest
     /// acceleration by root 3). Default 900, a pixel a frame squared at 30 frames a second.
     pub acceleration_sd_px: f64,
-    /// Standard deviation of a measurement of full quality, px. Default 0.5.
-    pub measurement_sd_px: f64,
-    /// Scores at which a measurement's quality is 0 and 1. Default 0.3 and 0.6.
-    pub quality_scores: [f64; 2],
-    /// Scores at which the reference adapts not at all and fully. Default 0.4 and 0.7.
-    pub adaptation_scores: [f64; 2],
-    /// Weight of the old reference at full adaptation (003). Default 0.93.
-    pub reference_memory: f64,
-    /// Weight of the first reference in the score, which holds the reference in its place. Default 0.15.
-    pub anchor_share: f64,
-    /// Threshold of the ellipsoidal gate on the innovation, `r' D^-1 r <= l^2` (001, 4.8). Default 25.
-    pub gate_threshold: f64,
-    /// The gate's half sides are at least this many standard deviations of the innovation, and at
-    /// least the reference's sides: the papers' gate of three sides. Default 4.
-    pub gate_sigmas: f64,
-    /// Frames without a measurement after which a target is searched for. Default 3.
-    pub search_after_frames: u32,
-    /// How fast the gate's half sides grow in the search, px/s. Default 750.
+    /// Standard deviation of the velocity of a target that is taken up, px/s. Default 120.
+    pub start_velocity_sd_px: f64,
+    /// Standard deviation of a place that is given (a box, a cue), px. Default 0.1.
+    pub given_sd_px: f64,
+    /// Floor of the prediction's standard deviation, px. Default 0.3.
+    pub prediction_floor_px: f64,
+    /// How much of the reference's energy a mismatch with the target may take: its inverse. Default 30;
+    /// at 60 textured background is taken for targets.
+    pub mismatch: f64,
+    /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.3.
+    pub contrast_sd: f64,
+    /// Probability that a target can be seen in an image. Default 0.95.
+    pub visible_probability: f64,
+    /// Share of the prior that lies anywhere in the gate. Default 0.01; it doubles with every image
+    /// without the target.
+    pub anywhere_share: f64,
+    /// How fast the search for a lost target widens, px/s. Default 750.
     pub search_growth_px: f64,
-    /// Score that ends the search. Default 0.55.
-    pub search_score: f64,
-    /// Standard deviation of the velocity after a search, px/s. Default 150.
+    /// Standard deviation of the velocity of a target found again, px/s. Default 150.
     pub search_velocity_sd_px: f64,
-    /// Share of the velocity that a target without a measurement keeps in a thirtieth of a second.
-    /// Default 0.9.
-    pub coasting_velocity: f64,
-    /// A target found by the detector and not measured for this long is given up, s. Default 0.5.
+    /// A target found by the detector and not seen for this long is given up, s. Default 0.5.
     /// One taken up by an operator is never given up.
     pub give_up_after_s: f64,
+    /// What [`Algorithm::Paper`] uses.
+    pub paper: PaperConfig,
     /// Finds targets by itself. Absent (default): only given boxes are followed.
     pub detector: Option<DetectorConfig>,
+}
+
+/// How a target's place is decided.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Algorithm {
+    /// By the posterior over all placements, with the likelihood of the zero-mean correlation in the
+    /// measured noise, the filters' prediction as prior, and a fit between the pixels.
+    #[default]
+    Posterior,
+    /// To the letter of 000 and 001: one peak of one measure, and filters of fixed noise.
+    Paper,
+}
+
+/// The gate (000, section 1; 001, 4.8 and 5.12).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum GateRule {
+    /// A rectangle of three times the reference's sides.
+    ThreeSided,
+    /// At least that, and wide enough for so many standard deviations of the innovation.
+    Innovation {
+        /// Standard deviations. Default 4.
+        sigmas: f64,
+    },
+    /// As wide as the ellipse `r' D^-1 r <= l^2` that holds the target with a probability (001, 4.8 to
+    /// 4.11); a measurement outside it is none.
+    Ellipsoid {
+        /// Probability, 0 to 1.
+        probability: f64,
+    },
+}
+
+impl Default for GateRule {
+    fn default() -> Self {
+        Self::Innovation { sigmas: 4.0 }
+    }
+}
+
+/// The choices of the papers' own algorithm.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PaperConfig {
+    /// The measure (001, chapter 3). Default: cross-correlation.
+    pub similarity: Similarity,
+    /// Whether it wraps round the gate. Default circular, as a product of spectra does.
+    pub extent: Extent,
+    /// Whether the reference is the whole gate about the target. Default true.
+    pub whole_gate: bool,
+    /// Whether the peak is refined between the pixels. Default false.
+    pub sub_pixel: bool,
+    /// Standard deviation of a measurement, px. Default 1.
+    pub measurement_sd_px: f64,
+}
+
+impl Default for PaperConfig {
+    fn default() -> Self {
+        Self {
+            similarity: Similarity::CrossCorrelation,
+            extent: Extent::Circular,
+            whole_gate: true,
+            sub_pixel: false,
+            measurement_sd_px: 1.0,
+        }
+    }
 }
 
 impl Default for TrackerConfig {
     fn default() -> Self {
         Self {
+            algorithm: Algorithm::default(),
+            reference: ReferenceStrategy::default(),
+            gate: GateRule::default(),
+            follow_shape: true,
             margin_px: 2.0,
-            window_share: 0.28,
             noise_floor: 1.0,
-            score_weight: 25.0,
-            prediction_floor_px: 2.0,
             acceleration_sd_px: 900.0,
-            measurement_sd_px: 0.5,
-            quality_scores: [0.3, 0.6],
-            adaptation_scores: [0.4, 0.7],
-            reference_memory: 0.93,
-            anchor_share: 0.15,
-            gate_threshold: 25.0,
-            gate_sigmas: 4.0,
-            search_after_frames: 3,
+            start_velocity_sd_px: 120.0,
+            given_sd_px: 0.1,
+            prediction_floor_px: 0.3,
+            mismatch: 30.0,
+            contrast_sd: 0.3,
+            visible_probability: 0.95,
+            anywhere_share: 0.01,
             search_growth_px: 750.0,
-            search_score: 0.55,
             search_velocity_sd_px: 150.0,
-            coasting_velocity: 0.9,
             give_up_after_s: 0.5,
+            paper: PaperConfig::default(),
             detector: None,
+        }
+    }
+}
+
+impl TrackerConfig {
+    /// The algorithm of 000 and 001 as their tables were made: fixed reference, gate of three sides.
+    pub fn paper() -> Self {
+        Self {
+            algorithm: Algorithm::Paper,
+            reference: ReferenceStrategy::Fixed,
+            gate: GateRule::ThreeSided,
+            follow_shape: false,
+            ..Self::default()
         }
     }
 }
@@ -135,34 +215,57 @@ impl TrackerConfig {
             if good { Ok(()) } else { Err(ConfigError { key, value, must }) }
         };
         let positive = [
-            ("window_share", self.window_share),
             ("noise_floor", self.noise_floor),
-            ("score_weight", self.score_weight),
-            ("prediction_floor_px", self.prediction_floor_px),
             ("acceleration_sd_px", self.acceleration_sd_px),
-            ("measurement_sd_px", self.measurement_sd_px),
-            ("gate_threshold", self.gate_threshold),
-            ("gate_sigmas", self.gate_sigmas),
+            ("start_velocity_sd_px", self.start_velocity_sd_px),
+            ("given_sd_px", self.given_sd_px),
+            ("prediction_floor_px", self.prediction_floor_px),
+            ("mismatch", self.mismatch),
+            ("contrast_sd", self.contrast_sd),
+            ("search_growth_px", self.search_growth_px),
             ("search_velocity_sd_px", self.search_velocity_sd_px),
             ("give_up_after_s", self.give_up_after_s),
+            ("paper.measurement_sd_px", self.paper.measurement_sd_px),
         ];
         for (key, value) in positive {
             check(key, value, value.is_finite() && value > 0.0, "a positive number")?;
         }
-        let shares = [
-            ("reference_memory", self.reference_memory),
-            ("anchor_share", self.anchor_share),
-            ("coasting_velocity", self.coasting_velocity),
-        ];
-        for (key, value) in shares {
-            check(key, value, (0.0..=1.0).contains(&value), "from 0 to 1")?;
-        }
+        let within = |value: f64| value > 0.0 && value < 1.0;
+        let visible = self.visible_probability;
+        check("visible_probability", visible, within(visible), "between 0 and 1")?;
+        check("anywhere_share", self.anywhere_share, within(self.anywhere_share), "between 0 and 1")?;
         let margin = self.margin_px;
         check("margin_px", margin, (0.0..=100.0).contains(&margin), "from 0 to 100 px")?;
-        for (key, [low, high]) in
-            [("quality_scores", self.quality_scores), ("adaptation_scores", self.adaptation_scores)]
-        {
-            check(key, low, low < high, "smaller than the second of the two")?;
+        match self.gate {
+            GateRule::ThreeSided => {}
+            GateRule::Innovation { sigmas } => {
+                check("gate.sigmas", sigmas, (0.0..=100.0).contains(&sigmas), "from 0 to 100")?;
+            }
+            GateRule::Ellipsoid { probability } => {
+                check("gate.probability", probability, within(probability), "between 0 and 1")?;
+            }
+        }
+        match self.reference {
+            ReferenceStrategy::Smoothing { memory: share }
+            | ReferenceStrategy::Mean { least_share: share } => {
+                check("reference", f64::from(share), (0.0..=1.0).contains(&share), "from 0 to 1")?;
+            }
+            ReferenceStrategy::PixelImm(imm) => {
+                let good = [imm.constant_sd, imm.drift_sd, imm.jump_sd]
+                    .iter()
+                    .all(|sd| sd.is_finite() && *sd >= 0.0)
+                    && imm.jump_rate.is_finite()
+                    && imm.jump_rate > 1e-3
+                    && imm.stay > 0.0
+                    && imm.stay < 1.0;
+                check(
+                    "reference",
+                    f64::from(imm.jump_rate),
+                    good,
+                    "of finite noises, a positive rate and a probability",
+                )?;
+            }
+            ReferenceStrategy::Fixed | ReferenceStrategy::Replacement => {}
         }
         if let Some(detector) = &self.detector {
             let memory = detector.background_memory;

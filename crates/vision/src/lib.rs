@@ -25,13 +25,23 @@
 //! # Ok::<(), crossfix_vision::ConfigError>(())
 //! ```
 
+mod appearance;
 mod config;
 mod detector;
+mod lanes;
+mod likelihood;
+mod lowpass;
+mod noise;
+mod paper;
+mod posterior;
+mod reference;
+mod search;
 mod target;
 mod tracker;
 
-pub use config::{ConfigError, DetectorConfig, TrackerConfig};
-pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, TrackPhase};
+pub use config::{Algorithm, ConfigError, DetectorConfig, GateRule, PaperConfig, TrackerConfig};
+pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
+pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, Measurement, TrackPhase};
 
 /// A place in the image, pixels; (0, 0) is the middle of the top left pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,53 +1,112 @@
-//! One target: its reference, its two filters, and one step with one image.
+//! One target followed by the posterior over its placements: the likelihood of every placement in
+//! the gate and the filters' prediction give where it is, how well that is known, and whether it can
+//! be seen at all.
 
-use crossfix_correlation::{Correlator, Plane, Reference, Window};
+use crossfix_correlation::{Correlator, Fit, FitOptions, Freedom, Plane, Statistics};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
+use nalgebra::Matrix2;
 
+use crate::appearance::{Appearance, Drift, Workshop};
+use crate::config::GateRule;
+use crate::likelihood::{Expectation, log_ratios};
+use crate::noise::NoiseMeter;
+use crate::posterior::{Part, Posterior, PosteriorMap, Prior};
+use crate::search::{Background, Search};
+use crate::tracker::Measurement;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// A measurement of less quality than this is none.
-const LEAST_QUALITY: f64 = 0.05;
-/// The frame interval to which the coasting velocity's share refers, s.
-const COASTING_INTERVAL: f64 = 1.0 / 30.0;
+/// Frames without the target after which it is searched for.
+pub(crate) const SEARCH_AFTER_FRAMES: u32 = 3;
+/// The frame interval to which shares a frame refer, s.
+pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
+/// Share of a frame's noise in the running estimate.
+const NOISE_SHARE: f32 = 0.3;
+/// Variance below which a fit is narrower than the pixels of the map, px^2.
+const NARROW: f64 = 0.5;
+/// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
+const MANOEUVRE: f64 = 25.0;
+/// Certainty above which a target counts as seen.
+const SEEN: f64 = 0.5;
+/// Log ratio of a placement outside the image.
+const IMPOSSIBLE: f32 = -50.0;
+/// How much of what the reference does not explain counts as noise: it is not white.
+const UNEXPLAINED_WEIGHT: f64 = 10.0;
+/// Floor of a measurement's standard deviation, px.
+const LEAST_MEASUREMENT_SD: f64 = 0.03;
+/// Correlations at which an image is not learned at all, and fully.
+const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
+/// How fast the contrast, the log scale and the turn wander, a frame; and the floors of their
+/// measurements' standard deviations.
+const CONTRAST_WALK: f64 = 0.14;
+const SCALE_WALK: f64 = 0.006;
+const TURN_WALK: f64 = 0.02;
+const CONTRAST_FLOOR: f64 = 0.1;
+const SHAPE_FLOOR: f64 = 0.05;
 
-/// Where a reference was found, and how well it fits there.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Match {
-    place: ImagePoint,
-    score: f64,
+/// Memory that all targets of a tracker share.
+#[derive(Debug, Default)]
+pub(crate) struct Workbench {
+    pub(crate) workshop: Workshop,
+    pub(crate) correlator: Correlator,
+    pub(crate) meter: NoiseMeter,
+    pub(crate) gate: Plane,
+    pub(crate) statistics: Statistics,
+    pub(crate) ratios: Plane,
+    pub(crate) search: Search,
+    map: PosteriorMap,
+}
+
+/// The next image, and what goes with it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Frame<'a> {
+    pub(crate) image: &'a Plane,
+    /// Time since the image before, s.
+    pub(crate) interval: f64,
+    /// A picture of a moment ago, in which every target was seen.
+    pub(crate) keepsake: Option<&'a Plane>,
+    pub(crate) config: &'a TrackerConfig,
 }
 
 /// What one step of one target gave.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Step {
-    /// The measured place with its variance (px^2, either axis), if there is one.
-    pub(crate) measured: Option<(ImagePoint, f64)>,
+    /// The measured place, if the target was seen.
+    pub(crate) measured: Option<Measurement>,
     /// The correlation at the best place.
     pub(crate) score: f64,
+    /// Probability that the target is at the best place.
+    pub(crate) certainty: f64,
 }
 
-/// The filters of both axes; absent until the second measurement.
-#[derive(Clone, Debug)]
-enum Motion {
-    /// One measurement, that of the box: nothing is known of the velocity.
-    Still(ImagePoint),
-    /// 000: the fourth-order filter splits into two of the second order.
-    Moving { x: AxisFilter, y: AxisFilter },
+/// A reference fitted to the image at the best placement.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Look {
+    pub(crate) place: ImagePoint,
+    pub(crate) covariance: Matrix2<f64>,
+    /// Contrast over the reference's.
+    contrast: f64,
+    /// Log scale and turn, with their variances.
+    shape: Option<[(f64, f64); 2]>,
+    /// Correlation with the noise taken out.
+    pub(crate) score: f64,
 }
 
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
-    /// Sides of the box, px.
-    pub(crate) width: f64,
-    pub(crate) height: f64,
-    reference: Reference,
-    anchor: Reference,
-    motion: Motion,
-    /// Frames in a row without a measurement.
-    missed: u32,
-    /// Time since the search began, s.
-    searching_s: f64,
+    pub(crate) appearance: Appearance,
+    axes: [AxisFilter; 2],
+    /// Variance of the image's noise.
+    pub(crate) noise: f32,
+    pub(crate) contrast: f64,
+    pub(crate) contrast_variance: f64,
+    shape_variances: [f64; 2],
+    pub(crate) missed: u32,
+    is_new: bool,
+    pub(crate) last_seen: ImagePoint,
+    /// Where it was in the tracker's keepsake picture.
+    pub(crate) in_keepsake: Option<ImagePoint>,
+    pub(crate) background: Option<Background>,
 }
 
 /// 0 below the first value, 1 above the second, linear between.
@@ -57,223 +116,372 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 
 impl Target {
     /// Takes a target up: the box and a margin become the reference (001, object model).
-    pub(crate) fn new(image: &Plane, place: PixelBox, config: &TrackerConfig) -> Self {
-        let side = |length: f64| (length + 2.0 * config.margin_px).round().max(3.0) as usize;
-        let (width, height) = (side(place.width), side(place.height));
+    ///
+    /// The velocity is unknown but for its prior: with the next measurement the state becomes that of
+    /// 000 (13)-(14), shrunk towards rest by the share of the measurement's variance in the prior's.
+    pub(crate) fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
         let centre = place.centre();
-        let window = Window::gaussian(width, height, config.window_share);
-        let crop = image.crop_centred(centre.x, centre.y, width, height);
-        let reference = Reference::new(crop, &window);
+        let around = [place.width, place.height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
+        let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
+        image.crop_into(corner[0] as isize, corner[1] as isize, around[0], around[1], &mut bench.gate);
+        let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
+        let start = |position| {
+            let first = AxisMeasurement { position, variance: LEAST_MEASUREMENT_SD.powi(2) };
+            AxisFilter::start_at_rest(first, config.start_velocity_sd_px, config.acceleration_sd_px)
+        };
         Self {
-            width: place.width,
-            height: place.height,
-            anchor: reference.clone(),
-            reference,
-            motion: Motion::Still(centre),
+            appearance: Appearance::new(image, place, noise, config, &mut bench.workshop),
+            axes: [start(centre.x), start(centre.y)],
+            noise,
+            contrast: 1.0,
+            contrast_variance: 0.0,
+            shape_variances: [1e-6; 2],
             missed: 0,
-            searching_s: 0.0,
+            is_new: true,
+            last_seen: centre,
+            in_keepsake: None,
+            background: None,
         }
     }
 
     /// Where the target is believed to be.
     pub(crate) fn position(&self) -> ImagePoint {
-        match &self.motion {
-            Motion::Still(place) => *place,
-            Motion::Moving { x, y } => ImagePoint { x: x.position(), y: y.position() },
-        }
-    }
-
-    /// Whether it has been missed so often that it is searched for.
-    pub(crate) fn is_searching(&self, config: &TrackerConfig) -> bool {
-        self.missed >= config.search_after_frames
+        ImagePoint { x: self.axes[0].position(), y: self.axes[1].position() }
     }
 
     /// How fast it is believed to move, px/s.
     pub(crate) fn velocity(&self) -> ImagePoint {
-        match &self.motion {
-            Motion::Still(_) => ImagePoint { x: 0.0, y: 0.0 },
-            Motion::Moving { x, y } => ImagePoint { x: x.velocity(), y: y.velocity() },
+        ImagePoint { x: self.axes[0].velocity(), y: self.axes[1].velocity() }
+    }
+
+    pub(crate) fn axes(&self) -> &[AxisFilter; 2] {
+        &self.axes
+    }
+
+    pub(crate) fn is_searching(&self) -> bool {
+        self.missed >= SEARCH_AFTER_FRAMES
+    }
+
+    /// What is expected of the target in the image.
+    pub(crate) fn expectation(
+        &self,
+        noise: f32,
+        energy: f32,
+        pixels: f32,
+        config: &TrackerConfig,
+    ) -> Expectation {
+        let contrast = self.contrast * f64::from(self.appearance.clear_share());
+        let variance = (config.contrast_sd * contrast).powi(2) + self.contrast_variance;
+        Expectation {
+            // A reference of nothing is found nowhere.
+            energy: energy.max(1e-3 * pixels * noise),
+            pixels,
+            noise: noise.max(f32::MIN_POSITIVE),
+            contrast: contrast as f32,
+            contrast_variance: variance as f32,
+            mismatch: config.mismatch as f32,
         }
     }
 
-    /// Follows the target into the next image, `interval` seconds later.
-    pub(crate) fn step(
-        &mut self,
-        image: &Plane,
-        interval: f64,
-        correlator: &mut Correlator,
-        config: &TrackerConfig,
-    ) -> Step {
-        match self.motion.clone() {
-            Motion::Still(first) => self.second_measurement(first, image, interval, correlator, config),
-            Motion::Moving { x, y } => {
-                self.motion = Motion::Moving {
-                    x: self.predicted(x, interval, image.width(), config),
-                    y: self.predicted(y, interval, image.height(), config),
-                };
-                if self.is_searching(config) {
-                    self.searching_s += interval;
-                    self.search(image, correlator, config)
-                } else {
-                    self.follow(image, correlator, config)
-                }
+    /// Follows the target into the next image.
+    pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+        let Frame { image, interval, .. } = frame;
+        for (axis, side) in self.axes.iter_mut().zip([image.width(), image.height()]) {
+            axis.time_update(interval);
+            let edge = side as f64 - 1.0;
+            if !(0.0..=edge).contains(&axis.position()) {
+                // Out of the picture: it is waited for at the border.
+                axis.hold_at(axis.position().clamp(0.0, edge));
             }
         }
+        let frames = interval / FRAME_INTERVAL;
+        let [scale, turn] = &mut self.shape_variances;
+        *scale = (*scale + SCALE_WALK.powi(2) * frames).min(0.09);
+        *turn = (*turn + TURN_WALK.powi(2) * frames).min(0.25);
+        if self.is_searching() { self.search(frame, bench) } else { self.follow(frame, bench) }
     }
 
-    fn predicted(
-        &self,
-        mut axis: AxisFilter,
-        interval: f64,
-        side: usize,
-        config: &TrackerConfig,
-    ) -> AxisFilter {
-        axis.time_update(interval);
-        if self.missed > 0 {
-            axis.damp_velocity(config.coasting_velocity.powf(interval / COASTING_INTERVAL));
-        }
-        let edge = side as f64 - 1.0;
-        if !(0.0..=edge).contains(&axis.position()) {
-            // Out of the picture: it is waited for at the border.
-            axis.hold_at(axis.position().clamp(0.0, edge));
-        }
-        axis
-    }
-
-    /// The start from two measurements (000, equations 13-14): the box, and the peak after it.
-    fn second_measurement(
-        &mut self,
-        first: ImagePoint,
-        image: &Plane,
-        interval: f64,
-        correlator: &mut Correlator,
-        config: &TrackerConfig,
-    ) -> Step {
-        let found = self.best_match(image, first, [0.0; 2], None, correlator, config);
-        let variance = config.measurement_sd_px.powi(2);
-        let start = |first: f64, second: f64| {
+    /// Takes a place in the next image from somebody who knows it, instead of measuring it: with the
+    /// box it is the start from two measurements (000 (13)-(14)).
+    pub(crate) fn take_place(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> Step {
+        let Frame { image, interval, config, .. } = frame;
+        let variance = config.given_sd_px.powi(2);
+        for (axis, position) in self.axes.iter_mut().zip([place.x, place.y]) {
             let at = |position| AxisMeasurement { position, variance };
-            AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px)
-        };
-        self.motion = Motion::Moving { x: start(first.x, found.place.x), y: start(first.y, found.place.y) };
-        self.adapt(image, found, config);
-        Step { measured: Some((found.place, variance)), score: found.score }
+            *axis = AxisFilter::start(at(axis.position()), at(position), interval, config.acceleration_sd_px);
+        }
+        self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
+        self.seen(place);
+        let measured = Measurement { place, covariance: Matrix2::identity() * variance };
+        Step { measured: Some(measured), score: 1.0, certainty: 1.0 }
     }
 
-    fn follow(&mut self, image: &Plane, correlator: &mut Correlator, config: &TrackerConfig) -> Step {
-        let Motion::Moving { x, y } = &self.motion else {
-            return Step { measured: None, score: 0.0 };
-        };
-        let variance = config.measurement_sd_px.powi(2);
+    /// Half sides of the gate (000, section 1; 001, 5.12): how far from the prediction the reference is
+    /// placed.
+    pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
+        let reference = self.appearance.working.image();
+        let sides = [(reference.width(), image.width()), (reference.height(), image.height())];
+        [0, 1].map(|i| {
+            let (side, most) = sides[i];
+            let sigmas = match config.gate {
+                GateRule::ThreeSided => 0.0,
+                GateRule::Innovation { sigmas } => sigmas,
+                GateRule::Ellipsoid { probability } => Gate::with_probability(probability).threshold().sqrt(),
+            };
+            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil();
+            (side as f64).max(spread).min(most as f64) as usize
+        })
+    }
+
+    fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+        let Frame { image, config, .. } = frame;
         let predicted = self.position();
-        let spread = [x.position_variance() + variance, y.position_variance() + variance];
-        let found = self.best_match(image, predicted, spread, Some(spread), correlator, config);
-        let at = |position| AxisMeasurement { position, variance };
-        // The ellipsoidal gate of both axes (001, equation 4.8).
-        let nis = x.innovation(at(found.place.x)).normalised_squared()
-            + y.innovation(at(found.place.y)).normalised_squared();
-        let inside = Gate::with_threshold(config.gate_threshold).holds(nis);
-        let quality = if inside { ramp(found.score, config.quality_scores) } else { 0.0 };
-        if quality <= LEAST_QUALITY {
-            self.missed += 1;
-            return Step { measured: None, score: found.score };
-        }
-        let variance = variance / quality;
-        let at = |position| AxisMeasurement { position, variance };
-        if let Motion::Moving { x, y } = &mut self.motion {
-            x.measurement_update(at(found.place.x));
-            y.measurement_update(at(found.place.y));
-        }
-        self.missed = 0;
-        self.adapt(image, found, config);
-        Step { measured: Some((found.place, variance)), score: found.score }
+        let half = self.half_gate(image, config);
+        let middle = [predicted.x.round(), predicted.y.round()];
+        let reference = self.appearance.working.image();
+        let sides = [reference.width(), reference.height()];
+        // Column 0 of the map is the placement whose middle is `origin`.
+        let origin = [0, 1].map(|i| middle[i] - half[i] as f64);
+        let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
+        let gate_sides = [0, 1].map(|i| 2 * half[i] + sides[i]);
+        image.crop_into(corner[0], corner[1], gate_sides[0], gate_sides[1], &mut bench.gate);
+        let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
+        self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
+
+        bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
+        let expected =
+            self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
+        log_ratios(&bench.statistics, expected, &mut bench.ratios);
+        mask_outside(&mut bench.ratios, origin, image);
+        let prior = Prior {
+            centre: [predicted.x - origin[0], predicted.y - origin[1]],
+            variance: [0, 1].map(|i| self.axes[i].position_variance() + config.prediction_floor_px.powi(2)),
+            anywhere: (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5),
+            visible: config.visible_probability,
+            near: sides.map(|side| (side / 8).max(2)),
+        };
+        let posterior = bench.map.of(&bench.ratios, &prior);
+        let [column, row] = posterior.peak;
+        let look = self.look(column, row, origin, bench, config);
+        self.update(frame, &posterior, look, origin, bench)
     }
 
-    /// Looks for a lost target in a gate that grows.
-    fn search(&mut self, image: &Plane, correlator: &mut Correlator, config: &TrackerConfig) -> Step {
-        let Motion::Moving { x, y } = &self.motion else {
-            return Step { measured: None, score: 0.0 };
-        };
-        let spread = [x.position_variance(), y.position_variance()];
-        let found = self.best_match(image, self.position(), spread, None, correlator, config);
-        let quality = ramp(found.score, config.quality_scores);
-        if found.score < config.search_score || quality <= LEAST_QUALITY {
-            self.missed += 1;
-            return Step { measured: None, score: found.score };
-        }
-        let variance = config.measurement_sd_px.powi(2);
-        let start = |position| {
-            let first = AxisMeasurement { position, variance };
-            AxisFilter::start_at_rest(first, config.search_velocity_sd_px, config.acceleration_sd_px)
-        };
-        self.motion = Motion::Moving { x: start(found.place.x), y: start(found.place.y) };
-        self.missed = 0;
-        self.searching_s = 0.0;
-        Step { measured: Some((found.place, variance / quality)), score: found.score }
-    }
-
-    /// The best place in the gate about `centre`: the peak of the correlation, or with a `prior`
-    /// variance an axis, of the correlation and the prediction's log density together.
-    fn best_match(
-        &self,
-        image: &Plane,
-        centre: ImagePoint,
-        spread: [f64; 2],
-        prior: Option<[f64; 2]>,
-        correlator: &mut Correlator,
+    /// Fits the reference at a placement of the gate.
+    pub(crate) fn look(
+        &mut self,
+        column: usize,
+        row: usize,
+        origin: [f64; 2],
+        bench: &mut Workbench,
         config: &TrackerConfig,
-    ) -> Match {
-        let (width, height) = (self.reference.image().width(), self.reference.image().height());
-        let grown = config.search_growth_px * self.searching_s;
-        let half = |side: usize, variance: f64, limit: usize| {
-            let sigmas = (config.gate_sigmas * variance.sqrt()).ceil();
-            (side as f64 + grown).max(sigmas).min(limit as f64) as isize
-        };
-        let half_x = half(width, spread[0], image.width());
-        let half_y = half(height, spread[1], image.height());
-        // A reference of even sides has its middle between two pixels.
-        let offset = |side: usize| if side.is_multiple_of(2) { 0.5 } else { 0.0 };
-        let left = centre.x.round() as isize - half_x;
-        let top = centre.y.round() as isize - half_y;
-        let gate = image.crop(
-            left - (width as isize - 1) / 2,
-            top - (height as isize - 1) / 2,
-            2 * half_x as usize + width,
-            2 * half_y as usize + height,
-        );
-        let anchor = config.anchor_share as f32;
-        let references = [(&self.reference, 1.0 - anchor), (&self.anchor, anchor)];
-        let scores = correlator.mixed_scores(&gate, &references, config.noise_floor as f32);
-
-        let x_of = |column: f64| left as f64 + column + offset(width);
-        let y_of = |row: f64| top as f64 + row + offset(height);
-        let (edge_x, edge_y) = (image.width() as f64 - 1.0, image.height() as f64 - 1.0);
-        let weight = config.score_weight as f32;
-        let penalty = |distance: f64, variance: f64| {
-            (0.5 * distance.powi(2) / (variance + config.prediction_floor_px.powi(2))) as f32
-        };
-        let posterior = Plane::from_fn(scores.width(), scores.height(), |column, row| {
-            let (x, y) = (x_of(column as f64), y_of(row as f64));
-            if !(0.0..=edge_x).contains(&x) || !(0.0..=edge_y).contains(&y) {
-                return f32::NEG_INFINITY;
-            }
-            let from_prediction =
-                prior.map_or(0.0, |[vx, vy]| penalty(x - centre.x, vx) + penalty(y - centre.y, vy));
-            weight * scores.row(row)[column] - from_prediction
-        });
-        let best = posterior.peak();
-        let score = scores.row(best.row)[best.column];
-        let peak = crossfix_correlation::Peak { score, ..best }.refined(&scores);
-        Match { place: ImagePoint { x: x_of(peak.x), y: y_of(peak.y) }, score: f64::from(score) }
+    ) -> Look {
+        let working = &self.appearance.working;
+        let freedom = if config.follow_shape { Freedom::ShiftScaleTurn } else { Freedom::Shift };
+        let options = FitOptions { border: 1, steps: 2, freedom, stiffness: 0.0 };
+        let fit = bench.workshop.fitter.fit(&bench.gate, working, column as f64, row as f64, options);
+        let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
+        let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
+        let contrast = fit.gain.max(least_contrast);
+        let (reference_noise, slope_noise) = self.appearance.noise();
+        let explained = image_noise * (1.0 + 2.0 * (2.0 / pixels).sqrt());
+        let unexplained =
+            (fit.residual_variance - explained - f64::from(reference_noise) * contrast * contrast).max(0.0);
+        let noise = image_noise + UNEXPLAINED_WEIGHT * unexplained;
+        let covariance = self.covariance(&fit, noise, f64::from(slope_noise) * pixels, contrast);
+        let drift = self.appearance.in_image(self.appearance.drift);
+        let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
+        let scaled = noise * (fit.gain / contrast).powi(2);
+        let Drift { log_scale, turn_rad, .. } = self.appearance.drift;
+        let shape = fit
+            .shape_variances(scaled)
+            .map(|[scale, turn]| [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]);
+        let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
+        let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
+        let score = (energy / (energy + rest + 1e-12)).sqrt();
+        Look { place, covariance, contrast, shape, score }
     }
 
-    /// Exponential adaptation of the reference, the more the better it fits (003).
-    fn adapt(&mut self, image: &Plane, found: Match, config: &TrackerConfig) {
-        let share = (1.0 - config.reference_memory) * ramp(found.score, config.adaptation_scores);
-        if share > 0.0 {
-            let (width, height) = (self.reference.image().width(), self.reference.image().height());
-            let crop = image.crop_centred(found.place.x, found.place.y, width, height);
-            self.reference = self.reference.adapted(&crop, (1.0 - share) as f32);
+    /// The covariance of a fit: the bound in the image's noise, and what of the reference's gradient
+    /// is itself noise.
+    fn covariance(&self, fit: &Fit, noise: f64, slope_noise: f64, contrast: f64) -> Matrix2<f64> {
+        let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
+            return Matrix2::identity();
+        };
+        let clear = fit.gradient_energy.map(|energy| (1.0 - slope_noise / energy.max(1e-12)).clamp(0.15, 1.0));
+        let floor = LEAST_MEASUREMENT_SD.powi(2);
+        Matrix2::from_fn(|i, j| {
+            bound[(i, j)] / (clear[i] * clear[j]).sqrt() + if i == j { floor } else { 0.0 }
+        })
+    }
+
+    /// Takes the posterior into the filters and the target's image into the reference.
+    fn update(
+        &mut self,
+        frame: Frame<'_>,
+        posterior: &Posterior,
+        look: Look,
+        origin: [f64; 2],
+        bench: &mut Workbench,
+    ) -> Step {
+        let certainty = posterior.near.mass;
+        let at = [look.place.x, look.place.y];
+        let variances = [look.covariance.m11, look.covariance.m22];
+        let distance: f64 = (0..2)
+            .map(|i| {
+                let measurement = AxisMeasurement { position: at[i], variance: variances[i] };
+                self.axes[i].innovation(measurement).normalised_squared()
+            })
+            .sum();
+        let step = |measured| Step { measured, score: look.score, certainty };
+        let measured = Measurement { place: look.place, covariance: look.covariance };
+        if let GateRule::Ellipsoid { probability } = frame.config.gate
+            && !Gate::with_probability(probability).holds(distance)
+        {
+            self.missed += 1;
+            return step(None);
+        }
+        if certainty > SEEN && distance > MANOEUVRE {
+            // Certain, and not where it was expected: the filters are too sure of themselves.
+            for i in 0..2 {
+                self.axes[i].inflate(distance / MANOEUVRE);
+                self.axes[i].measurement_update(AxisMeasurement { position: at[i], variance: variances[i] });
+            }
+            self.seen(look.place);
+            self.learn(frame, look.place, look, certainty, bench);
+            return step(Some(measured));
+        }
+        self.condition(posterior, at, variances, origin);
+        let estimate = self.position();
+        if certainty > SEEN {
+            self.seen(estimate);
+        } else {
+            self.missed += 1;
+        }
+        self.learn(frame, estimate, look, certainty, bench);
+        step((certainty > SEEN).then_some(measured))
+    }
+
+    /// The mixture of near, elsewhere and not seen, an axis, by its mean and variance.
+    fn condition(&mut self, posterior: &Posterior, at: [f64; 2], variances: [f64; 2], origin: [f64; 2]) {
+        let narrow = variances.iter().all(|v| *v < NARROW);
+        for i in 0..2 {
+            let (prior_mean, prior) = (self.axes[i].position(), self.axes[i].position_variance());
+            let (near_mean, near_variance) = if narrow {
+                let gain = prior / (prior + variances[i]);
+                (prior_mean + gain * (at[i] - prior_mean), (1.0 - gain) * prior)
+            } else {
+                (origin[i] + posterior.near.mean[i], posterior.near.variance[i])
+            };
+            let Part { mass, mean, variance } = posterior.elsewhere;
+            let parts = [
+                (posterior.near.mass, near_mean, near_variance),
+                (mass, origin[i] + mean[i], variance[i]),
+                (posterior.unseen, prior_mean, prior),
+            ];
+            let mean: f64 = parts.iter().map(|(mass, mean, _)| mass * mean).sum();
+            let spread: f64 =
+                parts.iter().map(|(mass, at, variance)| mass * (variance + (at - mean).powi(2))).sum();
+            self.axes[i].condition(AxisMeasurement { position: mean, variance: spread.min(4.0 * prior) });
+        }
+    }
+
+    fn seen(&mut self, place: ImagePoint) {
+        self.missed = 0;
+        self.is_new = false;
+        self.last_seen = place;
+        self.background = None;
+    }
+
+    /// Follows contrast, size, direction and appearance, the more the surer the target was seen.
+    fn learn(
+        &mut self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        look: Look,
+        certainty: f64,
+        bench: &mut Workbench,
+    ) {
+        let Frame { image, interval, .. } = frame;
+        if certainty < 0.05 {
+            return;
+        }
+        if certainty > SEEN {
+            let clear = f64::from(self.appearance.clear_share());
+            let measured = look.contrast / clear;
+            let variance =
+                f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2) + CONTRAST_FLOOR.powi(2);
+            self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
+            let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
+            self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
+            self.contrast_variance *= 1.0 - gain;
+            self.follow_shape(look);
+        }
+        let certainty = certainty * ramp(look.score, LEARNING_SCORES);
+        if certainty >= 0.02 {
+            self.appearance.learn(image, place, self.noise, certainty as f32, interval, &mut bench.workshop);
+        }
+    }
+
+    fn follow_shape(&mut self, look: Look) {
+        let Some(shape) = look.shape else { return };
+        let limits = [0.2, 0.5];
+        let mut steps = [0.0; 2];
+        for i in 0..2 {
+            let (change, variance) = shape[i];
+            if variance < 0.1 && change.abs() < limits[i] {
+                let known = &mut self.shape_variances[i];
+                let gain = *known / (*known + variance + SHAPE_FLOOR.powi(2));
+                steps[i] = gain * change;
+                *known *= 1.0 - gain;
+            }
+        }
+        self.appearance.reshape(steps[0], steps[1]);
+    }
+
+    fn search(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+        let config = frame.config;
+        let found = crate::search::find(self, frame, bench);
+        let Some(look) = found.look.filter(|_| found.accepted) else {
+            self.missed += 1;
+            return Step { measured: None, score: found.look.map_or(0.0, |look| look.score), certainty: 0.0 };
+        };
+        let at = [look.place.x, look.place.y];
+        let variances = [look.covariance.m11, look.covariance.m22];
+        for i in 0..2 {
+            let axis = &mut self.axes[i];
+            let near = (at[i] - axis.position()).powi(2) < MANOEUVRE * axis.position_variance();
+            if self.missed < 20 && near {
+                let variance = variances[i].min(axis.position_variance());
+                axis.condition(AxisMeasurement { position: at[i], variance });
+            } else {
+                let first = AxisMeasurement { position: at[i], variance: variances[i] };
+                *axis =
+                    AxisFilter::start_at_rest(first, config.search_velocity_sd_px, config.acceleration_sd_px);
+            }
+        }
+        self.seen(look.place);
+        let measured = Measurement { place: look.place, covariance: look.covariance };
+        Step { measured: Some(measured), score: look.score, certainty: 1.0 }
+    }
+}
+
+/// Placements whose middle lies outside the image are impossible.
+fn mask_outside(ratios: &mut Plane, origin: [f64; 2], image: &Plane) {
+    let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
+    let (width, height) = (ratios.width(), ratios.height());
+    let whole = inside(origin[0], image.width())
+        && inside(origin[1], image.height())
+        && inside(origin[0] + width as f64 - 1.0, image.width())
+        && inside(origin[1] + height as f64 - 1.0, image.height());
+    if whole {
+        return;
+    }
+    for row in 0..height {
+        let row_inside = inside(origin[1] + row as f64, image.height());
+        for (column, ratio) in ratios.row_mut(row).iter_mut().enumerate() {
+            if !row_inside || !inside(origin[0] + column as f64, image.width()) {
+                *ratio = IMPOSSIBLE;
+            }
         }
     }
 }

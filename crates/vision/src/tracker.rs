@@ -1,10 +1,13 @@
 use std::fmt;
 
-use crossfix_correlation::{Correlator, Plane};
+use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
+use nalgebra::Matrix2;
 
+use crate::config::Algorithm;
 use crate::detector::Detector;
-use crate::target::Target;
+use crate::paper::PaperTarget;
+use crate::target::{Frame, Step, Target, Workbench};
 use crate::{ConfigError, ImagePoint, PixelBox, TrackerConfig};
 
 /// Steps longer than this are taken as this: after a pause nothing is known of a target anyway.
@@ -33,6 +36,15 @@ pub enum TrackPhase {
     Searching,
 }
 
+/// A place measured in one image, whatever was known before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measurement {
+    /// The target's centre.
+    pub place: ImagePoint,
+    /// Its covariance, x and y, px^2.
+    pub covariance: Matrix2<f64>,
+}
+
 /// One target in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageTrack {
@@ -44,14 +56,18 @@ pub struct ImageTrack {
     pub position: ImagePoint,
     /// Its velocity, px/s.
     pub velocity: ImagePoint,
-    /// The centre as measured in this image alone, with its variance (px^2, either axis).
-    pub measured: Option<(ImagePoint, f64)>,
+    /// Covariance of position and velocity on x and on y; absent until there is a velocity.
+    pub covariances: Option<[Matrix2<f64>; 2]>,
+    /// The centre as measured in this image alone.
+    pub measured: Option<Measurement>,
     /// Sides of the box, px.
     pub width: f64,
     /// Sides of the box, px.
     pub height: f64,
     /// Correlation at the best place, -1 to 1.
     pub score: f64,
+    /// Probability that the target is at the best place and nowhere else.
+    pub certainty: f64,
 }
 
 /// Who took a target up.
@@ -63,13 +79,88 @@ enum Origin {
     Detected,
 }
 
+/// A target as one of the algorithms follows it.
+#[derive(Debug)]
+enum Follower {
+    Posterior(Box<Target>),
+    Paper(Box<PaperTarget>),
+}
+
+impl Follower {
+    fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
+        match config.algorithm {
+            Algorithm::Posterior => Self::Posterior(Box::new(Target::new(image, place, bench, config))),
+            Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
+        }
+    }
+
+    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
+        match (self, cue) {
+            (Self::Posterior(target), None) => target.step(frame, bench),
+            (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
+            (Self::Paper(target), None) => target.step(frame.image, frame.interval, bench, frame.config),
+            (Self::Paper(target), Some(place)) => target.take_place(place, frame.interval, frame.config),
+        }
+    }
+
+    fn position(&self) -> ImagePoint {
+        match self {
+            Self::Posterior(target) => target.position(),
+            Self::Paper(target) => target.position(),
+        }
+    }
+
+    fn velocity(&self) -> ImagePoint {
+        match self {
+            Self::Posterior(target) => target.velocity(),
+            Self::Paper(target) => target.velocity(),
+        }
+    }
+
+    fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
+        let axes = match self {
+            Self::Posterior(target) => Some(target.axes()),
+            Self::Paper(target) => target.axes(),
+        };
+        axes.map(|axes| [axes[0].covariance(), axes[1].covariance()])
+    }
+
+    /// Width and height of the target, px.
+    fn size(&self) -> [f64; 2] {
+        match self {
+            Self::Posterior(target) => target.appearance.size.map(|side| side * target.appearance.scale),
+            Self::Paper(target) => target.size,
+        }
+    }
+
+    fn is_searching(&self) -> bool {
+        matches!(self, Self::Posterior(target) if target.is_searching())
+    }
+
+    fn is_seen(&self) -> bool {
+        !matches!(self, Self::Posterior(target) if target.missed > 0)
+    }
+}
+
 #[derive(Debug)]
 struct Followed {
     id: ImageTrackId,
     origin: Origin,
-    target: Target,
+    target: Follower,
     measured_at: Timestamp,
+    /// Where it is in the next image, if somebody said so.
+    cue: Option<ImagePoint>,
 }
+
+/// A picture of a moment ago in which every target was seen: what a lost target is not.
+#[derive(Debug)]
+struct Keepsake {
+    picture: Plane,
+    taken: Timestamp,
+}
+
+/// Age at which a keepsake is replaced, s.
+const KEEPSAKE_AGE: f64 = 0.5;
 
 /// Finds and follows targets in one image stream.
 ///
@@ -78,7 +169,10 @@ struct Followed {
 #[derive(Debug)]
 pub struct ImageTracker {
     config: TrackerConfig,
-    correlator: Correlator,
+    bench: Workbench,
+    keepsake: Option<Keepsake>,
+    /// The image with its broken pixels mended, if it has any.
+    mended: Plane,
     detector: Option<Detector>,
     waiting: Vec<PixelBox>,
     followed: Vec<Followed>,
@@ -97,7 +191,9 @@ impl ImageTracker {
         let detector = config.detector.clone().map(Detector::new);
         Ok(Self {
             config,
-            correlator: Correlator::default(),
+            bench: Workbench::default(),
+            keepsake: None,
+            mended: Plane::default(),
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),
@@ -111,6 +207,16 @@ impl ImageTracker {
     pub fn take_up(&mut self, place: PixelBox) {
         if place.is_possible() {
             self.waiting.push(place);
+        }
+    }
+
+    /// Tells where a target is in the next image (an operator, a cue): the place is taken instead of
+    /// measured. With the box it is the start from two measurements (000 (13)-(14)). A track that is
+    /// not there, or a place that is not finite, is left out.
+    pub fn cue(&mut self, id: ImageTrackId, place: ImagePoint) {
+        let known = self.followed.iter_mut().find(|followed| followed.id == id);
+        if let Some(followed) = known.filter(|_| place.x.is_finite() && place.y.is_finite()) {
+            followed.cue = Some(place);
         }
     }
 
@@ -130,24 +236,53 @@ impl ImageTracker {
         let interval = self.last.map_or(0.0, |(last, ..)| time.seconds_since(last).min(LONGEST_INTERVAL));
         self.last = Some((time, size.0, size.1));
 
-        let image = &finite(image);
-        let mut tracks: Vec<ImageTrack> = Vec::new();
+        let mut mended = std::mem::take(&mut self.mended);
+        let image = mend(image, &mut mended);
+        let mut tracks: Vec<ImageTrack> = Vec::with_capacity(self.followed.len());
+        let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
+        let frame = Frame { image, interval, keepsake, config: &self.config };
         for followed in &mut self.followed {
-            let step = followed.target.step(image, interval, &mut self.correlator, &self.config);
+            let step = followed.target.step(frame, followed.cue.take(), &mut self.bench);
             if step.measured.is_some() {
                 followed.measured_at = time;
             }
             let phase = match step.measured {
                 Some(_) => TrackPhase::Tracking,
-                None if followed.target.is_searching(&self.config) => TrackPhase::Searching,
+                None if followed.target.is_searching() => TrackPhase::Searching,
                 None => TrackPhase::Coasting,
             };
-            tracks.push(describe(followed, phase, step.measured, step.score));
+            tracks.push(describe(followed, phase, step));
         }
         self.give_up(time);
         tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
         self.take_up_new(image, time, &mut tracks);
+        self.keep(image, time);
+        self.mended = mended;
         tracks
+    }
+
+    /// Keeps a picture for later losses: from time to time, while every target is seen, and when one
+    /// is new.
+    fn keep(&mut self, image: &Plane, time: Timestamp) {
+        let all_seen = self.followed.iter().all(|followed| followed.target.is_seen());
+        let new = self
+            .followed
+            .iter()
+            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.in_keepsake.is_none()));
+        let old = self.keepsake.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= KEEPSAKE_AGE);
+        let posterior = self.config.algorithm == Algorithm::Posterior;
+        if !posterior || self.followed.is_empty() || !all_seen || !(new || old) {
+            return;
+        }
+        let keepsake =
+            self.keepsake.get_or_insert_with(|| Keepsake { picture: Plane::default(), taken: time });
+        keepsake.picture.copy_from(image);
+        keepsake.taken = time;
+        for followed in &mut self.followed {
+            if let Follower::Posterior(target) = &mut followed.target {
+                target.in_keepsake = Some(target.last_seen);
+            }
+        }
     }
 
     /// Drops what the detector found and nobody has measured for long, and the younger of two
@@ -181,50 +316,55 @@ impl ImageTracker {
         for (place, origin) in new {
             let id = ImageTrackId(self.next_id);
             self.next_id += 1;
-            let target = Target::new(image, place, &self.config);
-            let followed = Followed { id, origin, target, measured_at: time };
-            tracks.push(describe(&followed, TrackPhase::Tentative, None, 1.0));
+            let target = Follower::new(image, place, &mut self.bench, &self.config);
+            let followed = Followed { id, origin, target, measured_at: time, cue: None };
+            let step = Step { measured: None, score: 1.0, certainty: 1.0 };
+            tracks.push(describe(&followed, TrackPhase::Tentative, step));
             self.followed.push(followed);
         }
     }
 }
 
-/// The image with its NaNs and infinities made black: a broken pixel must not spoil a whole gate.
-fn finite(image: &Plane) -> Plane {
-    let mut image = image.clone();
-    for sample in image.samples_mut().iter_mut().filter(|sample| !sample.is_finite()) {
+/// The image, or where it has NaNs or infinities, a copy with those made black: a broken pixel must
+/// not spoil a whole gate.
+fn mend<'a>(image: &'a Plane, mended: &'a mut Plane) -> &'a Plane {
+    // Their sum is not finite if a sample is not; that is quicker to see than each of them.
+    if image.mean().is_finite() {
+        return image;
+    }
+    mended.copy_from(image);
+    for sample in mended.samples_mut().iter_mut().filter(|sample| !sample.is_finite()) {
         *sample = 0.0;
     }
-    image
+    mended
 }
 
-fn box_of(target: &Target) -> PixelBox {
-    PixelBox::about(target.position(), target.width, target.height)
+fn box_of(target: &Follower) -> PixelBox {
+    let [width, height] = target.size();
+    PixelBox::about(target.position(), width, height)
 }
 
 /// Whether two targets lie on each other: their centres within half a box.
-fn same(one: &Target, other: &Target) -> bool {
+fn same(one: &Follower, other: &Follower) -> bool {
     let (a, b) = (one.position(), other.position());
-    (a.x - b.x).abs() < one.width.max(other.width) / 2.0
-        && (a.y - b.y).abs() < one.height.max(other.height) / 2.0
+    let ([aw, ah], [bw, bh]) = (one.size(), other.size());
+    (a.x - b.x).abs() < aw.max(bw) / 2.0 && (a.y - b.y).abs() < ah.max(bh) / 2.0
 }
 
-fn describe(
-    followed: &Followed,
-    phase: TrackPhase,
-    measured: Option<(ImagePoint, f64)>,
-    score: f64,
-) -> ImageTrack {
+fn describe(followed: &Followed, phase: TrackPhase, step: Step) -> ImageTrack {
     let target = &followed.target;
+    let [width, height] = target.size();
     ImageTrack {
         id: followed.id,
         phase,
         position: target.position(),
         velocity: target.velocity(),
-        measured,
-        width: target.width,
-        height: target.height,
-        score,
+        covariances: target.covariances(),
+        measured: step.measured,
+        width,
+        height,
+        score: step.score,
+        certainty: step.certainty,
     }
 }
 
@@ -261,7 +401,7 @@ mod tests {
             last = tracker.step(&image, at(frame));
         }
         assert_eq!(last.len(), 2, "{last:?}");
-        let mut x: Vec<f64> = last.iter().map(|track| track.measured.unwrap().0.x).collect();
+        let mut x: Vec<f64> = last.iter().map(|track| track.measured.unwrap().place.x).collect();
         x.sort_by(f64::total_cmp);
         assert!((x[0] - 51.5).abs() < 1.0 && (x[1] - 79.0).abs() < 1.0, "{x:?}");
     }

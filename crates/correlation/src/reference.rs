@@ -1,0 +1,166 @@
+use crate::Plane;
+use crate::interpolation::Spline;
+
+/// How much each pixel of a reference counts: the product of a weight of its column and one of its
+/// row. The weights of an axis sum to 1.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Window {
+    columns: Plane,
+    rows: Plane,
+    uniform: bool,
+}
+
+impl Window {
+    /// Every pixel alike: the plain zero-mean normalised cross-correlation.
+    pub fn uniform(width: usize, height: usize) -> Self {
+        let columns = normalised(Plane::from_fn(width, 1, |_, _| 1.0));
+        let rows = normalised(Plane::from_fn(1, height, |_, _| 1.0));
+        Self { columns, rows, uniform: true }
+    }
+
+    /// A Gaussian about the middle, with a standard deviation of a share of each side: the target in
+    /// the middle counts, the background at the border little.
+    pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
+        let weight = |index: usize, side: usize| {
+            let distance = (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
+            (-0.5 * distance.powi(2)).exp() as f32
+        };
+        let columns = normalised(Plane::from_fn(width, 1, |x, _| weight(x, width)));
+        let rows = normalised(Plane::from_fn(1, height, |_, y| weight(y, height)));
+        Self { columns, rows, uniform: false }
+    }
+
+    /// Columns.
+    pub fn width(&self) -> usize {
+        self.columns.width()
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.rows.height()
+    }
+
+    /// Whether every pixel counts alike.
+    pub fn is_uniform(&self) -> bool {
+        self.uniform
+    }
+
+    /// The number of equally weighted pixels that average noise as well as these do: the inverse of
+    /// the sum of the squared weights.
+    pub fn effective_pixels(&self) -> f64 {
+        let squares = |plane: &Plane| plane.samples().iter().map(|w| f64::from(w * w)).sum::<f64>();
+        1.0 / (squares(&self.columns) * squares(&self.rows))
+    }
+
+    /// The weight of a pixel.
+    pub fn weight(&self, column: usize, row: usize) -> f32 {
+        self.columns.samples()[column] * self.rows.samples()[row]
+    }
+
+    /// The weights of the columns, a plane of one row.
+    pub(crate) fn columns(&self) -> &Plane {
+        &self.columns
+    }
+
+    /// The weights of the rows, a plane of one column.
+    pub(crate) fn rows(&self) -> &Plane {
+        &self.rows
+    }
+}
+
+fn normalised(mut plane: Plane) -> Plane {
+    let sum: f32 = plane.samples().iter().sum();
+    plane.samples_mut().iter_mut().for_each(|weight| *weight /= sum);
+    plane
+}
+
+/// A reference image, ready to be correlated: its window, and its weighted deviation from its
+/// weighted mean.
+///
+/// ```
+/// use crossfix_correlation::{Plane, Reference, Window};
+/// let image = Plane::from_fn(3, 1, |x, _| x as f32);
+/// let reference = Reference::new(image, Window::uniform(3, 1));
+/// assert!((reference.variance() - 2.0 / 3.0).abs() < 1e-6);
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reference {
+    image: Plane,
+    window: Window,
+    kernel: Plane,
+    spline: Spline,
+    variance: f32,
+}
+
+impl Reference {
+    /// A reference of an image and a window of the same size.
+    ///
+    /// # Panics
+    /// If the sizes differ.
+    pub fn new(image: Plane, window: Window) -> Self {
+        let same = (image.width(), image.height()) == (window.width(), window.height());
+        assert!(same, "window and image differ in size");
+        let kernel = image.clone();
+        let mut reference = Self { image, window, kernel, spline: Spline::default(), variance: 0.0 };
+        reference.prepare();
+        reference
+    }
+
+    fn prepare(&mut self) {
+        let Self { image, window, kernel, spline, variance } = self;
+        spline.pass_through(image);
+        let (columns, rows) = (window.columns.samples(), window.rows.samples());
+        let mut mean = 0.0;
+        for (y, &across) in rows.iter().enumerate() {
+            let line: f32 = image.row(y).iter().zip(columns).map(|(sample, along)| sample * along).sum();
+            mean += across * line;
+        }
+        let mut sum = 0.0;
+        for (y, &across) in rows.iter().enumerate() {
+            let line = kernel.row_mut(y).iter_mut().zip(image.row(y)).zip(columns);
+            for ((value, sample), along) in line {
+                let deviation = sample - mean;
+                *value = across * along * deviation;
+                sum += *value * deviation;
+            }
+        }
+        *variance = sum;
+    }
+
+    /// Changes the image in place and prepares it anew; one that changes its size has a uniform window
+    /// from then on.
+    pub fn update(&mut self, change: impl FnOnce(&mut Plane)) {
+        change(&mut self.image);
+        let (width, height) = (self.image.width(), self.image.height());
+        if (width, height) != (self.window.width(), self.window.height()) {
+            self.window = Window::uniform(width, height);
+        }
+        self.kernel.reshape(width, height);
+        self.prepare();
+    }
+
+    /// The image.
+    pub fn image(&self) -> &Plane {
+        &self.image
+    }
+
+    /// Its window.
+    pub fn window(&self) -> &Window {
+        &self.window
+    }
+
+    /// The weighted variance of the image.
+    pub fn variance(&self) -> f32 {
+        self.variance
+    }
+
+    /// The image between its samples.
+    pub(crate) fn spline(&self) -> &Spline {
+        &self.spline
+    }
+
+    /// Each sample's weighted deviation from the weighted mean; sums to 0.
+    pub(crate) fn kernel(&self) -> &Plane {
+        &self.kernel
+    }
+}

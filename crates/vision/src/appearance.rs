@@ -1,0 +1,266 @@
+//! What a target looks like: its reference in a size and direction of its own, how large it is and
+//! how it is turned in the image, and how far its reference has drifted from what it was at first.
+
+use crossfix_correlation::{FitOptions, Fitter, Freedom, Plane, Reference, Resampler, View, Window};
+
+use crate::ImagePoint;
+use crate::lowpass::LowPass;
+use crate::reference::Adaptation;
+use crate::{PixelBox, TrackerConfig};
+
+/// Low-passes of which the one is taken that leaves least noise and error together, px.
+const LOW_PASSES: [f32; 5] = [0.0, 0.6, 0.9, 1.2, 1.6];
+/// Share of noise in the reference's energy below which it is taken as it is.
+const CLEAR_NOISE_SHARE: f32 = 0.01;
+/// Least low-pass for the comparison with the anchor, px.
+const ANCHOR_LOW_PASS: f32 = 0.6;
+/// Share of noise in the anchor's energy above which it is still averaged, and its least share of a
+/// new image.
+const ANCHOR_NOISE_SHARE: f32 = 0.02;
+const ANCHOR_LEAST_SHARE: f32 = 0.001;
+/// Correlation with the anchor below which the target has become another.
+const ANCHOR_LEAST_SCORE: f32 = 0.6;
+/// Stiffness of scale and turn in that comparison.
+const ANCHOR_STIFFNESS: f64 = 0.02;
+/// Scale of a target over its first size.
+const SCALE_RANGE: [f64; 2] = [0.25, 4.0];
+
+/// How a reference lies to the anchor: the displacement in its own pixels, log scale and turn.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Drift {
+    pub(crate) x: f64,
+    pub(crate) y: f64,
+    pub(crate) log_scale: f64,
+    pub(crate) turn_rad: f64,
+}
+
+/// Memory that all targets share.
+#[derive(Debug, Default)]
+pub(crate) struct Workshop {
+    pub(crate) resampler: Resampler,
+    pub(crate) fitter: Fitter,
+    padded: Plane,
+    lines: Plane,
+    filtered: Plane,
+    view: Plane,
+}
+
+/// The look of one target.
+#[derive(Clone, Debug)]
+pub(crate) struct Appearance {
+    /// Sides of the target's box at first, px.
+    pub(crate) size: [f64; 2],
+    /// Size over the first size, and direction.
+    pub(crate) scale: f64,
+    pub(crate) turn_rad: f64,
+    /// The reference, mean removed, in its own size and direction.
+    own: Plane,
+    adaptation: Adaptation,
+    /// A slow mean to which the reference is compared.
+    anchor: Reference,
+    anchor_noise: f32,
+    anchor_images: f32,
+    pub(crate) drift: Drift,
+    low_passes: Vec<LowPass>,
+    /// Index of the low-pass in use.
+    chosen: usize,
+    /// The low-passed reference, in its own size and direction.
+    smooth: Plane,
+    /// The reference that is correlated: low-passed, in the image's size and direction.
+    pub(crate) working: Reference,
+    memory: Reference,
+}
+
+/// The least odd number of pixels that holds a length: the middle of an odd side is a pixel.
+fn odd(length: f64) -> usize {
+    2 * (length / 2.0) as usize + 1
+}
+
+fn without_mean(plane: &mut Plane) {
+    let mean = plane.mean();
+    plane.samples_mut().iter_mut().for_each(|s| *s -= mean);
+}
+
+fn energy(plane: &Plane) -> f32 {
+    plane.samples().iter().map(|s| s * s).sum()
+}
+
+/// How much of white noise's variance a view between the samples keeps.
+fn noise_kept(place: ImagePoint) -> f32 {
+    let axis = |at: f64| {
+        let f = at - at.floor();
+        // The squared weights of linear interpolation; the cubic one keeps about a third more.
+        let linear = f * f + (1.0 - f) * (1.0 - f);
+        (linear + 0.28 * (1.0 - linear)) as f32
+    };
+    axis(place.x) * axis(place.y)
+}
+
+impl Appearance {
+    /// The look of what is in a box of an image with noise of a variance.
+    pub(crate) fn new(
+        image: &Plane,
+        place: PixelBox,
+        noise: f32,
+        config: &TrackerConfig,
+        workshop: &mut Workshop,
+    ) -> Self {
+        let side = |length: f64| odd(length + 2.0 * config.margin_px);
+        let (width, height) = (side(place.width), side(place.height));
+        let centre = place.centre();
+        let mut own = Plane::from_fn(width, height, |_, _| 0.0);
+        workshop.resampler.look(
+            image,
+            View { x: centre.x, y: centre.y, scale: 1.0, turn_rad: 0.0 },
+            &mut own,
+        );
+        without_mean(&mut own);
+        let noise = noise * noise_kept(centre);
+        let plain = Reference::new(own.clone(), Window::uniform(width, height));
+        let mut appearance = Self {
+            size: [place.width, place.height],
+            scale: 1.0,
+            turn_rad: 0.0,
+            adaptation: Adaptation::new(config.reference, &own, noise, config.noise_floor as f32),
+            anchor: plain.clone(),
+            anchor_noise: noise,
+            anchor_images: 1.0,
+            drift: Drift::default(),
+            low_passes: LOW_PASSES.into_iter().map(LowPass::new).collect(),
+            chosen: 0,
+            smooth: own.clone(),
+            working: plain.clone(),
+            memory: plain,
+            own,
+        };
+        appearance.prepare(workshop);
+        appearance
+    }
+
+    /// Energy of the reference in use.
+    pub(crate) fn energy(&self) -> f32 {
+        self.working.variance() * self.pixels()
+    }
+
+    /// Its pixels.
+    pub(crate) fn pixels(&self) -> f32 {
+        self.working.image().samples().len() as f32
+    }
+
+    /// Variance of the noise in it, and of that noise's gradient.
+    pub(crate) fn noise(&self) -> (f32, f32) {
+        let filter = &self.low_passes[self.chosen];
+        (self.adaptation.noise * filter.noise_gain, self.adaptation.noise * filter.gradient_gain)
+    }
+
+    /// Share of its energy that is the target's: a noisy reference finds the target fainter than it is.
+    pub(crate) fn clear_share(&self) -> f32 {
+        let noise = self.noise().0 * self.pixels();
+        (1.0 - noise / self.energy().max(f32::MIN_POSITIVE)).clamp(0.2, 1.0)
+    }
+
+    /// Takes the target's image in, with a certainty that it shows the target.
+    pub(crate) fn learn(
+        &mut self,
+        image: &Plane,
+        place: ImagePoint,
+        noise: f32,
+        certainty: f32,
+        interval: f64,
+        workshop: &mut Workshop,
+    ) {
+        let mut view = std::mem::take(&mut workshop.view);
+        view.reshape(self.own.width(), self.own.height());
+        let seen = View { x: place.x, y: place.y, scale: self.scale, turn_rad: self.turn_rad };
+        workshop.resampler.look(image, seen, &mut view);
+        without_mean(&mut view);
+        let noise = noise * noise_kept(place);
+        self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
+
+        let noise_share =
+            self.anchor_noise * view.samples().len() as f32 / energy(self.anchor.image()).max(1e-12);
+        let averaged = if noise_share > ANCHOR_NOISE_SHARE { 1.0 / (self.anchor_images + 1.0) } else { 0.0 };
+        let share = certainty * averaged.max(ANCHOR_LEAST_SHARE);
+        self.anchor.update(|anchor| {
+            for (old, new) in anchor.samples_mut().iter_mut().zip(view.samples()) {
+                *old += share * (new - *old);
+            }
+        });
+        self.anchor_noise = (1.0 - share).powi(2) * self.anchor_noise + share * share * noise;
+        self.anchor_images += certainty;
+        workshop.view = view;
+        self.prepare(workshop);
+        self.compare_with_anchor(workshop);
+    }
+
+    /// Changes size and direction; takes effect with the next [`learn`](Self::learn).
+    pub(crate) fn reshape(&mut self, log_scale: f64, turn_rad: f64) {
+        self.scale = (self.scale * log_scale.exp()).clamp(SCALE_RANGE[0], SCALE_RANGE[1]);
+        self.turn_rad += turn_rad;
+    }
+
+    /// The working reference from the one in its own size and direction: the low-pass of least risk
+    /// (Stein's estimate), scaled and turned.
+    fn prepare(&mut self, workshop: &mut Workshop) {
+        let noise = self.adaptation.noise;
+        let pixels = self.own.samples().len() as f32;
+        let clear = pixels * noise < CLEAR_NOISE_SHARE * energy(&self.own);
+        let mut least = f32::INFINITY;
+        let Workshop { padded, lines, filtered, .. } = workshop;
+        for (index, filter) in self.low_passes.iter().enumerate() {
+            filter.apply(&self.own, padded, lines, filtered);
+            let taken: f32 =
+                self.own.samples().iter().zip(filtered.samples()).map(|(a, b)| (a - b) * (a - b)).sum();
+            let risk = taken + pixels * noise * (2.0 * filter.own_weight - 1.0);
+            if risk < least {
+                (least, self.chosen) = (risk, index);
+                self.smooth.copy_from(filtered);
+            }
+            if clear {
+                break;
+            }
+        }
+        let (width, height) = (self.own.width() as f64, self.own.height() as f64);
+        let Self { smooth, working, scale, turn_rad, .. } = self;
+        working.update(|image| {
+            image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
+            let middle = [width, height].map(|side| (side - 1.0) / 2.0);
+            let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
+            workshop.resampler.look(smooth, View { x: middle[0], y: middle[1], scale, turn_rad }, image);
+            without_mean(image);
+        });
+    }
+
+    /// How the reference has drifted: each image was taken at an estimated place, and their errors
+    /// add up; the anchor, to which almost nothing is added any more, stays.
+    fn compare_with_anchor(&mut self, workshop: &mut Workshop) {
+        let index =
+            self.low_passes.iter().position(|f| f.deviation >= ANCHOR_LOW_PASS).unwrap_or(0).max(self.chosen);
+        let Workshop { padded, lines, filtered, fitter, .. } = workshop;
+        let filter = &self.low_passes[index];
+        self.memory.update(|image| filter.apply(self.anchor.image(), padded, lines, image));
+        filter.apply(&self.own, padded, lines, filtered);
+        self.drift = Drift::default();
+        let product: f32 =
+            self.memory.image().samples().iter().zip(filtered.samples()).map(|(a, b)| a * b).sum();
+        let score = product / (energy(self.memory.image()) * energy(filtered)).max(1e-12).sqrt();
+        if score < ANCHOR_LEAST_SCORE {
+            return;
+        }
+        let options =
+            FitOptions { border: 0, steps: 1, freedom: Freedom::ShiftScaleTurn, stiffness: ANCHOR_STIFFNESS };
+        let fit = fitter.fit(filtered, &self.memory, 0.0, 0.0, options);
+        self.drift = Drift {
+            x: fit.x.clamp(-1.0, 1.0),
+            y: fit.y.clamp(-1.0, 1.0),
+            log_scale: fit.log_scale.clamp(-0.1, 0.1),
+            turn_rad: fit.turn_rad.clamp(-0.1, 0.1),
+        };
+    }
+
+    /// A displacement in the reference's own pixels as one in the image.
+    pub(crate) fn in_image(&self, drift: Drift) -> [f64; 2] {
+        let (cos, sin) = (self.scale * self.turn_rad.cos(), self.scale * self.turn_rad.sin());
+        [cos * drift.x - sin * drift.y, sin * drift.x + cos * drift.y]
+    }
+}

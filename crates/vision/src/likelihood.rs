@@ -1,0 +1,63 @@
+use crossfix_correlation::{Plane, Statistics};
+use pulp::{Arch, Simd, WithSimd};
+
+use crate::lanes;
+
+/// What is expected of the target at its true place.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Expectation {
+    /// Energy of the reference, its mean removed.
+    pub(crate) energy: f32,
+    /// Its pixels.
+    pub(crate) pixels: f32,
+    /// Variance of the image's noise.
+    pub(crate) noise: f32,
+    /// The target's contrast over the reference's.
+    pub(crate) contrast: f32,
+    /// The contrast's variance.
+    pub(crate) contrast_variance: f32,
+    /// How many times the target's energy a mismatch of reference and target may be taken for noise.
+    pub(crate) mismatch: f32,
+}
+
+/// Fills `ratios` with the logarithm of the likelihood ratio of every placement: the image there is
+/// the reference with a contrast `c ~ N(contrast, contrast_variance)`, or background alone.
+///
+/// With `a = <reference, image>`, the zero-mean correlation, and `v` the noise's variance,
+///
+/// `ln L = z^2 / (2 u) - (z - contrast)^2 / (2 (s + u)) - ln(1 + s / u) / 2`, `z = a / E`, `u = v / E`,
+///
+/// the first term for `z > 0` only. `v^2 = noise^2 + (excess / mismatch)^2`, where the excess is the
+/// part's energy over the noise's, or the target's own: structured surroundings count for less.
+pub(crate) fn log_ratios(statistics: &Statistics, expected: Expectation, ratios: &mut Plane) {
+    ratios.reshape(statistics.covariance.width(), statistics.covariance.height());
+    Arch::new().dispatch(LogRatios { statistics, expected, ratios });
+}
+
+struct LogRatios<'a> {
+    statistics: &'a Statistics,
+    expected: Expectation,
+    ratios: &'a mut Plane,
+}
+
+impl WithSimd for LogRatios<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Expectation { energy, pixels, noise, contrast, contrast_variance, mismatch } = self.expected;
+        let own = contrast * contrast * energy;
+        let (per_energy, per_mismatch, flat) = (1.0 / energy, 1.0 / mismatch, pixels * noise);
+        let statistics = self.statistics.covariance.samples().iter().zip(self.statistics.variance.samples());
+        for (ratio, (covariance, variance)) in self.ratios.samples_mut().iter_mut().zip(statistics) {
+            let z = covariance * pixels * per_energy;
+            let excess = own.max(variance * pixels - flat) * per_mismatch;
+            let u = (noise * noise + excess * excess).sqrt() * per_energy;
+            let positive = z.max(0.0);
+            let miss = z - contrast;
+            let spread = contrast_variance + u;
+            *ratio =
+                positive * positive / (2.0 * u) - miss * miss / (2.0 * spread) - 0.5 * lanes::ln(spread / u);
+        }
+    }
+}

@@ -1,0 +1,101 @@
+use crossfix_correlation::Plane;
+
+/// Half the length of the longest filter.
+const MOST_REACH: usize = 5;
+
+/// A Gaussian low-pass over both axes, the border going on beyond itself.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct LowPass {
+    /// Standard deviation, px; 0 changes nothing.
+    pub(crate) deviation: f32,
+    taps: Vec<f32>,
+    /// White noise's variance after over before.
+    pub(crate) noise_gain: f32,
+    /// The weight of a sample in its own result.
+    pub(crate) own_weight: f32,
+    /// Variance of white noise's central difference along an axis, over the noise's variance.
+    pub(crate) gradient_gain: f32,
+}
+
+impl LowPass {
+    pub(crate) fn new(deviation: f32) -> Self {
+        let reach = ((3.0 * deviation).ceil() as usize).min(MOST_REACH);
+        let mut taps: Vec<f32> = (0..=2 * reach)
+            .map(|k| {
+                let distance = k.abs_diff(reach) as f32;
+                if distance == 0.0 { 1.0 } else { (-0.5 * (distance / deviation).powi(2)).exp() }
+            })
+            .collect();
+        let sum: f32 = taps.iter().sum();
+        taps.iter_mut().for_each(|tap| *tap /= sum);
+        let at = |k: isize| usize::try_from(k).ok().and_then(|k| taps.get(k)).copied().unwrap_or(0.0);
+        let squares: f32 = taps.iter().map(|tap| tap * tap).sum();
+        let slopes: f32 = (-1..=taps.len() as isize).map(|k| ((at(k + 1) - at(k - 1)) / 2.0).powi(2)).sum();
+        let own = taps[reach];
+        Self {
+            deviation,
+            noise_gain: squares * squares,
+            own_weight: own * own,
+            gradient_gain: slopes * squares,
+            taps,
+        }
+    }
+
+    /// Filters a plane; `lines` is memory.
+    pub(crate) fn apply(&self, from: &Plane, padded: &mut Plane, lines: &mut Plane, to: &mut Plane) {
+        if self.taps.len() == 1 {
+            to.copy_from(from);
+            return;
+        }
+        let reach = (self.taps.len() / 2) as isize;
+        let (width, height) = (from.width(), from.height());
+        from.crop_into(-reach, -reach, width + 2 * reach as usize, height + 2 * reach as usize, padded);
+        lines.reshape(width, padded.height());
+        to.reshape(width, height);
+        for y in 0..padded.height() {
+            let out = lines.row_mut(y);
+            out.fill(0.0);
+            for (k, tap) in self.taps.iter().enumerate() {
+                add_scaled(out, *tap, &padded.row(y)[k..]);
+            }
+        }
+        for y in 0..height {
+            let out = to.row_mut(y);
+            out.fill(0.0);
+            for (k, tap) in self.taps.iter().enumerate() {
+                add_scaled(out, *tap, lines.row(y + k));
+            }
+        }
+    }
+}
+
+fn add_scaled(out: &mut [f32], tap: f32, row: &[f32]) {
+    for (out, sample) in out.iter_mut().zip(row) {
+        *out += tap * sample;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_impulse_shows_the_gains() {
+        for deviation in [0.0, 0.6, 1.2] {
+            let filter = LowPass::new(deviation);
+            let impulse = Plane::from_fn(21, 21, |x, y| f32::from(u8::from((x, y) == (10, 10))));
+            let (mut padded, mut lines, mut out) = (Plane::default(), Plane::default(), Plane::default());
+            filter.apply(&impulse, &mut padded, &mut lines, &mut out);
+            let squares: f32 = out.samples().iter().map(|v| v * v).sum();
+            assert!((squares - filter.noise_gain).abs() < 1e-5);
+            assert!((out.row(10)[10] - filter.own_weight).abs() < 1e-6);
+            let mut slopes = 0.0;
+            for y in 0..21 {
+                for x in 1..20 {
+                    slopes += ((out.row(y)[x + 1] - out.row(y)[x - 1]) / 2.0).powi(2);
+                }
+            }
+            assert!((slopes - filter.gradient_gain).abs() < 1e-5);
+        }
+    }
+}

@@ -1,0 +1,71 @@
+use crossfix_correlation::Plane;
+
+/// Samples that the median is taken of; more tell little more.
+const SAMPLES: usize = 400;
+/// The response of the mask to white noise: the root of the sum of its squared weights.
+const MASK_GAIN: f32 = 6.0;
+/// Median of the absolute value of a normal variable.
+const MEDIAN_OF_NORMAL: f32 = 0.6745;
+
+/// Estimates the noise of an image from the image: the second difference of second differences, to
+/// which a smooth scene is zero, and its median, to which edges are outliers.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct NoiseMeter {
+    responses: Vec<f32>,
+}
+
+impl NoiseMeter {
+    /// The noise's variance in a part of an image, at least `floor^2`.
+    pub(crate) fn variance(&mut self, part: &Plane, floor: f32) -> f32 {
+        let (width, height) = (part.width(), part.height());
+        self.responses.clear();
+        if width >= 3 && height >= 3 {
+            let places = (width - 2) * (height - 2);
+            // An odd step walks over all columns.
+            let step = (places / SAMPLES).max(1) | 1;
+            for place in (0..places).step_by(step) {
+                let (x, y) = (place % (width - 2), place / (width - 2));
+                let [a, b, c] = [0, 1, 2].map(|k| &part.row(y + k)[x..x + 3]);
+                let corners = a[0] + a[2] + c[0] + c[2];
+                let sides = a[1] + b[0] + b[2] + c[1];
+                self.responses.push((corners - 2.0 * sides + 4.0 * b[1]).abs());
+            }
+        }
+        let middle = self.responses.len() / 2;
+        if middle == 0 {
+            return floor * floor;
+        }
+        let (_, median, _) = self.responses.select_nth_unstable_by(middle, f32::total_cmp);
+        let deviation = *median / (MEDIAN_OF_NORMAL * MASK_GAIN);
+        (deviation * deviation).max(floor * floor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    #[test]
+    fn the_noise_of_a_ramp_with_a_spot_is_found() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let normal = Normal::new(0.0f32, 5.0).unwrap();
+        let mut sum = 0.0;
+        for _ in 0..50 {
+            let part = Plane::from_fn(45, 27, |x, y| {
+                let spot = if (18..28).contains(&x) && (10..16).contains(&y) { 80.0 } else { 0.0 };
+                2.0 * x as f32 + spot + normal.sample(&mut rng)
+            });
+            sum += NoiseMeter::default().variance(&part, 1.0).sqrt();
+        }
+        assert!((sum / 50.0 - 5.0).abs() < 0.4, "{}", sum / 50.0);
+    }
+
+    #[test]
+    fn a_part_without_noise_has_the_floor() {
+        assert_eq!(NoiseMeter::default().variance(&Plane::from_fn(9, 9, |_, _| 3.0), 2.0), 4.0);
+        assert_eq!(NoiseMeter::default().variance(&Plane::from_fn(2, 9, |_, _| 3.0), 2.0), 4.0);
+    }
+}

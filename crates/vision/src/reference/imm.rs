@@ -1,0 +1,273 @@
+//! The brightness of each pixel by an interacting multiple model filter of three models (003,
+//! section 3, table 1; errata).
+
+use pulp::{Arch, Simd, WithSimd};
+use serde::{Deserialize, Serialize};
+
+use crate::lanes;
+
+/// Pixels that are filtered together.
+const LANES: usize = 8;
+/// Models: order 0, order 1, Singer's.
+const MODELS: usize = 3;
+/// Parts of a model's state: brightness, rate, and their covariance 11, 12, 22.
+const PARTS: usize = 5;
+/// Least probability of a model: one that has died cannot come back.
+const LEAST_PROBABILITY: f32 = 1e-6;
+
+/// The three models of 003, table 1. Brightness in levels of 8 bits, times in seconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ImmConfig {
+    /// Intensity `K_M` of the order-0 model, levels a frame. Default 0.05.
+    pub constant_sd: f32,
+    /// Rate noise `sigma_M` of the order-1 model, levels/s^2. Default 0.4.
+    pub drift_sd: f32,
+    /// Rate noise of Singer's model, levels/s^1.5. Default 120: the jumps.
+    pub jump_sd: f32,
+    /// Singer's manoeuvre constant `k_m`, 1/s. Default 1.
+    pub jump_rate: f32,
+    /// Probability that the model stays from frame to frame. Default 0.99.
+    pub stay: f32,
+}
+
+impl Default for ImmConfig {
+    fn default() -> Self {
+        Self { constant_sd: 0.05, drift_sd: 0.4, jump_sd: 120.0, jump_rate: 1.0, stay: 0.99 }
+    }
+}
+
+/// A model's transition `B = [[1, rate], [0, keep]]` and noise `M = [[m11, m12], [m12, m22]]`.
+#[derive(Clone, Copy, Debug)]
+struct Model {
+    rate: f32,
+    keep: f32,
+    noise: [f32; 3],
+}
+
+impl ImmConfig {
+    fn models(&self, interval: f32) -> [Model; MODELS] {
+        let constant = Model { rate: 0.0, keep: 0.0, noise: [self.constant_sd.powi(2), 0.0, 0.0] };
+        // M = S S' sigma_M^2 with S = [T^2 / 2, T]' (erratum: the square is missing).
+        let (half, drift) = (interval * interval / 2.0, self.drift_sd.powi(2));
+        let drifting = Model {
+            rate: interval,
+            keep: 1.0,
+            noise: [half * half * drift, half * interval * drift, interval * interval * drift],
+        };
+        // Singer's (erratum: V21 is 0, and M22 has e^2 and 2 k). In double precision: the terms of
+        // M11 nearly cancel.
+        let (k, t) = (f64::from(self.jump_rate), f64::from(interval));
+        let e = (-k * t).exp();
+        let jump = f64::from(self.jump_sd).powi(2);
+        let noise = [
+            (-3.0 + 4.0 * e - e * e + 2.0 * k * t) / (2.0 * k.powi(3)),
+            (1.0 + e * e - 2.0 * e) / (2.0 * k * k),
+            (1.0 - e * e) / (2.0 * k),
+        ];
+        let jumping =
+            Model { rate: ((1.0 - e) / k) as f32, keep: e as f32, noise: noise.map(|m| (m * jump) as f32) };
+        [constant, drifting, jumping]
+    }
+}
+
+type Lane = [f32; LANES];
+
+/// The filters of eight pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Block {
+    states: [[Lane; PARTS]; MODELS],
+    probabilities: [Lane; MODELS],
+}
+
+/// The filters of one colour channel of a reference: 18 numbers a pixel. A colour reference has one
+/// of these a channel.
+///
+/// ```
+/// use crossfix_vision::{ImmConfig, PixelImm};
+/// let mut filter = PixelImm::new(ImmConfig::default(), &[100.0], 25.0);
+/// for _ in 0..50 {
+///     filter.step(&[120.0], 0.04, 25.0, &mut [0.0]);
+/// }
+/// let mut brightness = [0.0];
+/// filter.step(&[120.0], 0.04, 25.0, &mut brightness);
+/// assert!((brightness[0] - 120.0).abs() < 1.0);
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct PixelImm {
+    config: ImmConfig,
+    blocks: Vec<Block>,
+}
+
+impl PixelImm {
+    /// Filters that start at given brightnesses, measured with noise of a variance.
+    pub fn new(config: ImmConfig, brightness: &[f32], variance: f32) -> Self {
+        let blocks = brightness.chunks(LANES).map(|pixels| {
+            let mut first = [0.0; LANES];
+            first[..pixels.len()].copy_from_slice(pixels);
+            let state = [first, [0.0; LANES], [variance; LANES], [0.0; LANES], [1.0; LANES]];
+            Block { states: [state; MODELS], probabilities: [[1.0 / MODELS as f32; LANES]; MODELS] }
+        });
+        Self { config, blocks: blocks.collect() }
+    }
+
+    /// One frame: takes the measured brightnesses in and writes the filtered ones, steps 1 to 7 of
+    /// 003, section 3. What of the slices is longer than the filters is left alone.
+    pub fn step(&mut self, measured: &[f32], interval: f32, variance: f32, filtered: &mut [f32]) {
+        let (models, stay) = (self.config.models(interval), self.config.stay);
+        Arch::new().dispatch(Step { blocks: &mut self.blocks, models, stay, measured, variance, filtered });
+    }
+}
+
+struct Step<'a> {
+    blocks: &'a mut [Block],
+    models: [Model; MODELS],
+    stay: f32,
+    measured: &'a [f32],
+    variance: f32,
+    filtered: &'a mut [f32],
+}
+
+impl WithSimd for Step<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let pixels = self.measured.chunks(LANES).zip(self.filtered.chunks_mut(LANES));
+        for (block, (measured, filtered)) in self.blocks.iter_mut().zip(pixels) {
+            let mut lane = [0.0; LANES];
+            lane[..measured.len()].copy_from_slice(measured);
+            let mut out = [0.0; LANES];
+            for i in 0..LANES {
+                out[i] = pixel(block, i, &self.models, self.stay, lane[i], self.variance);
+            }
+            filtered.copy_from_slice(&out[..filtered.len()]);
+        }
+    }
+}
+
+/// One pixel's step; a function of its lane alone, so that eight of them run together.
+#[inline(always)]
+fn pixel(
+    block: &mut Block,
+    i: usize,
+    models: &[Model; MODELS],
+    stay: f32,
+    measured: f32,
+    variance: f32,
+) -> f32 {
+    let leave = (1.0 - stay) / (MODELS - 1) as f32;
+    let before = [0, 1, 2].map(|m| block.probabilities[m][i]);
+    let states = [0, 1, 2].map(|m| [0, 1, 2, 3, 4].map(|part| block.states[m][part][i]));
+    let mut likelihoods = [0.0; MODELS];
+    let mut updated = [[0.0; PARTS]; MODELS];
+    let mut exponents = [0.0; MODELS];
+    let mut total = 0.0;
+    for l in 0..MODELS {
+        // (10): the probability of each model before, given that l holds now.
+        let weights = [0, 1, 2].map(|m| if m == l { stay * before[m] } else { leave * before[m] });
+        let prior = weights[0] + weights[1] + weights[2];
+        let share = weights.map(|w| w / prior);
+        // (11): mixed state and covariance.
+        let mut mixed = [0.0; PARTS];
+        for m in 0..MODELS {
+            mixed[0] += share[m] * states[m][0];
+            mixed[1] += share[m] * states[m][1];
+        }
+        for m in 0..MODELS {
+            let (d0, d1) = (states[m][0] - mixed[0], states[m][1] - mixed[1]);
+            mixed[2] += share[m] * (states[m][2] + d0 * d0);
+            mixed[3] += share[m] * (states[m][3] + d0 * d1);
+            mixed[4] += share[m] * (states[m][4] + d1 * d1);
+        }
+        // (12): extrapolation.
+        let Model { rate, keep, noise } = models[l];
+        let brightness = mixed[0] + rate * mixed[1];
+        let slope = keep * mixed[1];
+        let p11 = mixed[2] + rate * (2.0 * mixed[3] + rate * mixed[4]) + noise[0];
+        let p12 = keep * (mixed[3] + rate * mixed[4]) + noise[1];
+        let p22 = keep * keep * mixed[4] + noise[2];
+        // (13): the measurement, erratum: `f` is the measurement and `R_f` its variance.
+        let innovation = measured - brightness;
+        let s = p11 + variance;
+        let (k1, k2) = (p11 / s, p12 / s);
+        updated[l] = [
+            brightness + k1 * innovation,
+            slope + k2 * innovation,
+            k1 * variance,
+            k2 * variance,
+            p22 - k2 * p12,
+        ];
+        // (14)-(15) up to a common factor.
+        exponents[l] = -0.5 * innovation * innovation / s;
+        likelihoods[l] = prior / s.sqrt();
+    }
+    let largest = exponents[0].max(exponents[1]).max(exponents[2]);
+    for l in 0..MODELS {
+        likelihoods[l] = (likelihoods[l] * lanes::exp(exponents[l] - largest)).max(f32::MIN_POSITIVE);
+        total += likelihoods[l];
+    }
+    let mut filtered = 0.0;
+    for l in 0..MODELS {
+        let probability = (likelihoods[l] / total).max(LEAST_PROBABILITY);
+        block.probabilities[l][i] = probability;
+        for part in 0..PARTS {
+            block.states[l][part][i] = updated[l][part];
+        }
+        // (16): the estimate that does not depend on a hypothesis.
+        filtered += probability * updated[l][0];
+    }
+    filtered
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_pixel_is_filtered_alone() {
+        let start = [10.0, 50.0, 90.0, 130.0, 170.0, 200.0, 220.0, 240.0, 250.0, 30.0];
+        let mut together = PixelImm::new(ImmConfig::default(), &start, 25.0);
+        let mut out = [0.0; 10];
+        for frame in 0..20 {
+            let measured = start.map(|s| if frame > 9 { 255.0 - s } else { s + frame as f32 });
+            together.step(&measured, 0.04, 25.0, &mut out);
+        }
+        for (i, first) in start.iter().enumerate() {
+            let mut alone = PixelImm::new(ImmConfig::default(), &[*first], 25.0);
+            let mut one = [0.0];
+            for frame in 0..20 {
+                let measured = if frame > 9 { 255.0 - first } else { first + frame as f32 };
+                alone.step(&[measured], 0.04, 25.0, &mut one);
+            }
+            assert_eq!(one[0], out[i]);
+        }
+    }
+
+    #[test]
+    fn a_jump_is_followed_within_ten_frames_and_noise_is_not() {
+        let mut filter = PixelImm::new(ImmConfig::default(), &[100.0], 25.0);
+        let mut out = [0.0];
+        let mut spread = 0.0_f32;
+        for frame in 0..200 {
+            let noise = if frame % 2 == 0 { 5.0 } else { -5.0 };
+            filter.step(&[100.0 + noise], 0.04, 25.0, &mut out);
+            if frame > 100 {
+                spread = spread.max((out[0] - 100.0).abs());
+            }
+        }
+        assert!(spread < 1.0, "{spread}");
+        for _ in 0..10 {
+            filter.step(&[180.0], 0.04, 25.0, &mut out);
+        }
+        assert!((out[0] - 180.0).abs() < 5.0, "{}", out[0]);
+    }
+
+    #[test]
+    fn singers_model_is_stable() {
+        let [_, _, singer] = ImmConfig::default().models(0.04);
+        // Upper triangular: the eigenvalues are 1 and e.
+        assert!(singer.keep < 1.0 && singer.rate > 0.0);
+        assert!(singer.noise[0] > 0.0 && singer.noise[0] * singer.noise[2] >= singer.noise[1].powi(2) * 0.99);
+    }
+}

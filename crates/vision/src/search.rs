@@ -1,0 +1,254 @@
+//! Looking for a lost target in a gate that grows, on a picture made coarser.
+
+use std::ops::Range;
+
+use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
+
+use crate::TrackerConfig;
+use crate::likelihood::log_ratios;
+use crate::target::{FRAME_INTERVAL, Frame, Look, SEARCH_AFTER_FRAMES, Target, Workbench};
+
+/// Least side of the reference on the coarse picture, px, and the most that is made of one.
+const COARSE_SIDE: usize = 8;
+const MOST_COARSE: usize = 4;
+/// A found place is believed if its log ratio is at least this, at least `MARGIN` above the next
+/// best place's, and in white noise alone the best of all placements would not come near it.
+const LEAST_RATIO: f32 = 3.0;
+const MARGIN: f32 = 1.0;
+const ABOVE_CHANCE: f64 = 4.0;
+
+/// What the scene itself looks like to a target's reference: the log ratios in a picture in which the
+/// target was elsewhere.
+#[derive(Clone, Debug)]
+pub(crate) struct Background {
+    coarseness: usize,
+    ratios: Plane,
+}
+
+/// Memory for the search.
+#[derive(Debug, Default)]
+pub(crate) struct Search {
+    coarse: Plane,
+    fine: Plane,
+}
+
+/// The best place of a search.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Found {
+    pub(crate) look: Option<Look>,
+    pub(crate) accepted: bool,
+}
+
+/// The means of blocks of `side` by `side`.
+fn coarsened(from: &Plane, side: usize, to: &mut Plane) {
+    if side == 1 {
+        to.copy_from(from);
+        return;
+    }
+    to.reshape(from.width() / side, from.height() / side);
+    let share = 1.0 / (side * side) as f32;
+    for y in 0..to.height() {
+        let out = to.row_mut(y);
+        out.fill(0.0);
+        for row in 0..side {
+            let blocks = from.row((y * side + row).min(from.height() - 1)).chunks_exact(side);
+            for (mean, block) in out.iter_mut().zip(blocks) {
+                *mean += share * block.iter().sum::<f32>();
+            }
+        }
+    }
+}
+
+/// The target's reference on the coarse picture.
+fn coarse_reference(target: &Target, coarseness: usize, resampler: &mut Resampler) -> Reference {
+    let working = target.appearance.working.image();
+    let side = |length: usize| 2 * (length / (2 * coarseness)) + 1;
+    let (width, height) = (side(working.width()), side(working.height()));
+    let mut whole = Plane::from_fn(width * coarseness, height * coarseness, |_, _| 0.0);
+    let middle = |length: usize| (length as f64 - 1.0) / 2.0;
+    let view = View { x: middle(working.width()), y: middle(working.height()), scale: 1.0, turn_rad: 0.0 };
+    resampler.look(working, view, &mut whole);
+    let mut image = Plane::default();
+    coarsened(&whole, coarseness, &mut image);
+    let window = Window::uniform(image.width(), image.height());
+    Reference::new(image, window)
+}
+
+/// A reference on a picture made coarser by a whole number.
+struct Coarse {
+    reference: Reference,
+    coarseness: usize,
+}
+
+impl Coarse {
+    /// Log ratios of every placement whose middle is in the given part of a coarse picture, into
+    /// `bench.ratios`.
+    fn ratios(
+        &self,
+        target: &Target,
+        picture: &Plane,
+        [columns, rows]: &[Range<usize>; 2],
+        bench: &mut Workbench,
+        config: &TrackerConfig,
+    ) {
+        let (width, height) = (self.reference.image().width(), self.reference.image().height());
+        let left = columns.start as isize - (width as isize - 1) / 2;
+        let top = rows.start as isize - (height as isize - 1) / 2;
+        picture.crop_into(left, top, columns.len() + width - 1, rows.len() + height - 1, &mut bench.gate);
+        bench.correlator.statistics(&bench.gate, &self.reference, &mut bench.statistics);
+        let pixels = (width * height) as f32;
+        let noise = target.noise / (self.coarseness * self.coarseness) as f32;
+        let noise = noise.max((config.noise_floor * config.noise_floor) as f32);
+        let expected = target.expectation(noise, self.reference.variance() * pixels, pixels, config);
+        log_ratios(&bench.statistics, expected, &mut bench.ratios);
+    }
+}
+
+/// Looks for a lost target.
+pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench) -> Found {
+    let Frame { image, config, .. } = frame;
+    let working = target.appearance.working.image();
+    let sides = [working.width(), working.height()];
+    let coarseness = (sides[0].min(sides[1]) / COARSE_SIDE).clamp(1, MOST_COARSE);
+    let side = coarseness as f64;
+    if image.width() < 2 * coarseness || image.height() < 2 * coarseness {
+        return Found { look: None, accepted: false };
+    }
+    let predicted = target.position();
+    let at = [predicted.x, predicted.y];
+    let half = half_sides(target, image, sides, config);
+    let image_sides = [image.width(), image.height()];
+    let ranges = [0, 1].map(|i| {
+        let last = image_sides[i] / coarseness - 1;
+        let first = (((at[i] - half[i]) / side).max(0.0) as usize).min(last);
+        first..(((at[i] + half[i]) / side).max(0.0) as usize + 1).min(last).max(first) + 1
+    });
+    let coarse =
+        Coarse { reference: coarse_reference(target, coarseness, &mut bench.workshop.resampler), coarseness };
+    remember_background(target, frame, &coarse, bench);
+
+    let mut picture = std::mem::take(&mut bench.search.coarse);
+    coarsened(image, coarseness, &mut picture);
+    coarse.ratios(target, &picture, &ranges, bench, config);
+    bench.search.coarse = picture;
+    let area = Area { ranges, predicted: at, half, sides, coarseness };
+    let best = area.best_place(target, bench, config);
+
+    // Once more at full resolution, where the coarse search says.
+    let reach = coarseness + 1;
+    let origin = [0, 1].map(|i| best.place[i].round() - reach as f64);
+    let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
+    image.crop_into(corner[0], corner[1], 2 * reach + sides[0], 2 * reach + sides[1], &mut bench.gate);
+    bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
+    let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
+    let expected = target.expectation(target.noise, energy, pixels, config);
+    let mut fine = std::mem::take(&mut bench.search.fine);
+    log_ratios(&bench.statistics, expected, &mut fine);
+    let peak = fine.peak();
+    bench.search.fine = fine;
+    let contrast =
+        f64::from(bench.statistics.covariance.row(peak.row)[peak.column] * pixels / energy.max(1e-12)).max(0.0);
+    let look = target.look(peak.column, peak.row, origin, bench, config);
+    let above_chance = contrast * contrast * f64::from(energy / (2.0 * target.noise));
+    let placements = (2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0);
+    let accepted = peak.score - best.background > LEAST_RATIO
+        && best.margin > MARGIN
+        && above_chance > placements.ln() + ABOVE_CHANCE;
+    Found { look: Some(look), accepted }
+}
+
+/// Half sides of the search, px: they grow from frame to frame.
+fn half_sides(target: &Target, image: &Plane, sides: [usize; 2], config: &TrackerConfig) -> [f64; 2] {
+    let frames = f64::from(target.missed - SEARCH_AFTER_FRAMES.min(target.missed) + 1);
+    let grown = config.search_growth_px * FRAME_INTERVAL * frames;
+    let gate = target.half_gate(image, config);
+    let most = [image.width(), image.height()];
+    [0, 1].map(|i| (gate[i] as f64).max(sides[i] as f64 + grown).min(most[i] as f64))
+}
+
+/// The scene's own log ratios, once a loss.
+fn remember_background(target: &mut Target, frame: Frame<'_>, coarse: &Coarse, bench: &mut Workbench) {
+    let coarseness = coarse.coarseness;
+    let known = target.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
+    let Some(keepsake) = frame.keepsake.filter(|_| !known && target.in_keepsake.is_some()) else { return };
+    let mut picture = std::mem::take(&mut bench.search.coarse);
+    coarsened(keepsake, coarseness, &mut picture);
+    let whole = [0..picture.width(), 0..picture.height()];
+    coarse.ratios(target, &picture, &whole, bench, frame.config);
+    bench.search.coarse = picture;
+    target.background = Some(Background { coarseness, ratios: bench.ratios.clone() });
+}
+
+/// The best placement on the coarse picture.
+struct Best {
+    /// Its middle, px of the full picture.
+    place: [f64; 2],
+    /// Log ratio over the next best's.
+    margin: f32,
+    /// Log ratio that the scene had there.
+    background: f32,
+}
+
+/// Where a target is looked for.
+struct Area {
+    /// Columns and rows of the coarse picture.
+    ranges: [Range<usize>; 2],
+    /// The prediction, and how far from it is looked, px of the full picture.
+    predicted: [f64; 2],
+    half: [f64; 2],
+    /// Sides of the reference, px.
+    sides: [usize; 2],
+    coarseness: usize,
+}
+
+impl Area {
+    fn best_place(&self, target: &Target, bench: &mut Workbench, config: &TrackerConfig) -> Best {
+        let Self { ranges, predicted, half, sides, coarseness } = self;
+        let (sides, coarseness) = (*sides, *coarseness);
+        let side = coarseness as f64;
+        let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
+        let variances = [0, 1].map(|i| target.axes()[i].position_variance());
+        let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
+        let anywhere = (config.anywhere_share * f64::from(2_u32.saturating_pow(target.missed))).min(0.5);
+        let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));
+        let background_at = |column: usize, row: usize| -> f32 {
+            let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else { return 0.0 };
+            let near = (middle(column) - seen.x).abs() <= sides[0] as f64
+                && (middle(row) - seen.y).abs() <= sides[1] as f64;
+            if near { 0.0 } else { background.ratios.clamped(column as isize, row as isize).max(0.0) }
+        };
+        let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
+        for (y, row) in ranges[1].clone().enumerate() {
+            let across = (middle(row) - predicted[1]).powi(2) / variances[1];
+            for (x, column) in ranges[0].clone().enumerate() {
+                let ratio = &mut bench.ratios.row_mut(y)[x];
+                *ratio -= background_at(column, row);
+                // Where even the flat prior cannot reach the best, the logarithm is spared.
+                if f64::from(*ratio) + (density + flat).ln() <= most {
+                    continue;
+                }
+                let along = (middle(column) - predicted[0]).powi(2) / variances[0];
+                let prior = (1.0 - anywhere) * density * (-0.5 * (along + across)).exp() + flat;
+                let score = f64::from(*ratio) + prior.ln();
+                if score > most {
+                    (best, most) = ([x, y], score);
+                }
+            }
+        }
+        let near = sides.map(|s| ((s / coarseness) / 4).max(2));
+        let mut rival = f32::NEG_INFINITY;
+        for y in 0..bench.ratios.height() {
+            for (x, ratio) in bench.ratios.row(y).iter().enumerate() {
+                if x.abs_diff(best[0]) > near[0] || y.abs_diff(best[1]) > near[1] {
+                    rival = rival.max(*ratio);
+                }
+            }
+        }
+        let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
+        Best {
+            place: [middle(column), middle(row)],
+            margin: bench.ratios.row(best[1])[best[0]] - rival,
+            background: background_at(column, row),
+        }
+    }
+}
