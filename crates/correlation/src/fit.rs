@@ -10,6 +10,8 @@ const SETTLED_PX: f64 = 2e-3;
 const REACH_PX: f64 = 1.5;
 /// Share of the trace that keeps the normal matrix regular where the image tells nothing.
 const LEAST_SHARE: f64 = 1e-9;
+/// How much better than by the image a contrast is known that is given.
+const KNOWN: f64 = 1e6;
 /// Planes of a fit: model, its changes by the four freedoms, image.
 const PLANES: usize = 6;
 
@@ -85,11 +87,13 @@ pub struct FitOptions {
     /// Share of the reference's energy that is added to the information of scale and turn: a prior
     /// that they have not changed.
     pub stiffness: f64,
+    /// The image's contrast over the reference's, where it is known; otherwise it is fitted.
+    pub contrast: Option<f64>,
 }
 
 impl Default for FitOptions {
     fn default() -> Self {
-        Self { border: 1, steps: 4, freedom: Freedom::Shift, stiffness: 0.0 }
+        Self { border: 1, steps: 4, freedom: Freedom::Shift, stiffness: 0.0, contrast: None }
     }
 }
 
@@ -234,11 +238,15 @@ impl Normal {
         // moves against its slope.
         let sign = |i: usize| if i == 0 { 1.0 } else { -1.0 };
         let mut normal = Matrix5::from_fn(|i, j| sign(i) * sign(j) * p[i][j]);
-        let right = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
+        let mut right = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
         let shift_only = options.freedom == Freedom::Shift;
         let stiff = if shift_only { energy } else { options.stiffness * energy };
         for i in 0..5 {
             normal[(i, i)] += LEAST_SHARE * normal.trace() + if i > 2 { stiff } else { 0.0 };
+        }
+        if let Some(contrast) = options.contrast {
+            normal[(0, 0)] += KNOWN * energy;
+            right[0] += KNOWN * energy * contrast;
         }
         fit.gradient_energy = [p[1][1], p[2][2]];
         let solved = normal.cholesky()?;
@@ -246,7 +254,8 @@ impl Normal {
         let gain = solution[0];
         fit.gain = gain;
         let freedoms = if shift_only { 4.0 } else { 6.0 };
-        let explained = solution.dot(&right);
+        let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
+        let explained = if options.contrast.is_some() { gain * fitted[0] } else { solution.dot(&fitted) };
         fit.residual_variance = ((p[5][5] - explained) / (fit.pixels as f64 - freedoms).max(1.0)).max(0.0);
         if gain <= 0.0 || !gain.is_finite() {
             return None;

@@ -15,7 +15,7 @@ use clap::{Parser, Subcommand};
 
 use crate::commands::{
     agent, check, demo, evaluate, export, fuse, import as import_command, info, record, replay, simulate,
-    track, view,
+    track, validate, view,
 };
 
 /// Where in the air a small thing is, with nothing but cameras.
@@ -46,6 +46,7 @@ enum Command {
     Export(export::Args),
     Evaluate(evaluate::Args),
     Check(check::Args),
+    Validate(validate::Args),
 }
 
 fn run(cli: Cli) -> anyhow::Result<()> {
@@ -63,6 +64,7 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Export(args) => export::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Validate(args) => validate::run(&args),
     }
 }
 

@@ -19,7 +19,9 @@
 mod history;
 mod latency;
 mod metrics;
+mod papers;
 
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Report, TargetReport, TrueTarget};
+pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_tracker};

@@ -18,6 +18,7 @@ mod clock;
 mod path;
 mod render;
 mod scene;
+mod silhouette;
 mod sky;
 mod world;
 
@@ -25,4 +26,5 @@ pub use clock::SimulatedClock;
 pub use path::FlightPath;
 pub use render::RenderedFrame;
 pub use scene::{Scene, SceneCamera, SceneError, SceneTarget};
+pub use silhouette::{Silhouette, TEMPLATE_SIZES};
 pub use world::{SimulatedCamera, TargetState, World};

@@ -1,10 +1,12 @@
 //! What a target looks like: its reference in a size and direction of its own, how large it is and
 //! how it is turned in the image, and how far its reference has drifted from what it was at first.
 
-use crossfix_correlation::{FitOptions, Fitter, Freedom, Plane, Reference, Resampler, View, Window};
+use crossfix_correlation::{
+    FitOptions, Fitter, Freedom, LowPass, LowPassMemory, Plane, Reference, Resampler, View, Window,
+};
 
 use crate::ImagePoint;
-use crate::lowpass::LowPass;
+use crate::mend::mend;
 use crate::reference::Adaptation;
 use crate::{PixelBox, TrackerConfig};
 
@@ -39,8 +41,7 @@ pub(crate) struct Drift {
 pub(crate) struct Workshop {
     pub(crate) resampler: Resampler,
     pub(crate) fitter: Fitter,
-    padded: Plane,
-    lines: Plane,
+    memory: LowPassMemory,
     filtered: Plane,
     view: Plane,
 }
@@ -114,6 +115,7 @@ impl Appearance {
             View { x: centre.x, y: centre.y, scale: 1.0, turn_rad: 0.0 },
             &mut own,
         );
+        mend(&mut own);
         without_mean(&mut own);
         let noise = noise * noise_kept(centre);
         let plain = Reference::new(own.clone(), Window::uniform(width, height));
@@ -150,7 +152,7 @@ impl Appearance {
     /// Variance of the noise in it, and of that noise's gradient.
     pub(crate) fn noise(&self) -> (f32, f32) {
         let filter = &self.low_passes[self.chosen];
-        (self.adaptation.noise * filter.noise_gain, self.adaptation.noise * filter.gradient_gain)
+        (self.adaptation.noise * filter.noise_gain(), self.adaptation.noise * filter.gradient_gain())
     }
 
     /// Share of its energy that is the target's: a noisy reference finds the target fainter than it is.
@@ -173,6 +175,7 @@ impl Appearance {
         view.reshape(self.own.width(), self.own.height());
         let seen = View { x: place.x, y: place.y, scale: self.scale, turn_rad: self.turn_rad };
         workshop.resampler.look(image, seen, &mut view);
+        mend(&mut view);
         without_mean(&mut view);
         let noise = noise * noise_kept(place);
         self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
@@ -206,12 +209,12 @@ impl Appearance {
         let pixels = self.own.samples().len() as f32;
         let clear = pixels * noise < CLEAR_NOISE_SHARE * energy(&self.own);
         let mut least = f32::INFINITY;
-        let Workshop { padded, lines, filtered, .. } = workshop;
+        let Workshop { memory, filtered, .. } = workshop;
         for (index, filter) in self.low_passes.iter().enumerate() {
-            filter.apply(&self.own, padded, lines, filtered);
+            filter.apply(&self.own, memory, filtered);
             let taken: f32 =
                 self.own.samples().iter().zip(filtered.samples()).map(|(a, b)| (a - b) * (a - b)).sum();
-            let risk = taken + pixels * noise * (2.0 * filter.own_weight - 1.0);
+            let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
                 self.smooth.copy_from(filtered);
@@ -234,12 +237,16 @@ impl Appearance {
     /// How the reference has drifted: each image was taken at an estimated place, and their errors
     /// add up; the anchor, to which almost nothing is added any more, stays.
     fn compare_with_anchor(&mut self, workshop: &mut Workshop) {
-        let index =
-            self.low_passes.iter().position(|f| f.deviation >= ANCHOR_LOW_PASS).unwrap_or(0).max(self.chosen);
-        let Workshop { padded, lines, filtered, fitter, .. } = workshop;
+        let index = self
+            .low_passes
+            .iter()
+            .position(|f| f.deviation() >= ANCHOR_LOW_PASS)
+            .unwrap_or(0)
+            .max(self.chosen);
+        let Workshop { memory, filtered, fitter, .. } = workshop;
         let filter = &self.low_passes[index];
-        self.memory.update(|image| filter.apply(self.anchor.image(), padded, lines, image));
-        filter.apply(&self.own, padded, lines, filtered);
+        self.memory.update(|image| filter.apply(self.anchor.image(), memory, image));
+        filter.apply(&self.own, memory, filtered);
         self.drift = Drift::default();
         let product: f32 =
             self.memory.image().samples().iter().zip(filtered.samples()).map(|(a, b)| a * b).sum();
@@ -247,8 +254,13 @@ impl Appearance {
         if score < ANCHOR_LEAST_SCORE {
             return;
         }
-        let options =
-            FitOptions { border: 0, steps: 1, freedom: Freedom::ShiftScaleTurn, stiffness: ANCHOR_STIFFNESS };
+        let options = FitOptions {
+            border: 0,
+            steps: 1,
+            freedom: Freedom::ShiftScaleTurn,
+            stiffness: ANCHOR_STIFFNESS,
+            contrast: None,
+        };
         let fit = fitter.fit(filtered, &self.memory, 0.0, 0.0, options);
         self.drift = Drift {
             x: fit.x.clamp(-1.0, 1.0),

@@ -35,7 +35,7 @@ pub struct TrackerConfig {
     /// How much of the reference's energy a mismatch with the target may take: its inverse. Default 30;
     /// at 60 textured background is taken for targets.
     pub mismatch: f64,
-    /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.3.
+    /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.5.
     pub contrast_sd: f64,
     /// Probability that a target can be seen in an image. Default 0.95.
     pub visible_probability: f64,
@@ -134,7 +134,7 @@ impl Default for TrackerConfig {
             given_sd_px: 0.1,
             prediction_floor_px: 0.3,
             mismatch: 30.0,
-            contrast_sd: 0.3,
+            contrast_sd: 0.5,
             visible_probability: 0.95,
             anywhere_share: 0.01,
             search_growth_px: 750.0,

@@ -3,6 +3,7 @@
 
 use crossfix_correlation::Plane;
 
+use crate::mend::mend;
 use crate::{DetectorConfig, ImagePoint, PixelBox};
 
 /// Median absolute deviation of a normal distribution of standard deviation one.
@@ -44,12 +45,15 @@ impl Detector {
     pub(crate) fn step(&mut self, image: &Plane, known: &[PixelBox]) -> Vec<PixelBox> {
         let size = |plane: &Plane| (plane.width(), plane.height());
         let Some(background) = self.background.as_mut().filter(|b| size(b) == size(image)) else {
-            self.background = Some(image.clone());
+            let mut first = image.clone();
+            mend(&mut first);
+            self.background = Some(first);
             self.frames = 1;
             self.candidates.clear();
             return Vec::new();
         };
         let mut difference = image.clone();
+        mend(&mut difference);
         for (value, old) in difference.samples_mut().iter_mut().zip(background.samples()) {
             *value -= old;
         }

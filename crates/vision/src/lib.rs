@@ -30,7 +30,7 @@ mod config;
 mod detector;
 mod lanes;
 mod likelihood;
-mod lowpass;
+mod mend;
 mod noise;
 mod paper;
 mod posterior;

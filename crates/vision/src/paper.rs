@@ -2,9 +2,10 @@
 //! peak of one similarity measure, two Kalman filters of fixed measurement noise.
 
 use crossfix_correlation::{Extent, Plane, Reference, Window};
-use crossfix_filter::{AxisFilter, AxisMeasurement};
+use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
 use nalgebra::Matrix2;
 
+use crate::mend::mend;
 use crate::reference::Adaptation;
 use crate::target::{Step, Workbench};
 use crate::tracker::Measurement;
@@ -61,12 +62,12 @@ impl PaperTarget {
         let start =
             |first, second| AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px);
         self.axes = Some([start(self.first.x, place.x), start(self.first.y, place.y)]);
-        self.answer(place, 1.0, config)
+        self.answer(place, 1.0, None, config)
     }
 
-    fn answer(&self, place: ImagePoint, score: f64, config: &TrackerConfig) -> Step {
+    fn answer(&self, place: ImagePoint, score: f64, nis: Option<f64>, config: &TrackerConfig) -> Step {
         let covariance = Matrix2::identity() * config.paper.measurement_sd_px.powi(2);
-        Step { measured: Some(Measurement { place, covariance }), score, certainty: 1.0 }
+        Step { measured: Some(Measurement { place, covariance }), score, certainty: 1.0, nis }
     }
 
     pub(crate) fn step(
@@ -106,20 +107,21 @@ impl PaperTarget {
             x: gate_middle.x + offset(refined.x, bench.gate.width(), width),
             y: gate_middle.y + offset(refined.y, bench.gate.height(), height),
         };
-        match &mut self.axes {
-            Some([x, y]) => {
-                x.measurement_update(Self::at(place.x, config));
-                y.measurement_update(Self::at(place.y, config));
-            }
-            None => {
-                self.take_place(place, interval, config);
-            }
-        }
+        let nis = if let Some([x, y]) = &mut self.axes {
+            let innovations = [
+                x.measurement_update(Self::at(place.x, config)),
+                y.measurement_update(Self::at(place.y, config)),
+            ];
+            Some(innovations.iter().map(Innovation::normalised_squared).sum())
+        } else {
+            self.take_place(place, interval, config);
+            None
+        };
         let seen = crop(image, self.position(), width, height);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
         let adaptation = &mut self.adaptation;
         self.reference.update(|own| adaptation.take_in(own, &seen, noise, 1.0, interval as f32));
-        self.answer(place, f64::from(peak.score), config)
+        self.answer(place, f64::from(peak.score), nis, config)
     }
 }
 
@@ -127,5 +129,7 @@ impl PaperTarget {
 /// a pixel further.
 fn crop(image: &Plane, middle: ImagePoint, width: usize, height: usize) -> Plane {
     let start = |at: f64, side: usize| (at - (side as f64 - 1.0) / 2.0).round() as isize;
-    image.crop(start(middle.x, width), start(middle.y, height), width, height)
+    let mut part = image.crop(start(middle.x, width), start(middle.y, height), width, height);
+    mend(&mut part);
+    part
 }

@@ -109,12 +109,7 @@ impl PosteriorMap {
         let rest = Part { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
         let sum = total.mass + unseen;
         let share = |part: Part| Part { mass: part.mass / sum, ..part };
-        Posterior {
-            peak,
-            near: share(near),
-            elsewhere: share(rest),
-            unseen: unseen / sum,
-        }
+        Posterior { peak, near: share(near), elsewhere: share(rest), unseen: unseen / sum }
     }
 
     /// Mass, mean and variance of the weights of a part of the map.

@@ -6,6 +6,7 @@ use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
 use crate::likelihood::log_ratios;
+use crate::mend::mend;
 use crate::target::{FRAME_INTERVAL, Frame, Look, SEARCH_AFTER_FRAMES, Target, Workbench};
 
 /// Least side of the reference on the coarse picture, px, and the most that is made of one.
@@ -129,6 +130,7 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
 
     let mut picture = std::mem::take(&mut bench.search.coarse);
     coarsened(image, coarseness, &mut picture);
+    mend(&mut picture);
     coarse.ratios(target, &picture, &ranges, bench, config);
     bench.search.coarse = picture;
     let area = Area { ranges, predicted: at, half, sides, coarseness };
@@ -139,6 +141,7 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     let origin = [0, 1].map(|i| best.place[i].round() - reach as f64);
     let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
     image.crop_into(corner[0], corner[1], 2 * reach + sides[0], 2 * reach + sides[1], &mut bench.gate);
+    mend(&mut bench.gate);
     bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
     let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
     let expected = target.expectation(target.noise, energy, pixels, config);
@@ -147,7 +150,8 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     let peak = fine.peak();
     bench.search.fine = fine;
     let contrast =
-        f64::from(bench.statistics.covariance.row(peak.row)[peak.column] * pixels / energy.max(1e-12)).max(0.0);
+        f64::from(bench.statistics.covariance.row(peak.row)[peak.column] * pixels / energy.max(1e-12))
+            .max(0.0);
     let look = target.look(peak.column, peak.row, origin, bench, config);
     let above_chance = contrast * contrast * f64::from(energy / (2.0 * target.noise));
     let placements = (2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0);
@@ -173,6 +177,7 @@ fn remember_background(target: &mut Target, frame: Frame<'_>, coarse: &Coarse, b
     let Some(keepsake) = frame.keepsake.filter(|_| !known && target.in_keepsake.is_some()) else { return };
     let mut picture = std::mem::take(&mut bench.search.coarse);
     coarsened(keepsake, coarseness, &mut picture);
+    mend(&mut picture);
     let whole = [0..picture.width(), 0..picture.height()];
     coarse.ratios(target, &picture, &whole, bench, frame.config);
     bench.search.coarse = picture;

@@ -68,6 +68,9 @@ pub struct ImageTrack {
     pub score: f64,
     /// Probability that the target is at the best place and nowhere else.
     pub certainty: f64,
+    /// Normalised innovation squared of both axes, chi-square with two degrees of freedom if all is
+    /// well; absent if nothing was predicted.
+    pub nis: Option<f64>,
 }
 
 /// Who took a target up.
@@ -118,11 +121,10 @@ impl Follower {
     }
 
     fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
-        let axes = match self {
-            Self::Posterior(target) => Some(target.axes()),
-            Self::Paper(target) => target.axes(),
-        };
-        axes.map(|axes| [axes[0].covariance(), axes[1].covariance()])
+        match self {
+            Self::Posterior(target) => Some(target.covariances()),
+            Self::Paper(target) => target.axes().map(|[x, y]| [x.covariance(), y.covariance()]),
+        }
     }
 
     /// Width and height of the target, px.
@@ -171,8 +173,6 @@ pub struct ImageTracker {
     config: TrackerConfig,
     bench: Workbench,
     keepsake: Option<Keepsake>,
-    /// The image with its broken pixels mended, if it has any.
-    mended: Plane,
     detector: Option<Detector>,
     waiting: Vec<PixelBox>,
     followed: Vec<Followed>,
@@ -193,7 +193,6 @@ impl ImageTracker {
             config,
             bench: Workbench::default(),
             keepsake: None,
-            mended: Plane::default(),
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),
@@ -236,8 +235,6 @@ impl ImageTracker {
         let interval = self.last.map_or(0.0, |(last, ..)| time.seconds_since(last).min(LONGEST_INTERVAL));
         self.last = Some((time, size.0, size.1));
 
-        let mut mended = std::mem::take(&mut self.mended);
-        let image = mend(image, &mut mended);
         let mut tracks: Vec<ImageTrack> = Vec::with_capacity(self.followed.len());
         let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
         let frame = Frame { image, interval, keepsake, config: &self.config };
@@ -257,7 +254,6 @@ impl ImageTracker {
         tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
         self.take_up_new(image, time, &mut tracks);
         self.keep(image, time);
-        self.mended = mended;
         tracks
     }
 
@@ -318,25 +314,11 @@ impl ImageTracker {
             self.next_id += 1;
             let target = Follower::new(image, place, &mut self.bench, &self.config);
             let followed = Followed { id, origin, target, measured_at: time, cue: None };
-            let step = Step { measured: None, score: 1.0, certainty: 1.0 };
+            let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
             tracks.push(describe(&followed, TrackPhase::Tentative, step));
             self.followed.push(followed);
         }
     }
-}
-
-/// The image, or where it has NaNs or infinities, a copy with those made black: a broken pixel must
-/// not spoil a whole gate.
-fn mend<'a>(image: &'a Plane, mended: &'a mut Plane) -> &'a Plane {
-    // Their sum is not finite if a sample is not; that is quicker to see than each of them.
-    if image.mean().is_finite() {
-        return image;
-    }
-    mended.copy_from(image);
-    for sample in mended.samples_mut().iter_mut().filter(|sample| !sample.is_finite()) {
-        *sample = 0.0;
-    }
-    mended
 }
 
 fn box_of(target: &Follower) -> PixelBox {
@@ -365,6 +347,7 @@ fn describe(followed: &Followed, phase: TrackPhase, step: Step) -> ImageTrack {
         height,
         score: step.score,
         certainty: step.certainty,
+        nis: step.nis,
     }
 }
 

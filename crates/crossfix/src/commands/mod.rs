@@ -13,4 +13,5 @@ pub mod rejections;
 pub mod replay;
 pub mod simulate;
 pub mod track;
+pub mod validate;
 pub mod view;

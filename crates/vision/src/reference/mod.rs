@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 
 pub use imm::{ImmConfig, PixelImm};
 
+use crate::target::FRAME_INTERVAL;
+
 /// How the reference is formed from the images of the target.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
@@ -82,7 +84,8 @@ impl Adaptation {
                 if let Some(filter) = &mut self.filter {
                     // An uncertain image is a noisier one.
                     let variance = noise / certainty.max(0.01);
-                    filter.step(image.samples(), interval, variance, reference.samples_mut());
+                    let frames = interval / FRAME_INTERVAL as f32;
+                    filter.step(image.samples(), frames, variance, reference.samples_mut());
                     // About four frames' mean where nothing changes, one where it jumps.
                     self.noise = (0.75 * self.noise).max(noise / 4.0);
                 }

@@ -1,24 +1,30 @@
-use crossfix_correlation::Plane;
+use crate::Plane;
 
 /// Half the length of the longest filter.
 const MOST_REACH: usize = 5;
 
-/// A Gaussian low-pass over both axes, the border going on beyond itself.
+/// A Gaussian low-pass over both axes, the border going on beyond itself: what a noisy reference needs
+/// before it is interpolated, for between the samples its noise is less than at them, and a fit would
+/// go there.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct LowPass {
-    /// Standard deviation, px; 0 changes nothing.
-    pub(crate) deviation: f32,
+pub struct LowPass {
+    deviation: f32,
     taps: Vec<f32>,
-    /// White noise's variance after over before.
-    pub(crate) noise_gain: f32,
-    /// The weight of a sample in its own result.
-    pub(crate) own_weight: f32,
-    /// Variance of white noise's central difference along an axis, over the noise's variance.
-    pub(crate) gradient_gain: f32,
+    noise_gain: f32,
+    own_weight: f32,
+    gradient_gain: f32,
+}
+
+/// Memory for filtering.
+#[derive(Clone, Debug, Default)]
+pub struct LowPassMemory {
+    padded: Plane,
+    lines: Plane,
 }
 
 impl LowPass {
-    pub(crate) fn new(deviation: f32) -> Self {
+    /// A filter of a standard deviation in pixels; 0 changes nothing.
+    pub fn new(deviation: f32) -> Self {
         let reach = ((3.0 * deviation).ceil() as usize).min(MOST_REACH);
         let mut taps: Vec<f32> = (0..=2 * reach)
             .map(|k| {
@@ -41,8 +47,29 @@ impl LowPass {
         }
     }
 
-    /// Filters a plane; `lines` is memory.
-    pub(crate) fn apply(&self, from: &Plane, padded: &mut Plane, lines: &mut Plane, to: &mut Plane) {
+    /// Its standard deviation, px.
+    pub fn deviation(&self) -> f32 {
+        self.deviation
+    }
+
+    /// White noise's variance after over before.
+    pub fn noise_gain(&self) -> f32 {
+        self.noise_gain
+    }
+
+    /// The weight of a sample in its own result.
+    pub fn own_weight(&self) -> f32 {
+        self.own_weight
+    }
+
+    /// Variance of white noise's central difference along an axis, over the noise's variance.
+    pub fn gradient_gain(&self) -> f32 {
+        self.gradient_gain
+    }
+
+    /// Filters a plane.
+    pub fn apply(&self, from: &Plane, memory: &mut LowPassMemory, to: &mut Plane) {
+        let LowPassMemory { padded, lines } = memory;
         if self.taps.len() == 1 {
             to.copy_from(from);
             return;
@@ -84,8 +111,8 @@ mod tests {
         for deviation in [0.0, 0.6, 1.2] {
             let filter = LowPass::new(deviation);
             let impulse = Plane::from_fn(21, 21, |x, y| f32::from(u8::from((x, y) == (10, 10))));
-            let (mut padded, mut lines, mut out) = (Plane::default(), Plane::default(), Plane::default());
-            filter.apply(&impulse, &mut padded, &mut lines, &mut out);
+            let mut out = Plane::default();
+            filter.apply(&impulse, &mut LowPassMemory::default(), &mut out);
             let squares: f32 = out.samples().iter().map(|v| v * v).sum();
             assert!((squares - filter.noise_gain).abs() < 1e-5);
             assert!((out.row(10)[10] - filter.own_weight).abs() < 1e-6);

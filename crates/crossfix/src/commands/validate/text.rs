@@ -1,0 +1,59 @@
+//! Tables as text.
+
+use std::fmt::Write;
+
+use crossfix_evaluation::{Limit, Table, Verdict};
+
+fn limit(limit: Option<Limit>) -> String {
+    match limit {
+        None => String::new(),
+        Some(Limit::AtMost(most)) => format!("<= {}", short(most)),
+        Some(Limit::AtLeast(least)) => format!(">= {}", short(least)),
+        Some(Limit::Near { value, tolerance }) => format!("{} +- {}", short(value), short(tolerance)),
+    }
+}
+
+/// Four digits.
+fn short(value: f64) -> String {
+    let digits = if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 6) };
+    let text = format!("{value:.*}", digits as usize);
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}
+
+/// One table.
+pub fn table(table: &Table) -> String {
+    let mut text = format!("\n{}\n", table.title);
+    let width = table.rows.iter().map(|row| row.series.len()).max().unwrap_or(0).max(6);
+    let _ = writeln!(
+        text,
+        "{:width$} {:>12} {:>9} {:>9} {:>8}  {:16} {}",
+        "", table.x, "paper", "ours", "+-", "asked", table.y
+    );
+    for row in &table.rows {
+        let verdict = match row.verdict() {
+            Verdict::Pass => "pass",
+            Verdict::Fail => "FAIL",
+            Verdict::Information => "",
+        };
+        let _ = writeln!(
+            text,
+            "{:width$} {:>12} {:>9} {:>9} {:>8}  {:16} {}",
+            row.series,
+            short(row.x),
+            row.paper.map_or(String::new(), short),
+            short(row.ours),
+            short(row.standard_error),
+            limit(row.limit),
+            verdict
+        );
+    }
+    text
+}
+
+/// How many figures are what they must be.
+pub fn summary(tables: &[Table]) -> String {
+    let rows = || tables.iter().flat_map(|table| &table.rows);
+    let asked = rows().filter(|row| row.verdict() != Verdict::Information).count();
+    let failed = rows().filter(|row| row.verdict() == Verdict::Fail).count();
+    format!("{} of {asked} figures are what they must be ({} figures in all)", asked - failed, rows().count())
+}

@@ -1,0 +1,84 @@
+//! The brightness of one pixel by the interacting multiple models and by exponential smoothing (003,
+//! Fig. 4 to 6).
+
+use crossfix_vision::{ImmConfig, PixelImm};
+
+use super::ValidationOptions;
+use super::runs::{self, Noise};
+use super::table::{Limit, Row, Table, mean};
+
+/// Frames of an experiment, and their interval, s.
+const FRAMES: usize = 1000;
+const INTERVAL: f64 = 0.04;
+/// Weight of the old value in exponential smoothing.
+const MEMORY: f64 = 0.9;
+/// Runs of a pixel for each one of the tracker.
+const CHEAP: usize = 2;
+
+/// A cell of the experiment: rate of the jumps, 1/s; their SD and that of the noise, levels.
+#[derive(Clone, Copy)]
+struct Cell {
+    rate: f64,
+    jump: f64,
+    noise: f64,
+}
+
+/// Mean absolute errors (003, (17)-(19)) of the filter and of the smoothing, in one run.
+fn errors(seed: u64, run: usize, cell: Cell) -> [f64; 2] {
+    let mut random = Noise::new(seed, run);
+    let mut truth = 128.0;
+    let first = truth + cell.noise * random.normal();
+    let variance = (cell.noise * cell.noise) as f32;
+    let mut filter = PixelImm::new(ImmConfig::default(), &[first as f32], variance);
+    let (mut smoothed, mut sums) = (first, [0.0; 2]);
+    for _ in 0..FRAMES {
+        if random.uniform() < cell.rate * INTERVAL {
+            truth = (truth + cell.jump * random.normal()).clamp(0.0, 255.0);
+        }
+        let measured = truth + cell.noise * random.normal();
+        let mut filtered = [0.0];
+        filter.step(&[measured as f32], 1.0, variance, &mut filtered);
+        smoothed = MEMORY * smoothed + (1.0 - MEMORY) * measured;
+        sums[0] += (f64::from(filtered[0]) - truth).abs();
+        sums[1] += (smoothed - truth).abs();
+    }
+    sums.map(|sum| sum / FRAMES as f64)
+}
+
+/// Fig. 4 to 6: errors and their ratio.
+pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut rows, mut ratios) = (Vec::new(), Vec::new());
+    // The claimed ratios: 2.14 to 3.21 at sigma_w 5, 1.53 to 2.17 at 15, for lambda 0.1 to 0.9.
+    for (noise, jump, claimed) in
+        [(5.0, 60.0, [2.14, 3.21]), (5.0, 30.0, [2.14, 3.21]), (15.0, 60.0, [1.53, 2.17])]
+    {
+        for rate in [0.1, 0.3, 0.5, 0.7, 0.9] {
+            let cell = Cell { rate, jump, noise };
+            let samples = runs::all(CHEAP * options.runs, |run| errors(options.seed, run, cell));
+            let of = |i: usize| mean(&samples.iter().map(|s| s[i]).collect::<Vec<_>>());
+            let (filter, smoothing) = (of(0), of(1));
+            let name = format!("sigma_w {noise}, jumps {jump}");
+            // The errata's figures.
+            let asked = match (noise as u32, jump as u32, (rate * 10.0).round() as u32) {
+                (5, 60, 1) => Some(0.70),
+                (5, 60, 9) => Some(1.47),
+                _ => None,
+            };
+            let row = Row::new(format!("IMM, {name}"), rate, filter);
+            rows.push(Row { limit: asked.map(|value| Limit::Near { value, tolerance: 0.1 * value }), ..row });
+            rows.push(Row::new(format!("smoothing, {name}"), rate, smoothing));
+            let ratio = smoothing.0 / filter.0;
+            let relative = (filter.1 / filter.0).hypot(smoothing.1 / smoothing.0);
+            let row = Row::new(name, rate, (ratio, ratio * relative));
+            let paper = (rate == 0.1).then_some(claimed[0]).or((rate == 0.9).then_some(claimed[1]));
+            let limit = asked.map(|_| Limit::AtLeast(3.0));
+            ratios.push(Row { paper, limit, ..row });
+        }
+    }
+    let table =
+        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "lambda, 1/s", y, rows };
+    vec![
+        table("brightness", "Error of a pixel's brightness (003, Fig. 4 to 6)", "levels", rows),
+        table("brightness-ratio", "Smoothing's error over the IMM's", "ratio", ratios),
+    ]
+}

@@ -1,0 +1,134 @@
+//! Probability of losing the target, and how long it is kept (000, Fig. 7 and 8; 001, tables 3 and 4).
+
+use crossfix_simulation::Silhouette;
+use crossfix_vision::TrackerConfig;
+
+use super::ValidationOptions;
+use super::flight::{Canvas, FRAMES, Follower, Stamp, texts_path};
+use super::runs::{self, Noise};
+use super::table::{Limit, Row, Table, mean, share};
+
+const SIGMAS: [f64; 6] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
+
+/// A template of the texts: sides, the pedestal of the errata, and the figures of 001, tables 3 and 4.
+struct Template {
+    sides: [usize; 2],
+    pedestal: f32,
+    lost: [f64; 6],
+    frames: [f64; 6],
+}
+
+const TEMPLATES: [Template; 3] = [
+    Template {
+        sides: [50, 30],
+        pedestal: 0.20,
+        lost: [0.0, 0.0, 0.0, 0.0, 0.0, 0.033],
+        frames: [20.0, 20.0, 20.0, 20.0, 20.0, 19.45],
+    },
+    Template {
+        sides: [25, 15],
+        pedestal: 0.24,
+        lost: [0.0, 0.0, 0.0, 0.0, 0.13, 0.8],
+        frames: [20.0, 20.0, 20.0, 20.0, 17.03, 9.55],
+    },
+    Template {
+        sides: [10, 6],
+        pedestal: 0.28,
+        lost: [0.0, 0.0, 0.1, 1.0, 1.0, 1.0],
+        frames: [20.0, 20.0, 18.01, 8.15, 3.54, 3.4],
+    },
+];
+
+/// Frames that a target was kept in each run: the first whose prediction is off by more than the box
+/// on either axis ends it.
+fn kept(
+    options: ValidationOptions,
+    stamp: &Stamp,
+    sides: [usize; 2],
+    sigma_n: f64,
+    config: &TrackerConfig,
+) -> Vec<usize> {
+    runs::all(options.runs, |run| {
+        let mut noise = Noise::new(options.seed, run);
+        let path = texts_path(&mut noise, FRAMES, 1.0);
+        let mut canvas = Canvas::new(sides);
+        let Some(mut follower) = Follower::new(config.clone(), sides) else { return 0 };
+        for (frame, place) in path.iter().enumerate() {
+            let image = canvas.paint(Some(stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
+            let off = follower.step(image, *place, [0.0; 2]).map_or([0.0; 2], |outcome| outcome.prediction);
+            if off[0].abs() > sides[0] as f64 || off[1].abs() > sides[1] as f64 || off[0].is_nan() {
+                return frame;
+            }
+        }
+        FRAMES
+    })
+}
+
+fn lost(kept: &[usize]) -> (f64, f64) {
+    share(kept.iter().map(|frames| *frames < FRAMES))
+}
+
+fn frames(kept: &[usize]) -> (f64, f64) {
+    mean(&kept.iter().map(|frames| *frames as f64).collect::<Vec<_>>())
+}
+
+/// What an independent implementation of the papers' algorithm reaches (errata).
+fn expected_lost(sides: [usize; 2], sigma_n: f64) -> Option<Limit> {
+    let near = |value, tolerance| Some(Limit::Near { value, tolerance });
+    match (sides[0], (sigma_n * 10.0).round() as u32) {
+        (10, 3) => near(0.18, 0.055),
+        (10, 4) => near(0.95, 0.03),
+        (25, 5) => near(0.28, 0.06),
+        (25, 6) => near(0.90, 0.04),
+        _ => None,
+    }
+}
+
+/// Tables 3 and 4 in paper mode.
+pub(super) fn paper_tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut lost_rows, mut kept_rows) = (Vec::new(), Vec::new());
+    for Template { sides, pedestal, lost: paper_lost, frames: paper_frames } in &TEMPLATES {
+        let stamp = Stamp::pasted(&Silhouette::new(sides[0], sides[1]), *pedestal);
+        let name = format!("{}x{}", sides[0], sides[1]);
+        for (i, sigma_n) in SIGMAS.into_iter().enumerate() {
+            let runs = kept(options, &stamp, *sides, sigma_n, &TrackerConfig::paper());
+            let row = Row::new(&name, sigma_n, lost(&runs)).paper(paper_lost[i]);
+            lost_rows.push(Row { limit: expected_lost(*sides, sigma_n), ..row });
+            let row = Row::new(&name, sigma_n, frames(&runs)).paper(paper_frames[i]);
+            let asked = (sides[0] == 10 && i == 3).then_some(Limit::Near { value: 7.4, tolerance: 0.7 });
+            kept_rows.push(Row { limit: asked, ..row });
+        }
+    }
+    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "sigma_n", y, rows };
+    vec![
+        table("loss-paper", "Loss probability, the papers' algorithm", "P", lost_rows),
+        table("frames-paper", "Mean frames tracked of 20, the papers' algorithm", "frames", kept_rows),
+    ]
+}
+
+/// What is asked of the default, by the template's columns and tenths of sigma_n.
+const ASKED: [(usize, u32, f64); 6] =
+    [(10, 3, 0.01), (10, 4, 0.02), (10, 5, 0.05), (10, 6, 0.2), (25, 6, 0.01), (25, 8, 0.02)];
+
+/// The same flights with the default tracker, silhouettes between the pixels.
+pub(super) fn default_tables(options: ValidationOptions) -> Vec<Table> {
+    let mut rows = Vec::new();
+    for Template { sides, lost: paper, .. } in &TEMPLATES {
+        let stamp = Stamp::Drawn(Silhouette::new(sides[0], sides[1]));
+        let name = format!("{}x{}", sides[0], sides[1]);
+        let more = (sides[0] == 25).then_some(0.8);
+        for (i, sigma_n) in SIGMAS.into_iter().chain(more).enumerate() {
+            let runs = kept(options, &stamp, *sides, sigma_n, &TrackerConfig::default());
+            let asked =
+                ASKED.iter().find(|(w, s, _)| *w == sides[0] && *s == (sigma_n * 10.0).round() as u32);
+            let row = Row::new(&name, sigma_n, lost(&runs));
+            rows.push(Row {
+                paper: paper.get(i).copied(),
+                limit: asked.map(|(_, _, most)| Limit::AtMost(*most)),
+                ..row
+            });
+        }
+    }
+    let title = "Loss probability, default tracker".to_owned();
+    vec![Table { name: "loss-default", title, x: "sigma_n", y: "P", rows }]
+}

@@ -1,0 +1,65 @@
+//! The papers' tables and figures made again, each figure beside the paper's: the image tracker of
+//! 000 and 001, and the adaptive reference of 003.
+
+mod brightness;
+mod energy;
+mod flight;
+mod looped;
+mod loss;
+mod motion;
+mod positioning;
+mod runs;
+mod table;
+
+pub use table::{Limit, Row, Table, Verdict};
+
+/// How much is simulated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ValidationOptions {
+    /// Monte Carlo runs of each experiment; the texts have 1000.
+    pub runs: usize,
+    /// Seed of all of them.
+    pub seed: u64,
+}
+
+impl Default for ValidationOptions {
+    fn default() -> Self {
+        Self { runs: 200, seed: 1 }
+    }
+}
+
+/// One experiment: its name, and what makes its tables.
+struct Experiment {
+    name: &'static str,
+    make: fn(ValidationOptions) -> Vec<Table>,
+}
+
+const EXPERIMENTS: [Experiment; 7] = [
+    Experiment { name: "energies and signal-to-noise ratios (001, tables 1 and 2)", make: energy::tables },
+    Experiment { name: "positioning (000, Fig. 5) against the Cramer-Rao bound", make: positioning::tables },
+    Experiment { name: "Kalman filter and prediction (000, Fig. 6)", make: motion::tables },
+    Experiment {
+        name: "loss of track (000, Fig. 7 and 8; 001, tables 3 and 4), paper mode",
+        make: loss::paper_tables,
+    },
+    Experiment { name: "loss of track, default", make: loss::default_tables },
+    Experiment { name: "brightness of a pixel (003, Fig. 4 to 6)", make: brightness::tables },
+    Experiment { name: "reference strategies in the loop", make: looped::tables },
+];
+
+/// Makes the tables of the image tracker of those experiments whose name holds `only`. `progress` is
+/// told the number of experiments done, how many there are, and the name of the next.
+pub fn validate_tracker(
+    options: ValidationOptions,
+    only: &str,
+    mut progress: impl FnMut(usize, usize, &str),
+) -> Vec<Table> {
+    let wanted: Vec<&Experiment> = EXPERIMENTS.iter().filter(|e| e.name.contains(only)).collect();
+    let mut tables = Vec::new();
+    for (done, experiment) in wanted.iter().enumerate() {
+        progress(done, wanted.len(), experiment.name);
+        tables.extend((experiment.make)(options));
+    }
+    progress(wanted.len(), wanted.len(), "");
+    tables
+}

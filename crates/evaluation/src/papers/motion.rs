@@ -1,0 +1,137 @@
+//! The Kalman filters: honesty of the covariance, and the curves of 000, Fig. 6.
+
+use crossfix_filter::{AxisFilter, AxisMeasurement};
+use crossfix_simulation::Silhouette;
+use crossfix_vision::TrackerConfig;
+use nalgebra::Vector2;
+
+use super::ValidationOptions;
+use super::flight::{Canvas, FRAMES, Follower, Outcome, Stamp, TACT, texts_path};
+use super::runs::{self, Noise};
+use super::table::{Limit, Row, Table, mean, root_mean_square};
+
+/// Runs of the filter alone for each one of the tracker: they cost nothing.
+const CHEAP: usize = 20;
+
+/// NEES of the filter on its own model; tolerance +-0.1.
+fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
+    let samples = runs::all(CHEAP * options.runs, |run| {
+        let mut noise = Noise::new(options.seed, run);
+        let (mut position, mut velocity) = (0.0, 10.0);
+        let mut next = |noise: &mut Noise| {
+            let acceleration = sigma_a * noise.normal();
+            position += velocity + acceleration / 2.0;
+            velocity += acceleration;
+            let measured = AxisMeasurement { position: position + noise.normal(), variance: 1.0 };
+            (position, velocity, measured)
+        };
+        let (first, second) = (next(&mut noise).2, next(&mut noise).2);
+        let mut filter = AxisFilter::start(first, second, 1.0, sigma_a);
+        let mut truth = (0.0, 0.0);
+        for _ in 2..FRAMES {
+            let (position, velocity, measured) = next(&mut noise);
+            filter.time_update(1.0);
+            filter.measurement_update(measured);
+            truth = (position, velocity);
+        }
+        let error = Vector2::new(truth.0 - filter.position(), truth.1 - filter.velocity());
+        let inverse = filter.covariance().try_inverse();
+        inverse.map_or(f64::NAN, |inverse| (error.transpose() * inverse * error).x)
+    });
+    mean(&samples)
+}
+
+/// The outcomes of every frame of runs that the tracker kept.
+fn outcomes(
+    options: ValidationOptions,
+    sides: [usize; 2],
+    sigma_n: f64,
+    config: &TrackerConfig,
+) -> Vec<Vec<Outcome>> {
+    let stamp = Stamp::Drawn(Silhouette::new(sides[0], sides[1]));
+    let runs = runs::all(options.runs, |run| {
+        let mut noise = Noise::new(options.seed, run);
+        let path = texts_path(&mut noise, FRAMES, 1.0);
+        let mut canvas = Canvas::new(sides);
+        let mut follower = Follower::new(config.clone(), sides)?;
+        let mut outcomes = Vec::new();
+        for (frame, place) in path.iter().enumerate() {
+            let image = canvas.paint(Some(&stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
+            // The velocity at the end of the tact: the mean over it is the difference of places.
+            let velocity = velocity_at(&path, frame);
+            outcomes.extend(follower.step(image, *place, velocity));
+        }
+        Some(outcomes)
+    });
+    let kept = |run: &Vec<Outcome>| {
+        run.iter()
+            .all(|o| o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64)
+    };
+    runs.into_iter().flatten().filter(kept).collect()
+}
+
+/// The velocity at a frame, px/s: with constant acceleration over each tact, v+ = 2 dx / T - v.
+fn velocity_at(path: &[[f64; 2]], frame: usize) -> [f64; 2] {
+    let mut velocity = [10.0; 2];
+    for pair in path[..=frame].windows(2) {
+        for axis in 0..2 {
+            velocity[axis] = 2.0 * (pair[1][axis] - pair[0][axis]) - velocity[axis];
+        }
+    }
+    velocity.map(|v| v / TACT)
+}
+
+/// The mean over all frames and runs; the runs are independent, the frames of a run are not.
+fn over_runs(runs: &[Vec<Outcome>], of: impl Fn(&Outcome) -> Option<f64>) -> (f64, f64) {
+    let each: Vec<f64> =
+        runs.iter().map(|run| mean(&run.iter().filter_map(&of).collect::<Vec<_>>()).0).collect();
+    mean(&each)
+}
+
+/// Fig. 6, and the consistency of filter and tracker.
+pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
+    let near_two = |tolerance| Limit::Near { value: 2.0, tolerance };
+    let nees = [0.3, 1.0, 3.0]
+        .map(|sigma_a| Row::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1)));
+    let mut honesty = Vec::new();
+    for sides in [[25, 15], [10, 6]] {
+        for sigma_n in [0.1, 0.2, 0.3, 0.4] {
+            let runs = outcomes(options, sides, sigma_n, &TrackerConfig::default());
+            // Runs are independent: 95 % is 1.96 standard errors.
+            for (what, figure) in
+                [("NIS", over_runs(&runs, |o| o.nis)), ("NEES", over_runs(&runs, |o| Some(o.nees)))]
+            {
+                let name = format!("{what} {}x{}", sides[0], sides[1]);
+                honesty.push(Row::new(name, sigma_n, figure).limit(near_two(1.96 * figure.1)));
+            }
+        }
+    }
+    let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
+    vec![
+        table("nees", "NEES of the Kalman filter", "sigma_a", "NEES", nees.to_vec()),
+        table("honesty", "Consistency of the default tracker", "sigma_n", "NIS, NEES", honesty),
+        figure_6(options),
+    ]
+}
+
+/// Fig. 6: 10x6 at sigma_n 0.1 in paper mode, x axis.
+fn figure_6(options: ValidationOptions) -> Table {
+    let runs = outcomes(options, [10, 6], 0.1, &TrackerConfig::paper());
+    let mut rows = Vec::new();
+    for frame in 0..FRAMES - 2 {
+        let at = |of: &dyn Fn(&Outcome) -> f64| -> Vec<f64> {
+            runs.iter().filter_map(|run| run.get(frame)).map(of).collect()
+        };
+        let x = (frame + 2) as f64;
+        rows.push(Row::new("prediction, Monte Carlo", x, root_mean_square(&at(&|o| o.prediction[0]))));
+        let filters = mean(&at(&|o| o.prediction_variance[0].sqrt()));
+        rows.push(Row::new("prediction, filter", x, filters));
+        // "The actual SD does not exceed the theoretical SD": holds at sigma_n 0.1 (errata).
+        let actual = root_mean_square(&at(&|o| o.estimate[0]));
+        let theoretical = mean(&at(&|o| o.estimate_variance[0].sqrt()));
+        rows.push(Row::new("estimate, Monte Carlo", x, actual).limit(Limit::AtMost(theoretical.0)));
+        rows.push(Row::new("estimate, filter", x, theoretical));
+    }
+    let title = "Errors of prediction and estimate on x, 10x6, sigma_n 0.1 (000, Fig. 6)".to_owned();
+    Table { name: "figure-6", title, x: "tact", y: "SD, px", rows }
+}

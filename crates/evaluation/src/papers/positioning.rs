@@ -1,0 +1,150 @@
+//! Accuracy of one measurement (000, Fig. 5), beside the Cramer-Rao bound.
+
+use crossfix_correlation::{FitOptions, Fitter, LowPass, LowPassMemory, Plane, Reference, Window};
+use crossfix_simulation::{Silhouette, TEMPLATE_SIZES};
+
+use super::ValidationOptions;
+use super::runs::{self, Noise};
+use super::table::{Limit, Row, Table, root_mean_square};
+
+/// Margin of the reference, px.
+const MARGIN: usize = 3;
+/// Low-pass of a clean reference, px: without one the silhouettes' edges, which are finer than a pixel,
+/// pull the fit towards whole pixels.
+const CLEAN_LOW_PASS: f32 = 0.45;
+/// Runs of a fit for each one of the tracker.
+const CHEAP: usize = 20;
+/// The bound for noise of SD 1 (errata), x and y, of the sizes in their order.
+const ERRATA_BOUNDS: [[f64; 2]; 4] = [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
+
+/// The bound for noise of SD 1: `sqrt(diag J^-1)`, J the sum of the gradient's outer products, here
+/// with contrast and brightness known.
+fn bound(silhouette: &Silhouette) -> [f64; 2] {
+    const STEP: f64 = 0.05;
+    let [width, height] = silhouette.sides().map(|side| side as i32 / 2 + 5);
+    let half = silhouette.sides().map(|side| (side as f64 - 1.0) / 2.0);
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for row in -height..=height {
+        for column in -width..=width {
+            let (x, y) = (f64::from(column) + half[0].fract(), f64::from(row) + half[1].fract());
+            let slope = |dx: f64, dy: f64| {
+                let ahead = f64::from(silhouette.pixel(x + dx, y + dy));
+                (ahead - f64::from(silhouette.pixel(x - dx, y - dy))) / (2.0 * STEP)
+            };
+            let (gx, gy) = (slope(STEP, 0.0), slope(0.0, STEP));
+            xx += gx * gx;
+            xy += gx * gy;
+            yy += gy * gy;
+        }
+    }
+    let determinant = xx * yy - xy * xy;
+    [(yy / determinant).sqrt(), (xx / determinant).sqrt()]
+}
+
+/// Low-pass of a noisy reference, px: the wider, the more noise.
+fn noisy_low_pass(sigma_n: f64) -> f32 {
+    (0.75 + 0.5 * sigma_n) as f32
+}
+
+/// A picture of the silhouette with its middle off the picture's by (dx, dy).
+fn picture(silhouette: &Silhouette, margin: usize, [dx, dy]: [f64; 2]) -> Plane {
+    let [width, height] = silhouette.sides().map(|side| side + 2 * margin);
+    let mut image = Plane::from_fn(width, height, |_, _| 0.0);
+    let middle = [(width as f64 - 1.0) / 2.0 + dx, (height as f64 - 1.0) / 2.0 + dy];
+    silhouette.draw(image.samples_mut(), width, middle, 1.0);
+    image
+}
+
+/// The error of one fit, px, after the low-pass, and the contrast that it had or was given.
+fn error(
+    image: &Plane,
+    reference: &Plane,
+    low_pass: f32,
+    contrast: Option<f64>,
+    offset: [f64; 2],
+) -> ([f64; 2], f64) {
+    let mut smooth = Plane::default();
+    LowPass::new(low_pass).apply(reference, &mut LowPassMemory::default(), &mut smooth);
+    let window = Window::uniform(reference.width(), reference.height());
+    let reference = Reference::new(smooth, window);
+    let start = 2.0;
+    let options = FitOptions { steps: 6, contrast, ..FitOptions::default() };
+    let fit = Fitter::default().fit(image, &reference, start, start, options);
+    ([fit.x - start - offset[0], fit.y - start - offset[1]], fit.gain)
+}
+
+/// Fig. 5 with clean and noisy reference, and the bias over the phases of a pixel.
+pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut accuracy, mut ratios, mut bias) = (Vec::new(), Vec::new(), Vec::new());
+    for (size, errata) in TEMPLATE_SIZES.into_iter().zip(ERRATA_BOUNDS) {
+        let silhouette = Silhouette::new(size[0], size[1]);
+        let name = format!("{}x{}", size[0], size[1]);
+        let bound = bound(&silhouette);
+        for sigma_n in [0.1, 0.2, 0.3] {
+            for noisy in [false, true] {
+                let errors = runs::all(CHEAP * options.runs, |run| {
+                    let mut noise = Noise::new(options.seed, run);
+                    let offset = [noise.uniform() - 0.5, noise.uniform() - 0.5];
+                    let clean =
+                        [picture(&silhouette, MARGIN + 2, offset), picture(&silhouette, MARGIN, [0.0; 2])];
+                    let [mut image, mut reference] = clean.clone();
+                    noise.add_to(image.samples_mut(), sigma_n as f32);
+                    if noisy {
+                        noise.add_to(reference.samples_mut(), sigma_n as f32);
+                    }
+                    let low_pass = if noisy { noisy_low_pass(sigma_n) } else { CLEAN_LOW_PASS };
+                    // The bias at this phase has a row of its own.
+                    // The bound has the contrast known, and so has a tracker after a few frames.
+                    let (bias, contrast) = error(&clean[0], &clean[1], low_pass, None, offset);
+                    let ([x, y], _) = error(&image, &reference, low_pass, Some(contrast), offset);
+                    [x - bias[0], y - bias[1]]
+                });
+                for (axis, label) in ["x", "y"].into_iter().enumerate() {
+                    let of: Vec<f64> = errors.iter().map(|e| e[axis]).collect();
+                    let (deviation, standard_error) = root_mean_square(&of);
+                    let kind = if noisy { "noisy reference" } else { "clean reference" };
+                    let series = format!("{name} {label}, {kind}");
+                    // (16): 2 sigma over the side. The text: below a pixel.
+                    let normalised = 2.0 / size[axis] as f64;
+                    accuracy.push(Row::new(
+                        &series,
+                        sigma_n,
+                        (deviation * normalised, standard_error * normalised),
+                    ));
+                    // Two noisy pictures tell their offset root 2 less well than one.
+                    let best = bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
+                    let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
+                    ratios.push(
+                        Row::new(series, sigma_n, (deviation / best, standard_error / best)).limit(asked),
+                    );
+                }
+            }
+        }
+        for axis in 0..2 {
+            let label = ["x", "y"][axis];
+            let near = Limit::Near { value: errata[axis], tolerance: 0.02 * errata[axis] };
+            ratios.push(Row::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near));
+            let worst = (0..400)
+                .map(|phase| {
+                    let offset = [(phase % 20) as f64 / 20.0 - 0.475, (phase / 20) as f64 / 20.0 - 0.475];
+                    let image = picture(&silhouette, MARGIN + 2, offset);
+                    let reference = picture(&silhouette, MARGIN, [0.0; 2]);
+                    error(&image, &reference, CLEAN_LOW_PASS, None, offset).0[axis].abs()
+                })
+                .fold(0.0, f64::max);
+            bias.push(Row::new(format!("{name} {label}"), 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)));
+        }
+    }
+    let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
+    vec![
+        table(
+            "figure-5",
+            "Normalised positioning error 2 sigma / side (000, Fig. 5)",
+            "sigma_n",
+            "",
+            accuracy,
+        ),
+        table("bound", "Positioning error over the Cramer-Rao bound", "sigma_n", "ratio", ratios),
+        table("bias", "Largest bias over the phases of a pixel", "", "px", bias),
+    ]
+}

@@ -1,0 +1,152 @@
+use serde::Serialize;
+
+/// What a figure must be.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Limit {
+    /// At most this.
+    AtMost(f64),
+    /// At least this.
+    AtLeast(f64),
+    /// This, within a tolerance.
+    Near {
+        /// The figure.
+        value: f64,
+        /// Its tolerance; with few runs, three standard errors if they are more.
+        tolerance: f64,
+    },
+}
+
+/// Whether a figure is what it must be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// It is.
+    Pass,
+    /// It is not.
+    Fail,
+    /// Nothing is asked of it.
+    Information,
+}
+
+/// A figure beside the paper's.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// What it is of: the curve.
+    pub series: String,
+    /// Where on the curve.
+    pub x: f64,
+    /// The paper's figure, if it prints one.
+    pub paper: Option<f64>,
+    /// What is asked.
+    pub limit: Option<Limit>,
+    /// Ours.
+    pub ours: f64,
+    /// Its Monte Carlo standard error; 0 where nothing is random.
+    pub standard_error: f64,
+}
+
+impl Row {
+    /// A row with ours alone.
+    pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
+        Self { series: series.into(), x, paper: None, limit: None, ours, standard_error }
+    }
+
+    /// With the paper's figure.
+    #[must_use]
+    pub fn paper(mut self, paper: f64) -> Self {
+        self.paper = Some(paper);
+        self
+    }
+
+    /// With what is asked.
+    #[must_use]
+    pub fn limit(mut self, limit: Limit) -> Self {
+        self.limit = Some(limit);
+        self
+    }
+
+    /// Whether ours is what is asked.
+    pub fn verdict(&self) -> Verdict {
+        let good = match self.limit {
+            None => return Verdict::Information,
+            Some(Limit::AtMost(most)) => self.ours <= most,
+            Some(Limit::AtLeast(least)) => self.ours >= least,
+            Some(Limit::Near { value, tolerance }) => {
+                (self.ours - value).abs() <= tolerance.max(3.0 * self.standard_error)
+            }
+        };
+        if good { Verdict::Pass } else { Verdict::Fail }
+    }
+}
+
+/// A table, or the curves of a figure.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Table {
+    /// Short name, for a file.
+    pub name: &'static str,
+    /// What it shows.
+    pub title: String,
+    /// What `x` is.
+    pub x: &'static str,
+    /// What the figures are.
+    pub y: &'static str,
+    /// Its rows.
+    pub rows: Vec<Row>,
+}
+
+impl Table {
+    /// Rows that fail.
+    pub fn failures(&self) -> usize {
+        self.rows.iter().filter(|row| row.verdict() == Verdict::Fail).count()
+    }
+}
+
+/// The mean of samples with its standard error.
+pub(crate) fn mean(samples: &[f64]) -> (f64, f64) {
+    let count = samples.len().max(1) as f64;
+    let mean = samples.iter().sum::<f64>() / count;
+    let variance = samples.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
+    (mean, (variance / count).sqrt())
+}
+
+/// The root of the mean square of samples with its standard error.
+pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
+    let squares: Vec<f64> = samples.iter().map(|s| s * s).collect();
+    let (square, error) = mean(&squares);
+    let root = square.sqrt();
+    (root, if root > 0.0 { error / (2.0 * root) } else { 0.0 })
+}
+
+/// The share of runs in which something happened, with its standard error.
+pub(crate) fn share(happened: impl Iterator<Item = bool>) -> (f64, f64) {
+    let samples: Vec<f64> = happened.map(|h| f64::from(u8::from(h))).collect();
+    let (p, _) = mean(&samples);
+    (p, (p * (1.0 - p) / samples.len().max(1) as f64).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn verdicts_follow_the_limits() {
+        let row = |ours, limit| Row::new("", 0.0, (ours, 0.01)).limit(limit).verdict();
+        assert_eq!(row(0.5, Limit::AtMost(0.5)), Verdict::Pass);
+        assert_eq!(row(0.6, Limit::AtMost(0.5)), Verdict::Fail);
+        assert_eq!(row(0.4, Limit::AtLeast(0.5)), Verdict::Fail);
+        let near = |tolerance| Limit::Near { value: 1.0, tolerance };
+        assert_eq!(row(1.029, near(0.001)), Verdict::Pass);
+        assert_eq!(row(1.031, near(0.001)), Verdict::Fail);
+        assert_eq!(row(1.031, near(0.05)), Verdict::Pass);
+        assert_eq!(Row::new("", 0.0, (1.0, 0.0)).verdict(), Verdict::Information);
+    }
+
+    #[test]
+    fn statistics_by_hand() {
+        assert_eq!(mean(&[1.0, 3.0]), (2.0, 1.0));
+        assert_eq!(root_mean_square(&[3.0, 3.0]).0, 3.0);
+        let (p, error) = share([true, false, false, false].into_iter());
+        assert!((p - 0.25).abs() < 1e-12 && (error - (0.25_f64 * 0.75 / 4.0).sqrt()).abs() < 1e-12);
+    }
+}
