@@ -265,23 +265,56 @@ impl Resampler {
             return;
         }
         let (cos, sin) = (view.scale * view.turn_rad.cos(), view.scale * view.turn_rad.sin());
-        for row in 0..to.height() {
-            let v = row as f64 - half[1];
-            for (column, sample) in to.row_mut(row).iter_mut().enumerate() {
-                let u = column as f64 - half[0];
-                *sample = value_at(from, view.x + cos * u - sin * v, view.y + sin * u + cos * v);
-            }
-        }
+        // What the view can see, so that no sample lies outside it.
+        let reach = [0, 1].map(|i| cos.abs() * half[i] + sin.abs() * half[1 - i] + 2.0);
+        let corner = [(view.x - reach[0]).floor(), (view.y - reach[1]).floor()];
+        let sides = reach.map(|reach| (2.0 * reach).ceil() as usize + 2);
+        from.crop_into(corner[0] as isize, corner[1] as isize, sides[0], sides[1], &mut self.part);
+        let start = [
+            view.x - corner[0] - cos * half[0] + sin * half[1],
+            view.y - corner[1] - sin * half[0] - cos * half[1],
+        ];
+        let step = [cos as f32, sin as f32];
+        Arch::new().dispatch(Turned { part: &self.part, start: start.map(|s| s as f32), step, to });
     }
 }
 
-/// One value of a plane between its samples, linearly; beyond the border, the border goes on.
-fn value_at(plane: &Plane, x: f64, y: f64) -> f32 {
-    let ((column, fx), (row, fy)) = (split(x), split(y));
-    let at = |i: isize, j: isize| plane.clamped(column + i, row + j);
-    let upper = at(0, 0) * (1.0 - fx) + at(1, 0) * fx;
-    let lower = at(0, 1) * (1.0 - fx) + at(1, 1) * fx;
-    upper * (1.0 - fy) + lower * fy
+/// Linear interpolation along turned rows.
+struct Turned<'a> {
+    part: &'a Plane,
+    /// Where the first sample lies.
+    start: [f32; 2],
+    /// From a sample to the next in the row.
+    step: [f32; 2],
+    to: &'a mut Plane,
+}
+
+impl WithSimd for Turned<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { part, start, step: [cos, sin], to } = self;
+        let (stride, samples) = (part.width(), part.samples());
+        for row in 0..to.height() {
+            let v = row as f32;
+            for (column, out) in to.row_mut(row).iter_mut().enumerate() {
+                let u = column as f32;
+                let (x, y) = (start[0] + cos * u - sin * v, start[1] + sin * u + cos * v);
+                let (i, j) = (x as usize, y as usize);
+                let (fx, fy) = (x - i as f32, y - j as f32);
+                let at = j * stride + i;
+                let Some([a, b]) = samples.get(at..at + 2).and_then(|pair| pair.first_chunk()) else {
+                    continue;
+                };
+                let below = samples.get(at + stride..at + stride + 2).and_then(|pair| pair.first_chunk());
+                let Some([c, d]) = below else { continue };
+                let upper = a + fx * (b - a);
+                let lower = c + fx * (d - c);
+                *out = upper + fy * (lower - upper);
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -18,9 +18,9 @@ impl PartialEq for Plane {
 }
 
 impl Default for Plane {
-    /// One sample of zero: a plane to be written into.
+    /// No samples, and no memory: a plane to be written into.
     fn default() -> Self {
-        Self { width: 1, height: 1, samples: vec![0.0; 1 + PADDING] }
+        Self { width: 0, height: 0, samples: Vec::new() }
     }
 }
 
@@ -130,7 +130,7 @@ impl Plane {
     pub fn mean(&self) -> f32 {
         // Lanes of single precision a row, double precision over the rows.
         let mut sum = 0.0_f64;
-        for row in self.samples().chunks(self.width) {
+        for row in self.samples().chunks(self.width.max(1)) {
             let mut lanes = [0.0_f32; 8];
             let (whole, rest) = row.as_chunks::<8>();
             for samples in whole {
@@ -140,6 +140,6 @@ impl Plane {
             }
             sum += f64::from(lanes.iter().sum::<f32>() + rest.iter().sum::<f32>());
         }
-        (sum / self.samples().len() as f64) as f32
+        (sum / self.samples().len().max(1) as f64) as f32
     }
 }

@@ -46,7 +46,7 @@ fn update(bencher: Bencher, (width, height): (usize, usize), reference: Referenc
     let mut step = || {
         let time = Timestamp::from_seconds(frame as f64 / 30.0);
         frame += 1;
-        tracker.step(black_box(&pictures[(frame - 1) % ROUND]), time)
+        tracker.step(black_box(&pictures[(frame - 1) % ROUND]), time).len()
     };
     for _ in 0..2 * ROUND {
         step();

@@ -16,10 +16,9 @@ const LOW_PASSES: [f32; 5] = [0.0, 0.6, 0.9, 1.2, 1.6];
 const CLEAR_NOISE_SHARE: f32 = 0.01;
 /// Least low-pass for the comparison with the anchor, px.
 const ANCHOR_LOW_PASS: f32 = 0.6;
-/// Share of noise in the anchor's energy above which it is still averaged, and its least share of a
-/// new image.
+/// Share of noise in the anchor's energy above which it is still averaged. Then it stays: whatever is
+/// added to it, it drifts with.
 const ANCHOR_NOISE_SHARE: f32 = 0.02;
-const ANCHOR_LEAST_SHARE: f32 = 0.001;
 /// Correlation with the anchor below which the target has become another.
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
 /// Stiffness of scale and turn in that comparison.
@@ -57,8 +56,8 @@ pub(crate) struct Appearance {
     /// The reference, mean removed, in its own size and direction.
     own: Plane,
     adaptation: Adaptation,
-    /// A slow mean to which the reference is compared.
-    anchor: Reference,
+    /// The mean of the first images, to which the reference is compared.
+    anchor: Plane,
     anchor_noise: f32,
     anchor_images: f32,
     pub(crate) drift: Drift,
@@ -69,7 +68,9 @@ pub(crate) struct Appearance {
     smooth: Plane,
     /// The reference that is correlated: low-passed, in the image's size and direction.
     pub(crate) working: Reference,
+    /// The anchor low-passed, and by which low-pass; absent while the anchor changes.
     memory: Reference,
+    remembered: Option<usize>,
 }
 
 /// The least odd number of pixels that holds a length: the middle of an odd side is a pixel.
@@ -124,7 +125,7 @@ impl Appearance {
             scale: 1.0,
             turn_rad: 0.0,
             adaptation: Adaptation::new(config.reference, &own, noise, config.noise_floor as f32),
-            anchor: plain.clone(),
+            anchor: own.clone(),
             anchor_noise: noise,
             anchor_images: 1.0,
             drift: Drift::default(),
@@ -133,6 +134,7 @@ impl Appearance {
             smooth: own.clone(),
             working: plain.clone(),
             memory: plain,
+            remembered: None,
             own,
         };
         appearance.prepare(workshop);
@@ -180,17 +182,16 @@ impl Appearance {
         let noise = noise * noise_kept(place);
         self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
 
-        let noise_share =
-            self.anchor_noise * view.samples().len() as f32 / energy(self.anchor.image()).max(1e-12);
-        let averaged = if noise_share > ANCHOR_NOISE_SHARE { 1.0 / (self.anchor_images + 1.0) } else { 0.0 };
-        let share = certainty * averaged.max(ANCHOR_LEAST_SHARE);
-        self.anchor.update(|anchor| {
-            for (old, new) in anchor.samples_mut().iter_mut().zip(view.samples()) {
+        let noise_share = self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
+        if noise_share > ANCHOR_NOISE_SHARE {
+            let share = certainty / (self.anchor_images + 1.0);
+            for (old, new) in self.anchor.samples_mut().iter_mut().zip(view.samples()) {
                 *old += share * (new - *old);
             }
-        });
-        self.anchor_noise = (1.0 - share).powi(2) * self.anchor_noise + share * share * noise;
-        self.anchor_images += certainty;
+            self.anchor_noise = (1.0 - share).powi(2) * self.anchor_noise + share * share * noise;
+            self.anchor_images += certainty;
+            self.remembered = None;
+        }
         workshop.view = view;
         self.prepare(workshop);
         self.compare_with_anchor(workshop);
@@ -245,7 +246,10 @@ impl Appearance {
             .max(self.chosen);
         let Workshop { memory, filtered, fitter, .. } = workshop;
         let filter = &self.low_passes[index];
-        self.memory.update(|image| filter.apply(self.anchor.image(), memory, image));
+        if self.remembered != Some(index) {
+            self.memory.update(|image| filter.apply(&self.anchor, memory, image));
+            self.remembered = Some(index);
+        }
         filter.apply(&self.own, memory, filtered);
         self.drift = Drift::default();
         let product: f32 =

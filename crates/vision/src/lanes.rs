@@ -1,6 +1,8 @@
 //! Exponential and logarithm in single precision that the compiler can run in lanes: no branches, no
 //! calls. Good to 2e-7 of the result, and of 1.
 
+use std::ops::{Add, Div, Mul, Sub};
+
 /// `e^x`; below -87 it is 0 to single precision, and -87 is taken.
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
@@ -26,6 +28,95 @@ pub(crate) fn ln(x: f32) -> f32 {
     let s = t * t;
     let series = 2.0 * t * (1.0 + s * (1.0 / 3.0 + s * (0.2 + s * (1.0 / 7.0 + s / 9.0))));
     exponent as f32 * std::f32::consts::LN_2 + series
+}
+
+/// Numbers that are calculated together.
+pub(crate) const LANES: usize = 8;
+
+/// Eight numbers in one: what is done to it is done to each, by one instruction where there is one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Lanes(pub(crate) [f32; LANES]);
+
+impl Lanes {
+    /// Eight times the same.
+    #[inline(always)]
+    pub(crate) fn splat(value: f32) -> Self {
+        Self([value; LANES])
+    }
+
+    #[inline(always)]
+    fn with(self, other: Self, of: impl Fn(f32, f32) -> f32) -> Self {
+        let mut lanes = self.0;
+        for (lane, other) in lanes.iter_mut().zip(other.0) {
+            *lane = of(*lane, other);
+        }
+        Self(lanes)
+    }
+
+    #[inline(always)]
+    fn each(self, of: impl Fn(f32) -> f32) -> Self {
+        let mut lanes = self.0;
+        for lane in &mut lanes {
+            *lane = of(*lane);
+        }
+        Self(lanes)
+    }
+
+    #[inline(always)]
+    pub(crate) fn max(self, other: Self) -> Self {
+        self.with(other, f32::max)
+    }
+
+    #[inline(always)]
+    pub(crate) fn sqrt(self) -> Self {
+        self.each(f32::sqrt)
+    }
+
+    /// [`exp`] of each.
+    #[inline(always)]
+    pub(crate) fn exp(self) -> Self {
+        self.each(exp)
+    }
+}
+
+impl Add for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.with(other, |a, b| a + b)
+    }
+}
+
+impl Sub for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.with(other, |a, b| a - b)
+    }
+}
+
+impl Mul for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.with(other, |a, b| a * b)
+    }
+}
+
+impl Div for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.with(other, |a, b| a / b)
+    }
+}
+
+impl Mul<f32> for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, factor: f32) -> Self {
+        self.each(|a| a * factor)
+    }
 }
 
 #[cfg(test)]

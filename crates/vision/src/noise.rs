@@ -1,7 +1,7 @@
 use crossfix_correlation::Plane;
 
 /// Samples that the median is taken of; more tell little more.
-const SAMPLES: usize = 400;
+const SAMPLES: usize = 200;
 /// The response of the mask to white noise: the root of the sum of its squared weights.
 const MASK_GAIN: f32 = 6.0;
 /// Median of the absolute value of a normal variable.

@@ -176,6 +176,7 @@ pub struct ImageTracker {
     detector: Option<Detector>,
     waiting: Vec<PixelBox>,
     followed: Vec<Followed>,
+    tracks: Vec<ImageTrack>,
     next_id: u64,
     last: Option<(Timestamp, usize, usize)>,
     refused: u64,
@@ -196,6 +197,7 @@ impl ImageTracker {
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),
+            tracks: Vec::new(),
             next_id: 1,
             last: None,
             refused: 0,
@@ -224,18 +226,19 @@ impl ImageTracker {
         self.refused
     }
 
-    /// Follows all targets into the next image and returns its tracks, ordered by id.
-    pub fn step(&mut self, image: &Plane, time: Timestamp) -> Vec<ImageTrack> {
+    /// Follows all targets into the next image and returns its tracks, ordered by id. An image without
+    /// new, lost or given-up targets allocates no memory, but for the detector.
+    pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
         let size = (image.width(), image.height());
         let fits = self.last.is_none_or(|(last, w, h)| time > last && (w, h) == size);
         if !fits {
             self.refused += 1;
-            return Vec::new();
+            return &[];
         }
         let interval = self.last.map_or(0.0, |(last, ..)| time.seconds_since(last).min(LONGEST_INTERVAL));
         self.last = Some((time, size.0, size.1));
 
-        let mut tracks: Vec<ImageTrack> = Vec::with_capacity(self.followed.len());
+        self.tracks.clear();
         let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
         let frame = Frame { image, interval, keepsake, config: &self.config };
         for followed in &mut self.followed {
@@ -248,13 +251,13 @@ impl ImageTracker {
                 None if followed.target.is_searching() => TrackPhase::Searching,
                 None => TrackPhase::Coasting,
             };
-            tracks.push(describe(followed, phase, step));
+            self.tracks.push(describe(followed, phase, step));
         }
         self.give_up(time);
-        tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
-        self.take_up_new(image, time, &mut tracks);
+        self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
+        self.take_up_new(image, time);
         self.keep(image, time);
-        tracks
+        &self.tracks
     }
 
     /// Keeps a picture for later losses: from time to time, while every target is seen, and when one
@@ -299,7 +302,7 @@ impl ImageTracker {
         }
     }
 
-    fn take_up_new(&mut self, image: &Plane, time: Timestamp, tracks: &mut Vec<ImageTrack>) {
+    fn take_up_new(&mut self, image: &Plane, time: Timestamp) {
         let given = std::mem::take(&mut self.waiting).into_iter().map(|place| (place, Origin::Given));
         let mut new: Vec<(PixelBox, Origin)> = given.collect();
         if let Some(detector) = &mut self.detector {
@@ -315,7 +318,7 @@ impl ImageTracker {
             let target = Follower::new(image, place, &mut self.bench, &self.config);
             let followed = Followed { id, origin, target, measured_at: time, cue: None };
             let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
-            tracks.push(describe(&followed, TrackPhase::Tentative, step));
+            self.tracks.push(describe(&followed, TrackPhase::Tentative, step));
             self.followed.push(followed);
         }
     }
@@ -381,7 +384,7 @@ mod tests {
             let t = frame as f32;
             let image =
                 if frame < 12 { spots(&[]) } else { spots(&[(20.0 + t, 30.0), (140.0 - 1.5 * t, 90.0)]) };
-            last = tracker.step(&image, at(frame));
+            last = tracker.step(&image, at(frame)).to_vec();
         }
         assert_eq!(last.len(), 2, "{last:?}");
         let mut x: Vec<f64> = last.iter().map(|track| track.measured.unwrap().place.x).collect();

@@ -4,10 +4,8 @@
 use pulp::{Arch, Simd, WithSimd};
 use serde::{Deserialize, Serialize};
 
-use crate::lanes;
+use crate::lanes::{LANES, Lanes};
 
-/// Pixels that are filtered together.
-const LANES: usize = 8;
 /// Models: order 0, order 1, Singer's.
 const MODELS: usize = 3;
 /// Parts of a model's state: brightness, rate, and their covariance 11, 12, 22.
@@ -72,13 +70,11 @@ impl ImmConfig {
     }
 }
 
-type Lane = [f32; LANES];
-
 /// The filters of eight pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Block {
-    states: [[Lane; PARTS]; MODELS],
-    probabilities: [Lane; MODELS],
+    states: [[Lanes; PARTS]; MODELS],
+    probabilities: [Lanes; MODELS],
 }
 
 /// The filters of one colour channel of a reference: 18 numbers a pixel. A colour reference has one
@@ -106,8 +102,9 @@ impl PixelImm {
         let blocks = brightness.chunks(LANES).map(|pixels| {
             let mut first = [0.0; LANES];
             first[..pixels.len()].copy_from_slice(pixels);
-            let state = [first, [0.0; LANES], [variance; LANES], [0.0; LANES], [1.0; LANES]];
-            Block { states: [state; MODELS], probabilities: [[1.0 / MODELS as f32; LANES]; MODELS] }
+            let [variance, rate_variance] = [variance, 1.0].map(Lanes::splat);
+            let state = [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
+            Block { states: [state; MODELS], probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS] }
         });
         Self { config, blocks: blocks.collect() }
     }
@@ -138,87 +135,84 @@ impl WithSimd for Step<'_> {
         for (block, (measured, filtered)) in self.blocks.iter_mut().zip(pixels) {
             let mut lane = [0.0; LANES];
             lane[..measured.len()].copy_from_slice(measured);
-            let mut out = [0.0; LANES];
-            for i in 0..LANES {
-                out[i] = pixel(block, i, &self.models, self.stay, lane[i], self.variance);
-            }
+            let Lanes(out) = block.step(&self.models, self.stay, Lanes(lane), Lanes::splat(self.variance));
             filtered.copy_from_slice(&out[..filtered.len()]);
         }
     }
 }
 
-/// One pixel's step; a function of its lane alone, so that eight of them run together.
-#[inline(always)]
-fn pixel(
-    block: &mut Block,
-    i: usize,
-    models: &[Model; MODELS],
-    stay: f32,
-    measured: f32,
-    variance: f32,
-) -> f32 {
-    let leave = (1.0 - stay) / (MODELS - 1) as f32;
-    let before = [0, 1, 2].map(|m| block.probabilities[m][i]);
-    let states = [0, 1, 2].map(|m| [0, 1, 2, 3, 4].map(|part| block.states[m][part][i]));
-    let mut likelihoods = [0.0; MODELS];
-    let mut updated = [[0.0; PARTS]; MODELS];
-    let mut exponents = [0.0; MODELS];
-    let mut total = 0.0;
-    for l in 0..MODELS {
-        // (10): the probability of each model before, given that l holds now.
-        let weights = [0, 1, 2].map(|m| if m == l { stay * before[m] } else { leave * before[m] });
-        let prior = weights[0] + weights[1] + weights[2];
-        let share = weights.map(|w| w / prior);
-        // (11): mixed state and covariance.
-        let mut mixed = [0.0; PARTS];
-        for m in 0..MODELS {
-            mixed[0] += share[m] * states[m][0];
-            mixed[1] += share[m] * states[m][1];
+impl Block {
+    /// One step of eight pixels; returns their filtered brightness.
+    #[inline(always)]
+    fn step(&mut self, models: &[Model; MODELS], stay: f32, measured: Lanes, variance: Lanes) -> Lanes {
+        let leave = (1.0 - stay) / (MODELS - 1) as f32;
+        let (before, states) = (self.probabilities, self.states);
+        let zero = Lanes::splat(0.0);
+        let mut likelihoods = [zero; MODELS];
+        let mut exponents = [zero; MODELS];
+        for l in 0..MODELS {
+            // (10): the probability of each model before, given that l holds now.
+            let [mut prior, mut mixed] = [zero, zero];
+            let mut weights = [zero; MODELS];
+            let mut rate = zero;
+            for m in 0..MODELS {
+                weights[m] = before[m] * if m == l { stay } else { leave };
+                prior = prior + weights[m];
+            }
+            let share = Lanes::splat(1.0) / prior;
+            // (11): mixed state and covariance.
+            for m in 0..MODELS {
+                weights[m] = weights[m] * share;
+                mixed = mixed + weights[m] * states[m][0];
+                rate = rate + weights[m] * states[m][1];
+            }
+            let [mut p11, mut p12, mut p22] = [zero; 3];
+            for m in 0..MODELS {
+                let (d0, d1) = (states[m][0] - mixed, states[m][1] - rate);
+                p11 = p11 + weights[m] * (states[m][2] + d0 * d0);
+                p12 = p12 + weights[m] * (states[m][3] + d0 * d1);
+                p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
+            }
+            // (12): extrapolation.
+            let Model { rate: step, keep, noise } = models[l];
+            let brightness = mixed + rate * step;
+            let slope = rate * keep;
+            let cross = p12 + p22 * step;
+            p11 = p11 + (p12 + cross) * step + Lanes::splat(noise[0]);
+            p12 = cross * keep + Lanes::splat(noise[1]);
+            p22 = p22 * (keep * keep) + Lanes::splat(noise[2]);
+            // (13): the measurement, erratum: `f` is the measurement and `R_f` its variance.
+            let innovation = measured - brightness;
+            let inverse = Lanes::splat(1.0) / (p11 + variance);
+            let (k1, k2) = (p11 * inverse, p12 * inverse);
+            self.states[l] = [
+                brightness + k1 * innovation,
+                slope + k2 * innovation,
+                k1 * variance,
+                k2 * variance,
+                p22 - k2 * p12,
+            ];
+            // (14)-(15) up to a common factor.
+            exponents[l] = innovation * innovation * inverse * -0.5;
+            likelihoods[l] = prior * inverse.sqrt();
         }
-        for m in 0..MODELS {
-            let (d0, d1) = (states[m][0] - mixed[0], states[m][1] - mixed[1]);
-            mixed[2] += share[m] * (states[m][2] + d0 * d0);
-            mixed[3] += share[m] * (states[m][3] + d0 * d1);
-            mixed[4] += share[m] * (states[m][4] + d1 * d1);
+        let largest = exponents[0].max(exponents[1]).max(exponents[2]);
+        let least = Lanes::splat(f32::MIN_POSITIVE);
+        let mut total = zero;
+        for l in 0..MODELS {
+            likelihoods[l] = (likelihoods[l] * (exponents[l] - largest).exp()).max(least);
+            total = total + likelihoods[l];
         }
-        // (12): extrapolation.
-        let Model { rate, keep, noise } = models[l];
-        let brightness = mixed[0] + rate * mixed[1];
-        let slope = keep * mixed[1];
-        let p11 = mixed[2] + rate * (2.0 * mixed[3] + rate * mixed[4]) + noise[0];
-        let p12 = keep * (mixed[3] + rate * mixed[4]) + noise[1];
-        let p22 = keep * keep * mixed[4] + noise[2];
-        // (13): the measurement, erratum: `f` is the measurement and `R_f` its variance.
-        let innovation = measured - brightness;
-        let s = p11 + variance;
-        let (k1, k2) = (p11 / s, p12 / s);
-        updated[l] = [
-            brightness + k1 * innovation,
-            slope + k2 * innovation,
-            k1 * variance,
-            k2 * variance,
-            p22 - k2 * p12,
-        ];
-        // (14)-(15) up to a common factor.
-        exponents[l] = -0.5 * innovation * innovation / s;
-        likelihoods[l] = prior / s.sqrt();
-    }
-    let largest = exponents[0].max(exponents[1]).max(exponents[2]);
-    for l in 0..MODELS {
-        likelihoods[l] = (likelihoods[l] * lanes::exp(exponents[l] - largest)).max(f32::MIN_POSITIVE);
-        total += likelihoods[l];
-    }
-    let mut filtered = 0.0;
-    for l in 0..MODELS {
-        let probability = (likelihoods[l] / total).max(LEAST_PROBABILITY);
-        block.probabilities[l][i] = probability;
-        for part in 0..PARTS {
-            block.states[l][part][i] = updated[l][part];
+        let share = Lanes::splat(1.0) / total;
+        let mut filtered = zero;
+        for l in 0..MODELS {
+            let probability = (likelihoods[l] * share).max(Lanes::splat(LEAST_PROBABILITY));
+            self.probabilities[l] = probability;
+            // (16): the estimate that does not depend on a hypothesis.
+            filtered = filtered + probability * self.states[l][0];
         }
-        // (16): the estimate that does not depend on a hypothesis.
-        filtered += probability * updated[l][0];
+        filtered
     }
-    filtered
 }
 
 #[cfg(test)]
