@@ -82,10 +82,7 @@ impl CameraIdentity {
                 (block.sum::<f32>() / (divisor * divisor) as f32).round().clamp(0.0, 255.0) as u8
             })
             .collect();
-        let mut data = Vec::new();
-        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut data, JPEG_QUALITY)
-            .encode(&small, width as u32, height as u32, image::ExtendedColorType::L8)
-            .ok()?;
+        let data = jpeg(&small, width, height)?;
         let preview = Preview {
             camera: self.name.to_string(),
             capture_time_ns: capture.time.nanos(),
@@ -96,4 +93,13 @@ impl CameraIdentity {
         };
         Some(preview.stamped())
     }
+}
+
+/// 8-bit brightness as JPEG; `None` if it cannot be encoded.
+pub fn jpeg(brightness: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
+    let mut data = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut data, JPEG_QUALITY)
+        .encode(brightness, width as u32, height as u32, image::ExtendedColorType::L8)
+        .ok()?;
+    Some(data)
 }

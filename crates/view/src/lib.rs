@@ -13,6 +13,8 @@ mod limiter;
 mod paths;
 mod picture;
 mod sink;
+mod tracking;
 
 pub use picture::Picture;
 pub use sink::{ViewError, connect, save, spawn_viewer};
+pub use tracking::{FollowedTarget, ImageBox, Sight, TrackingPicture};

@@ -1,9 +1,12 @@
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Instant;
 
 use anyhow::{Context, bail};
-use crossfix_video::{FrameClock, VideoError};
+use crossfix_correlation::Plane;
+use crossfix_video::{Frame, FrameClock, VideoError};
+use crossfix_view::{FollowedTarget, ImageBox, Sight, TrackingPicture};
 use crossfix_vision::{DetectorConfig, ImageTrack, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
 
 use crate::output;
@@ -14,7 +17,9 @@ use crate::{config, eye};
 /// The table has the columns frame,x,y,w,h,ok,us: frames from 0, top left corner and size of the
 /// box in pixels, ok 1 while the target is measured or shortly predicted, microseconds of tracking.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv")]
+#[command(
+    after_help = "Examples:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv --labels labels.csv --save clip.rrd"
+)]
 pub struct Args {
     /// The video: .mp4 (H.264), .y4m, or a folder of PNG or JPEG images.
     video: PathBuf,
@@ -24,6 +29,13 @@ pub struct Args {
     /// The table to write (CSV); stdout without.
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
+    /// Write a picture of the tracker's work for Rerun: the video, box, measurement, score, certainty
+    /// and innovation of every frame.
+    #[arg(long, value_name = "FILE.rrd")]
+    save: Option<PathBuf>,
+    /// Where the target truly is (CSV with the columns frame,x,y,w,h), for that picture.
+    #[arg(long, value_name = "FILE", requires = "save")]
+    labels: Option<PathBuf>,
     /// The tracker's configuration (TOML, the keys of a camera file's section `tracker`); its defaults without.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -78,6 +90,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let mut writer = csv::Writer::from_writer(sink);
     writer.write_record(["frame", "x", "y", "w", "h", "ok", "us"])?;
+    let picture = args.save.as_deref().map(|path| Picture::new(path, args.labels.as_deref())).transpose()?;
     let mut frames = 0_u64;
     loop {
         let frame = match source.next_frame() {
@@ -98,9 +111,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         let microseconds = begun.elapsed().as_secs_f64() * 1e6;
         frames += 1;
         writer.write_record(row(frame.index, tracks.first(), microseconds))?;
+        if let Some(picture) = &picture {
+            picture.show(&frame, &image, tracks.first())?;
+        }
     }
     writer.flush().context("cannot write the table")?;
     drop(writer);
+    if let (Some(picture), Some(path)) = (picture, &args.save) {
+        picture.picture.finish()?;
+        output::line(format!("picture written to {0}: `rerun {0}` shows it", path.display()));
+    }
     if let Some(path) = &args.csv {
         output::line(format!("{frames} frames tracked, boxes written to {}", path.display()));
     }
@@ -127,4 +147,60 @@ fn row(frame: u64, track: Option<&ImageTrack>, microseconds: f64) -> Vec<String>
     row.extend([place.x, place.y, place.width, place.height].map(|value| format!("{value:.3}")));
     row.extend([ok.to_string(), format!("{microseconds:.1}")]);
     row
+}
+
+/// The picture of the tracker's work.
+struct Picture {
+    picture: TrackingPicture,
+    labels: BTreeMap<u64, ImageBox>,
+}
+
+impl Picture {
+    fn new(path: &Path, labels: Option<&Path>) -> anyhow::Result<Self> {
+        let labels = labels.map(read_labels).transpose()?.unwrap_or_default();
+        Ok(Self { picture: TrackingPicture::new(crossfix_view::save(path)?)?, labels })
+    }
+
+    fn show(&self, frame: &Frame, image: &Plane, track: Option<&ImageTrack>) -> anyhow::Result<()> {
+        let bytes: Vec<u8> = image.samples().iter().map(|v| v.clamp(0.0, 255.0) as u8).collect();
+        let jpeg = eye::jpeg(&bytes, image.width(), image.height()).context("cannot encode a picture")?;
+        let target = track.map(|track| {
+            let PixelBox { x, y, width, height } = PixelBox::about(track.position, track.width, track.height);
+            FollowedTarget {
+                place: ImageBox { x, y, width, height },
+                // Rerun's pixels have their upper left corner at whole numbers.
+                measured: track.measured.map(|m| [m.place.x + 0.5, m.place.y + 0.5]),
+                sight: match track.phase {
+                    TrackPhase::Tentative | TrackPhase::Tracking => Sight::Seen,
+                    TrackPhase::Coasting => Sight::Coasting,
+                    TrackPhase::Searching => Sight::Lost,
+                },
+                score: track.score,
+                certainty: track.certainty,
+                nis: track.nis,
+            }
+        });
+        let label = self.labels.get(&frame.index).copied();
+        self.picture.show(frame.capture.time, jpeg, target, label).context("cannot draw a frame")
+    }
+}
+
+/// The boxes of a table of labels; a row without one is a frame without a target.
+fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
+    let context = || format!("cannot read the labels in {}", path.display());
+    let mut reader = csv::Reader::from_path(path).with_context(context)?;
+    let columns: Vec<String> = reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
+    let mut labels = BTreeMap::new();
+    for record in reader.records() {
+        let record = record.with_context(context)?;
+        let value = |name: &str| -> Option<f64> {
+            let index = columns.iter().position(|column| column.trim() == name)?;
+            record.get(index)?.trim().parse().ok()
+        };
+        let place = (value("frame"), value("x"), value("y"), value("w"), value("h"));
+        if let (Some(frame), Some(x), Some(y), Some(width), Some(height)) = place {
+            labels.insert(frame as u64, ImageBox { x, y, width, height });
+        }
+    }
+    Ok(labels)
 }
