@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crossfix_message::{BearingFrame, Channel, TruthFrame, decode};
 use crossfix_tests::{messages, real_data, succeed};

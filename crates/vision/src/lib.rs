@@ -65,6 +65,17 @@ pub struct PixelBox {
     pub height: f64,
 }
 
+/// No place of an image is further from its corner, px.
+const FARTHEST: f64 = 1e6;
+
+impl ImagePoint {
+    /// Whether the numbers describe a place that an image can have, or that lies not too far off it.
+    pub fn is_possible(&self) -> bool {
+        // A NaN is not.
+        self.x.abs() <= FARTHEST && self.y.abs() <= FARTHEST
+    }
+}
+
 impl PixelBox {
     /// The middle, as a place: the box of one pixel at (0, 0) has its middle at (0, 0).
     pub fn centre(&self) -> ImagePoint {
@@ -78,7 +89,7 @@ impl PixelBox {
 
     /// Whether the numbers describe a box that a target can have.
     pub fn is_possible(&self) -> bool {
-        let finite = [self.x, self.y, self.width, self.height].iter().all(|v| v.is_finite());
-        finite && (1.0..=1000.0).contains(&self.width) && (1.0..=1000.0).contains(&self.height)
+        let corner = ImagePoint { x: self.x, y: self.y };
+        corner.is_possible() && (1.0..=1000.0).contains(&self.width) && (1.0..=1000.0).contains(&self.height)
     }
 }

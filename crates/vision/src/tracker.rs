@@ -213,10 +213,10 @@ impl ImageTracker {
 
     /// Tells where a target is in the next image (an operator, a cue): the place is taken instead of
     /// measured. With the box it is the start from two measurements (000 (13)-(14)). A track that is
-    /// not there, or a place that is not finite, is left out.
+    /// not there, or a place that no image has, is left out.
     pub fn cue(&mut self, id: ImageTrackId, place: ImagePoint) {
         let known = self.followed.iter_mut().find(|followed| followed.id == id);
-        if let Some(followed) = known.filter(|_| place.x.is_finite() && place.y.is_finite()) {
+        if let Some(followed) = known.filter(|_| place.is_possible()) {
             followed.cue = Some(place);
         }
     }

@@ -227,7 +227,7 @@ impl Agent {
                 continue;
             };
             let tracks = tracker.step(&image, capture.time);
-            let message = self.identity.bearing_frame(frame.index, capture, &tracks);
+            let message = self.identity.bearing_frame(frame.index, capture, tracks);
             self.publish(&message)?;
             let rate = file.preview.rate_hz;
             let due = shown.is_none_or(|last| capture.time.seconds_since(last) * rate >= 1.0);

@@ -199,17 +199,17 @@ impl Block {
         let largest = exponents[0].max(exponents[1]).max(exponents[2]);
         let least = Lanes::splat(f32::MIN_POSITIVE);
         let mut total = zero;
-        for l in 0..MODELS {
-            likelihoods[l] = (likelihoods[l] * (exponents[l] - largest).exp()).max(least);
-            total = total + likelihoods[l];
+        for (likelihood, exponent) in likelihoods.iter_mut().zip(exponents) {
+            *likelihood = (*likelihood * (exponent - largest).exp()).max(least);
+            total = total + *likelihood;
         }
         let share = Lanes::splat(1.0) / total;
         let mut filtered = zero;
-        for l in 0..MODELS {
-            let probability = (likelihoods[l] * share).max(Lanes::splat(LEAST_PROBABILITY));
-            self.probabilities[l] = probability;
+        let models = self.probabilities.iter_mut().zip(&self.states).zip(likelihoods);
+        for ((probability, state), likelihood) in models {
+            *probability = (likelihood * share).max(Lanes::splat(LEAST_PROBABILITY));
             // (16): the estimate that does not depend on a hypothesis.
-            filtered = filtered + probability * self.states[l][0];
+            filtered = filtered + *probability * state[0];
         }
         filtered
     }
