@@ -30,6 +30,9 @@ pub struct TrackerConfig {
     pub start_velocity_sd_px: f64,
     /// Standard deviation of a place that is given (a box, a cue), px. Default 0.1.
     pub given_sd_px: f64,
+    /// Standard deviation of the box's centre about the target's own, px: the same in all images of a
+    /// track, and part of every covariance that is answered. Default 0.1.
+    pub centre_sd_px: f64,
     /// Floor of the prediction's standard deviation, px. Default 0.3.
     pub prediction_floor_px: f64,
     /// How much of the reference's energy a mismatch with the target may take: its inverse. Default 30;
@@ -132,6 +135,7 @@ impl Default for TrackerConfig {
             acceleration_sd_px: 900.0,
             start_velocity_sd_px: 120.0,
             given_sd_px: 0.1,
+            centre_sd_px: 0.1,
             prediction_floor_px: 0.3,
             mismatch: 30.0,
             contrast_sd: 0.5,
@@ -230,6 +234,8 @@ impl TrackerConfig {
         for (key, value) in positive {
             check(key, value, value.is_finite() && value > 0.0, "a positive number")?;
         }
+        let centre = self.centre_sd_px;
+        check("centre_sd_px", centre, (0.0..=100.0).contains(&centre), "from 0 to 100 px")?;
         let within = |value: f64| value > 0.0 && value < 1.0;
         let visible = self.visible_probability;
         check("visible_probability", visible, within(visible), "between 0 and 1")?;

@@ -114,6 +114,8 @@ pub(crate) struct Target {
     shape_variances: [f64; 2],
     /// Variance of the reference's own place, x and y, px^2.
     common: [f64; 2],
+    /// Variance of the box's centre about the target's own, px^2.
+    centre_variance: f64,
     pub(crate) missed: u32,
     is_new: bool,
     pub(crate) last_seen: ImagePoint,
@@ -151,6 +153,7 @@ impl Target {
             contrast_variance: 0.0,
             shape_variances: [1e-6; 2],
             common: [0.0; 2],
+            centre_variance: config.centre_sd_px.powi(2),
             missed: 0,
             is_new: true,
             last_seen: centre,
@@ -177,9 +180,15 @@ impl Target {
     pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
         [0, 1].map(|i| {
             let mut covariance = self.axes[i].covariance();
-            covariance.m11 += self.common[i];
+            covariance.m11 += self.common[i] + self.centre_variance;
             covariance
         })
+    }
+
+    /// What a look measured, with all that its covariance must hold.
+    fn measurement(&self, look: &Look) -> Measurement {
+        let covariance = look.covariance + Matrix2::identity() * self.centre_variance;
+        Measurement { place: look.place, covariance }
     }
 
     pub(crate) fn is_searching(&self) -> bool {
@@ -236,7 +245,8 @@ impl Target {
         }
         self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.seen(place);
-        let measured = Measurement { place, covariance: Matrix2::identity() * variance };
+        let covariance = Matrix2::identity() * (variance + self.centre_variance);
+        let measured = Measurement { place, covariance };
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
 
@@ -363,7 +373,7 @@ impl Target {
             })
             .sum();
         let step = |measured| Step { measured, score: look.score, certainty, nis: Some(distance) };
-        let measured = Measurement { place: look.place, covariance: look.covariance };
+        let measured = self.measurement(&look);
         if let GateRule::Ellipsoid { probability } = frame.config.gate
             && !Gate::with_probability(probability).holds(distance)
         {
@@ -491,7 +501,7 @@ impl Target {
             }
         }
         self.seen(look.place);
-        let measured = Measurement { place: look.place, covariance: look.covariance };
+        let measured = self.measurement(&look);
         Step { measured: Some(measured), score: look.score, certainty: 1.0, nis: None }
     }
 }

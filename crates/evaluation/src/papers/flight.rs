@@ -147,9 +147,13 @@ impl Follower {
     /// A tracker of a configuration for brightness from 0 to 1.
     pub(crate) fn new(config: TrackerConfig, sides: [usize; 2]) -> Option<Self> {
         let sigma_a = config.acceleration_sd_px;
-        let tracker =
-            ImageTracker::new(TrackerConfig { noise_floor: 1.0 / 255.0, given_sd_px: GIVEN_SD, ..config })
-                .ok()?;
+        let tracker = ImageTracker::new(TrackerConfig {
+            noise_floor: 1.0 / 255.0,
+            given_sd_px: GIVEN_SD,
+            centre_sd_px: 0.0,
+            ..config
+        })
+        .ok()?;
         Some(Self { tracker, frame: 0, size: sides.map(|s| s as f64), last: None, sigma_a })
     }
 
