@@ -66,7 +66,8 @@ pub enum Algorithm {
     /// measured noise, the filters' prediction as prior, and a fit between the pixels.
     #[default]
     Posterior,
-    /// To the letter of 000 and 001: one peak of one measure, and filters of fixed noise.
+    /// To the letter of 000 and 001: one peak of one measure in a gate of three sides, and filters of
+    /// fixed noise.
     Paper,
 }
 

@@ -30,6 +30,7 @@ mod config;
 mod detector;
 mod lanes;
 mod likelihood;
+mod look;
 mod mend;
 mod noise;
 mod paper;

@@ -7,7 +7,7 @@ use nalgebra::Matrix2;
 
 use crate::mend::mend;
 use crate::reference::Adaptation;
-use crate::target::{Step, Workbench};
+use crate::target::{Step, Workbench, predict};
 use crate::tracker::Measurement;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
@@ -77,8 +77,8 @@ impl PaperTarget {
         bench: &mut Workbench,
         config: &TrackerConfig,
     ) -> Step {
-        for axis in self.axes.iter_mut().flatten() {
-            axis.time_update(interval);
+        if let Some(axes) = &mut self.axes {
+            predict(axes, interval, image);
         }
         let predicted = self.position();
         let gate_middle = ImagePoint { x: predicted.x.round(), y: predicted.y.round() };

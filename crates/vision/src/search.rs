@@ -6,8 +6,9 @@ use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
 use crate::likelihood::log_ratios;
+use crate::look::Look;
 use crate::mend::mend;
-use crate::target::{FRAME_INTERVAL, Frame, Look, SEARCH_AFTER_FRAMES, Target, Workbench};
+use crate::target::{FRAME_INTERVAL, Frame, SEARCH_AFTER_FRAMES, Target, Workbench};
 
 /// Least side of the reference on the coarse picture, px, and the most that is made of one.
 const COARSE_SIDE: usize = 8;

@@ -2,13 +2,14 @@
 //! the gate and the filters' prediction give where it is, how well that is known, and whether it can
 //! be seen at all.
 
-use crossfix_correlation::{Correlator, Fit, FitOptions, Freedom, Plane, Statistics};
+use crossfix_correlation::{Correlator, Plane, Statistics};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 use nalgebra::Matrix2;
 
-use crate::appearance::{Appearance, Drift, Workshop};
+use crate::appearance::{Appearance, Workshop};
 use crate::config::GateRule;
 use crate::likelihood::{Expectation, log_ratios};
+use crate::look::Look;
 use crate::mend::mend;
 use crate::noise::NoiseMeter;
 use crate::posterior::{Part, Posterior, PosteriorMap, Prior};
@@ -30,14 +31,8 @@ const MANOEUVRE: f64 = 25.0;
 const SEEN: f64 = 0.5;
 /// Log ratio of a placement outside the image.
 const IMPOSSIBLE: f32 = -50.0;
-/// How much of what the reference does not explain counts as noise: it is not white.
-const UNEXPLAINED_WEIGHT: f64 = 10.0;
 /// Floor of a measurement's standard deviation, px.
-const LEAST_MEASUREMENT_SD: f64 = 0.015;
-/// A fit's variance over the bound, and what is added to it for each time that the noise's energy holds
-/// the target's. Measured: `validate tracker` shows the consistency that follows.
-const FIT_LOSS: f64 = 1.2;
-const FIT_LOSS_IN_NOISE: f64 = 0.05;
+pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.015;
 /// Share of a measurement's variance that is the image's own noise, new in every frame. The rest is
 /// where the noise of the first image has put the reference: it is common to all measurements of a
 /// track, and no filter can take it out. About half, since image and first image are alike.
@@ -89,19 +84,6 @@ pub(crate) struct Step {
     pub(crate) nis: Option<f64>,
 }
 
-/// A reference fitted to the image at the best placement.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Look {
-    pub(crate) place: ImagePoint,
-    pub(crate) covariance: Matrix2<f64>,
-    /// Contrast over the reference's.
-    contrast: f64,
-    /// Log scale and turn, with their variances.
-    shape: Option<[(f64, f64); 2]>,
-    /// Correlation with the noise taken out.
-    pub(crate) score: f64,
-}
-
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
@@ -127,6 +109,17 @@ pub(crate) struct Target {
 /// 0 below the first value, 1 above the second, linear between.
 fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
     ((value - low) / (high - low)).clamp(0.0, 1.0)
+}
+
+/// Moves both axes on; a target that leaves the picture is waited for at its border.
+pub(crate) fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
+    for (axis, side) in axes.iter_mut().zip([image.width(), image.height()]) {
+        axis.time_update(interval);
+        let edge = side as f64 - 1.0;
+        if !(0.0..=edge).contains(&axis.position()) {
+            axis.hold_at(axis.position().clamp(0.0, edge));
+        }
+    }
 }
 
 impl Target {
@@ -219,14 +212,7 @@ impl Target {
     /// Follows the target into the next image.
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, interval, .. } = frame;
-        for (axis, side) in self.axes.iter_mut().zip([image.width(), image.height()]) {
-            axis.time_update(interval);
-            let edge = side as f64 - 1.0;
-            if !(0.0..=edge).contains(&axis.position()) {
-                // Out of the picture: it is waited for at the border.
-                axis.hold_at(axis.position().clamp(0.0, edge));
-            }
-        }
+        predict(&mut self.axes, interval, image);
         let frames = interval / FRAME_INTERVAL;
         let [scale, turn] = &mut self.shape_variances;
         *scale = (*scale + SCALE_WALK.powi(2) * frames).min(0.09);
@@ -299,58 +285,6 @@ impl Target {
         let [column, row] = posterior.peak;
         let look = self.look(column, row, origin, bench, config);
         self.update(frame, &posterior, look, origin, bench)
-    }
-
-    /// Fits the reference at a placement of the gate.
-    pub(crate) fn look(
-        &mut self,
-        column: usize,
-        row: usize,
-        origin: [f64; 2],
-        bench: &mut Workbench,
-        config: &TrackerConfig,
-    ) -> Look {
-        let working = &self.appearance.working;
-        let freedom = if config.follow_shape { Freedom::ShiftScaleTurn } else { Freedom::Shift };
-        let options = FitOptions { steps: 2, freedom, ..FitOptions::default() };
-        let fit = bench.workshop.fitter.fit(&bench.gate, working, column as f64, row as f64, options);
-        let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
-        let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
-        let contrast = fit.gain.max(least_contrast);
-        let (reference_noise, slope_noise) = self.appearance.noise();
-        let explained = image_noise * (1.0 + 2.0 * (2.0 / pixels).sqrt());
-        let unexplained =
-            (fit.residual_variance - explained - f64::from(reference_noise) * contrast * contrast).max(0.0);
-        let noise = image_noise + UNEXPLAINED_WEIGHT * unexplained;
-        let energy = contrast.powi(2) * f64::from(self.appearance.energy()).max(1e-12);
-        let inverse_ratio = f64::from(self.appearance.pixels()) * image_noise / energy;
-        let loss = FIT_LOSS + FIT_LOSS_IN_NOISE * inverse_ratio.min(10.0);
-        let covariance = self.covariance(&fit, loss * noise, f64::from(slope_noise) * pixels, contrast);
-        let drift = self.appearance.in_image(self.appearance.drift);
-        let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
-        let scaled = noise * (fit.gain / contrast).powi(2);
-        let Drift { log_scale, turn_rad, .. } = self.appearance.drift;
-        let shape = fit
-            .shape_variances(scaled)
-            .map(|[scale, turn]| [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]);
-        let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
-        let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
-        let score = (energy / (energy + rest + 1e-12)).sqrt();
-        Look { place, covariance, contrast, shape, score }
-    }
-
-    /// The covariance of a fit: the bound in the image's noise, and what of the reference's gradient
-    /// is itself noise.
-    fn covariance(&self, fit: &Fit, noise: f64, slope_noise: f64, contrast: f64) -> Matrix2<f64> {
-        let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
-            return Matrix2::identity();
-        };
-        let clear =
-            fit.gradient_energy.map(|energy| (1.0 - slope_noise / energy.max(1e-12)).clamp(0.15, 1.0));
-        let floor = LEAST_MEASUREMENT_SD.powi(2);
-        Matrix2::from_fn(|i, j| {
-            bound[(i, j)] / (clear[i] * clear[j]).sqrt() + if i == j { floor } else { 0.0 }
-        })
     }
 
     /// Takes the posterior into the filters and the target's image into the reference.
