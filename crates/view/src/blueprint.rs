@@ -60,6 +60,24 @@ pub(crate) fn send(stream: &RecordingStream, cameras: &[NamedPlace]) -> Result<(
     send_with(stream, &blueprint, &properties)
 }
 
+/// Lays an image tracker's work out: the video on the left, the curves on the right.
+pub(crate) fn send_tracking(stream: &RecordingStream) -> Result<(), ViewError> {
+    let video: ContainerLike = Spatial2DView::new("video").with_origin("/video").into();
+    let curves = Vertical::new([
+        ContainerLike::from(TimeSeriesView::new("score and certainty").with_origin("/curves")),
+        ContainerLike::from(TimeSeriesView::new("innovation squared").with_origin("/innovation")),
+    ]);
+    let root = Horizontal::new([video, curves.into()]).with_column_shares([1.6, 1.0]);
+    let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
+    let blueprint = Blueprint::new(root)
+        .with_auto_views(false)
+        .with_auto_layout(false)
+        .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
+        .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
+        .with_time_panel(time);
+    send_with(stream, &blueprint, &[])
+}
+
 /// An eye that has all cameras and the air above them in view.
 fn eye_on(cameras: &[NamedPlace]) -> EyeControls3D {
     let count = cameras.len().max(1) as f64;

@@ -2,8 +2,8 @@ use crossfix_message::Timestamp;
 use rerun::components::MediaType;
 use rerun::{Boxes2D, Clear, Color, EncodedImage, Points2D, Radius, RecordingStream, Scalars};
 
-use crate::ViewError;
 use crate::paths::TIMELINE;
+use crate::{ViewError, blueprint};
 
 /// A rectangle in an image: left, top, width, height, pixels; (0, 0) is the upper left corner.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,6 +73,7 @@ impl TrackingPicture {
     /// [`ViewError`] if the stream does not take it.
     pub fn new(stream: RecordingStream) -> Result<Self, ViewError> {
         stream.set_log_time_enabled(false);
+        blueprint::send_tracking(&stream)?;
         Ok(Self { stream })
     }
 

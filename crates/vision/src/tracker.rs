@@ -412,6 +412,51 @@ mod tests {
         assert_eq!(phases[45], TrackPhase::Tracking);
     }
 
+    /// A textured sky with a spot: what a target can be told from.
+    fn over_sky(x: f32, y: f32, hidden: impl Fn(usize) -> bool) -> Plane {
+        Plane::from_fn(160, 120, |column, row| {
+            let sky = 50.0 + 3.0 * ((column as f32 / 9.0).sin() + (row as f32 / 7.0).cos());
+            let (dx, dy) = (column as f32 - x, row as f32 - y);
+            let noise = ((column * 7919 + row * 104_729 + (x * 31.0) as usize * 613) % 17) as f32 / 8.0;
+            let spot = if hidden(column) { 0.0 } else { 120.0 * (-(dx * dx + dy * dy) / 8.0).exp() };
+            sky + noise + spot
+        })
+    }
+
+    #[test]
+    fn a_target_that_leaves_the_image_is_taken_back_where_it_enters_again() {
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.take_up(PixelBox { x: 126.0, y: 56.0, width: 9.0, height: 9.0 });
+        let mut last = None;
+        // To the right out of the image, ten frames away, and in again.
+        for frame in 0..60 {
+            let t = f32::from(u8::try_from(frame).unwrap());
+            let x = 130.0 + 50.0 * (t / 60.0 * std::f32::consts::PI).sin();
+            let image = over_sky(x, 60.0, |_| false);
+            let track = tracker.step(&image, at(frame))[0];
+            if (28..32).contains(&frame) {
+                assert_ne!(track.phase, TrackPhase::Tracking, "frame {frame}");
+            }
+            last = Some((track, f64::from(x)));
+        }
+        let (track, x) = last.unwrap();
+        assert_eq!(track.phase, TrackPhase::Tracking);
+        assert!((track.position.x - x).abs() < 0.5 && (track.position.y - 60.0).abs() < 0.5, "{track:?}");
+    }
+
+    #[test]
+    fn a_target_half_hidden_is_still_followed() {
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.take_up(PixelBox { x: 16.0, y: 56.0, width: 9.0, height: 9.0 });
+        for frame in 0..60 {
+            let x = 20.0 + 1.5 * frame as f32;
+            // A mast of three columns stands in the way.
+            let image = over_sky(x, 60.0, |column| (60..63).contains(&column));
+            let track = tracker.step(&image, at(frame))[0];
+            assert!((track.position.x - f64::from(x)).abs() < 2.0, "frame {frame}: {track:?}");
+        }
+    }
+
     #[test]
     fn images_of_another_size_or_out_of_order_are_refused() {
         let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
