@@ -80,6 +80,8 @@ fn silhouettes_are_those_of_the_reference() {
         let canvas = crossfix_simulation::Silhouette::new(width, height).canvas(margin);
         let rows = template["image"].as_array().unwrap();
         let wanted = rows.iter().flat_map(|row| row.as_array().unwrap()).map(|b| b.as_f64().unwrap());
+        let wanted: Vec<f64> = wanted.collect();
+        assert_eq!(canvas.len(), wanted.len());
         for (drawn, wanted) in canvas.iter().zip(wanted) {
             assert!((f64::from(*drawn) - wanted).abs() < 0.01, "{width}x{height}: {drawn} for {wanted}");
         }

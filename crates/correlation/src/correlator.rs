@@ -26,8 +26,8 @@ const SPECTRAL_NS: f64 = 0.30;
 /// cache.
 const PIECE: Size = Size { width: 256, height: 128 };
 
-/// Correlates references with gates; keeps its plans and its memory, so that a second gate of the
-/// same size allocates nothing.
+/// Correlates references with gates; keeps its plans and its memory, so that the statistics of a
+/// second gate of the same size allocate nothing.
 #[derive(Default)]
 pub struct Correlator {
     route: Option<Route>,

@@ -1,4 +1,4 @@
-use crossfix_correlation::{Extent, Similarity};
+use crossfix_correlation::{Extent, Similarity, SpectralWeight};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -20,8 +20,8 @@ pub struct TrackerConfig {
     /// Pixels added to each side of the target's box to make the reference. Default 2: the target's
     /// edge is most of what is known of its place.
     pub margin_px: f64,
-    /// Least standard deviation of the image's noise. Default 1, a level of 8 bits; the noise above it
-    /// is measured in every image.
+    /// Least standard deviation of the image's noise: a level. Default 1, a level of 8 bits; the noise
+    /// above it is measured in every image. The per-pixel filters' noises are in this unit.
     pub noise_floor: f64,
     /// Standard deviation of the target's white acceleration, px/s^2 (000, equation 4: the largest
     /// acceleration by root 3). Default 900, a pixel a frame squared at 30 frames a second.
@@ -43,7 +43,7 @@ pub struct TrackerConfig {
     /// Probability that a target can be seen in an image. Default 0.95.
     pub visible_probability: f64,
     /// Share of the prior that lies anywhere in the gate. Default 0.01; it doubles with every image
-    /// without the target.
+    /// without the target, up to a half.
     pub anywhere_share: f64,
     /// How fast the search for a lost target widens, px/s. Default 750.
     pub search_growth_px: f64,
@@ -67,7 +67,7 @@ pub enum Algorithm {
     #[default]
     Posterior,
     /// To the letter of 000 and 001: one peak of one measure in a gate of three sides, and filters of
-    /// fixed noise.
+    /// fixed noise. `gate`, `margin_px` and `follow_shape` do not matter to it.
     Paper,
 }
 
@@ -77,7 +77,7 @@ pub enum Algorithm {
 pub enum GateRule {
     /// A rectangle of three times the reference's sides.
     ThreeSided,
-    /// At least that, and wide enough for so many standard deviations of the innovation.
+    /// At least that, and wide enough for so many standard deviations of the prediction.
     Innovation {
         /// Standard deviations. Default 4.
         sigmas: f64,
@@ -233,7 +233,7 @@ impl TrackerConfig {
             ("paper.measurement_sd_px", self.paper.measurement_sd_px),
         ];
         for (key, value) in positive {
-            check(key, value, value.is_finite() && value > 0.0, "a positive number")?;
+            check(key, value, (1e-6..=1e6).contains(&value), "from 0.000001 to 1000000")?;
         }
         let centre = self.centre_sd_px;
         check("centre_sd_px", centre, (0.0..=100.0).contains(&centre), "from 0 to 100 px")?;
@@ -243,6 +243,41 @@ impl TrackerConfig {
         check("anywhere_share", self.anywhere_share, within(self.anywhere_share), "between 0 and 1")?;
         let margin = self.margin_px;
         check("margin_px", margin, (0.0..=100.0).contains(&margin), "from 0 to 100 px")?;
+        if let Similarity::CrossSpectrum(SpectralWeight { whitening, band }) = self.paper.similarity {
+            let good = (0.0..=1.0).contains(&whitening);
+            check("paper.similarity.cross-spectrum.whitening", f64::from(whitening), good, "from 0 to 1")?;
+            let good = (1e-3..=1e3).contains(&band);
+            check("paper.similarity.cross-spectrum.band", f64::from(band), good, "from 0.001 to 1000")?;
+        }
+        if self.paper.whole_gate && self.paper.extent == Extent::Linear {
+            let must =
+                "false where the extent is linear: a reference as large as the gate has one place in it";
+            check("paper.whole_gate", 1.0, false, must)?;
+        }
+        self.validate_gate_and_reference()?;
+        if let Some(detector) = &self.detector {
+            let memory = detector.background_memory;
+            check("detector.background_memory", memory, (0.0..1.0).contains(&memory), "from 0 to 1")?;
+            let sigmas = detector.threshold_sigmas;
+            check(
+                "detector.threshold_sigmas",
+                sigmas,
+                (1e-3..=1e6).contains(&sigmas),
+                "from 0.001 to 1000000",
+            )?;
+            let step = detector.max_step_px;
+            check("detector.max_step_px", step, (0.0..=1e6).contains(&step), "from 0 to 1000000 px")?;
+            let [least, most] = detector.area_px;
+            check("detector.area_px", least as f64, least <= most, "at most the second of the two")?;
+        }
+        Ok(())
+    }
+
+    fn validate_gate_and_reference(&self) -> Result<(), ConfigError> {
+        let check = |key, value: f64, good: bool, must| {
+            if good { Ok(()) } else { Err(ConfigError { key, value, must }) }
+        };
+        let within = |value: f64| value > 0.0 && value < 1.0;
         match self.gate {
             GateRule::ThreeSided => {}
             GateRule::Innovation { sigmas } => {
@@ -258,27 +293,25 @@ impl TrackerConfig {
                 check("reference", f64::from(share), (0.0..=1.0).contains(&share), "from 0 to 1")?;
             }
             ReferenceStrategy::PixelImm(imm) => {
-                let good = [imm.constant_sd, imm.drift_sd, imm.jump_sd]
-                    .iter()
-                    .all(|sd| sd.is_finite() && *sd >= 0.0)
-                    && imm.jump_rate.is_finite()
-                    && imm.jump_rate > 1e-3
-                    && imm.stay > 0.0
-                    && imm.stay < 1.0;
+                let noises = [
+                    ("reference.constant_sd", imm.constant_sd),
+                    ("reference.drift_sd", imm.drift_sd),
+                    ("reference.jump_sd", imm.jump_sd),
+                ];
+                for (key, sd) in noises {
+                    check(key, f64::from(sd), (0.0..=1e6).contains(&sd), "from 0 to 1000000")?;
+                }
+                let rate = imm.jump_rate;
                 check(
-                    "reference",
-                    f64::from(imm.jump_rate),
-                    good,
-                    "of finite noises, a positive rate and a probability",
+                    "reference.jump_rate",
+                    f64::from(rate),
+                    (1e-2..=1e2).contains(&rate),
+                    "from 0.01 to 100",
                 )?;
+                let stay = f64::from(imm.stay);
+                check("reference.stay", stay, within(stay), "between 0 and 1")?;
             }
             ReferenceStrategy::Fixed | ReferenceStrategy::Replacement => {}
-        }
-        if let Some(detector) = &self.detector {
-            let memory = detector.background_memory;
-            check("detector.background_memory", memory, (0.0..1.0).contains(&memory), "from 0 to 1")?;
-            let sigmas = detector.threshold_sigmas;
-            check("detector.threshold_sigmas", sigmas, sigmas > 0.0, "a positive number")?;
         }
         Ok(())
     }

@@ -28,6 +28,7 @@
 mod appearance;
 mod config;
 mod detector;
+mod frame;
 mod lanes;
 mod likelihood;
 mod look;
@@ -41,8 +42,9 @@ mod target;
 mod tracker;
 
 pub use config::{Algorithm, ConfigError, DetectorConfig, GateRule, PaperConfig, TrackerConfig};
+pub use frame::Measurement;
 pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
-pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, Measurement, TrackPhase};
+pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, TrackPhase};
 
 /// A place in the image, pixels; (0, 0) is the middle of the top left pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -5,10 +5,10 @@ use crossfix_correlation::{Extent, Plane, Reference, Window};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
 use nalgebra::Matrix2;
 
+use crate::frame::{Measurement, Step};
 use crate::mend::mend;
 use crate::reference::Adaptation;
-use crate::target::{Step, Workbench, predict};
-use crate::tracker::Measurement;
+use crate::target::{Workbench, predict};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// A target under track.
@@ -20,6 +20,8 @@ pub(crate) struct PaperTarget {
     /// Absent until the second measurement (000 (13)-(14)).
     axes: Option<[AxisFilter; 2]>,
     first: ImagePoint,
+    /// Where the box's middle lies from the middle of the reference, which is cut at whole pixels.
+    middle: [f64; 2],
 }
 
 impl PaperTarget {
@@ -28,7 +30,11 @@ impl PaperTarget {
         let times = if config.paper.whole_gate { 3.0 } else { 1.0 };
         let side = |length: f64| (times * length).round().max(1.0) as usize;
         let (width, height) = (side(place.width), side(place.height));
-        let first = crop(image, centre, width, height);
+        let (first, start) = crop(image, centre, width, height);
+        let middle = [
+            centre.x - start[0] - (width as f64 - 1.0) / 2.0,
+            centre.y - start[1] - (height as f64 - 1.0) / 2.0,
+        ];
         let noise = (config.noise_floor * config.noise_floor) as f32;
         Self {
             size: [place.width, place.height],
@@ -36,6 +42,7 @@ impl PaperTarget {
             reference: Reference::new(first, Window::uniform(width, height)),
             axes: None,
             first: centre,
+            middle,
         }
     }
 
@@ -56,12 +63,25 @@ impl PaperTarget {
         AxisMeasurement { position, variance: config.paper.measurement_sd_px.powi(2) }
     }
 
-    /// The start from two measurements (000 (13)-(14)).
-    pub(crate) fn take_place(&mut self, place: ImagePoint, interval: f64, config: &TrackerConfig) -> Step {
+    /// Takes a place from somebody who knows it; after the box alone, the start from two measurements
+    /// (000 (13)-(14)).
+    pub(crate) fn take_place(
+        &mut self,
+        image: &Plane,
+        place: ImagePoint,
+        interval: f64,
+        config: &TrackerConfig,
+    ) -> Step {
         let at = |position| Self::at(position, config);
-        let start =
-            |first, second| AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px);
-        self.axes = Some([start(self.first.x, place.x), start(self.first.y, place.y)]);
+        if let Some(axes) = &mut self.axes {
+            predict(axes, interval, image);
+            axes[0].measurement_update(at(place.x));
+            axes[1].measurement_update(at(place.y));
+        } else {
+            let start =
+                |first, second| AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px);
+            self.axes = Some([start(self.first.x, place.x), start(self.first.y, place.y)]);
+        }
         self.answer(place, 1.0, None, config)
     }
 
@@ -83,7 +103,8 @@ impl PaperTarget {
         let predicted = self.position();
         let gate_middle = ImagePoint { x: predicted.x.round(), y: predicted.y.round() };
         let sides = self.size.map(|side| (3.0 * side).round().max(1.0) as usize);
-        bench.gate = crop(image, gate_middle, sides[0], sides[1]);
+        let (gate, start) = crop(image, gate_middle, sides[0], sides[1]);
+        bench.gate = gate;
         let extent = config.paper.extent;
         bench.correlator.similarity(
             &bench.gate,
@@ -97,15 +118,15 @@ impl PaperTarget {
         let refined = if config.paper.sub_pixel { peak.refined(&bench.ratios) } else { peak.whole() };
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
-        let offset = |at: f64, gate: usize, reference: usize| {
-            // Where the reference lies against the middle of the gate; wrapped round, it lies before it.
-            let offset = at - (gate as f64 - reference as f64) / 2.0;
-            let wraps = extent == Extent::Circular && offset > gate as f64 / 2.0;
-            if wraps { offset - gate as f64 } else { offset }
+        let whole = |at: f64, gate: usize, reference: usize| {
+            // Placed more than half a gate from the middle, it comes in on the other side.
+            let off = at - (gate as f64 - reference as f64) / 2.0;
+            let wraps = extent == Extent::Circular && off > gate as f64 / 2.0;
+            at + (reference as f64 - 1.0) / 2.0 - if wraps { gate as f64 } else { 0.0 }
         };
         let place = ImagePoint {
-            x: gate_middle.x + offset(refined.x, bench.gate.width(), width),
-            y: gate_middle.y + offset(refined.y, bench.gate.height(), height),
+            x: start[0] + whole(refined.x, bench.gate.width(), width) + self.middle[0],
+            y: start[1] + whole(refined.y, bench.gate.height(), height) + self.middle[1],
         };
         let nis = if let Some([x, y]) = &mut self.axes {
             let innovations = [
@@ -114,10 +135,10 @@ impl PaperTarget {
             ];
             Some(innovations.iter().map(Innovation::normalised_squared).sum())
         } else {
-            self.take_place(place, interval, config);
+            self.take_place(image, place, interval, config);
             None
         };
-        let seen = crop(image, self.position(), width, height);
+        let (seen, _) = crop(image, self.position(), width, height);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
         let adaptation = &mut self.adaptation;
         self.reference.update(|own| adaptation.take_in(own, &seen, noise, 1.0, interval as f32));
@@ -125,11 +146,38 @@ impl PaperTarget {
     }
 }
 
-/// The part of an image about a place rounded to whole pixels; one of even sides has its middle half
-/// a pixel further.
-fn crop(image: &Plane, middle: ImagePoint, width: usize, height: usize) -> Plane {
-    let start = |at: f64, side: usize| (at - (side as f64 - 1.0) / 2.0).round() as isize;
-    let mut part = image.crop(start(middle.x, width), start(middle.y, height), width, height);
+/// The part of an image about a place, cut at whole pixels, and where its first pixel is.
+fn crop(image: &Plane, middle: ImagePoint, width: usize, height: usize) -> (Plane, [f64; 2]) {
+    let start =
+        [(middle.x, width), (middle.y, height)].map(|(at, side)| (at - (side as f64 - 1.0) / 2.0).round());
+    let mut part = image.crop(start[0] as isize, start[1] as isize, width, height);
     mend(&mut part);
-    part
+    (part, start)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_box_of_even_sides_that_stands_still_is_measured_where_it_is() {
+        for (whole_gate, extent) in
+            [(true, Extent::Circular), (false, Extent::Linear), (false, Extent::Circular)]
+        {
+            let mut config = TrackerConfig::paper();
+            (config.paper.whole_gate, config.paper.extent) = (whole_gate, extent);
+            let image = Plane::from_fn(120, 90, |x, y| {
+                let (dx, dy) = (x as f32 - 60.0, y as f32 - 45.0);
+                10.0 + 90.0 * (-(dx * dx + dy * dy) / 18.0).exp()
+            });
+            let place = PixelBox { x: 50.0, y: 38.0, width: 20.0, height: 14.0 };
+            let mut target = PaperTarget::new(&image, place, &config);
+            let mut bench = Workbench::default();
+            for _ in 0..20 {
+                let step = target.step(&image, 1.0 / 30.0, &mut bench, &config);
+                let measured = step.measured.map(|m| m.place);
+                assert_eq!(measured, Some(place.centre()), "{whole_gate} {extent:?}");
+            }
+        }
+    }
 }

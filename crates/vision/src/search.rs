@@ -5,10 +5,11 @@ use std::ops::Range;
 use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
+use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::look::Look;
 use crate::mend::mend;
-use crate::target::{FRAME_INTERVAL, Frame, SEARCH_AFTER_FRAMES, Target, Workbench};
+use crate::target::{Target, Workbench};
 
 /// Least side of the reference on the coarse picture, px, and the most that is made of one.
 const COARSE_SIDE: usize = 8;
@@ -164,8 +165,7 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
 
 /// Half sides of the search, px: they grow from frame to frame.
 fn half_sides(target: &Target, image: &Plane, sides: [usize; 2], config: &TrackerConfig) -> [f64; 2] {
-    let frames = f64::from(target.missed - SEARCH_AFTER_FRAMES.min(target.missed) + 1);
-    let grown = config.search_growth_px * FRAME_INTERVAL * frames;
+    let grown = config.search_growth_px * target.unseen_s;
     let gate = target.half_gate(image, config);
     let most = [image.width(), image.height()];
     [0, 1].map(|i| (gate[i] as f64).max(sides[i] as f64 + grown).min(most[i] as f64))

@@ -8,19 +8,17 @@ use nalgebra::Matrix2;
 
 use crate::appearance::{Appearance, Workshop};
 use crate::config::GateRule;
+use crate::frame::{FRAME_INTERVAL, Frame, Measurement, Step};
 use crate::likelihood::{Expectation, log_ratios};
 use crate::look::Look;
 use crate::mend::mend;
 use crate::noise::NoiseMeter;
 use crate::posterior::{Part, Posterior, PosteriorMap, Prior};
 use crate::search::{Background, Search};
-use crate::tracker::Measurement;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Frames without the target after which it is searched for.
 pub(crate) const SEARCH_AFTER_FRAMES: u32 = 3;
-/// The frame interval to which shares a frame refer, s.
-pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
 /// Share of a frame's noise in the running estimate.
 const NOISE_SHARE: f32 = 0.3;
 /// Variance below which a fit is narrower than the pixels of the map, px^2.
@@ -60,30 +58,6 @@ pub(crate) struct Workbench {
     map: PosteriorMap,
 }
 
-/// The next image, and what goes with it.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Frame<'a> {
-    pub(crate) image: &'a Plane,
-    /// Time since the image before, s.
-    pub(crate) interval: f64,
-    /// A picture of a moment ago, in which every target was seen.
-    pub(crate) keepsake: Option<&'a Plane>,
-    pub(crate) config: &'a TrackerConfig,
-}
-
-/// What one step of one target gave.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Step {
-    /// The measured place, if the target was seen.
-    pub(crate) measured: Option<Measurement>,
-    /// The correlation at the best place.
-    pub(crate) score: f64,
-    /// Probability that the target is at the best place.
-    pub(crate) certainty: f64,
-    /// Normalised innovation squared of both axes.
-    pub(crate) nis: Option<f64>,
-}
-
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
@@ -100,6 +74,8 @@ pub(crate) struct Target {
     centre_variance: f64,
     pub(crate) missed: u32,
     is_new: bool,
+    /// Time since it was last seen, s.
+    pub(crate) unseen_s: f64,
     pub(crate) last_seen: ImagePoint,
     /// Where it was in the tracker's keepsake picture.
     pub(crate) in_keepsake: Option<ImagePoint>,
@@ -135,7 +111,7 @@ impl Target {
         mend(&mut bench.gate);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
         let start = |position| {
-            let first = AxisMeasurement { position, variance: LEAST_MEASUREMENT_SD.powi(2) };
+            let first = AxisMeasurement { position, variance: config.given_sd_px.powi(2) };
             AxisFilter::start_at_rest(first, config.start_velocity_sd_px, config.acceleration_sd_px)
         };
         Self {
@@ -149,6 +125,7 @@ impl Target {
             centre_variance: config.centre_sd_px.powi(2),
             missed: 0,
             is_new: true,
+            unseen_s: 0.0,
             last_seen: centre,
             in_keepsake: None,
             background: None,
@@ -213,6 +190,7 @@ impl Target {
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, interval, .. } = frame;
         predict(&mut self.axes, interval, image);
+        self.unseen_s += interval;
         let frames = interval / FRAME_INTERVAL;
         let [scale, turn] = &mut self.shape_variances;
         *scale = (*scale + SCALE_WALK.powi(2) * frames).min(0.09);
@@ -225,9 +203,24 @@ impl Target {
     pub(crate) fn take_place(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> Step {
         let Frame { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
+        let searching = self.is_searching();
+        let at = |position| AxisMeasurement { position, variance };
+        if !self.is_new {
+            predict(&mut self.axes, interval, image);
+        }
         for (axis, position) in self.axes.iter_mut().zip([place.x, place.y]) {
-            let at = |position| AxisMeasurement { position, variance };
-            *axis = AxisFilter::start(at(axis.position()), at(position), interval, config.acceleration_sd_px);
+            if self.is_new {
+                *axis =
+                    AxisFilter::start(at(axis.position()), at(position), interval, config.acceleration_sd_px);
+            } else if searching {
+                *axis = AxisFilter::start_at_rest(
+                    at(position),
+                    config.search_velocity_sd_px,
+                    config.acceleration_sd_px,
+                );
+            } else {
+                axis.measurement_update(at(position));
+            }
         }
         self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.seen(place);
@@ -361,6 +354,7 @@ impl Target {
 
     fn seen(&mut self, place: ImagePoint) {
         self.missed = 0;
+        self.unseen_s = 0.0;
         self.is_new = false;
         self.last_seen = place;
         self.background = None;
@@ -388,10 +382,13 @@ impl Target {
             let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
             self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
             self.contrast_variance *= 1.0 - gain;
-            self.follow_shape(look);
         }
         let certainty = certainty * ramp(look.score, LEARNING_SCORES);
         if certainty >= 0.02 {
+            // Size and direction take effect with the learning; without it they would run away.
+            if certainty > SEEN * ramp(look.score, LEARNING_SCORES) {
+                self.follow_shape(look);
+            }
             self.appearance.learn(image, place, self.noise, certainty as f32, interval, &mut bench.workshop);
         }
     }

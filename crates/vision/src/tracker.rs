@@ -6,8 +6,9 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::Detector;
+use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
-use crate::target::{Frame, Step, Target, Workbench};
+use crate::target::{Target, Workbench};
 use crate::{ConfigError, ImagePoint, PixelBox, TrackerConfig};
 
 /// Steps longer than this are taken as this: after a pause nothing is known of a target anyway.
@@ -36,15 +37,6 @@ pub enum TrackPhase {
     Searching,
 }
 
-/// A place measured in one image, whatever was known before.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Measurement {
-    /// The target's centre.
-    pub place: ImagePoint,
-    /// Its covariance, x and y, px^2.
-    pub covariance: Matrix2<f64>,
-}
-
 /// One target in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageTrack {
@@ -64,7 +56,7 @@ pub struct ImageTrack {
     pub width: f64,
     /// Sides of the box, px.
     pub height: f64,
-    /// Correlation at the best place, -1 to 1.
+    /// Correlation at the best place, 0 to 1; with the papers' algorithm, the peak of its measure.
     pub score: f64,
     /// Probability that the target is at the best place and nowhere else.
     pub certainty: f64,
@@ -102,7 +94,9 @@ impl Follower {
             (Self::Posterior(target), None) => target.step(frame, bench),
             (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
             (Self::Paper(target), None) => target.step(frame.image, frame.interval, bench, frame.config),
-            (Self::Paper(target), Some(place)) => target.take_place(place, frame.interval, frame.config),
+            (Self::Paper(target), Some(place)) => {
+                target.take_place(frame.image, place, frame.interval, frame.config)
+            }
         }
     }
 
@@ -164,10 +158,28 @@ struct Keepsake {
 /// Age at which a keepsake is replaced, s.
 const KEEPSAKE_AGE: f64 = 0.5;
 
+/// Images that must agree with each other before the tracker believes them and not the last one.
+const RESYNCHRONISE_AFTER: u32 = 3;
+
+/// When an image was taken, and its sides.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shot {
+    time: Timestamp,
+    size: (usize, usize),
+}
+
+impl Shot {
+    fn follows(self, before: Self) -> bool {
+        self.time > before.time && self.size == before.size
+    }
+}
+
 /// Finds and follows targets in one image stream.
 ///
 /// Images must come in the order of their times; one whose time is not after the last one's, or
-/// whose size differs from the first one's, is answered with no tracks and counted.
+/// whose size differs from the last one's, is answered with no tracks and counted. After three of
+/// them that agree with each other, the fourth is taken: after another size, what was followed is
+/// given up.
 #[derive(Debug)]
 pub struct ImageTracker {
     config: TrackerConfig,
@@ -178,8 +190,10 @@ pub struct ImageTracker {
     followed: Vec<Followed>,
     tracks: Vec<ImageTrack>,
     next_id: u64,
-    last: Option<(Timestamp, usize, usize)>,
+    last: Option<Shot>,
     refused: u64,
+    /// The newest refused image, and how many in a row agreed with each other.
+    refused_last: Option<(Shot, u32)>,
 }
 
 impl ImageTracker {
@@ -201,6 +215,7 @@ impl ImageTracker {
             next_id: 1,
             last: None,
             refused: 0,
+            refused_last: None,
         })
     }
 
@@ -229,14 +244,14 @@ impl ImageTracker {
     /// Follows all targets into the next image and returns its tracks, ordered by id. An image without
     /// new, lost or given-up targets allocates no memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
-        let size = (image.width(), image.height());
-        let fits = self.last.is_none_or(|(last, w, h)| time > last && (w, h) == size);
-        if !fits {
+        let shot = Shot { time, size: (image.width(), image.height()) };
+        if image.samples().is_empty() || !self.admits(shot) {
             self.refused += 1;
             return &[];
         }
-        let interval = self.last.map_or(0.0, |(last, ..)| time.seconds_since(last).min(LONGEST_INTERVAL));
-        self.last = Some((time, size.0, size.1));
+        let interval =
+            self.last.map_or(0.0, |last| time.seconds_since(last.time).clamp(0.0, LONGEST_INTERVAL));
+        self.last = Some(shot);
 
         self.tracks.clear();
         let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
@@ -258,6 +273,32 @@ impl ImageTracker {
         self.take_up_new(image, time);
         self.keep(image, time);
         &self.tracks
+    }
+
+    /// Whether an image follows the last one. After some that agree with each other and not with that
+    /// one, they are right: a camera has changed its mode, or one clock reading was from the future.
+    fn admits(&mut self, shot: Shot) -> bool {
+        if self.last.is_none_or(|last| shot.follows(last)) {
+            self.refused_last = None;
+            return true;
+        }
+        let agreed = match self.refused_last {
+            Some((before, agreed)) if shot.follows(before) => agreed + 1,
+            _ => 1,
+        };
+        self.refused_last = Some((shot, agreed));
+        if agreed <= RESYNCHRONISE_AFTER {
+            return false;
+        }
+        self.refused_last = None;
+        if self.last.is_some_and(|last| last.size != shot.size) {
+            // Places in pictures of another size mean nothing.
+            self.followed.clear();
+        }
+        self.keepsake = None;
+        self.last = None;
+        self.detector = self.config.detector.clone().map(Detector::new);
+        true
     }
 
     /// Keeps a picture for later losses: from time to time, while every target is seen, and when one
@@ -465,6 +506,18 @@ mod tests {
         assert_eq!(tracker.step(&spots(&[]), at(5)).len(), 0);
         assert_eq!(tracker.step(&Plane::from_fn(10, 10, |_, _| 0.0), at(6)).len(), 0);
         assert_eq!(tracker.refused(), 2);
+    }
+
+    #[test]
+    fn a_camera_that_changes_its_size_or_has_had_one_wrong_time_is_followed_again() {
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.step(&Plane::from_fn(10, 10, |_, _| 0.0), at(1_000_000));
+        for frame in 0..3 {
+            assert!(tracker.step(&spots(&[]), at(frame)).is_empty());
+        }
+        tracker.take_up(PixelBox { x: 16.0, y: 56.0, width: 9.0, height: 9.0 });
+        assert_eq!(tracker.step(&spots(&[]), at(3)).len(), 1);
+        assert_eq!(tracker.refused(), 3);
     }
 
     proptest! {

@@ -55,10 +55,10 @@ impl FromStr for BoxArg {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
-        let [x, y, width, height] = numbers[..] else {
-            return Err(format!("`{text}` is not left,top,width,height"));
-        };
+        let misread = || format!("`{text}` is not left,top,width,height");
+        let numbers = text.split(',').map(|part| part.trim().parse());
+        let numbers: Vec<f64> = numbers.collect::<Result<_, _>>().map_err(|_| misread())?;
+        let [x, y, width, height] = numbers[..] else { return Err(misread()) };
         let place = PixelBox { x, y, width, height };
         if place.is_possible() {
             Ok(Self(place))
@@ -114,6 +114,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         if let Some(picture) = &picture {
             picture.show(&frame, &image, tracks.first())?;
         }
+    }
+    if tracker.refused() > 0 {
+        tracing::warn!(
+            "{} frames were refused: another size, or not after the one before",
+            tracker.refused()
+        );
     }
     writer.flush().context("cannot write the table")?;
     drop(writer);
@@ -190,6 +196,11 @@ fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
     let context = || format!("cannot read the labels in {}", path.display());
     let mut reader = csv::Reader::from_path(path).with_context(context)?;
     let columns: Vec<String> = reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
+    for name in ["frame", "x", "y", "w", "h"] {
+        if !columns.iter().any(|column| column.trim() == name) {
+            bail!("{} has no column `{name}`; it needs frame,x,y,w,h", path.display());
+        }
+    }
     let mut labels = BTreeMap::new();
     for record in reader.records() {
         let record = record.with_context(context)?;

@@ -102,8 +102,8 @@ impl Canvas {
 
     fn paste(&mut self, crop: &[f32], width: usize, at: [f64; 2]) {
         let height = crop.len() / width;
-        // The same rounding as the tracker's crop of the gate.
-        let start = |at: f64, side: usize| (at.round() - (side as f64 - 1.0) / 2.0).round() as isize;
+        // At whole pixels, as near to the place as they are.
+        let start = |at: f64, side: usize| (at - (side as f64 - 1.0) / 2.0).round() as isize;
         let (left, top) = (start(at[0], width), start(at[1], height));
         for (i, value) in crop.iter().enumerate() {
             let (x, y) = (left + (i % width) as isize, top + (i / width) as isize);

@@ -94,7 +94,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let nees = [0.3, 1.0, 3.0]
         .map(|sigma_a| Row::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1)));
     let mut honesty = Vec::new();
-    for sides in [[25, 15], [10, 6]] {
+    for sides in [[50, 30], [25, 15], [18, 12], [10, 6]] {
         for sigma_n in [0.1, 0.2, 0.3, 0.4] {
             let runs = outcomes(options, sides, sigma_n, &TrackerConfig::default());
             // Runs are independent: 95 % is 1.96 standard errors.
@@ -102,7 +102,9 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 [("NIS", over_runs(&runs, |o| o.nis)), ("NEES", over_runs(&runs, |o| Some(o.nees)))]
             {
                 let name = format!("{what} {}x{}", sides[0], sides[1]);
-                honesty.push(Row::new(name, sigma_n, figure).limit(near_two(1.96 * figure.1)));
+                let margin = 1.96 * figure.1;
+                honesty
+                    .push(Row::new(name, sigma_n, figure).limit(Limit::Between(2.0 - margin, 2.0 + margin)));
             }
         }
     }

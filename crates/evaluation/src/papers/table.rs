@@ -8,6 +8,8 @@ pub enum Limit {
     AtMost(f64),
     /// At least this.
     AtLeast(f64),
+    /// From the first to the second.
+    Between(f64, f64),
     /// This, within a tolerance.
     Near {
         /// The figure.
@@ -72,6 +74,7 @@ impl Row {
             None => return Verdict::Information,
             Some(Limit::AtMost(most)) => self.ours <= most,
             Some(Limit::AtLeast(least)) => self.ours >= least,
+            Some(Limit::Between(least, most)) => (least..=most).contains(&self.ours),
             Some(Limit::Near { value, tolerance }) => {
                 (self.ours - value).abs() <= tolerance.max(3.0 * self.standard_error)
             }
@@ -102,9 +105,9 @@ impl Table {
     }
 }
 
-/// The mean of samples with its standard error.
+/// The mean of samples with its standard error; of none it is not a number, which no limit passes.
 pub(crate) fn mean(samples: &[f64]) -> (f64, f64) {
-    let count = samples.len().max(1) as f64;
+    let count = samples.len() as f64;
     let mean = samples.iter().sum::<f64>() / count;
     let variance = samples.iter().map(|s| (s - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
     (mean, (variance / count).sqrt())

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 pub use imm::{ImmConfig, PixelImm};
 
-use crate::target::FRAME_INTERVAL;
+use crate::frame::FRAME_INTERVAL;
 
 /// How the reference is formed from the images of the target.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -67,7 +67,9 @@ fn picture(bytes: &mut Bytes<'_>, frame: u32) -> Plane {
             1 => 255.0,
             2 => broken,
             // Broken pixels here and there.
-            3 if (x * 7 + y * 13) % usize::from(texture % 30 + 2) == 0 => broken,
+            3 if (x * 7 + y * 13) % usize::from(texture % 30 + 2) == 0 => {
+                broken * if x % 2 == 0 { 1.0 } else { -1.0 }
+            }
             4 => scene + f32::from(((x * 31 + y * 17) as u8).wrapping_mul(texture)),
             // Very bright, and hardly anything.
             5 => scene * 1e7,
@@ -93,6 +95,11 @@ fn is_sound(track: &ImageTrack) -> bool {
         && track.width > 0.0
         && track.height > 0.0
         && track.score.is_finite()
+        && track.certainty.is_finite()
+        && track.nis.is_none_or(f64::is_finite)
+        && track
+            .covariances
+            .is_none_or(|axes| axes.iter().all(|c| c.iter().all(|v| v.is_finite()) && c.m11 > 0.0))
 }
 
 /// Runs a tracker on bytes. Panics if it does, or if it answers with what cannot be.

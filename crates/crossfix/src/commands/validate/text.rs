@@ -9,6 +9,7 @@ fn limit(limit: Option<Limit>) -> String {
         None => String::new(),
         Some(Limit::AtMost(most)) => format!("<= {}", short(most)),
         Some(Limit::AtLeast(least)) => format!(">= {}", short(least)),
+        Some(Limit::Between(least, most)) => format!("{} to {}", short(least), short(most)),
         Some(Limit::Near { value, tolerance }) => format!("{} +- {}", short(value), short(tolerance)),
     }
 }

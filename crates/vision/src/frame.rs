@@ -1,0 +1,42 @@
+//! What goes into a step of a target, and what comes out.
+
+use crossfix_correlation::Plane;
+use nalgebra::Matrix2;
+
+use crate::{ImagePoint, TrackerConfig};
+
+/// The frame interval to which shares a frame refer, s.
+pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
+
+/// The next image, and what goes with it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Frame<'a> {
+    pub(crate) image: &'a Plane,
+    /// Time since the image before, s.
+    pub(crate) interval: f64,
+    /// A picture of a moment ago, in which every target was seen.
+    pub(crate) keepsake: Option<&'a Plane>,
+    pub(crate) config: &'a TrackerConfig,
+}
+
+/// A place measured in one image, whatever was known before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measurement {
+    /// The target's centre.
+    pub place: ImagePoint,
+    /// Its covariance, x and y, px^2.
+    pub covariance: Matrix2<f64>,
+}
+
+/// What one step of one target gave.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Step {
+    /// The measured place, if the target was seen.
+    pub(crate) measured: Option<Measurement>,
+    /// The correlation at the best place.
+    pub(crate) score: f64,
+    /// Probability that the target is at the best place.
+    pub(crate) certainty: f64,
+    /// Normalised innovation squared of both axes.
+    pub(crate) nis: Option<f64>,
+}
