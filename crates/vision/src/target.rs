@@ -34,7 +34,7 @@ pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.015;
 /// Share of a measurement's variance that is the image's own noise, new in every frame. The rest is
 /// where the noise of the first image has put the reference: it is common to all measurements of a
 /// track, and no filter can take it out. About half, since image and first image are alike.
-const OWN_SHARE: f64 = 0.58;
+const OWN_SHARE: f64 = 0.62;
 /// Correlations at which an image is not learned at all, and fully.
 const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
 /// How fast the contrast, the log scale and the turn wander, a frame; and the floors of their
