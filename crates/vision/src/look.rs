@@ -11,8 +11,8 @@ use crate::{ImagePoint, TrackerConfig};
 const UNEXPLAINED_WEIGHT: f64 = 10.0;
 /// A fit's variance over the bound, and what is added to it for each time that the noise's energy holds
 /// the target's. Measured: `validate tracker` shows the consistency that follows.
-const FIT_LOSS: f64 = 1.13;
-const FIT_LOSS_IN_NOISE: f64 = 0.047;
+const FIT_LOSS: f64 = 1.1;
+const FIT_LOSS_IN_NOISE: f64 = 0.035;
 
 /// A reference fitted to the image at the best placement.
 #[derive(Clone, Copy, Debug)]
