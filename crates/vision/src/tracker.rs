@@ -11,8 +11,10 @@ use crate::paper::PaperTarget;
 use crate::target::{Target, Workbench};
 use crate::{ConfigError, ImagePoint, PixelBox, TrackerConfig};
 
-/// Steps longer than this are taken as this: after a pause nothing is known of a target anyway.
+/// Steps longer or shorter than these are taken as these: after a pause nothing is known of a target
+/// anyway, and no camera is that fast.
 const LONGEST_INTERVAL: f64 = 1.0;
+const SHORTEST_INTERVAL: f64 = 1e-4;
 
 /// Number of a 2D track, unique within its image stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -249,8 +251,8 @@ impl ImageTracker {
             self.refused += 1;
             return &[];
         }
-        let interval =
-            self.last.map_or(0.0, |last| time.seconds_since(last.time).clamp(0.0, LONGEST_INTERVAL));
+        let since = |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
+        let interval = self.last.map_or(LONGEST_INTERVAL, since);
         self.last = Some(shot);
 
         self.tracks.clear();
