@@ -4,7 +4,7 @@
 //! `cargo bench -p crossfix-correlation`
 
 use crossfix_correlation::{
-    Correlator, Extent, FitOptions, Fitter, Plane, Reference, Route, Similarity, Window,
+    Correlator, Extent, FitOptions, Fitter, Plane, Reference, Resampler, Route, Similarity, Window,
 };
 use divan::{Bencher, black_box};
 
@@ -14,8 +14,11 @@ fn main() {
 
 const TEMPLATES: [(usize, usize); 4] = [(10, 6), (25, 15), (50, 30), (100, 60)];
 
+/// Smooth structure of some pixels, and a little noise.
 fn texture(x: usize, y: usize) -> f32 {
-    (((x * 7919 + y * 104_729) ^ (x * y * 31)) % 251) as f32
+    let (u, v) = (x as f32, y as f32);
+    let smooth = (0.9 * u + 0.3 * v).sin() + (0.7 * v - 0.2 * u).cos() + (0.013 * u * v).sin();
+    128.0 + 30.0 * smooth + (((x * 7919 + y * 104_729) ^ (x * y * 31)) % 11) as f32
 }
 
 fn search(
@@ -26,14 +29,18 @@ fn search(
 ) {
     let gate = Plane::from_fn(gate.0, gate.1, texture);
     let (left, top) = ((gate.width() - width) / 2, (gate.height() - height) / 2);
-    let crop = gate.crop(left as isize, top as isize, width, height);
-    let reference = Reference::new(crop, Window::uniform(width, height));
+    // Between the pixels, so that the fit has its way to go.
+    let mut part = Plane::from_fn(width, height, |_, _| 0.0);
+    Resampler::default().sample(&gate, left as f64 + 0.3, top as f64 - 0.2, &mut part);
+    let reference = Reference::new(part, Window::uniform(width, height));
     let (mut scores, mut fitter) = (Plane::default(), Fitter::default());
+    // As many steps as the tracker takes.
+    let options = FitOptions { steps: 2, ..FitOptions::default() };
     bencher.bench_local(|| {
         let measure = Similarity::ZeroMeanNormalised;
         correlator.similarity(black_box(&gate), &reference, measure, Extent::Linear, 1.0, &mut scores);
         let peak = scores.peak();
-        let fit = fitter.fit(&gate, &reference, peak.column as f64, peak.row as f64, FitOptions::default());
+        let fit = fitter.fit(&gate, &reference, peak.column as f64, peak.row as f64, options);
         fit.covariance(fit.residual_variance)
     });
 }

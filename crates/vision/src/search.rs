@@ -215,7 +215,7 @@ impl Area {
         let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
         let variances = [0, 1].map(|i| target.axes()[i].position_variance());
         let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
-        let anywhere = (config.anywhere_share * f64::from(2_u32.saturating_pow(target.missed))).min(0.5);
+        let anywhere = target.anywhere(config);
         let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));
         let background_at = |column: usize, row: usize| -> f32 {
             let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else { return 0.0 };

@@ -246,6 +246,11 @@ impl Target {
         })
     }
 
+    /// Share of the prior that lies anywhere: it doubles with every image without the target.
+    pub(crate) fn anywhere(&self, config: &TrackerConfig) -> f64 {
+        (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5)
+    }
+
     fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
         let predicted = self.position();
@@ -270,7 +275,7 @@ impl Target {
         let prior = Prior {
             centre: [predicted.x - origin[0], predicted.y - origin[1]],
             variance: [0, 1].map(|i| self.axes[i].position_variance() + config.prediction_floor_px.powi(2)),
-            anywhere: (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5),
+            anywhere: self.anywhere(config),
             visible: config.visible_probability,
             near: sides.map(|side| (side / 8).max(2)),
         };
@@ -373,7 +378,8 @@ impl Target {
         if certainty < 0.05 {
             return;
         }
-        if certainty > SEEN {
+        let seen = certainty > SEEN;
+        if seen {
             let clear = f64::from(self.appearance.clear_share());
             let measured = look.contrast / clear;
             let variance = f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)
@@ -386,7 +392,7 @@ impl Target {
         let certainty = certainty * ramp(look.score, LEARNING_SCORES);
         if certainty >= 0.02 {
             // Size and direction take effect with the learning; without it they would run away.
-            if certainty > SEEN * ramp(look.score, LEARNING_SCORES) {
+            if seen {
                 self.follow_shape(look);
             }
             self.appearance.learn(image, place, self.noise, certainty as f32, interval, &mut bench.workshop);
