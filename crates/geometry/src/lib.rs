@@ -34,4 +34,4 @@ pub use bearing::{Bearing, SightLine, tangent_basis};
 pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
 pub use pose::Pose;
-pub use scanning::{ScanAngles, optical_bearing};
+pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};
