@@ -2,6 +2,13 @@
 //! residual from the group's extrapolation, with an accumulated indicator, and
 //! the best groups without common sight lines are handed over (002, temporal
 //! processing of both algorithms).
+//!
+//! How many targets there are, the paper's `m^` (step 5 of the alternative
+//! algorithm, step 4 of the proposed one), is the number of groups selected by
+//! this rule: of the groups with enough fixes, in the order of their
+//! indicators, each that shares at most `shared_lines` sight lines with all
+//! those selected before it together. With no sharing allowed it cannot exceed
+//! the number of lines of any camera.
 
 use std::collections::BTreeSet;
 
@@ -61,7 +68,8 @@ pub struct GroupingRules {
     pub gate: TemporalGate,
     /// The fastest target, m/s: limits the second fix where the first has no velocity.
     pub max_speed: f64,
-    /// How many lines two selected groups may share.
+    /// How many sight lines a selected group may share with those selected before it: the paper's
+    /// "small number of crossings", for targets that a camera saw as one.
     pub shared_lines: usize,
 }
 
@@ -71,6 +79,7 @@ pub struct Grouping {
     rules: GroupingRules,
     groups: Vec<Group>,
     period: u64,
+    targets: usize,
 }
 
 impl Group {
@@ -79,24 +88,30 @@ impl Group {
         &self.fixes[self.fixes.len() - 1]
     }
 
-    /// The velocity to extrapolate with: the fix's own, or the line through the group's fixes.
-    fn velocity(&self) -> Option<Vector3<f64>> {
+    /// Where the group is at the time of its last fix and how fast: the fix itself where it has a
+    /// velocity (002, proposed algorithm, step 3), or the line through all vectors of the group
+    /// (alternative algorithm, steps 1 and 4). `None` for a single fix without a velocity.
+    fn trajectory(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
+        let state = &self.last().fix.state;
         match self.last().fix.velocity {
-            VelocityKnowledge::Solved => Some(self.last().fix.state.velocity()),
-            VelocityKnowledge::Unknown => self.fitted_velocity(),
+            VelocityKnowledge::Solved => Some((state.position(), state.velocity())),
+            VelocityKnowledge::Unknown => self.fitted_line(),
         }
     }
 
-    /// Slope of the positions over time by least squares, over all vectors of the group.
-    fn fitted_velocity(&self) -> Option<Vector3<f64>> {
+    /// Positions over time by least squares, at the time of the last.
+    fn fitted_line(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
         let reference = self.last().fix.time;
         let times: Vec<f64> = self.fixes.iter().map(|f| f.fix.time.seconds_since(reference)).collect();
-        let mean_time = times.iter().sum::<f64>() / times.len() as f64;
+        let count = times.len() as f64;
+        let mean_time = times.iter().sum::<f64>() / count;
+        let positions = || self.fixes.iter().map(|f| f.fix.state.position().coords);
+        let mean = positions().sum::<Vector3<f64>>() / count;
         let spread: f64 = times.iter().map(|t| (t - mean_time).powi(2)).sum();
         (spread > 0.0).then(|| {
-            let weighted =
-                self.fixes.iter().zip(&times).map(|(f, t)| f.fix.state.position().coords * (t - mean_time));
-            weighted.sum::<Vector3<f64>>() / spread
+            let weighted = positions().zip(&times).map(|(position, t)| position * (t - mean_time));
+            let velocity = weighted.sum::<Vector3<f64>>() / spread;
+            (Point3::from(mean - velocity * mean_time), velocity)
         })
     }
 
@@ -112,7 +127,12 @@ impl Group {
 impl Grouping {
     /// No group yet.
     pub fn new(rules: GroupingRules) -> Self {
-        Self { rules, groups: Vec::new(), period: 0 }
+        Self { rules, groups: Vec::new(), period: 0, targets: 0 }
+    }
+
+    /// The estimate `m^` of the number of targets: how many groups the newest period selected.
+    pub fn target_count(&self) -> usize {
+        self.targets
     }
 
     /// Takes in all fixes of one period and returns the groups that are good enough, best first;
@@ -153,13 +173,12 @@ impl Grouping {
         if dt <= 0.0 {
             return None;
         }
-        let Some(velocity) = group.velocity() else {
+        let Some((position, velocity)) = group.trajectory() else {
             // 002, alternative algorithm, step 1: any pair of the first two periods starts a group.
             let distance = (fix.fix.state.position() - last.state.position()).norm();
             return (distance <= self.rules.max_speed * dt).then_some(0.0);
         };
-        let predicted: Point3<f64> = last.state.position() + velocity * dt;
-        let difference = fix.fix.state.position() - predicted;
+        let difference = fix.fix.state.position() - (position + velocity * dt);
         match self.rules.gate {
             TemporalGate::Distance(beta) => {
                 let distance = difference.norm();
@@ -174,7 +193,8 @@ impl Grouping {
         }
     }
 
-    /// The groups with the least indicators that share no lines (002, step 5 and step 4).
+    /// The groups with the least indicators that share no lines, or few (002, step 5 of the
+    /// alternative algorithm and step 4 of the proposed one).
     fn select(&mut self) -> Vec<Group> {
         let mut good: Vec<&Group> =
             self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes).collect();
@@ -187,7 +207,12 @@ impl Grouping {
                 selected.push(group.clone());
             }
         }
-        self.groups.retain(|group| group.shares(&taken) == 0);
+        // What goes on may cross what is taken as seldom as what was selected, and must have more.
+        self.groups.retain(|group| {
+            let shared = group.shares(&taken);
+            shared <= self.rules.shared_lines && (shared == 0 || shared < group.lines().len())
+        });
+        self.targets = selected.len();
         selected
     }
 }
@@ -219,7 +244,7 @@ mod tests {
                 },
                 velocity,
                 solver: Solver::Triple,
-                observability: Observability { rank: 6, unknowns: 6, condition_number: 1.0 },
+                observability: Observability::full(6, 1.0),
             },
             lines: vec![line_of("a"), line_of("b")],
         }
@@ -260,5 +285,69 @@ mod tests {
         assert!(grouping.advance(&[fix(1, 10.0, 0, VelocityKnowledge::Solved)]).is_empty());
         assert!(grouping.advance(&[]).is_empty());
         assert_eq!(grouping.advance(&[fix(3, 30.0, 0, VelocityKnowledge::Solved)]).len(), 1);
+    }
+
+    /// Two targets on straight lines whose fixes share `lines` of the first camera and not the second.
+    fn two_that_cross(shared_lines: usize, merged_periods: &[u64]) -> Grouping {
+        let rules = GroupingRules {
+            periods: 5,
+            fixes: 5,
+            gate: TemporalGate::Distance(4.0),
+            max_speed: 60.0,
+            shared_lines,
+        };
+        let mut grouping = Grouping::new(rules);
+        for period in 0..5 {
+            let x = 10.0 * period as f64;
+            let one = fix(period, x, 0, VelocityKnowledge::Solved);
+            let mut other = fix(period, x + 20.0, 1, VelocityKnowledge::Solved);
+            if merged_periods.contains(&period) {
+                other.lines[0] = one.lines[0].clone();
+            }
+            grouping.advance(&[one, other]);
+        }
+        grouping
+    }
+
+    #[test]
+    fn the_number_of_targets_is_that_of_the_groups_selected() {
+        assert_eq!(two_that_cross(0, &[]).target_count(), 2);
+        assert_eq!(Grouping::new(grouping(TemporalGate::Distance(1.0)).rules).target_count(), 0);
+    }
+
+    #[test]
+    fn a_small_number_of_crossings_is_allowed_and_a_larger_is_not() {
+        assert_eq!(two_that_cross(0, &[2]).target_count(), 1, "seen as one once, none allowed");
+        assert_eq!(two_that_cross(1, &[2]).target_count(), 2, "seen as one once, one allowed");
+        assert_eq!(two_that_cross(1, &[2, 3]).target_count(), 1, "seen as one twice, one allowed");
+        assert_eq!(two_that_cross(2, &[2, 3]).target_count(), 2);
+    }
+
+    #[test]
+    fn crossings_are_counted_with_all_groups_before_together() {
+        let of = |lines: [usize; 2], period: u64, x: f64| {
+            let mut made = fix(period, x, 0, VelocityKnowledge::Solved);
+            for (line, number) in made.lines.iter_mut().zip(lines) {
+                line.0.2 = number;
+            }
+            made
+        };
+        let rules =
+            GroupingRules { shared_lines: 2, fixes: 2, ..grouping(TemporalGate::Distance(1.0)).rules };
+        let mut grouping = Grouping::new(rules);
+        grouping.advance(&[of([0, 0], 0, 0.0), of([1, 1], 0, 50.0), of([0, 1], 0, 99.0)]);
+        // The third comes last, as it wanders by half a metre. It shares a line a period with the
+        // first and one with the second: two with each, four in all.
+        grouping.advance(&[of([0, 0], 1, 10.0), of([1, 1], 1, 60.0), of([0, 1], 1, 109.5)]);
+        assert_eq!(grouping.target_count(), 2);
+    }
+
+    #[test]
+    fn a_group_without_velocity_is_extrapolated_along_the_line_through_all_its_fixes() {
+        let fixes =
+            [(0, 0.0), (1, 1.0), (2, 1.4)].map(|(period, x)| fix(period, x, 0, VelocityKnowledge::Unknown));
+        let group = Group { fixes: fixes.to_vec(), indicator: 0.0, first_period: 1 };
+        let (position, velocity) = group.trajectory().unwrap();
+        assert!((velocity.x - 0.7).abs() < 1e-12 && (position.x - 1.5).abs() < 1e-12);
     }
 }

@@ -93,7 +93,8 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
-    use super::super::tests_support::{line_at, noisy_line_at, orthogonal_cameras};
+    use super::super::Quantity;
+    use super::super::tests_support::{coplanar_cameras, line_at, noisy_line_at, orthogonal_cameras};
     use super::*;
 
     /// Root mean squared errors of position and velocity and the mean NEES over `runs` runs.
@@ -137,17 +138,17 @@ mod tests {
 
     #[test]
     fn a_coplanar_fix_reports_the_axis_it_cannot_see() {
-        let cameras = [(0.0f64), -90.0, 90.0].map(|azimuth| {
-            let (sin, cos) = azimuth.to_radians().sin_cos();
-            Point3::new(-150.0 * cos, -150.0 * sin, 0.0)
-        });
-        let lines: Vec<_> = cameras
+        let lines: Vec<_> = coplanar_cameras()
             .iter()
             .zip([0.0, 0.1, 0.2])
             .map(|(camera, t)| line_at(*camera, Point3::new(1.0, 2.0, 0.0), t))
             .collect();
         let found = map(&lines, Timestamp::EPOCH, 15.0).unwrap();
         assert!(!found.observability.is_full());
+        let weak = found.observability.weak_axis.unwrap();
+        // The second and the third camera look along y, from both sides; the first sees y once.
+        assert_eq!(weak.quantity, Quantity::Velocity);
+        assert!(weak.direction.y > 0.99, "{weak:?}");
         let velocity: Matrix3<f64> = found.state.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         assert!(velocity.symmetric_eigenvalues().max().sqrt() > 5.0, "the prior's, not a fantasy");
     }

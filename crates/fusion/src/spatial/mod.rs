@@ -6,14 +6,20 @@
 //! | [`pair`] | two ranges | 002, equations 7-9 |
 //! | [`triple`] | three ranges, velocity | 002, equations 10-11 |
 //! | [`stacked`] | n ranges, velocity | the same for n cameras |
+//! | [`stacked_with`] | n ranges, velocity, acceleration | the same with equation 5 in full |
 //! | [`map`] | position, velocity | weighted, with a prior on the velocity |
+//!
+//! [`pair_range_covariance`] and [`triple_range_covariance`] are the paper's accuracy of ranges
+//! (equations 12 and 13); [`Observability`] says what a system could see, and what not.
 //!
 //! All work in the world frame: where the paper turns the axes of receiver k
 //! into those of receiver 1 (`P_k`) and has the base vector `b_k`, here the
 //! sight lines are world vectors and `b_k` is the difference of the cameras'
 //! centres. That is the same system in other axes.
 
+mod accuracy;
 mod map;
+mod motion;
 mod observability;
 mod pair;
 mod stacked;
@@ -24,10 +30,12 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Point3, Vector3};
 
+pub use accuracy::{pair_range_covariance, triple_range_covariance};
 pub use map::{MapSolution, map};
-pub use observability::Observability;
+pub use motion::Motion;
+pub use observability::{Observability, Quantity, WeakAxis};
 pub use pair::{PairSolution, pair};
-pub use stacked::stacked;
+pub use stacked::{stacked, stacked_with};
 pub use triple::triple;
 
 /// A sight line with the time at which it was seen.
@@ -44,8 +52,10 @@ pub struct TimedLine {
 pub struct RangeSolution {
     /// Range from each camera, m, in the order of the lines.
     pub ranges: Vec<f64>,
-    /// Velocity, m/s.
+    /// Velocity at the first line's time, m/s.
     pub velocity: Vector3<f64>,
+    /// Acceleration, m/s^2, where the motion has one (002, equation 5).
+    pub acceleration: Option<Vector3<f64>>,
     /// The target at the first line's time, refined by the pair solution with the displacement
     /// removed (002, below equation 11).
     pub position: Point3<f64>,
@@ -97,6 +107,14 @@ pub(crate) mod tests_support {
             let azimuth = azimuth.to_radians();
             let (cos, sin) = (elevation.cos(), elevation.sin());
             Point3::from(Vector3::new(cos * azimuth.cos(), cos * azimuth.sin(), sin) * -150.0)
+        })
+    }
+
+    /// Cameras whose lines of sight to the origin lie in the horizontal plane.
+    pub(crate) fn coplanar_cameras() -> [Point3<f64>; 3] {
+        [0.0f64, -90.0, 90.0].map(|azimuth| {
+            let (sin, cos) = azimuth.to_radians().sin_cos();
+            Point3::new(-150.0 * cos, -150.0 * sin, 0.0)
         })
     }
 

@@ -1,4 +1,4 @@
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix6, Unit, Vector3, Vector6};
 
 /// How much a system of equations says about its unknowns.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -9,9 +9,64 @@ pub struct Observability {
     pub unknowns: usize,
     /// Largest singular value of the system by the smallest; infinite if that is 0.
     pub condition_number: f64,
+    /// What the data say least about; `None` if they say enough about everything.
+    pub weak_axis: Option<WeakAxis>,
+}
+
+/// What a combination of unknowns is of, for its greater part.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Quantity {
+    /// The position, or a range.
+    Position,
+    /// The velocity.
+    Velocity,
+    /// The acceleration.
+    Acceleration,
+}
+
+/// The worst determined combination of the unknowns of a degenerate system.
+///
+/// Unknowns are compared in units of what is known of them beforehand: the combination is the
+/// singular vector of the scaled system, and this is the greatest part of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WeakAxis {
+    /// What cannot be seen.
+    pub quantity: Quantity,
+    /// Along which line, world frame; its greatest component is positive.
+    pub direction: Unit<Vector3<f64>>,
+}
+
+impl WeakAxis {
+    /// The part of a combination with the greatest norm; `None` if the combination is zero.
+    pub(crate) fn of_parts(parts: &[(Quantity, Vector3<f64>)]) -> Option<Self> {
+        let &(quantity, part) = parts.iter().max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))?;
+        let direction = Unit::try_new(part, f64::MIN_POSITIVE)?;
+        let sign = if direction[direction.iamax()] < 0.0 { -1.0 } else { 1.0 };
+        Some(Self { quantity, direction: Unit::new_unchecked(direction.into_inner() * sign) })
+    }
+
+    /// Of a combination of ranges and then velocity, acceleration: a range that is not known is a
+    /// place on that range's line that is not known.
+    pub(crate) fn of_ranges(combination: &[f64], directions: &[Unit<Vector3<f64>>]) -> Option<Self> {
+        let (ranges, motion) = combination.split_at_checked(directions.len())?;
+        let along = ranges.iter().zip(directions).map(|(range, a)| a.into_inner() * *range);
+        let along = along.max_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap_or_default();
+        // All ranges together are one part: they move with the one target.
+        let length = ranges.iter().map(|range| range * range).sum::<f64>().sqrt();
+        let position = along.try_normalize(f64::MIN_POSITIVE).unwrap_or_default() * length;
+        let mut parts = vec![(Quantity::Position, position)];
+        let quantities = [Quantity::Velocity, Quantity::Acceleration];
+        parts.extend(quantities.into_iter().zip(motion.chunks_exact(3).map(Vector3::from_column_slice)));
+        Self::of_parts(&parts)
+    }
 }
 
 impl Observability {
+    /// Of a system in which everything can be seen.
+    pub fn full(unknowns: usize, condition_number: f64) -> Self {
+        Self { rank: unknowns, unknowns, condition_number, weak_axis: None }
+    }
+
     /// Whether everything asked for can be seen.
     pub fn is_full(&self) -> bool {
         self.rank == self.unknowns
@@ -22,14 +77,23 @@ impl Observability {
     ///
     /// A direction of singular value s is known to `noise / s` of its scale; beyond 1 the prior
     /// scale knows better. A fixed threshold on the condition number does not do: noise makes a
-    /// singular system look regular.
-    pub(crate) fn of_singular_values(values: &[f64], noise: f64) -> Self {
+    /// singular system look regular. `weak_axis` is asked, if the rank is not full, for what the
+    /// singular vector of that place means.
+    pub(crate) fn of_singular_values(
+        values: &[f64],
+        noise: f64,
+        weak_axis: impl FnOnce(usize) -> Option<WeakAxis>,
+    ) -> Self {
         let largest = values.iter().copied().fold(0.0, f64::max);
         let smallest = values.iter().copied().fold(f64::INFINITY, f64::min);
+        let rank = values.iter().filter(|&&value| determined(value, noise, largest)).count();
+        let worst = values.iter().enumerate().min_by(|a, b| a.1.total_cmp(b.1));
+        let degenerate = worst.filter(|_| rank < values.len());
         Self {
-            rank: values.iter().filter(|&&value| determined(value, noise, largest)).count(),
+            rank,
             unknowns: values.len(),
             condition_number: if smallest > 0.0 { largest / smallest } else { f64::INFINITY },
+            weak_axis: degenerate.and_then(|(index, _)| weak_axis(index)),
         }
     }
 
@@ -37,9 +101,16 @@ impl Observability {
     pub fn of_information(information: &Matrix6<f64>, position_scale: f64, velocity_scale: f64) -> Self {
         let [p, v] = [position_scale, velocity_scale];
         let scale = Matrix6::from_diagonal(&Vector6::new(p, p, p, v, v, v));
-        let eigenvalues = (scale * information * scale).symmetric_eigenvalues();
-        let values: Vec<f64> = eigenvalues.iter().map(|value| value.max(0.0).sqrt()).collect();
-        Self::of_singular_values(&values, 1.0)
+        let scaled = scale * information * scale;
+        let singular = |eigenvalue: &f64| eigenvalue.max(0.0).sqrt();
+        let values: Vec<f64> = scaled.symmetric_eigenvalues().iter().map(singular).collect();
+        Self::of_singular_values(&values, 1.0, |_| {
+            // The vectors cost as much again, and a good track never asks for them.
+            let eigen = scaled.symmetric_eigen();
+            let combination = eigen.eigenvectors.column(eigen.eigenvalues.imin());
+            let part = |row: usize| combination.fixed_rows::<3>(row).into_owned();
+            WeakAxis::of_parts(&[(Quantity::Position, part(0)), (Quantity::Velocity, part(3))])
+        })
     }
 }
 

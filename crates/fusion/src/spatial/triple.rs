@@ -1,7 +1,7 @@
 use nalgebra::{Matrix6, Vector3, Vector6};
 
 use super::observability::determined;
-use super::{Observability, RangeSolution, TimedLine, pair};
+use super::{Observability, RangeSolution, TimedLine, WeakAxis, pair};
 
 /// The three-receiver algorithm: three ranges and the velocity from three lines of three times
 /// (002, equations 10-11), by the pseudo-inverse where the system cannot carry all six.
@@ -40,7 +40,10 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     let (u, v_t) = (svd.u?, svd.v_t?);
     let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * base;
     let values = svd.singular_values;
-    let mut observability = Observability::of_singular_values(values.as_slice(), noise);
+    let mut observability = Observability::of_singular_values(values.as_slice(), noise, |worst| {
+        let combination: Vec<f64> = v_t.row(worst).iter().copied().collect();
+        WeakAxis::of_ranges(&combination, &lines.map(|l| l.line.direction))
+    });
     observability.condition_number = condition_number(&a);
 
     let x = if observability.is_full() {
@@ -58,6 +61,7 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     Some(RangeSolution {
         ranges: vec![x[0], x[1], x[2]],
         velocity,
+        acceleration: None,
         position: refined.position,
         observability,
     })
@@ -72,7 +76,8 @@ fn condition_number(a: &Matrix6<f64>) -> f64 {
 mod tests {
     use nalgebra::Point3;
 
-    use super::super::tests_support::{line_at, orthogonal_cameras};
+    use super::super::Quantity;
+    use super::super::tests_support::{coplanar_cameras, line_at, orthogonal_cameras};
     use super::*;
 
     #[test]
@@ -86,6 +91,7 @@ mod tests {
             .collect();
         let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
         assert!(solution.observability.is_full());
+        assert_eq!(solution.observability.weak_axis, None);
         assert!((solution.velocity - velocity).norm() < 1e-8);
         assert!((solution.position - position).norm() < 1e-8);
         // FUSION.md has 20 for this geometry and these delays.
@@ -99,6 +105,7 @@ mod tests {
             orthogonal_cameras().iter().map(|camera| line_at(*camera, position, 0.0)).collect();
         let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
         assert_eq!(solution.observability.rank, 3);
+        assert_eq!(solution.observability.weak_axis.unwrap().quantity, Quantity::Velocity);
         assert!((solution.position - position).norm() < 1e-6);
         assert!(solution.velocity.norm() < 1e-6);
     }
@@ -116,5 +123,18 @@ mod tests {
             .collect();
         let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
         assert!(!solution.observability.is_full(), "{:?}", solution.observability);
+    }
+    #[test]
+    fn coplanar_lines_do_not_see_the_velocity_that_only_one_camera_sees_across() {
+        let lines: Vec<_> = coplanar_cameras()
+            .iter()
+            .zip([0.0, 0.1, 0.2])
+            .map(|(camera, t)| line_at(*camera, Point3::new(1.0, 2.0, 0.0), t))
+            .collect();
+        let solution = triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap();
+        // The second and the third look along y, from both sides; the first sees y once.
+        let weak = solution.observability.weak_axis.unwrap();
+        assert_eq!(weak.quantity, Quantity::Velocity);
+        assert!(weak.direction.y > 0.99, "{weak:?}");
     }
 }

@@ -1,0 +1,50 @@
+use nalgebra::Vector3;
+
+/// How a target moves between the instants of two lines (002, equation 5).
+///
+/// The scales say what is known beforehand, as standard deviations an axis: the rank is decided
+/// against them, and where the data cannot carry an unknown the answer stays near zero of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Motion {
+    /// `dM = V dt`: three unknowns.
+    Velocity {
+        /// Scale of V, m/s.
+        velocity_scale: f64,
+    },
+    /// `dM = V dt + V' dt^2 / 2`: six unknowns.
+    Acceleration {
+        /// Scale of V, m/s.
+        velocity_scale: f64,
+        /// Scale of V', m/s^2.
+        acceleration_scale: f64,
+    },
+}
+
+impl Motion {
+    /// The scale of each vector of unknowns, with the factor by which it moves the target in `dt`.
+    pub(crate) fn terms(self, dt: f64) -> Vec<(f64, f64)> {
+        match self {
+            Self::Velocity { velocity_scale } => vec![(velocity_scale, dt)],
+            Self::Acceleration { velocity_scale, acceleration_scale } => {
+                vec![(velocity_scale, dt), (acceleration_scale, dt * dt / 2.0)]
+            }
+        }
+    }
+
+    /// How many unknowns it has.
+    pub(crate) fn unknowns(self) -> usize {
+        match self {
+            Self::Velocity { .. } => 3,
+            Self::Acceleration { .. } => 6,
+        }
+    }
+}
+
+/// `dM` of a motion found (002, equation 5), m.
+pub(crate) fn displacement(
+    velocity: Vector3<f64>,
+    acceleration: Option<Vector3<f64>>,
+    dt: f64,
+) -> Vector3<f64> {
+    velocity * dt + acceleration.unwrap_or_default() * (dt * dt / 2.0)
+}
