@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 /// Position and velocity in space with their covariance.
 ///
@@ -48,10 +48,18 @@ impl KinematicState {
     ///
     /// Continuous, so that the noise of a second does not depend on how many updates cut it.
     pub fn time_update(&mut self, interval: f64, density: f64) {
-        let mut f = Matrix6::identity();
-        f.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * interval));
-        self.mean = f * self.mean;
-        self.covariance = f * self.covariance * f.transpose();
+        // F = [I, I dt; 0, I], so F x and F P F' are sums of blocks.
+        let velocity = self.velocity();
+        let mut position = self.mean.fixed_rows_mut::<3>(0);
+        position += velocity * interval;
+        let ties: Matrix3<f64> = self.covariance.fixed_view::<3, 3>(0, 3).into_owned();
+        let speeds: Matrix3<f64> = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let growth = (ties + ties.transpose()) * interval + speeds * interval.powi(2);
+        let mut positions = self.covariance.fixed_view_mut::<3, 3>(0, 0);
+        positions += growth;
+        let tied = ties + speeds * interval;
+        self.covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
+        self.covariance.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
         let noise = density * interval.abs();
         for axis in 0..3 {
             self.covariance[(axis, axis)] += noise * interval.powi(2) / 3.0;
@@ -59,6 +67,43 @@ impl KinematicState {
             self.covariance[(axis + 3, axis)] += noise * interval / 2.0;
             self.covariance[(axis + 3, axis + 3)] += noise;
         }
+    }
+
+    /// The state after a measurement of its position, with the logarithm of the measurement's
+    /// likelihood: a plain Kalman update, covariance in metres^2 (004, equations 6 and 9; erratum:
+    /// the update is `(I - K H) P`). `None` if the innovation's covariance is not positive definite.
+    pub fn position_updated(&self, measured: Point3<f64>, noise: &Matrix3<f64>) -> Option<(Self, f64)> {
+        let innovation = measured - self.position();
+        let spread = self.position_covariance() + noise;
+        let factor = spread.cholesky()?;
+        let nis = innovation.dot(&factor.solve(&innovation));
+        let across: Matrix6x3<f64> = self.covariance.fixed_columns::<3>(0).into_owned();
+        let gain = across * factor.inverse();
+        let covariance = self.covariance - gain * across.transpose();
+        let state = Self {
+            mean: self.mean + gain * innovation,
+            covariance: (covariance + covariance.transpose()) / 2.0,
+        };
+        let normaliser =
+            3.0 * (2.0 * std::f64::consts::PI).ln() + 2.0 * factor.l().diagonal().map(f64::ln).sum();
+        Some((state, -(nis + normaliser) / 2.0))
+    }
+
+    /// Forgets: position and velocity become independent, and no axis of either is known better
+    /// than the standard deviations given (004, equation 8).
+    pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
+        let mut covariance = Matrix6::zeros();
+        for (block, sd) in [(0, position_sd), (3, velocity_sd)] {
+            let old: Matrix3<f64> = self.covariance.fixed_view::<3, 3>(block, block).into_owned();
+            let widened = old + Matrix3::identity() * (sd * sd);
+            covariance.fixed_view_mut::<3, 3>(block, block).copy_from(&widened);
+        }
+        self.covariance = covariance;
+    }
+
+    /// Whether all numbers are finite.
+    pub fn is_finite(&self) -> bool {
+        self.mean.iter().chain(self.covariance.iter()).all(|value| value.is_finite())
     }
 
     /// The state `interval` seconds on, leaving this one as it is.
@@ -75,6 +120,18 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+
+    #[test]
+    fn a_measured_position_by_hand() {
+        let state = KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() };
+        let (updated, logarithm) =
+            state.position_updated(Point3::new(2.0, 0.0, 0.0), &Matrix3::identity()).unwrap();
+        assert!((updated.position().x - 1.0).abs() < 1e-12);
+        assert!((updated.covariance[(0, 0)] - 0.5).abs() < 1e-12);
+        // N(2; 0, 2) on x, N(0; 0, 2) on y and z.
+        let by_hand = -1.0 - 1.5 * (2.0 * std::f64::consts::PI * 2.0).ln();
+        assert!((logarithm - by_hand).abs() < 1e-12);
+    }
 
     proptest! {
         #[test]

@@ -1,0 +1,291 @@
+use nalgebra::{Matrix6, Vector6};
+
+use crate::KinematicState;
+
+/// More models than this say nothing that fewer do not.
+pub const MAX_MODELS: usize = 4;
+
+/// One way of flying: constant velocity driven by white acceleration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MotionModel {
+    /// Power spectral density of the white acceleration, m^2/s^3.
+    pub density: f64,
+    /// Share of the time that targets fly like this, before anything is known of one.
+    pub share: f64,
+}
+
+/// The ways in which targets fly, and how often they change from one to another.
+///
+/// The mode is a Markov process in continuous time that is drawn anew from the shares at
+/// `switching_rate`, so that the transition over an interval is the same however it is cut.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MotionModels {
+    models: Vec<MotionModel>,
+    switching_rate: f64,
+}
+
+/// Weights of the models, in their order; what lies beyond the last model is 0.
+pub type ModelWeights = [f64; MAX_MODELS];
+
+impl MotionModels {
+    /// One to [`MAX_MODELS`] models, with the switching rate in 1/s. The shares are scaled to a sum of 1.
+    ///
+    /// `None` if a density is negative, a share or the rate is not positive (a lone model needs no
+    /// rate), or a number is not finite.
+    pub fn new(models: &[MotionModel], switching_rate: f64) -> Option<Self> {
+        let total: f64 = models.iter().map(|m| m.share).sum();
+        let possible = |m: &MotionModel| m.density >= 0.0 && m.density.is_finite() && m.share > 0.0;
+        let rate_is_one = switching_rate.is_finite() && (switching_rate > 0.0 || models.len() == 1);
+        let good = (1..=MAX_MODELS).contains(&models.len()) && models.iter().all(possible);
+        if !(good && rate_is_one && total.is_finite()) {
+            return None;
+        }
+        let scaled = |m: &MotionModel| MotionModel { density: m.density, share: m.share / total };
+        Some(Self { models: models.iter().map(scaled).collect(), switching_rate })
+    }
+
+    /// A single model: a plain Kalman filter.
+    pub fn single(density: f64) -> Option<Self> {
+        Self::new(&[MotionModel { density, share: 1.0 }], 0.0)
+    }
+
+    /// The models.
+    pub fn models(&self) -> &[MotionModel] {
+        &self.models
+    }
+
+    /// The largest density of acceleration among the models, m^2/s^3.
+    pub fn widest(&self) -> f64 {
+        self.models.iter().map(|m| m.density).fold(0.0, f64::max)
+    }
+
+    /// Probability that the mode is not drawn anew within an interval of seconds.
+    fn staying(&self, interval: f64) -> f64 {
+        (-self.switching_rate * interval.abs()).exp()
+    }
+}
+
+/// Interacting multiple models (IMM): a bank of Kalman filters that differ in their process noise,
+/// weighted by how well each predicts (003, equations 10-17, with the errata; there for the
+/// brightness of a pixel, here for position and velocity).
+///
+/// All models share the transition of constant velocity. So the moments of the prediction follow
+/// from those of the combined state in closed form, and a gate needs no mixing: see
+/// [`Self::predicted`].
+///
+/// ```
+/// use crossfix_filter::{Imm, KinematicState, MotionModel, MotionModels};
+/// use nalgebra::{Matrix3, Matrix6, Point3, Vector6};
+/// let quiet = MotionModel { density: 0.001, share: 0.8 };
+/// let lively = MotionModel { density: 10.0, share: 0.2 };
+/// let models = MotionModels::new(&[quiet, lively], 0.1).ok_or("models")?;
+/// let start = KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() };
+/// let mut imm = Imm::new(start, &models);
+/// let noise = Matrix3::identity() * 0.01;
+/// for k in 0..20 {
+///     // At rest, then suddenly away.
+///     let x = f64::from(k - 10).max(0.0) * 10.0;
+///     imm.update(1.0, &models, |state| state.position_updated(Point3::new(x, 0.0, 0.0), &noise));
+///     if k == 10 {
+///         assert!(imm.probabilities()[1] < 0.2);
+///     } else if k == 11 {
+///         assert!(imm.probabilities()[1] > 0.9);
+///     }
+/// }
+/// # Ok::<(), &str>(())
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imm {
+    states: Vec<KinematicState>,
+    probabilities: ModelWeights,
+    combined: KinematicState,
+}
+
+impl Imm {
+    /// All models at one state, with the shares as probabilities.
+    pub fn new(state: KinematicState, models: &MotionModels) -> Self {
+        let mut probabilities = [0.0; MAX_MODELS];
+        for (probability, model) in probabilities.iter_mut().zip(models.models()) {
+            *probability = model.share;
+        }
+        Self { states: vec![state.clone(); models.models().len()], probabilities, combined: state }
+    }
+
+    /// Mean and covariance over all models.
+    pub fn combined(&self) -> &KinematicState {
+        &self.combined
+    }
+
+    /// Each model's probability.
+    pub fn probabilities(&self) -> &[f64] {
+        &self.probabilities[..self.states.len()]
+    }
+
+    /// Each model's probability `interval` seconds on.
+    pub fn predicted_probabilities(&self, interval: f64, models: &MotionModels) -> ModelWeights {
+        let stay = models.staying(interval);
+        let mut predicted = [0.0; MAX_MODELS];
+        for ((p, now), model) in predicted.iter_mut().zip(self.probabilities()).zip(models.models()) {
+            *p = stay * now + (1.0 - stay) * model.share;
+        }
+        predicted
+    }
+
+    /// Mean and covariance of the prediction over `interval` seconds.
+    ///
+    /// Mixing leaves the moments of the whole as they are, and the models' transition is the same:
+    /// so these are the moments that mixing, predicting and combining would give.
+    pub fn predicted(&self, interval: f64, models: &MotionModels) -> KinematicState {
+        let weights = self.predicted_probabilities(interval, models);
+        let density = models.models().iter().zip(weights).map(|(model, weight)| model.density * weight).sum();
+        self.combined.predicted(interval, density)
+    }
+
+    /// Mixes, predicts every model `interval` seconds on and updates each by `update`, which
+    /// returns the updated state with the logarithm of the measurement's likelihood.
+    ///
+    /// Returns the logarithm of the likelihood over all models; `None`, with everything left as it
+    /// was, if `update` has failed for all of them or the numbers have.
+    pub fn update(
+        &mut self,
+        interval: f64,
+        models: &MotionModels,
+        mut update: impl FnMut(&KinematicState) -> Option<(KinematicState, f64)>,
+    ) -> Option<f64> {
+        let weights = self.predicted_probabilities(interval, models);
+        let mut states = Vec::with_capacity(self.states.len());
+        let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
+        for (j, model) in models.models().iter().enumerate() {
+            let mut predicted = self.mixed(j, interval, models);
+            predicted.time_update(interval, model.density);
+            let updated = update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
+            if let Some((state, logarithm)) = updated {
+                logarithms[j] = logarithm + weights[j].ln();
+                states.push(state);
+            } else {
+                states.push(predicted);
+            }
+        }
+        let largest = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        if !largest.is_finite() {
+            return None;
+        }
+        let sum: f64 = logarithms.iter().map(|l| (l - largest).exp()).sum();
+        self.probabilities = logarithms.map(|l| (l - largest).exp() / sum);
+        self.states = states;
+        self.combined = combined(&self.states, &self.probabilities);
+        Some(largest + sum.ln())
+    }
+
+    /// Widens every model's knowledge to at least these standard deviations and forgets what ties
+    /// velocity to position: the covariance re-initialisation of 004 (equation 8), per block.
+    pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
+        for state in &mut self.states {
+            state.reinitialise(position_sd, velocity_sd);
+        }
+        self.combined = combined(&self.states, &self.probabilities);
+    }
+
+    /// What model `j` starts its step from: the states weighted by the probability of each having
+    /// been the mode, given that `j` is the mode now.
+    fn mixed(&self, j: usize, interval: f64, models: &MotionModels) -> KinematicState {
+        if self.states.len() == 1 {
+            return self.states[0].clone();
+        }
+        let stay = models.staying(interval);
+        let share = models.models()[j].share;
+        let mut weights = [0.0; MAX_MODELS];
+        let mut total = 0.0;
+        for (i, (weight, probability)) in weights.iter_mut().zip(self.probabilities()).enumerate() {
+            let kept = if i == j { stay } else { 0.0 };
+            *weight = (kept + (1.0 - stay) * share) * probability;
+            total += *weight;
+        }
+        combined(&self.states, &weights.map(|weight| weight / total))
+    }
+}
+
+/// Mean and covariance of a mixture.
+fn combined(states: &[KinematicState], weights: &ModelWeights) -> KinematicState {
+    if let [only] = states {
+        return only.clone();
+    }
+    let mean: Vector6<f64> = states.iter().zip(weights).map(|(state, &weight)| state.mean * weight).sum();
+    let mut covariance = Matrix6::zeros();
+    for (state, &weight) in states.iter().zip(weights) {
+        let difference = state.mean - mean;
+        covariance += (state.covariance + difference * difference.transpose()) * weight;
+    }
+    KinematicState { mean, covariance }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Point3};
+
+    use super::*;
+
+    fn models() -> MotionModels {
+        let model = |density, share| MotionModel { density, share };
+        MotionModels::new(&[model(0.0, 0.7), model(1.0, 0.2), model(20.0, 0.1)], 0.2).unwrap()
+    }
+
+    fn running() -> Imm {
+        let start = KinematicState { mean: Vector6::repeat(1.0), covariance: Matrix6::identity() * 4.0 };
+        let mut imm = Imm::new(start, &models());
+        for k in 0..4 {
+            let z = Point3::new(f64::from(k * k), 0.5, -1.0);
+            imm.update(0.7, &models(), |s| s.position_updated(z, &Matrix3::identity())).unwrap();
+        }
+        imm
+    }
+
+    #[test]
+    fn the_closed_form_of_the_prediction_is_what_mixing_and_predicting_give() {
+        let (imm, models) = (running(), models());
+        let dt = 1.3;
+        let weights = imm.predicted_probabilities(dt, &models);
+        let states: Vec<KinematicState> = models
+            .models()
+            .iter()
+            .enumerate()
+            .map(|(j, model)| imm.mixed(j, dt, &models).predicted(dt, model.density))
+            .collect();
+        let (slow, fast) = (combined(&states, &weights), imm.predicted(dt, &models));
+        assert!((slow.mean - fast.mean).norm() < 1e-9);
+        assert!((slow.covariance - fast.covariance).norm() < 1e-9);
+    }
+
+    #[test]
+    fn a_transition_is_the_same_however_its_interval_is_cut() {
+        let (imm, models) = (running(), models());
+        let whole = imm.predicted_probabilities(2.0, &models);
+        let mut halves = imm.clone();
+        halves.probabilities = imm.predicted_probabilities(1.0, &models);
+        let halves = halves.predicted_probabilities(1.0, &models);
+        for (a, b) in whole.iter().zip(halves) {
+            assert!((a - b).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn a_measurement_that_cannot_be_leaves_everything() {
+        let mut imm = running();
+        let before = imm.clone();
+        assert!(imm.update(1.0, &models(), |_| None).is_none());
+        assert_eq!(imm, before);
+        assert!(imm.update(1.0, &models(), |s| Some((s.clone(), f64::NAN))).is_none());
+        assert_eq!(imm, before);
+    }
+
+    #[test]
+    fn models_that_cannot_be_are_refused() {
+        let model = |density, share| MotionModel { density, share };
+        assert!(MotionModels::new(&[], 1.0).is_none());
+        assert!(MotionModels::new(&[model(-1.0, 1.0)], 1.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 0.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, f64::NAN)], 1.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 5], 1.0).is_none());
+        assert!(MotionModels::single(1.0).is_some());
+    }
+}
