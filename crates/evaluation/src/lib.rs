@@ -24,4 +24,4 @@ mod papers;
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Report, TargetReport, TrueTarget};
-pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_tracker};
+pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker};

@@ -1,9 +1,10 @@
 //! The papers' tables and figures made again, each figure beside the paper's: the image tracker of
-//! 000 and 001, and the adaptive reference of 003.
+//! 000 and 001, the adaptive reference of 003, the fusion of 002 and the manoeuvres of 004.
 
 mod brightness;
 mod energy;
 mod flight;
+mod fusion;
 mod looped;
 mod loss;
 mod motion;
@@ -34,7 +35,7 @@ struct Experiment {
     make: fn(ValidationOptions) -> Vec<Table>,
 }
 
-const EXPERIMENTS: [Experiment; 7] = [
+const TRACKER: [Experiment; 7] = [
     Experiment { name: "energies and signal-to-noise ratios (001, tables 1 and 2)", make: energy::tables },
     Experiment { name: "positioning (000, Fig. 5) against the Cramer-Rao bound", make: positioning::tables },
     Experiment { name: "Kalman filter and prediction (000, Fig. 6)", make: motion::tables },
@@ -52,9 +53,28 @@ const EXPERIMENTS: [Experiment; 7] = [
 pub fn validate_tracker(
     options: ValidationOptions,
     only: &str,
+    progress: impl FnMut(usize, usize, &str),
+) -> Vec<Table> {
+    make(&TRACKER, options, only, progress)
+}
+
+/// Makes the tables of the fusion of those experiments whose name holds `only`; `progress` as in
+/// [`validate_tracker`].
+pub fn validate_fusion(
+    options: ValidationOptions,
+    only: &str,
+    progress: impl FnMut(usize, usize, &str),
+) -> Vec<Table> {
+    make(&fusion::EXPERIMENTS, options, only, progress)
+}
+
+fn make(
+    experiments: &[Experiment],
+    options: ValidationOptions,
+    only: &str,
     mut progress: impl FnMut(usize, usize, &str),
 ) -> Vec<Table> {
-    let wanted: Vec<&Experiment> = EXPERIMENTS.iter().filter(|e| e.name.contains(only)).collect();
+    let wanted: Vec<&Experiment> = experiments.iter().filter(|e| e.name.contains(only)).collect();
     let mut tables = Vec::new();
     for (done, experiment) in wanted.iter().enumerate() {
         progress(done, wanted.len(), experiment.name);

@@ -40,6 +40,8 @@ pub struct Row {
     pub x: f64,
     /// The paper's figure, if it prints one.
     pub paper: Option<f64>,
+    /// An independent reference implementation's figure, if there is one.
+    pub reference: Option<f64>,
     /// What is asked.
     pub limit: Option<Limit>,
     /// Ours.
@@ -51,13 +53,20 @@ pub struct Row {
 impl Row {
     /// A row with ours alone.
     pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
-        Self { series: series.into(), x, paper: None, limit: None, ours, standard_error }
+        Self { series: series.into(), x, paper: None, reference: None, limit: None, ours, standard_error }
     }
 
     /// With the paper's figure.
     #[must_use]
     pub fn paper(mut self, paper: f64) -> Self {
         self.paper = Some(paper);
+        self
+    }
+
+    /// With the reference implementation's figure.
+    #[must_use]
+    pub fn reference(mut self, reference: f64) -> Self {
+        self.reference = Some(reference);
         self
     }
 
@@ -119,6 +128,13 @@ pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
     let (square, error) = mean(&squares);
     let root = square.sqrt();
     (root, if root > 0.0 { error / (2.0 * root) } else { 0.0 })
+}
+
+/// The standard deviation of samples with its standard error.
+pub(crate) fn deviation(samples: &[f64]) -> (f64, f64) {
+    let (middle, _) = mean(samples);
+    let off: Vec<f64> = samples.iter().map(|s| s - middle).collect();
+    root_mean_square(&off)
 }
 
 /// The share of runs in which something happened, with its standard error.

@@ -4,7 +4,7 @@ mod text;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use crossfix_evaluation::{Table, ValidationOptions, validate_tracker};
+use crossfix_evaluation::{Table, ValidationOptions, validate_fusion, validate_tracker};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::output;
@@ -18,16 +18,26 @@ pub struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum What {
-    Tracker(TrackerArgs),
+    /// The image tracker: positioning, loss of track, consistency, reference strategies (000, 001, 003).
+    ///
+    /// Prints each figure with the paper's, ours, the Monte Carlo standard error and, where something
+    /// is asked of it, pass or fail.
+    #[command(
+        after_help = "Example:\n  crossfix validate tracker --runs 1000 --json tracker.json --plots plots"
+    )]
+    Tracker(Options),
+    /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (002, 004).
+    ///
+    /// Prints each figure with the paper's, a reference implementation's, ours, the Monte Carlo
+    /// standard error and, where something is asked of it, pass or fail.
+    #[command(
+        after_help = "Example:\n  crossfix validate fusion --runs 4000 --only bound --json fusion.json"
+    )]
+    Fusion(Options),
 }
 
-/// The image tracker: positioning, loss of track, consistency, reference strategies (000, 001, 003).
-///
-/// Prints each figure with the paper's, ours, the Monte Carlo standard error and, where something is
-/// asked of it, pass or fail.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix validate tracker --runs 1000 --json tracker.json --plots plots")]
-struct TrackerArgs {
+struct Options {
     /// Monte Carlo runs of an experiment; the texts have 1000.
     #[arg(long, default_value_t = 200, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     runs: u32,
@@ -48,17 +58,21 @@ struct TrackerArgs {
     strict: bool,
 }
 
-pub fn run(args: &Args) -> anyhow::Result<()> {
-    let What::Tracker(args) = &args.what;
+pub fn run(what: &Args) -> anyhow::Result<()> {
+    let (What::Tracker(args) | What::Fusion(args)) = &what.what;
     let options = ValidationOptions { runs: args.runs as usize, seed: args.seed };
     let bar = ProgressBar::new(0)
         .with_style(ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {pos}/{len} {msg}")?);
     bar.enable_steady_tick(std::time::Duration::from_millis(200));
-    let tables = validate_tracker(options, &args.only, |done, all, next| {
+    let progress = |done, all, next: &str| {
         bar.set_length(all as u64);
         bar.set_position(done as u64);
         bar.set_message(next.to_owned());
-    });
+    };
+    let tables = match &what.what {
+        What::Tracker(_) => validate_tracker(options, &args.only, progress),
+        What::Fusion(_) => validate_fusion(options, &args.only, progress),
+    };
     bar.finish_and_clear();
     if tables.is_empty() {
         bail!("no experiment has `{}` in its name", args.only);

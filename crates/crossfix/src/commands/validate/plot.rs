@@ -1,4 +1,5 @@
-//! Tables as figures: ours as lines with points, the paper's as crosses.
+//! Tables as figures: ours as lines with points, the paper's as crosses, a reference
+//! implementation's as circles.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,7 +26,8 @@ fn draw_on(table: &Table, path: &Path) -> Result<(), Box<dyn std::error::Error>>
         (low - margin)..(high + margin)
     };
     let x = range(&mut table.rows.iter().map(|row| row.x));
-    let y = range(&mut table.rows.iter().flat_map(|row| [Some(row.ours), row.paper]).flatten());
+    let y =
+        range(&mut table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.reference]).flatten());
     let mut chart = ChartBuilder::on(&area)
         .caption(&table.title, ("sans-serif", 20))
         .margin(12)
@@ -44,9 +46,11 @@ fn draw_on(table: &Table, path: &Path) -> Result<(), Box<dyn std::error::Error>>
             .draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)).point_size(3))?
             .label(name)
             .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
-        let papers = table.rows.iter().filter(|row| row.series == name);
-        let papers = papers.filter_map(|row| row.paper.map(|paper| (row.x, paper)));
+        let rows = || table.rows.iter().filter(|row| row.series == name);
+        let papers = rows().filter_map(|row| row.paper.map(|paper| (row.x, paper)));
         chart.draw_series(papers.map(|place| Cross::new(place, 5, colour.stroke_width(2))))?;
+        let references = rows().filter_map(|row| row.reference.map(|reference| (row.x, reference)));
+        chart.draw_series(references.map(|place| Circle::new(place, 5, colour.stroke_width(2))))?;
     }
     chart
         .configure_series_labels()

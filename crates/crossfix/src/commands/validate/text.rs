@@ -14,8 +14,11 @@ fn limit(limit: Option<Limit>) -> String {
     }
 }
 
-/// Four digits.
+/// Four digits; powers of ten where there are too many.
 fn short(value: f64) -> String {
+    if value.abs() >= 1e7 {
+        return format!("{value:.0e}");
+    }
     let digits = if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 6) };
     let text = format!("{value:.*}", digits as usize);
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
@@ -25,10 +28,19 @@ fn short(value: f64) -> String {
 pub fn table(table: &Table) -> String {
     let mut text = format!("\n{}\n", table.title);
     let width = table.rows.iter().map(|row| row.series.len()).max().unwrap_or(0).max(6);
+    let referenced = table.rows.iter().any(|row| row.reference.is_some());
+    let reference = |cell: &str| if referenced { format!("{cell:>9} ") } else { String::new() };
     let _ = writeln!(
         text,
-        "{:width$} {:>12} {:>9} {:>9} {:>8}  {:16} {}",
-        "", table.x, "paper", "ours", "+-", "asked", table.y
+        "{:width$} {:>12} {:>9} {}{:>9} {:>8}  {:16} {}",
+        "",
+        table.x,
+        "paper",
+        reference("reference"),
+        "ours",
+        "+-",
+        "asked",
+        table.y
     );
     for row in &table.rows {
         let verdict = match row.verdict() {
@@ -38,10 +50,11 @@ pub fn table(table: &Table) -> String {
         };
         let _ = writeln!(
             text,
-            "{:width$} {:>12} {:>9} {:>9} {:>8}  {:16} {}",
+            "{:width$} {:>12} {:>9} {}{:>9} {:>8}  {:16} {}",
             row.series,
             short(row.x),
             row.paper.map_or(String::new(), short),
+            reference(&row.reference.map_or(String::new(), short)),
             short(row.ours),
             short(row.standard_error),
             limit(row.limit),

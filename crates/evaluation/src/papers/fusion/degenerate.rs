@@ -1,0 +1,246 @@
+//! Where the paper's system breaks: one period of three cameras whose times or places cannot carry
+//! position and velocity.
+
+use crossfix_fusion::spatial::{Observability, Quantity, TimedLine, WeakAxis, map, pair, triple};
+use crossfix_message::Timestamp;
+use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+
+use super::super::ValidationOptions;
+use super::super::runs::{self, Noise};
+use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
+use super::site::{LAYOUTS, Layout, PERIODS, Target, line, tangent_noise};
+use super::{REFERENCE_RUNS, VELOCITY_SD, reference_tolerance};
+
+/// Runs of a layout for each one of the options.
+const CHEAP: usize = 10;
+/// Standard deviation of the prior on the velocity in the reference's table, m/s.
+const PRIOR_SD: f64 = 30.0;
+/// Above this condition number the reference's solver takes the pseudo-inverse.
+const WORST_CONDITION: f64 = 1e9;
+/// What counts as infinite, as a condition number.
+const SINGULAR: f64 = 1e12;
+
+/// The reference implementation's figures of a layout.
+struct Reference {
+    condition: f64,
+    degeneracy: Degeneracy,
+    /// Root mean squared errors of position, m, and velocity, m/s.
+    papers: [f64; 2],
+    map: [f64; 2],
+}
+
+/// Whether the fixes of a layout must say that they are degenerate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Degeneracy {
+    /// None may.
+    Regular,
+    /// It depends on where the target is, and on what is known of its velocity.
+    OfPlace,
+    /// All must: the times alone make them so.
+    OfTimes,
+}
+
+const fn reference(condition: f64, degeneracy: Degeneracy, papers: [f64; 2], map: [f64; 2]) -> Reference {
+    Reference { condition, degeneracy, papers, map }
+}
+
+/// Of [`LAYOUTS`], in their order.
+const REFERENCES: [Reference; 7] = [
+    reference(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
+    reference(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
+    reference(f64::INFINITY, Degeneracy::OfTimes, [6.5, 32.0], [3.2, 16.0]),
+    reference(f64::INFINITY, Degeneracy::OfTimes, [0.17, 34.0], [0.15, 16.0]),
+    reference(f64::INFINITY, Degeneracy::OfTimes, [0.18, 27.0], [0.12, 26.0]),
+    reference(469.0, Degeneracy::OfPlace, [3.1, 118.0], [0.44, 12.0]),
+    reference(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
+];
+
+/// The solvers, with the name of each.
+const SOLVERS: [&str; 3] = ["papers' inverse", "rank against the noise", "map, 30 m/s prior"];
+
+/// What a solver says of one period.
+struct Answer {
+    position: Point3<f64>,
+    velocity: Vector3<f64>,
+    /// When that is.
+    time: Timestamp,
+    observability: Option<Observability>,
+}
+
+/// 002 to the letter (equations 10 and 11): the inverse, or the minimum-norm solution where the
+/// condition number is out of all measure, and the range refined from the pair.
+fn papers_inverse(lines: &[TimedLine; 3]) -> Option<Answer> {
+    let [first, second, third] = lines;
+    let mut a = Matrix6::zeros();
+    let mut b = Vector6::zeros();
+    for (row, column, other) in [(0, 1, second), (3, 2, third)] {
+        let dt = other.time.seconds_since(first.time);
+        a.fixed_view_mut::<3, 1>(row, 0).copy_from(&first.line.direction);
+        a.fixed_view_mut::<3, 1>(row, column).copy_from(&-other.line.direction.into_inner());
+        a.fixed_view_mut::<3, 3>(row, 3).fill_diagonal(dt);
+        b.fixed_rows_mut::<3>(row).copy_from(&(other.line.origin - first.line.origin));
+    }
+    let values = a.singular_values();
+    let x = if values.max() < WORST_CONDITION * values.min() {
+        a.lu().solve(&b)?
+    } else {
+        a.pseudo_inverse(values.max() / WORST_CONDITION).ok()? * b
+    };
+    let velocity: Vector3<f64> = x.fixed_rows::<3>(3).into_owned();
+    let dt = second.time.seconds_since(first.time);
+    let position = pair(first, second, velocity * dt)?.position;
+    Some(Answer { position, velocity, time: first.time, observability: None })
+}
+
+/// The answers of [`SOLVERS`] in their order.
+fn answers(lines: &[TimedLine; 3]) -> [Option<Answer>; 3] {
+    let [first, second, third] = lines;
+    let ours = triple([first, second, third], VELOCITY_SD).map(|solution| Answer {
+        position: solution.position,
+        velocity: solution.velocity,
+        time: first.time,
+        observability: Some(solution.observability),
+    });
+    let posterior = map(lines, first.time, PRIOR_SD).map(|solution| Answer {
+        position: solution.state.position(),
+        velocity: solution.state.velocity(),
+        time: first.time,
+        observability: Some(solution.observability),
+    });
+    [papers_inverse(lines), ours, posterior]
+}
+
+/// The sight lines of the middle period.
+fn lines(layout: &Layout, target: &Target, mut noise: Option<&mut Noise>) -> Option<[TimedLine; 3]> {
+    let cameras = layout.cameras().ok()?;
+    let seen = cameras.iter().zip(layout.delays).map(|(camera, delay)| {
+        let time = (PERIODS / 2) as f64 + delay;
+        line(camera, target.at(time), tangent_noise(noise.as_deref_mut()), time)
+    });
+    seen.collect::<Option<Vec<TimedLine>>>()?.try_into().ok()
+}
+
+/// What a solver said in one run, held against the truth.
+#[derive(Clone, Copy)]
+struct Outcome {
+    /// Errors of position, m, and velocity, m/s.
+    errors: [f64; 2],
+    observability: Option<Observability>,
+    /// Whether lines without noise would have had the same rank.
+    rank_is_true: bool,
+}
+
+fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
+    let target = Target::random(noise);
+    let (Some(noisy), Some(exact)) = (lines(layout, &target, Some(noise)), lines(layout, &target, None))
+    else {
+        return [None; 3];
+    };
+    let rank = |answer: &Option<Answer>| answer.as_ref().and_then(|a| Some(a.observability?.rank));
+    let ranks = answers(&exact).map(|answer| rank(&answer));
+    let mut outcomes = [None; 3];
+    for ((outcome, answer), true_rank) in outcomes.iter_mut().zip(answers(&noisy)).zip(ranks) {
+        let rank_is_true = rank(&answer) == true_rank;
+        *outcome = answer.map(|answer| Outcome {
+            errors: [
+                (answer.position - target.at(answer.time.seconds())).norm(),
+                (answer.velocity - target.velocity).norm(),
+            ],
+            observability: answer.observability,
+            rank_is_true,
+        });
+    }
+    outcomes
+}
+
+/// How the degenerate fixes of one solver describe what they do not see.
+fn said(series: &str, at: f64, outcomes: &[&Outcome], degeneracy: Degeneracy) -> Vec<Row> {
+    let of_solver: Vec<Observability> = outcomes.iter().filter_map(|o| o.observability).collect();
+    if of_solver.is_empty() {
+        return Vec::new();
+    }
+    let weak: Vec<WeakAxis> = of_solver.iter().filter_map(|o| o.weak_axis).collect();
+    let row = |what: &str, figure| Row::new(format!("{series}: {what}"), at, figure);
+    let mut say_so = row("share that say so", share(of_solver.iter().map(|o| !o.is_full())));
+    say_so.limit = match degeneracy {
+        Degeneracy::Regular => Some(Limit::AtMost(0.01)),
+        Degeneracy::OfPlace => None,
+        Degeneracy::OfTimes => Some(Limit::AtLeast(0.99)),
+    };
+    // Noise must not make a singular system look regular.
+    let truly = share(outcomes.iter().map(|o| o.rank_is_true));
+    let truly = row("rank is that without noise", truly).limit(Limit::AtLeast(0.95));
+    let mut rows = vec![say_so, truly];
+    if !weak.is_empty() {
+        let velocity = share(weak.iter().map(|axis| axis.quantity == Quantity::Velocity));
+        rows.push(row("of these, of a velocity", velocity));
+        for (index, axis) in ["x", "y", "z"].into_iter().enumerate() {
+            let along: Vec<f64> = weak.iter().map(|weak| weak.direction[index].abs()).collect();
+            rows.push(row(&format!("mean |{axis}| of the axis"), mean(&along)));
+        }
+    }
+    rows
+}
+
+/// What is asked of a solver's error. Of ours, that it is no greater than the reference's; of the
+/// papers' inverse, that it is the same, for it is here to be compared with: but not where noise
+/// makes a singular matrix look regular, as its error has no finite variance there.
+fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> Option<Limit> {
+    match (SOLVERS[solver], degeneracy) {
+        (name, _) if name == SOLVERS[2] => Some(Limit::AtMost(value + tolerance)),
+        (_, Degeneracy::OfPlace) => None,
+        _ => Some(Limit::Near { value, tolerance }),
+    }
+}
+
+/// Condition numbers, errors and what the fixes say of themselves.
+pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut conditions, mut positions, mut velocities, mut says) = (vec![], vec![], vec![], vec![]);
+    for (number, (layout, reference)) in LAYOUTS.iter().zip(&REFERENCES).enumerate() {
+        let at = (number + 1) as f64;
+        conditions.push(condition_row(layout, reference, at));
+        let runs = runs::all(CHEAP * options.runs, |index| run(layout, &mut Noise::new(options.seed, index)));
+        for (solver, name) in SOLVERS.into_iter().enumerate() {
+            let answered: Vec<&Outcome> = runs.iter().filter_map(|run| run[solver].as_ref()).collect();
+            let series = format!("{}: {name}", layout.name);
+            let expected = [Some(reference.papers), None, Some(reference.map)][solver];
+            for (quantity, rows) in [&mut positions, &mut velocities].into_iter().enumerate() {
+                let errors: Vec<f64> = answered.iter().map(|outcome| outcome.errors[quantity]).collect();
+                let figure = root_mean_square(&errors);
+                let mut row = Row::new(&series, at, figure);
+                if let Some(value) = expected.map(|expected| expected[quantity]) {
+                    let digit = [0.01, 1.0][quantity];
+                    let tolerance = reference_tolerance(figure.1, errors.len(), REFERENCE_RUNS, digit);
+                    row = row.reference(value);
+                    row.limit = asked(solver, reference.degeneracy, value, tolerance);
+                }
+                rows.push(row);
+            }
+            says.extend(said(&series, at, &answered, reference.degeneracy));
+        }
+    }
+    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "layout", y, rows };
+    vec![
+        table(
+            "degenerate-condition",
+            "Condition number of the papers' system, target at rest",
+            "",
+            conditions,
+        ),
+        table("degenerate-position", "RMS error of the position, one period", "m", positions),
+        table("degenerate-velocity", "RMS error of the velocity, one period", "m/s", velocities),
+        table("degenerate-said", "What degenerate fixes say of themselves", "share", says),
+    ]
+}
+
+fn condition_row(layout: &Layout, reference: &Reference, at: f64) -> Row {
+    let exact = lines(layout, &Target::at_rest(Point3::origin()), None);
+    let solution = exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
+    let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
+    let row = Row::new(layout.name, at, (condition, 0.0));
+    if reference.condition > SINGULAR {
+        return row.limit(Limit::AtLeast(SINGULAR));
+    }
+    let tolerance = 0.05 * reference.condition;
+    row.reference(reference.condition).limit(Limit::Near { value: reference.condition, tolerance })
+}

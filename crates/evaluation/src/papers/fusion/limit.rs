@@ -1,0 +1,250 @@
+//! How far from the Cramer-Rao bound of all periods: the whole fusion, and the batch solution.
+
+use crossfix_filter::KinematicState;
+use crossfix_fusion::spatial::{TimedLine, map};
+use crossfix_fusion::{Fusion, FusionConfig, Output};
+use crossfix_geometry::{Bearing, Camera};
+use crossfix_message::{
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState, Payload,
+    Timestamp, TrackFrame, TrackState,
+};
+use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+
+use super::super::ValidationOptions;
+use super::super::runs::{self, Noise};
+use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
+use super::bound::bound;
+use super::site::{LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
+
+/// Standard deviation of the batch solution's prior on the velocity, m/s: the fusion's default.
+const PRIOR_SD: f64 = 15.0;
+/// An error of so many of its own standard deviations, or of so many metres, has diverged.
+const DIVERGED_SDS: f64 = 10.0;
+const DIVERGED_M: f64 = 100.0;
+
+/// One bearing of one camera.
+struct Seen {
+    camera: usize,
+    period: usize,
+    time_s: f64,
+    bearing: Bearing,
+}
+
+/// A run's target and all bearings of it in the order of their times.
+struct Flight {
+    target: Target,
+    seen: Vec<Seen>,
+    /// What they would be without noise.
+    exact: Vec<TimedLine>,
+}
+
+impl Flight {
+    fn new(layout: &Layout, cameras: &[Camera], noise: &mut Noise) -> Option<Self> {
+        let target = Target::random(noise);
+        let (mut seen, mut exact) = (Vec::new(), Vec::new());
+        for period in 0..PERIODS {
+            for (index, (camera, delay)) in cameras.iter().zip(layout.delays).enumerate() {
+                let time_s = period as f64 + delay;
+                let place = target.at(time_s);
+                let bearing = bearing(camera, place, tangent_noise(Some(noise)))?;
+                seen.push(Seen { camera: index, period, time_s, bearing });
+                exact.push(line(camera, place, tangent_noise(None), time_s)?);
+            }
+        }
+        seen.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+        Some(Self { target, seen, exact })
+    }
+
+    /// The time of the last bearing.
+    fn end(&self) -> Timestamp {
+        self.exact.iter().map(|line| line.time).max().unwrap_or(Timestamp::EPOCH)
+    }
+}
+
+/// What an estimator says at the time of the last bearing, held against the truth.
+struct Outcome {
+    /// Errors of position, m, and velocity, m/s.
+    errors: [f64; 2],
+    nees: f64,
+    diverged: bool,
+    /// The bound's variances, m^2 and m^2/s^2.
+    bound: [f64; 2],
+}
+
+impl Outcome {
+    fn of(flight: &Flight, state: &KinematicState) -> Option<Self> {
+        let time = flight.end();
+        let limit = bound(&flight.exact, &flight.target, time)?;
+        let truth = flight.target.at(time.seconds());
+        let (position, velocity) = (state.position() - truth, state.velocity() - flight.target.velocity);
+        let error = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
+        let own_sd = state.position_covariance().trace().sqrt();
+        let trace = |block: usize| limit.fixed_view::<3, 3>(block, block).trace();
+        Some(Self {
+            errors: [position.norm(), velocity.norm()],
+            nees: error.dot(&(state.covariance.try_inverse()? * error)),
+            diverged: position.norm() > DIVERGED_M || position.norm() > DIVERGED_SDS * own_sd,
+            bound: [trace(0), trace(3)],
+        })
+    }
+}
+
+/// The messages of a flight through the whole fusion with its default configuration; the last track
+/// frame's confirmed track, the nearest one if there are several.
+fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
+    let mut fusion = Fusion::new(FusionConfig::default()).ok()?;
+    for (name, camera) in cameras {
+        fusion.calibrate(&CameraCalibration::new(name, camera, Timestamp::EPOCH)).ok()?;
+    }
+    let mut outputs = Vec::new();
+    for seen in &flight.seen {
+        outputs.extend(fusion.ingest(&frame(seen, &cameras.get(seen.camera)?.0)));
+    }
+    outputs.extend(fusion.flush());
+    let last = outputs.into_iter().rev().find_map(|output| match output {
+        Output::Tracks(frame) => Some(frame),
+        Output::Event(_) | Output::Rejected(_) => None,
+    })?;
+    (last.time_ns == flight.end().nanos()).then_some(())?;
+    let truth = flight.target.at(flight.end().seconds());
+    let states = confirmed(&last);
+    states.into_iter().min_by(|a, b| (a.position() - truth).norm().total_cmp(&(b.position() - truth).norm()))
+}
+
+fn frame(seen: &Seen, camera: &CameraName) -> BearingFrame {
+    let covariance = seen.bearing.covariance();
+    let track = BearingTrack {
+        track_id: 1,
+        bearing: Some(seen.bearing.direction().into_inner().into()),
+        covariance_xx: covariance.m11,
+        covariance_xy: covariance.m12,
+        covariance_yy: covariance.m22,
+        state: ImageTrackState::Tracking.into(),
+        ..Default::default()
+    };
+    BearingFrame {
+        camera: camera.to_string(),
+        sequence: seen.period as u64,
+        capture_time_ns: Timestamp::from_seconds(seen.time_s).nanos(),
+        clock_source: ClockSource::Simulated.into(),
+        tracks: vec![track],
+        ..Default::default()
+    }
+    .stamped()
+}
+
+/// The states of a frame's confirmed tracks.
+fn confirmed(frame: &TrackFrame) -> Vec<KinematicState> {
+    let sure =
+        frame.tracks.iter().filter(|t| matches!(t.state(), TrackState::Confirmed | TrackState::Coasting));
+    sure.filter_map(|track| {
+        let position: Point3<f64> = track.position?.into();
+        let velocity: Vector3<f64> = track.velocity?.into();
+        let mean = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
+        let covariance: [f64; 36] = track.covariance.as_slice().try_into().ok()?;
+        Some(KinematicState { mean, covariance: Matrix6::from_row_slice(&covariance) })
+    })
+    .collect()
+}
+
+/// The outcomes of all runs; `None` where the estimator had nothing to say.
+fn outcomes(
+    options: ValidationOptions,
+    layout: &Layout,
+    estimate: impl Fn(&Flight, &[(CameraName, Camera)]) -> Option<KinematicState> + Sync,
+) -> Vec<Option<Outcome>> {
+    let cameras = layout.cameras().unwrap_or_default();
+    let names = ["first", "second", "third"].into_iter().filter_map(|name| name.parse().ok());
+    let named: Vec<(CameraName, Camera)> = names.zip(cameras.iter().cloned()).collect();
+    runs::all(options.runs, |index| {
+        let flight = Flight::new(layout, &cameras, &mut Noise::new(options.seed, index))?;
+        Outcome::of(&flight, &estimate(&flight, &named)?)
+    })
+}
+
+/// The rows of the tables that both estimators have.
+#[derive(Default)]
+struct Rows {
+    ratios: Vec<Row>,
+    errors: Vec<Row>,
+    consistency: Vec<Row>,
+}
+
+impl Rows {
+    fn add(&mut self, layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) {
+        let known: Vec<&Outcome> = outcomes.iter().flatten().collect();
+        for (index, quantity) in ["position", "velocity"].into_iter().enumerate() {
+            let errors: Vec<f64> = known.iter().map(|o| o.errors[index]).collect();
+            let bounds: Vec<f64> = known.iter().map(|o| o.bound[index]).collect();
+            // The root of the mean trace over the runs.
+            let best = mean(&bounds).0.sqrt();
+            let (rms, standard_error) = root_mean_square(&errors);
+            let series = format!("{}: {quantity}", layout.name);
+            self.errors.push(Row::new(&series, at, (rms, standard_error)));
+            self.errors.push(Row::new(format!("{series}, bound"), at, (best, 0.0)));
+            let ratio = Row::new(series, at, (rms / best, standard_error / best));
+            self.ratios.push(ratio.limit(Limit::AtMost(1.1)));
+        }
+        let nees: Vec<f64> = known.iter().map(|o| o.nees).collect();
+        self.consistency.push(Row::new(layout.name, at, mean(&nees)));
+    }
+}
+
+fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<Row>) -> Table {
+    Table { name, title: title.to_owned(), x: "layout", y, rows }
+}
+
+/// The two layouts in which the paper's own system is regular.
+const REGULAR: [Layout; 2] = [
+    Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
+    Layout::orthogonal("orthogonal, 0.3/0.4", [0.0, 0.3, 0.4]),
+];
+
+/// The whole fusion, from messages to the last track frame, with its default configuration.
+pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut rows, mut shares) = (Rows::default(), Vec::new());
+    for (number, layout) in REGULAR.iter().enumerate() {
+        let at = (number + 1) as f64;
+        let outcomes = outcomes(options, layout, fused);
+        rows.add(layout, at, &outcomes);
+        let confirmed = share(outcomes.iter().map(Option::is_some));
+        shares.push(Row::new(layout.name, at, confirmed).limit(Limit::AtLeast(0.99)));
+    }
+    for row in &mut rows.consistency {
+        row.limit = Some(Limit::Near { value: 6.0, tolerance: 0.15 });
+    }
+    let Rows { ratios, errors, consistency } = rows;
+    vec![
+        table("fusion-bound", "Whole fusion: RMS error over the bound of all periods", "ratio", ratios),
+        table("fusion-error", "Whole fusion: RMS error and the bound", "m, m/s", errors),
+        table("fusion-nees", "Whole fusion: mean NEES, 6 is honest", "NEES", consistency),
+        table("fusion-confirmed", "Whole fusion: runs with a confirmed track", "share", shares),
+    ]
+}
+
+/// All bearings at once, [`map`] with a prior on the velocity, in every layout.
+pub(super) fn batch_tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut rows, mut diverged) = (Rows::default(), Vec::new());
+    let batch = |flight: &Flight, cameras: &[(CameraName, Camera)]| {
+        let lines = flight.seen.iter().map(|seen| {
+            let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
+            Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s) })
+        });
+        let lines: Vec<TimedLine> = lines.collect::<Option<_>>()?;
+        Some(map(&lines, flight.end(), PRIOR_SD)?.state)
+    };
+    for (number, layout) in LAYOUTS.iter().enumerate() {
+        let at = (number + 1) as f64;
+        let outcomes = outcomes(options, layout, batch);
+        rows.add(layout, at, &outcomes);
+        let lost = outcomes.iter().filter(|o| o.as_ref().is_none_or(|o| o.diverged)).count();
+        diverged.push(Row::new(layout.name, at, (lost as f64, 0.0)).limit(Limit::AtMost(0.0)));
+    }
+    let Rows { ratios, errors, consistency } = rows;
+    vec![
+        table("batch-bound", "Batch MAP: RMS error over the bound of all periods", "ratio", ratios),
+        table("batch-error", "Batch MAP: RMS error and the bound", "m, m/s", errors),
+        table("batch-nees", "Batch MAP: mean NEES, 6 is honest", "NEES", consistency),
+        table("batch-diverged", "Batch MAP: runs that diverged or gave nothing", "runs", diverged),
+    ]
+}

@@ -1,0 +1,28 @@
+//! The fusion of 002.
+
+mod bound;
+mod degenerate;
+mod detection;
+mod limit;
+mod site;
+
+use super::Experiment;
+
+/// Standard deviation of each component of the targets' velocities, m/s.
+const VELOCITY_SD: f64 = 15.6;
+/// Runs of the reference implementation behind each of its figures.
+const REFERENCE_RUNS: usize = 300;
+
+pub(super) const EXPERIMENTS: [Experiment; 4] = [
+    Experiment { name: "detection (002, tables 1 and 2)", make: detection::tables },
+    Experiment { name: "degenerate geometries, one period", make: degenerate::tables },
+    Experiment { name: "bound of all periods, whole fusion", make: limit::fusion_tables },
+    Experiment { name: "bound of all periods, batch", make: limit::batch_tables },
+];
+
+/// How far ours may be from a reference figure: three standard errors of the difference, the
+/// reference's runs having the scatter that ours have over `samples` samples, and half of the
+/// reference's last digit.
+fn reference_tolerance(standard_error: f64, samples: usize, reference_samples: usize, digit: f64) -> f64 {
+    3.0 * standard_error * (1.0 + samples as f64 / reference_samples as f64).sqrt() + digit / 2.0
+}

@@ -1,0 +1,64 @@
+//! The figures of the fusion, with few runs: what must be must be already with these.
+
+use crossfix_evaluation::{Row, Table, ValidationOptions, Verdict, validate_fusion};
+
+fn tables(only: &str, runs: usize) -> Vec<Table> {
+    let tables = validate_fusion(ValidationOptions { runs, seed: 3 }, only, |_, _, _| {});
+    assert!(!tables.is_empty(), "no experiment is called {only}");
+    tables
+}
+
+/// The rows of a table that are not what they must be; that some are asked for is sure.
+fn failures<'a>(tables: &'a [Table], name: &str) -> Vec<&'a Row> {
+    let table = tables.iter().find(|table| table.name == name).expect("the table is there");
+    assert!(table.rows.iter().any(|row| row.limit.is_some()), "nothing is asked of {name}");
+    table.rows.iter().filter(|row| row.verdict() == Verdict::Fail).collect()
+}
+
+const NONE: [&Row; 0] = [];
+
+#[test]
+fn both_algorithms_find_what_the_reference_finds() {
+    let tables = tables("detection", 20);
+    for name in ["detection-distance", "detection-deviation", "detection-probability"] {
+        assert_eq!(failures(&tables, name), NONE);
+    }
+}
+
+#[test]
+fn the_delays_cost_two_receivers_metres_and_three_nothing() {
+    let tables = tables("detection", 20);
+    let rows = &tables[0].rows;
+    let of = |series: &str, delay: f64| {
+        let row = rows.iter().find(|row| row.series == series && row.x == delay);
+        row.expect("the row is there").ours
+    };
+    assert!(of("two receivers, m = 1, noise on M", 0.25) > 2.0);
+    assert!(of("three receivers, m = 1, noise on M", 0.3) < 0.2);
+}
+
+#[test]
+fn degenerate_fixes_say_so_whatever_the_noise() {
+    let tables = tables("degenerate", 20);
+    assert_eq!(failures(&tables, "degenerate-condition"), NONE);
+    assert_eq!(failures(&tables, "degenerate-said"), NONE);
+    assert_eq!(failures(&tables, "degenerate-position"), NONE);
+}
+
+#[test]
+fn all_bearings_at_once_reach_the_bound_in_every_geometry() {
+    let tables = tables("batch", 300);
+    assert_eq!(failures(&tables, "batch-bound"), NONE);
+    assert_eq!(failures(&tables, "batch-diverged"), NONE);
+}
+
+#[test]
+fn the_whole_fusion_confirms_a_lone_target() {
+    let tables = tables("whole fusion", 20);
+    assert_eq!(failures(&tables, "fusion-confirmed"), NONE);
+}
+
+#[test]
+fn runs_are_repeatable() {
+    assert_eq!(tables("batch", 5), tables("batch", 5));
+}
