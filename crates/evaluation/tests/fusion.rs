@@ -10,7 +10,8 @@ fn tables(only: &str, runs: usize) -> Vec<Table> {
 
 /// The rows of a table that are not what they must be; that some are asked for is sure.
 fn failures<'a>(tables: &'a [Table], name: &str) -> Vec<&'a Row> {
-    let table = tables.iter().find(|table| table.name == name).expect("the table is there");
+    let table = tables.iter().find(|table| table.name == name);
+    let table = table.unwrap_or_else(|| panic!("there is no table {name}"));
     assert!(table.rows.iter().any(|row| row.limit.is_some()), "nothing is asked of {name}");
     table.rows.iter().filter(|row| row.verdict() == Verdict::Fail).collect()
 }
@@ -56,6 +57,11 @@ fn all_bearings_at_once_reach_the_bound_in_every_geometry() {
 fn the_whole_fusion_confirms_a_lone_target() {
     let tables = tables("whole fusion", 20);
     assert_eq!(failures(&tables, "fusion-confirmed"), NONE);
+}
+
+#[test]
+fn after_sharp_turns_the_chi_square_test_is_best_in_little_noise_and_the_models_in_much() {
+    assert_eq!(failures(&tables("manoeuvres", 40), "manoeuvre-ratio"), NONE);
 }
 
 #[test]

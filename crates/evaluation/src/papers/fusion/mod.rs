@@ -1,9 +1,10 @@
-//! The fusion of 002.
+//! The fusion of 002 and the manoeuvres of 004.
 
 mod bound;
 mod degenerate;
 mod detection;
 mod limit;
+mod manoeuvre;
 mod site;
 
 use super::Experiment;
@@ -13,11 +14,12 @@ const VELOCITY_SD: f64 = 15.6;
 /// Runs of the reference implementation behind each of its figures.
 const REFERENCE_RUNS: usize = 300;
 
-pub(super) const EXPERIMENTS: [Experiment; 4] = [
+pub(super) const EXPERIMENTS: [Experiment; 5] = [
     Experiment { name: "detection (002, tables 1 and 2)", make: detection::tables },
     Experiment { name: "degenerate geometries, one period", make: degenerate::tables },
     Experiment { name: "bound of all periods, whole fusion", make: limit::fusion_tables },
     Experiment { name: "bound of all periods, batch", make: limit::batch_tables },
+    Experiment { name: "manoeuvres (004, Fig. 11)", make: manoeuvre::tables },
 ];
 
 /// How far ours may be from a reference figure: three standard errors of the difference, the
