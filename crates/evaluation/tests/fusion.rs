@@ -40,7 +40,7 @@ fn the_delays_cost_two_receivers_metres_and_three_nothing() {
 
 #[test]
 fn degenerate_fixes_say_so_whatever_the_noise() {
-    let tables = tables("degenerate", 20);
+    let tables = tables("one period", 20);
     assert_eq!(failures(&tables, "degenerate-condition"), NONE);
     assert_eq!(failures(&tables, "degenerate-said"), NONE);
     assert_eq!(failures(&tables, "degenerate-position"), NONE);
@@ -55,7 +55,7 @@ fn all_bearings_at_once_reach_the_bound_in_every_geometry() {
 
 #[test]
 fn the_whole_fusion_confirms_a_lone_target() {
-    let tables = tables("whole fusion", 20);
+    let tables = tables("bound of all periods, whole", 20);
     assert_eq!(failures(&tables, "fusion-confirmed"), NONE);
 }
 

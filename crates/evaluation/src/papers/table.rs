@@ -130,6 +130,14 @@ pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
     (root, if root > 0.0 { error / (2.0 * root) } else { 0.0 })
 }
 
+/// The root of the ratio of two means of squares over the same runs, with its standard error.
+pub(crate) fn root_ratio(squares: &[f64], other_squares: &[f64]) -> (f64, f64) {
+    let (above, below) = (mean(squares).0, mean(other_squares).0);
+    let root = (above / below).sqrt();
+    let off: Vec<f64> = squares.iter().zip(other_squares).map(|(a, b)| a / above - b / below).collect();
+    (root, root / 2.0 * mean(&off).1)
+}
+
 /// The standard deviation of samples with its standard error.
 pub(crate) fn deviation(samples: &[f64]) -> (f64, f64) {
     let (middle, _) = mean(samples);
@@ -165,6 +173,7 @@ mod tests {
     fn statistics_by_hand() {
         assert_eq!(mean(&[1.0, 3.0]), (2.0, 1.0));
         assert_eq!(root_mean_square(&[3.0, 3.0]).0, 3.0);
+        assert_eq!(root_ratio(&[4.0, 12.0], &[1.0, 3.0]), (2.0, 0.0));
         let (p, error) = share([true, false, false, false].into_iter());
         assert!((p - 0.25).abs() < 1e-12 && (error - (0.25_f64 * 0.75 / 4.0).sqrt()).abs() < 1e-12);
     }

@@ -12,7 +12,7 @@ use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
+use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 use super::bound::bound;
 use super::site::{LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
 
@@ -222,23 +222,55 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
+/// All bearings at once.
+fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
+    let lines = flight.seen.iter().map(|seen| {
+        let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
+        Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s) })
+    });
+    let lines: Vec<TimedLine> = lines.collect::<Option<_>>()?;
+    Some(map(&lines, flight.end(), PRIOR_SD)?.state)
+}
+
+/// How many runs diverged or gave nothing.
+fn lost(outcomes: &[Option<Outcome>]) -> f64 {
+    outcomes.iter().filter(|outcome| outcome.as_ref().is_none_or(|o| o.diverged)).count() as f64
+}
+
+/// The whole fusion where one period does not determine position and velocity, against the batch
+/// solution of the same bearings.
+pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
+    let (mut ratios, mut consistency, mut losses) = (Vec::new(), Vec::new(), Vec::new());
+    for (number, layout) in LAYOUTS.iter().enumerate().skip(1) {
+        let at = (number + 1) as f64;
+        let (ours, best) = (outcomes(options, layout, fused), outcomes(options, layout, batch));
+        let both: Vec<(&Outcome, &Outcome)> =
+            ours.iter().zip(&best).filter_map(|(ours, best)| ours.as_ref().zip(best.as_ref())).collect();
+        for (index, quantity) in ["position", "velocity"].into_iter().enumerate() {
+            let ours: Vec<f64> = both.iter().map(|(ours, _)| ours.errors[index].powi(2)).collect();
+            let best: Vec<f64> = both.iter().map(|(_, best)| best.errors[index].powi(2)).collect();
+            let row = Row::new(format!("{}: {quantity}", layout.name), at, root_ratio(&ours, &best));
+            ratios.push(row.limit(Limit::AtMost(1.1)));
+        }
+        let nees: Vec<f64> = both.iter().map(|(ours, _)| ours.nees).collect();
+        consistency.push(Row::new(layout.name, at, mean(&nees)));
+        losses.push(Row::new(layout.name, at, (lost(&ours), 0.0)).limit(Limit::AtMost(0.0)));
+    }
+    vec![
+        table("fusion-degenerate", "Whole fusion: RMS error over the batch MAP's", "ratio", ratios),
+        table("fusion-degenerate-nees", "Whole fusion: mean NEES, 6 is honest", "NEES", consistency),
+        table("fusion-degenerate-lost", "Whole fusion: runs that diverged or gave nothing", "runs", losses),
+    ]
+}
+
 /// All bearings at once, [`map`] with a prior on the velocity, in every layout.
 pub(super) fn batch_tables(options: ValidationOptions) -> Vec<Table> {
     let (mut rows, mut diverged) = (Rows::default(), Vec::new());
-    let batch = |flight: &Flight, cameras: &[(CameraName, Camera)]| {
-        let lines = flight.seen.iter().map(|seen| {
-            let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
-            Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s) })
-        });
-        let lines: Vec<TimedLine> = lines.collect::<Option<_>>()?;
-        Some(map(&lines, flight.end(), PRIOR_SD)?.state)
-    };
     for (number, layout) in LAYOUTS.iter().enumerate() {
         let at = (number + 1) as f64;
         let outcomes = outcomes(options, layout, batch);
         rows.add(layout, at, &outcomes);
-        let lost = outcomes.iter().filter(|o| o.as_ref().is_none_or(|o| o.diverged)).count();
-        diverged.push(Row::new(layout.name, at, (lost as f64, 0.0)).limit(Limit::AtMost(0.0)));
+        diverged.push(Row::new(layout.name, at, (lost(&outcomes), 0.0)).limit(Limit::AtMost(0.0)));
     }
     let Rows { ratios, errors, consistency } = rows;
     vec![

@@ -13,7 +13,7 @@ use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
-use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
+use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 
 /// Time between measurements, s (004: T = 1).
 const STEP: f64 = 1.0;
@@ -236,14 +236,6 @@ const REFERENCES: [[Option<f64>; 2]; 8] = [
     [Some(0.077), Some(3.67)],
 ];
 
-/// Root of the ratio of two means of squares of the same runs, with its standard error.
-fn ratio(ours: &[f64], others: &[f64]) -> (f64, f64) {
-    let (above, below) = (mean(ours).0, mean(others).0);
-    let root = (above / below).sqrt();
-    let off: Vec<f64> = ours.iter().zip(others).map(|(a, b)| a / above - b / below).collect();
-    (root, root / 2.0 * mean(&off).1)
-}
-
 /// Frames from a turn to its first alarm, 1 being the first frame that can show it; `None` for a
 /// turn without an alarm before the next.
 fn delays(flight: &Flight, alarms: &[usize]) -> Vec<Option<f64>> {
@@ -281,7 +273,7 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
             errors.push(Row { reference, ..row });
         }
         if matches!(method, Method::Smoothed(_)) {
-            let over = |other: usize| ratio(&all_axes(index), &all_axes(other));
+            let over = |other: usize| root_ratio(&all_axes(index), &all_axes(other));
             let row = |other: &str, figure| {
                 Row::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
             };
@@ -301,7 +293,7 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
     }
     let between = |one: usize, other: usize, limit| {
         let name = format!("{} over {}", methods[one].name(), methods[other].name());
-        Row::new(name, deviation, ratio(&all_axes(one), &all_axes(other))).limit(limit)
+        Row::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
     };
     // Which is best: the detector of innovations where turns stand out of the noise, else the models.
     let turns_stand_out = SPEED * STEP > deviation;

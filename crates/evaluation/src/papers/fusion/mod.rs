@@ -14,10 +14,11 @@ const VELOCITY_SD: f64 = 15.6;
 /// Runs of the reference implementation behind each of its figures.
 const REFERENCE_RUNS: usize = 300;
 
-pub(super) const EXPERIMENTS: [Experiment; 5] = [
+pub(super) const EXPERIMENTS: [Experiment; 6] = [
     Experiment { name: "detection (002, tables 1 and 2)", make: detection::tables },
     Experiment { name: "degenerate geometries, one period", make: degenerate::tables },
     Experiment { name: "bound of all periods, whole fusion", make: limit::fusion_tables },
+    Experiment { name: "degenerate geometries, whole fusion", make: limit::degenerate_tables },
     Experiment { name: "bound of all periods, batch", make: limit::batch_tables },
     Experiment { name: "manoeuvres (004, Fig. 11)", make: manoeuvre::tables },
 ];
