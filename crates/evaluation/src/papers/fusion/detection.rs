@@ -99,6 +99,8 @@ const CELLS: [Cell; 8] = [
 struct Found {
     distances: Vec<f64>,
     all: bool,
+    /// Whether the estimate of their number is right.
+    counted: bool,
 }
 
 /// All fixes that the lines of one period give, by the paper's solver for that many receivers.
@@ -197,7 +199,7 @@ fn run(cell: &Cell, reading: Reading, cameras: &[(CameraName, Camera)], noise: &
     let places: Vec<Point3<f64>> = targets.iter().map(|target| target.at(time)).collect();
     let distances = matched(&places, &ends);
     let near = distances.iter().filter(|&&distance| distance <= MATCH_GATE).count();
-    Found { all: near == targets.len(), distances }
+    Found { all: near == targets.len(), counted: grouping.target_count() == targets.len(), distances }
 }
 
 /// The distances of targets to ends, each end for one target: the pairing of least total distance.
@@ -216,8 +218,9 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
     }
 }
 
-/// Mean distance, SD and probability of a cell, each with its standard error and the number of samples.
-fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64, f64), usize); 3] {
+/// Mean distance, SD and probability of a cell, and the share of runs whose number of targets is
+/// right, each with its standard error and the number of samples.
+fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64, f64), usize); 4] {
     let layout = Layout::orthogonal("", cell.delays);
     let cameras = layout.cameras().unwrap_or_default();
     let names = ["first", "second", "third"].into_iter().filter_map(|name| name.parse().ok());
@@ -227,19 +230,28 @@ fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64,
     });
     let distances: Vec<f64> = runs.iter().flat_map(|run| run.distances.iter().copied()).collect();
     let found = share(runs.iter().map(|run| run.all));
-    [(mean(&distances), distances.len()), (deviation(&distances), distances.len()), (found, runs.len())]
+    let counted = share(runs.iter().map(|run| run.counted));
+    [
+        (mean(&distances), distances.len()),
+        (deviation(&distances), distances.len()),
+        (found, runs.len()),
+        (counted, runs.len()),
+    ]
 }
 
 /// Tables 1 and 2 with both readings.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let mut rows: [Vec<Row>; 3] = Default::default();
+    let mut rows: [Vec<Row>; 4] = Default::default();
     for cell in &CELLS {
         for reading in [Reading::Positions, Reading::Bearings] {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
             let series = format!("{receivers} receivers, m = {}, {}", cell.targets, reading.name());
             let reference = cell.reference[reading as usize];
             for (quantity, (figure, samples)) in figures(options, cell, reading).into_iter().enumerate() {
-                let value = reference[quantity];
+                let Some(&value) = reference.get(quantity) else {
+                    rows[quantity].push(Row::new(&series, cell.delays[1], figure));
+                    continue;
+                };
                 let probability = quantity == 2;
                 let reference_samples = REFERENCE_RUNS * if probability { 1 } else { cell.targets };
                 let mut tolerance = reference_tolerance(figure.1, samples, reference_samples, 0.01);
@@ -258,10 +270,11 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         }
     }
     let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "dt2, s", y, rows };
-    let [distances, deviations, probabilities] = rows;
+    let [distances, deviations, probabilities, counts] = rows;
     vec![
         table("detection-distance", "Mean distance from the target (002, tables 1 and 2)", "m", distances),
         table("detection-deviation", "Its standard deviation (002, tables 1 and 2)", "m", deviations),
         table("detection-probability", "Probability of finding all (002, tables 1 and 2)", "", probabilities),
+        table("detection-count", "Number of targets estimated rightly (002, step 5)", "share", counts),
     ]
 }
