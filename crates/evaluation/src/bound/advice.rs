@@ -48,6 +48,21 @@ pub struct Advice {
     pub candidates: Vec<Candidate>,
 }
 
+impl Advice {
+    /// The best candidates that stand at least so far apart, m: neighbours are as good as each other.
+    pub fn best_apart(&self, count: usize, apart_m: f64) -> Vec<Candidate> {
+        let mut best: Vec<Candidate> = Vec::new();
+        for candidate in &self.candidates {
+            let place = Point3::from(candidate.position_m);
+            let apart = |other: &Candidate| (Point3::from(other.position_m) - place).norm() >= apart_m;
+            if best.len() < count && best.iter().all(apart) {
+                best.push(*candidate);
+            }
+        }
+        best
+    }
+}
+
 fn score(deviations: &mut [f64], fixed: usize) -> Score {
     deviations.sort_by(f64::total_cmp);
     let count = deviations.len().max(1) as f64;
@@ -183,6 +198,9 @@ mod tests {
         let advice = advise(&cameras, &volume(), &assumptions()).unwrap();
         assert_eq!(advice.candidates.len(), RINGS.len() * DIRECTIONS as usize);
         let best = &advice.candidates[0];
+        let few = advice.best_apart(3, 40.0);
+        assert_eq!(few.first(), Some(best));
+        assert!((Point3::from(few[1].position_m) - Point3::from(few[2].position_m)).norm() >= 40.0);
         let [x, y, z] = best.position_m;
         assert!(y.abs() > 2.0 * x.abs(), "across the line of sight, not at ({x}, {y})");
         assert_eq!(z, 50.0);

@@ -4,11 +4,15 @@
 mod advice;
 mod information;
 mod plan;
+mod summary;
 mod volume;
 
 pub use advice::{Advice, Candidate, Score, advise};
 pub use information::{
     BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
 };
-pub use plan::{Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict};
+pub use plan::{
+    Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict, smallest_target,
+};
+pub use summary::{Contribution, Summary, contributions, layers};
 pub use volume::{Volume, VolumeError};

@@ -194,6 +194,19 @@ pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpt
     volume.centres().map(cell).collect()
 }
 
+/// The smallest target, m, that two cameras see at a point when it must span so many pixels; none if
+/// fewer than two have the point in their images.
+pub fn smallest_target(cameras: &[PlannedCamera], point: Point3<f64>, least_px: f64) -> Option<f64> {
+    let size = |planned: &PlannedCamera| {
+        let lens = planned.camera.model().intrinsics();
+        let range = (point - planned.camera.pose().position()).norm();
+        planned.camera.sees(point).then(|| least_px * range / (lens.fx * lens.fy).sqrt())
+    };
+    let mut sizes: Vec<f64> = cameras.iter().filter_map(size).collect();
+    sizes.sort_by(f64::total_cmp);
+    sizes.get(1).copied()
+}
+
 #[cfg(test)]
 mod tests {
     use crossfix_geometry::{Distortion, ImageSize, Intrinsics, Pose};
@@ -266,6 +279,9 @@ mod tests {
         // 0.4 m * 1000 px / 6 px.
         assert!((assumptions.reach_m(&cameras[0].camera).unwrap() - 66.7).abs() < 0.1);
         assert_eq!(cell(&cameras, target, &assumptions).cameras, [1]);
+        // The farther camera is the second: 100 m * 6 px / 1000 px.
+        assert!((smallest_target(&cameras, target.into(), 6.0).unwrap() - 0.6).abs() < 1e-9);
+        assert_eq!(smallest_target(&cameras[..1], target.into(), 6.0), None);
         let near = Assumptions { target: None, max_range_m: Some(50.0), ..assumptions };
         assert_eq!(cell(&cameras, target, &near).cameras, [0; 0]);
     }

@@ -132,11 +132,12 @@ impl Volume {
     }
 }
 
-/// The next of 1, 2, 5, 10, ... from a number upwards.
+/// The nearest of 1, 2, 5, 10, ... to a number, by their ratio.
 fn round_number(value: f64) -> f64 {
     let power = 10.0_f64.powf(value.log10().floor());
-    let factor = [1.0, 2.0, 5.0].into_iter().find(|factor| factor * power >= value * (1.0 - 1e-9));
-    factor.unwrap_or(10.0) * power
+    let near = |factor: &f64| (value / (factor * power)).ln().abs();
+    let factor = [1.0, 2.0, 5.0, 10.0].into_iter().min_by(|a, b| near(a).total_cmp(&near(b)));
+    factor.unwrap_or(1.0) * power
 }
 
 /// The point nearest to all optical axes (least squares), if there is one in front of all cameras.
@@ -204,7 +205,9 @@ mod tests {
 
     #[test]
     fn steps_are_round() {
-        for (value, expected) in [(0.9, 1.0), (1.0, 1.0), (1.1, 2.0), (3.0, 5.0), (7.0, 10.0), (0.03, 0.05)] {
+        for (value, expected) in
+            [(0.9, 1.0), (1.0, 1.0), (1.1, 1.0), (3.0, 2.0), (4.0, 5.0), (7.5, 10.0), (0.04, 0.05)]
+        {
             assert!((round_number(value) - expected).abs() < 1e-9, "{value}");
         }
     }
