@@ -50,7 +50,11 @@ fn a_small_target_is_fixed_in_fewer_cells_and_a_better_pose_gives_better_fixes()
         json(&["--target-size", "1", "--rotation-sd-deg", "0", "--position-sd", "0", "--clock-sd", "0"]);
     assert!(median(&exact) < 0.5 * median(&large), "{} {}", median(&exact), median(&large));
     let late = json(&["--target-size", "1", "--clock-sd", "0.1"]);
-    assert!(median(&late) > 0.8 && median(&late) < 1.2, "1.5 m along the flight in each camera: {}", median(&late));
+    assert!(
+        median(&late) > 0.8 && median(&late) < 1.2,
+        "1.5 m along the flight in each camera: {}",
+        median(&late)
+    );
 }
 
 #[test]

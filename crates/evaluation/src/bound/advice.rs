@@ -20,7 +20,8 @@ pub struct Score {
     /// Median of the position's standard deviation, m, over *all* of the volume: where there is no fix, or
     /// a worse one, the volume's diagonal counts.
     pub median_sd_m: f64,
-    /// The mean of the same, m: what decides between equal medians.
+    /// The geometric mean of the same, m: what decides between equal medians. The arithmetic one would
+    /// count the bad fixes of two cameras side by side as well nigh as good as a good one.
     pub mean_sd_m: f64,
     /// Share of the volume with a fix.
     pub fixed: f64,
@@ -68,7 +69,7 @@ fn score(deviations: &mut [f64], fixed: usize) -> Score {
     let count = deviations.len().max(1) as f64;
     Score {
         median_sd_m: deviations.get(deviations.len() / 2).copied().unwrap_or(f64::INFINITY),
-        mean_sd_m: deviations.iter().sum::<f64>() / count,
+        mean_sd_m: (deviations.iter().map(|sd| sd.ln()).sum::<f64>() / count).exp(),
         fixed: fixed as f64 / count,
     }
 }
@@ -164,6 +165,7 @@ pub fn advise(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpti
 mod tests {
     use crossfix_geometry::{Distortion, ImageSize, Intrinsics};
 
+    use super::super::TargetSize;
     use super::*;
 
     fn planned(position: [f64; 3]) -> PlannedCamera {
@@ -215,6 +217,27 @@ mod tests {
         let best = &advice.candidates[0];
         assert!(best.score.fixed > 0.9 && best.score.median_sd_m < 1.0, "{best:?}");
         assert_eq!(advise(&[], &volume(), &assumptions()), None);
+    }
+
+    #[test]
+    fn where_little_is_fixed_at_all_a_camera_beside_another_is_not_the_best() {
+        // The site to copy and a target that a camera sees 97 m far: no two see it in one place.
+        let size = ImageSize { width: 1920, height: 1080 };
+        let lens =
+            Intrinsics { size, fx: 1460.0, fy: 1460.0, cx: 960.0, cy: 540.0, distortion: Distortion::None };
+        let cameras =
+            [[115.0, -45.0, 4.0], [15.0, 120.0, 3.0], [-110.0, -60.0, 2.0]].map(|place: [f64; 3]| {
+                let pose = Pose::looking_at(place.into(), Point3::new(0.0, 0.0, 46.0)).unwrap();
+                PlannedCamera { camera: Camera::new(lens, pose).unwrap(), ..planned(place) }
+            });
+        let target = Some(TargetSize { size_m: 0.4, least_px: 6.0 });
+        let volume = Volume::new(Point3::new(-65.0, -65.0, 0.0), Point3::new(65.0, 65.0, 110.0), Some(10.0));
+        let advice = advise(&cameras, &volume.unwrap(), &Assumptions { target, ..assumptions() }).unwrap();
+        assert_eq!(advice.now.fixed, 0.0);
+        let best = Point3::from(advice.candidates[0].position_m);
+        for camera in &cameras {
+            assert!((camera.camera.pose().position() - best).norm() > 20.0, "{best}");
+        }
     }
 
     #[test]

@@ -72,6 +72,10 @@ pub fn layers(cells: &[Cell]) -> Vec<Summary> {
 pub struct Contribution {
     /// The camera.
     pub name: String,
+    /// Frames a second.
+    pub rate_hz: f64,
+    /// Standard deviation of its capture times, s.
+    pub clock_sd_s: f64,
     /// As far as it sees the target, m; none is without limit.
     pub reach_m: Option<f64>,
     /// Standard deviation of one bearing on the optical axis, rad.
@@ -96,6 +100,8 @@ pub fn contributions(
         let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
         Contribution {
             name: camera.name.clone(),
+            rate_hz: camera.rate_hz,
+            clock_sd_s: camera.clock_sd_s,
             reach_m: assumptions.reach_m(&camera.camera),
             bearing_sd_rad: assumptions.pixel_sd_px / (lens.fx * lens.fy).sqrt(),
             sees: seen as f64 / cells.len().max(1) as f64,

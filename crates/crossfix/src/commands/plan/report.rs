@@ -70,21 +70,21 @@ pub fn assumed(report: &Report) -> String {
     let taken = &report.assumptions;
     let target = taken.target.map_or_else(
         || "targets of any size".to_owned(),
-        |target| format!("targets of {} m, seen from {} px on", target.size_m, target.least_px),
+        |target| format!("targets of {} m, seen where they span {} px", target.size_m, target.least_px),
     );
     format!(
         "{} cells of {} m from {} to {} m (east, north, up)\n\
-         {target}, {} s of bearings, straight flight; SD at the end of them, lower bound\n\
-         SD of the image {} px, of the cameras' rotation {:.3} deg, position {} m, clocks at {} m/s",
+         {target}, and fly straight at {} m/s; SD at the end of {} s of bearings, a lower bound\n\
+         SD in the image {} px, of the cameras' rotation {:.3} deg and position {} m",
         report.whole.cells,
         report.step_m,
         place(report.min_m),
         place(report.max_m),
+        taken.speed_mps,
         taken.window_s,
         taken.pixel_sd_px,
         taken.rotation_sd_rad.to_degrees(),
         taken.position_sd_m,
-        taken.speed_mps,
     )
 }
 
@@ -93,7 +93,7 @@ fn layer_table(report: &Report) -> String {
         "altitude [m]",
         "with a fix",
         "position SD [m]: 50 %",
-        "90 % of the fixes",
+        "90 %",
         "velocity SD [m/s]: 50 %",
         "degenerate",
     ];
@@ -116,8 +116,10 @@ fn layer_table(report: &Report) -> String {
 fn camera_table(report: &Report) -> String {
     let head = [
         "camera",
-        "reach [m]",
+        "rate [1/s]",
+        "clock SD [ms]",
         "bearing SD [mrad]",
+        "reach [m]",
         "sees",
         "without it: with a fix",
         "position SD [m]: 50 %",
@@ -126,8 +128,10 @@ fn camera_table(report: &Report) -> String {
     rows.extend(report.cameras.iter().map(|camera| {
         vec![
             camera.name.clone(),
-            output::number(camera.reach_m, 0),
+            format!("{:.0}", camera.rate_hz),
+            format!("{:.1}", 1e3 * camera.clock_sd_s),
             format!("{:.2}", 1e3 * camera.bearing_sd_rad),
+            output::number(camera.reach_m, 0),
             percent(camera.sees),
             percent(camera.without.fixed),
             output::number(camera.without.position_sd_median_m, 3),
@@ -159,15 +163,17 @@ fn advice_table(report: &Report, advice: &Advice) -> String {
 pub fn conclusion(report: &Report) -> Option<String> {
     let (advice, best) = (report.advice.as_ref()?, report.best.first()?);
     let (now, then) = (advice.now, best.score);
-    let metres = |score| median(score).map_or_else(|| "none".to_owned(), |sd| format!("{sd:.3} m"));
+    let metres = |sd: f64| format!("{sd:.3} m");
+    let medians = median(&then).map_or_else(String::new, |then| {
+        let now = median(&now).map_or_else(|| "none".to_owned(), metres);
+        format!(", median position SD {} instead of {now}", metres(then))
+    });
     Some(format!(
-        "camera {} helps most at {}: fixes in {} of the volume instead of {}, median position SD {} instead of {}",
+        "camera {} helps most at {}: fixes in {} of the volume instead of {}{medians}",
         report.cameras.len() + 1,
         place(best.position_m),
         percent(then.fixed),
         percent(now.fixed),
-        metres(&then),
-        metres(&now),
     ))
 }
 
