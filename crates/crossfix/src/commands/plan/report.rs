@@ -108,7 +108,9 @@ fn layer_table(report: &Report) -> String {
         ]
     };
     let mut rows = vec![head.map(str::to_owned).to_vec()];
-    rows.extend(report.layers.iter().map(|layer| row(format!("{:.0}", layer.altitude_m), layer)));
+    let whole = report.layers.iter().all(|layer| (layer.altitude_m - layer.altitude_m.round()).abs() < 1e-6);
+    let decimals = if whole { 0 } else { 1 };
+    rows.extend(report.layers.iter().map(|layer| row(format!("{:.decimals$}", layer.altitude_m), layer)));
     rows.push(row("all".to_owned(), &report.whole));
     output::table(&rows)
 }
