@@ -176,10 +176,9 @@ impl CameraFile {
 
     /// Checks everything that can be checked without starting, and returns the camera.
     pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
-        let camera = self.described(path)?;
-        self.check_source()
-            .with_context(|| format!("the configuration file {} has an error", path.display()))?;
-        Ok(camera)
+        let wrong = || format!("the configuration file {} has an error", path.display());
+        self.check().and_then(|()| self.check_source()).with_context(wrong)?;
+        self.described(path)
     }
 
     /// The camera that the file describes, whether or not its pictures are there yet.
