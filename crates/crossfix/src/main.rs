@@ -14,8 +14,8 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use crate::commands::{
-    agent, check, demo, evaluate, export, fuse, import as import_command, info, record, replay, simulate,
-    track, validate, view,
+    agent, check, demo, evaluate, export, fuse, import as import_command, info, plan, record, replay,
+    simulate, track, validate, view,
 };
 
 /// Where in the air a small thing is, with nothing but cameras.
@@ -46,6 +46,7 @@ enum Command {
     Export(export::Args),
     Evaluate(evaluate::Args),
     Check(check::Args),
+    Plan(plan::Args),
     Validate(validate::Args),
 }
 
@@ -64,6 +65,7 @@ fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Export(args) => export::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Plan(args) => plan::run(&args),
         Command::Validate(args) => validate::run(&args),
     }
 }

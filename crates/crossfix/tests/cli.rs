@@ -4,9 +4,9 @@
 
 use assert_cmd::Command;
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 14] = [
     "demo", "agent", "track", "fuse", "record", "replay", "view", "info", "simulate", "import", "export",
-    "evaluate", "check",
+    "evaluate", "check", "plan",
 ];
 
 fn crossfix() -> Command {

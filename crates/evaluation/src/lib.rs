@@ -1,5 +1,6 @@
 //! Tracks held against truth: root mean squared errors, NEES, OSPA and GOSPA,
-//! completeness, false tracks, changes of identity, latency.
+//! completeness, false tracks, changes of identity, latency. And before anything
+//! flies: how well a site's cameras can do at best ([`bound`]).
 //!
 //! ```
 //! use crossfix_evaluation::{Estimate, Evaluator, TrueTarget};
@@ -16,6 +17,7 @@
 //! assert_eq!(report.completeness, 1.0);
 //! ```
 
+pub mod bound;
 mod history;
 mod latency;
 mod metrics;

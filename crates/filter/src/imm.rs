@@ -54,6 +54,11 @@ impl MotionModels {
         &self.models
     }
 
+    /// How often the mode is drawn anew, 1/s.
+    pub fn switching_rate(&self) -> f64 {
+        self.switching_rate
+    }
+
     /// The largest density of acceleration among the models, m^2/s^3.
     pub fn widest(&self) -> f64 {
         self.models.iter().map(|m| m.density).fold(0.0, f64::max)

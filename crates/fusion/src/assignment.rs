@@ -1,50 +1,132 @@
-use pathfinding::prelude::{Matrix, kuhn_munkres_min};
+//! Who gets what: the assignment of greatest total gain.
 
-/// What a cost equal to the gate weighs; costs are quantised, as the solver wants an order.
-const GATE_WEIGHT: i64 = 1 << 30;
-/// What a forbidden pair weighs: more than leaving both alone.
-const FORBIDDEN: i64 = 4 * GATE_WEIGHT;
+use std::collections::BTreeMap;
 
-/// The pairs (row, column) of least total cost; a pair costlier than `gate` stays apart.
+use pathfinding::prelude::{Matrix, kuhn_munkres};
+
+/// Gains are quantised, as the solver wants an order: steps of a millionth.
+const STEPS: f64 = 1e6;
+/// A knot of more pairs than this (all rows times all columns) is cut greedily: time is bounded.
+const MAX_KNOT: usize = 40_000;
+
+/// A row and a column that may be paired, and what that is worth more than leaving both alone.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Candidate {
+    pub(crate) row: usize,
+    pub(crate) column: usize,
+    pub(crate) gain: f64,
+}
+
+/// The pairs (row, column) of greatest total gain, ordered by row; a gain of 0 and less is never taken.
 ///
-/// `cost` gives `None` for a pair that cannot be.
-pub(crate) fn assign(
-    rows: usize,
-    columns: usize,
-    gate: f64,
-    cost: impl Fn(usize, usize) -> Option<f64>,
-) -> Vec<(usize, usize)> {
-    if rows == 0 || columns == 0 {
-        return Vec::new();
+/// Candidates that touch no other's row or column decide themselves; only knots of several are
+/// solved as a whole, so the cost grows with the knots and not with the site.
+pub(crate) fn assign(candidates: &[Candidate]) -> Vec<(usize, usize)> {
+    let mut pairs: Vec<(usize, usize)> = knots(candidates).iter().flat_map(|knot| solve(knot)).collect();
+    pairs.sort_unstable();
+    pairs
+}
+
+/// Groups of candidates that are linked through rows and columns.
+fn knots(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
+    let mut leader: Vec<usize> = (0..candidates.len()).collect();
+    fn find(leader: &mut [usize], mut i: usize) -> usize {
+        while leader[i] != i {
+            leader[i] = leader[leader[i]];
+            i = leader[i];
+        }
+        i
     }
-    let weight = |row, column| match cost(row, column) {
-        Some(cost) if cost <= gate => (cost / gate * GATE_WEIGHT as f64) as i64,
-        _ => FORBIDDEN,
+    let (mut rows, mut columns) = (BTreeMap::new(), BTreeMap::new());
+    for (i, candidate) in candidates.iter().enumerate() {
+        for first in [*rows.entry(candidate.row).or_insert(i), *columns.entry(candidate.column).or_insert(i)]
+        {
+            let (a, b) = (find(&mut leader, first), find(&mut leader, i));
+            leader[a.max(b)] = a.min(b);
+        }
+    }
+    let mut knots: BTreeMap<usize, Vec<Candidate>> = BTreeMap::new();
+    for (i, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.gain > 0.0) {
+        knots.entry(find(&mut leader, i)).or_default().push(*candidate);
+    }
+    knots.into_values().collect()
+}
+
+fn solve(knot: &[Candidate]) -> Vec<(usize, usize)> {
+    if let [only] = knot {
+        return vec![(only.row, only.column)];
+    }
+    let places = |of: fn(&Candidate) -> usize| {
+        let mut values: Vec<usize> = knot.iter().map(of).collect();
+        values.sort_unstable();
+        values.dedup();
+        values
     };
-    // Each row has a column of its own at the gate's price: it may stay alone.
-    let weights = Matrix::from_fn(rows, columns + rows, |(row, column)| {
-        if column < columns { weight(row, column) } else { GATE_WEIGHT }
-    });
-    let (_, column_of) = kuhn_munkres_min(&weights);
-    let pairs = column_of.into_iter().enumerate();
-    pairs.filter(|&(row, column)| column < columns && weights[(row, column)] < FORBIDDEN).collect()
+    let (rows, columns) = (places(|c| c.row), places(|c| c.column));
+    if rows.len() * (columns.len() + rows.len()) > MAX_KNOT {
+        return greedy(knot);
+    }
+    // Each row has a column of its own where it gains nothing: it may stay alone.
+    let mut gains = Matrix::new(rows.len(), columns.len() + rows.len(), 0i64);
+    for candidate in knot {
+        let place = (rows.binary_search(&candidate.row), columns.binary_search(&candidate.column));
+        if let (Ok(row), Ok(column)) = place {
+            gains[(row, column)] = (candidate.gain * STEPS) as i64;
+        }
+    }
+    let (_, column_of) = kuhn_munkres(&gains);
+    let taken = column_of.into_iter().enumerate();
+    taken
+        .filter(|&(row, column)| column < columns.len() && gains[(row, column)] > 0)
+        .map(|(row, column)| (rows[row], columns[column]))
+        .collect()
+}
+
+fn greedy(knot: &[Candidate]) -> Vec<(usize, usize)> {
+    let mut by_gain = knot.to_vec();
+    by_gain.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column)));
+    let (mut rows, mut columns) = (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
+    let mut pairs = Vec::new();
+    for candidate in by_gain {
+        if !rows.contains(&candidate.row) && !columns.contains(&candidate.column) {
+            rows.insert(candidate.row);
+            columns.insert(candidate.column);
+            pairs.push((candidate.row, candidate.column));
+        }
+    }
+    pairs
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn the_total_counts_and_not_each_ones_best() {
-        let costs = [[1.0, 2.0], [1.5, 9.0]];
-        assert_eq!(assign(2, 2, 10.0, |r, c| Some(costs[r][c])), [(0, 1), (1, 0)]);
+    fn all(gains: &[(usize, usize, f64)]) -> Vec<(usize, usize)> {
+        let candidate = |&(row, column, gain): &(usize, usize, f64)| Candidate { row, column, gain };
+        assign(&gains.iter().map(candidate).collect::<Vec<_>>())
     }
 
     #[test]
-    fn what_is_beyond_the_gate_stays_alone() {
-        let costs = [[1.0, 50.0], [50.0, f64::NAN]];
-        assert_eq!(assign(2, 2, 10.0, |r, c| Some(costs[r][c])), [(0, 0)]);
-        assert_eq!(assign(1, 1, 10.0, |_, _| None), []);
-        assert_eq!(assign(3, 0, 10.0, |_, _| Some(0.0)), []);
+    fn the_total_counts_and_not_each_ones_best() {
+        assert_eq!(all(&[(0, 0, 9.0), (0, 1, 8.0), (1, 0, 8.5), (1, 1, 1.0)]), [(0, 1), (1, 0)]);
+    }
+
+    #[test]
+    fn what_gains_nothing_stays_alone() {
+        assert_eq!(all(&[(0, 0, 1.0), (0, 1, -1.0), (1, 1, 0.0)]), [(0, 0)]);
+        assert_eq!(all(&[(0, 0, -3.0)]), []);
+        assert_eq!(all(&[]), []);
+        assert_eq!(all(&[(7, 3, 0.5)]), [(7, 3)]);
+    }
+
+    #[test]
+    fn a_knot_too_large_is_cut_and_nobody_gets_two() {
+        let side = 300;
+        let gains: Vec<_> = (0..side)
+            .flat_map(|r| (0..side).map(move |c| (r, c, 1.0 + ((r * 7 + c * 13) % 50) as f64)))
+            .collect();
+        let pairs = all(&gains);
+        let columns: std::collections::BTreeSet<usize> = pairs.iter().map(|p| p.1).collect();
+        assert_eq!((pairs.len(), columns.len()), (side, side));
     }
 }

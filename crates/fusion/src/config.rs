@@ -1,6 +1,8 @@
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::motion::Motion;
+
 /// How the fusion centre works. Every field has a default; the file's keys are the fields' names.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -78,11 +80,28 @@ pub enum SpatialSolver {
     Map,
 }
 
+/// How the bearings of several periods become a track.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum InitiationMethod {
+    /// Every way in which bearings may belong together is followed as a hypothesis over several
+    /// periods, by likelihood; the best set of hypotheses without common bearings is confirmed.
+    #[default]
+    Hypotheses,
+    /// Each period is solved for fixes, and fixes are grouped by their residuals (002).
+    Grouping,
+}
+
 /// How new tracks are found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Initiation {
-    /// `map` (default), `stacked`, `triple` or `pair`.
+    /// `hypotheses` (default) or `grouping`.
+    pub method: InitiationMethod,
+    /// New targets that a period is expected to bring, 1/m^3, for `hypotheses`. Default 1e-9: one in a
+    /// cubic kilometre.
+    pub birth_density_per_m3: f64,
+    /// `map` (default), `stacked`, `triple` or `pair`, for `grouping`.
     pub solver: SpatialSolver,
     /// The shortest observation period, s; a period lasts until every camera that is heard has
     /// given an exposure, and these lie as close together as they do. Default 0.05.
@@ -108,6 +127,8 @@ pub struct Initiation {
 impl Default for Initiation {
     fn default() -> Self {
         Self {
+            method: InitiationMethod::default(),
+            birth_density_per_m3: 1e-9,
             solver: SpatialSolver::default(),
             period_s: 0.05,
             periods: 4,
@@ -122,13 +143,53 @@ impl Default for Initiation {
     }
 }
 
+/// What keeps a track with a target that turns.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Manoeuvres {
+    /// Interacting multiple models, `models`.
+    #[default]
+    Models,
+    /// One model, `acceleration_density`, re-initialised when the smoothed residual is too large (004).
+    SmoothedResidual,
+    /// The same when the normalised innovation squared is too large.
+    Innovation,
+    /// One model, `acceleration_density`.
+    None,
+}
+
+/// One way of flying.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FlightModel {
+    /// Power spectral density of the white acceleration, m^2/s^3: its root is the change of velocity
+    /// in a second, m/s.
+    pub acceleration_density: f64,
+    /// Share of the time that targets fly like this.
+    pub share: f64,
+}
+
 /// How tracks are kept up.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tracking {
-    /// Power spectral density of the white acceleration, m^2/s^3. Default 3, for UAVs that turn and
-    /// stop (1.7 m/s of change in a second); 0.02 for what flies straight.
+    /// `models` (default), `smoothed-residual`, `innovation` or `none`.
+    pub manoeuvres: Manoeuvres,
+    /// The ways of flying of `models`. Default: straight (1e-6), drifting (0.3), manoeuvring (5).
+    pub models: Vec<FlightModel>,
+    /// How often a target changes its way of flying, 1/s. Default 0.02.
+    pub switching_rate_per_s: f64,
+    /// Power spectral density of the white acceleration where there is one model, m^2/s^3. Default 3,
+    /// for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for what flies straight.
     pub acceleration_density: f64,
+    /// Residuals that `smoothed-residual` takes the mean of. Default 8.
+    pub residual_window: usize,
+    /// Its threshold in standard deviations of a bearing. Default 0.81, as in 004.
+    pub residual_scale: f64,
+    /// Innovations that `innovation` sums. Default 2.
+    pub innovation_window: usize,
+    /// Probability of its false alarm. Default 0.0001.
+    pub innovation_false_alarm: f64,
     /// Probability with which a true bearing passes a track's gate. Default 0.9999.
     pub gate_probability: f64,
     /// Probability that a camera reports a target in its field of view. Default 0.9.
@@ -147,8 +208,16 @@ pub struct Tracking {
 
 impl Default for Tracking {
     fn default() -> Self {
+        let model = |acceleration_density, share| FlightModel { acceleration_density, share };
         Self {
+            manoeuvres: Manoeuvres::default(),
+            models: vec![model(1e-6, 0.9), model(0.3, 0.05), model(5.0, 0.05)],
+            switching_rate_per_s: 0.02,
             acceleration_density: 3.0,
+            residual_window: 8,
+            residual_scale: 0.81,
+            innovation_window: 2,
+            innovation_false_alarm: 1e-4,
             gate_probability: 0.9999,
             detection_probability: 0.9,
             clutter_per_sr: 5.0,
@@ -189,6 +258,9 @@ impl FusionConfig {
             ("initiation.pair_gate_m2", initiation.pair_gate_m2),
             ("initiation.temporal_gate_m", initiation.temporal_gate_m.unwrap_or(1.0)),
             ("tracking.acceleration_density", tracking.acceleration_density),
+            ("tracking.switching_rate_per_s", tracking.switching_rate_per_s),
+            ("tracking.residual_scale", tracking.residual_scale),
+            ("initiation.birth_density_per_m3", initiation.birth_density_per_m3),
             ("tracking.clutter_per_sr", tracking.clutter_per_sr),
             ("tracking.confirm_score", tracking.confirm_score),
             ("tracking.coasting_after_s", tracking.coasting_after_s),
@@ -204,6 +276,7 @@ impl FusionConfig {
             ("initiation.spatial_gate_probability", initiation.spatial_gate_probability),
             ("tracking.gate_probability", tracking.gate_probability),
             ("tracking.detection_probability", tracking.detection_probability),
+            ("tracking.innovation_false_alarm", tracking.innovation_false_alarm),
         ];
         for (key, value) in probabilities {
             if !(value > 0.0 && value < 1.0) {
@@ -222,6 +295,9 @@ impl FusionConfig {
             let good = (low..=high).contains(&value);
             if good { Ok(()) } else { Err(ConfigError { key, value: value as f64, must }) }
         };
+        range("tracking.residual_window", tracking.residual_window, 1, 1000, "from 1 to 1000")?;
+        range("tracking.innovation_window", tracking.innovation_window, 1, 1000, "from 1 to 1000")?;
+        Motion::new(tracking)?;
         range("initiation.periods", initiation.periods, 2, 20, "from 2 to 20")?;
         range("initiation.fixes", initiation.fixes, 1, initiation.periods, "from 1 to `periods`")
     }

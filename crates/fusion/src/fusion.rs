@@ -2,15 +2,16 @@ use std::collections::BTreeMap;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload, TrackEvent,
-    TrackFrame, TrackState,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload, Timestamp,
+    TrackEvent, TrackFrame, TrackState,
 };
 
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
+use crate::motion::Motion;
 use crate::track::{Track, TrackStatus};
-use crate::tracker::{Happening, Tracker};
+use crate::tracker::{Happening, Step, Tracker};
 use crate::{ConfigError, Counters, FusionConfig};
 
 /// What comes out of the fusion centre.
@@ -43,11 +44,12 @@ impl Fusion {
     /// [`ConfigError`] if a number of the configuration makes no sense.
     pub fn new(config: FusionConfig) -> Result<Self, ConfigError> {
         config.validate()?;
+        let motion = Motion::new(&config.tracking)?;
         Ok(Self {
             cameras: BTreeMap::new(),
             buffer: EventBuffer::new(config.event_time.clone()),
-            tracker: Tracker::new(config.tracking.clone()),
-            initiator: Initiator::new(config.initiation.clone(), &config.tracking),
+            tracker: Tracker::new(config.tracking.clone(), motion),
+            initiator: Initiator::new(&config),
             counters: Counters::default(),
             sequence: 0,
             config,
@@ -149,21 +151,23 @@ impl Fusion {
             return;
         };
         self.counters.count("exposures");
-        let (free, mut happenings) = self.tracker.step(exposure, camera);
+        let Step { free, claims, mut happenings } = self.tracker.step(exposure, camera);
         let rest = Exposure { sightings: free, ..exposure.clone() };
-        for group in self.initiator.add(rest) {
-            happenings.extend(self.tracker.start(&group, exposure.time));
+        for start in self.initiator.add(rest, &claims, &self.cameras, self.tracker.motion()) {
+            happenings.extend(self.tracker.adopt(start));
         }
         for happening in happenings {
             self.counters.count(match happening.kind {
                 crossfix_message::TrackEventKind::Born => "tracks_born",
                 crossfix_message::TrackEventKind::Confirmed => "tracks_confirmed",
                 crossfix_message::TrackEventKind::Merged => "tracks_merged",
+                crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
                 _ => "tracks_lost",
             });
             outputs.push(Output::Event(event(happening, exposure)));
         }
-        let tracks: Vec<crossfix_message::Track> = self.tracker.tracks().map(track_message).collect();
+        let tracks: Vec<crossfix_message::Track> =
+            self.tracker.tracks().map(|track| self.track_message(track, exposure.time)).collect();
         if !tracks.is_empty() {
             let frame = TrackFrame {
                 sequence: self.sequence,
@@ -190,30 +194,34 @@ fn event(happening: Happening, exposure: &Exposure) -> TrackEvent {
     .stamped()
 }
 
-fn track_message(track: &Track) -> crossfix_message::Track {
-    let state = match track.status {
-        TrackStatus::Tentative => TrackState::Tentative,
-        TrackStatus::Confirmed => TrackState::Confirmed,
-        TrackStatus::Coasting => TrackState::Coasting,
-        TrackStatus::Lost => TrackState::Lost,
-    };
-    let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {
-        camera: camera.to_string(),
-        time_ns: residual.time.nanos(),
-        angle_rad: residual.angle,
-        nis: residual.nis,
-    });
-    crossfix_message::Track {
-        id: track.id.0,
-        state: state.into(),
-        position: Some(track.state.position().into()),
-        velocity: Some(track.state.velocity().into()),
-        // Symmetric, so columns are rows.
-        covariance: track.state.covariance.as_slice().to_vec(),
-        residuals: residuals.collect(),
-        solver: track.solver.into(),
-        rank: track.observability.rank as u32,
-        condition_number: track.observability.condition_number,
-        updated_ns: track.updated.nanos(),
+impl Fusion {
+    /// A track as of `time`.
+    fn track_message(&self, track: &Track, time: Timestamp) -> crossfix_message::Track {
+        let now = track.predicted(time, self.tracker.motion());
+        let state = match track.status {
+            TrackStatus::Tentative => TrackState::Tentative,
+            TrackStatus::Confirmed => TrackState::Confirmed,
+            TrackStatus::Coasting => TrackState::Coasting,
+            TrackStatus::Lost => TrackState::Lost,
+        };
+        let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {
+            camera: camera.to_string(),
+            time_ns: residual.time.nanos(),
+            angle_rad: residual.angle,
+            nis: residual.nis,
+        });
+        crossfix_message::Track {
+            id: track.id.0,
+            state: state.into(),
+            position: Some(now.position().into()),
+            velocity: Some(now.velocity().into()),
+            // Symmetric, so columns are rows.
+            covariance: now.covariance.as_slice().to_vec(),
+            residuals: residuals.collect(),
+            solver: track.solver.into(),
+            rank: track.observability.rank as u32,
+            condition_number: track.observability.condition_number,
+            updated_ns: track.updated.nanos(),
+        }
     }
 }

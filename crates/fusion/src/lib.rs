@@ -32,13 +32,16 @@ mod event_time;
 mod fusion;
 mod ingress;
 mod initiation;
+mod motion;
+mod prediction;
 pub mod spatial;
 pub mod temporal;
 mod track;
 mod tracker;
 
 pub use config::{
-    Bearings, ConfigError, EventTime, FusionConfig, Initiation, SpatialSolver, Tracking, Weighting,
+    Bearings, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod, Manoeuvres,
+    SpatialSolver, Tracking, Weighting,
 };
 pub use counters::Counters;
 pub use fusion::{Fusion, Output};

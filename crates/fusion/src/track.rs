@@ -1,17 +1,24 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crossfix_filter::KinematicState;
+use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Solver, Timestamp};
-use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix6x3, Vector2};
 
-use crate::Tracking;
 use crate::ingress::with_time_uncertainty;
-use crate::spatial::Observability;
+use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
+use crate::prediction::BearingPrediction;
+use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 
 /// Rounds of the iterated update; the linearisation settles in two or three.
 const MAX_ITERATIONS: usize = 5;
+/// The linearisation has settled when a round moves the position by less than this, m.
+const SETTLED_M: f64 = 1e-5;
+/// What a track can be told apart by is looked at this often, s: eigenvalues cost more than an update.
+const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
+/// A position is observable if it is known better than this, m.
+const POSITION_SCALE_M: f64 = 20.0;
 
 /// Number of a 3D track, unique within a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -47,23 +54,6 @@ pub struct MeasurementResidual {
     pub nis: f64,
 }
 
-/// What a bearing is off a track's prediction by.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct BearingInnovation {
-    value: Vector2<f64>,
-    covariance: Matrix2<f64>,
-    /// Squared Mahalanobis distance.
-    pub(crate) nis: f64,
-}
-
-impl BearingInnovation {
-    /// Log-likelihood ratio of the bearing being this target's against being clutter.
-    pub(crate) fn log_likelihood_ratio(&self, config: &Tracking) -> f64 {
-        let area = 2.0 * std::f64::consts::PI * self.covariance.determinant().sqrt();
-        (config.detection_probability / (config.clutter_per_sr * area)).ln() - self.nis / 2.0
-    }
-}
-
 /// A target in space, kept up from single bearings of single cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
@@ -71,11 +61,7 @@ pub struct Track {
     pub id: TrackId,
     /// The life it leads.
     pub status: TrackStatus,
-    /// Position and velocity at [`Self::time`].
-    pub state: KinematicState,
-    /// The time of the state.
-    pub time: Timestamp,
-    /// Capture time of the newest bearing used.
+    /// Capture time of the newest bearing used: the time of [`Self::state`].
     pub updated: Timestamp,
     /// Log-likelihood ratio of being a target against being clutter.
     pub score: f64,
@@ -83,113 +69,196 @@ pub struct Track {
     pub residuals: BTreeMap<CameraName, MeasurementResidual>,
     /// What made the newest update.
     pub solver: Solver,
-    /// What the state's covariance says is known.
+    /// What the state's covariance says is known; renewed about once a second.
     pub observability: Observability,
+    observed: Timestamp,
+    held: bool,
+    imm: Imm,
+    detector: Option<Detector>,
 }
 
-/// `h(x)` and its derivative: the direction to the state's position as an offset from the sight
-/// line on its tangent plane.
-fn predicted_offset(state: &KinematicState, line: &SightLine) -> Option<(Vector2<f64>, Matrix2x6<f64>)> {
-    let offset = state.position() - line.origin;
-    let range = offset.norm();
-    let value = line.tangent_offset(state.position())?;
-    let direction = offset / range;
-    let across = (Matrix3::identity() - direction * direction.transpose()) / range;
-    let mut jacobian = Matrix2x6::zeros();
-    jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(line.basis.transpose() * across));
-    Some((value, jacobian))
+/// A bearing against a state: `h(x)`, its derivative by the position, and the noise.
+struct Linearised {
+    /// Direction to the state's position as an offset from the sight line, rad.
+    offset: Vector2<f64>,
+    jacobian: Matrix2x3<f64>,
+    noise: Matrix2<f64>,
+}
+
+impl Linearised {
+    /// `None` if the position lies behind the camera.
+    fn at(state: &KinematicState, line: &SightLine, time_sd_s: f64) -> Option<Self> {
+        let position = state.position();
+        let offset = line.tangent_offset(position)?;
+        let away = position - line.origin;
+        let range = away.norm();
+        let direction = away / range;
+        let across = (Matrix3::identity() - direction * direction.transpose()) / range;
+        let jacobian = line.basis.transpose() * across;
+        let noise = with_time_uncertainty(&line.covariance, jacobian * state.velocity(), time_sd_s);
+        Some(Self { offset, jacobian, noise })
+    }
+}
+
+/// The state after a bearing of its time, with the logarithm of the bearing's likelihood: an
+/// iterated extended Kalman update (Gauss-Newton on the posterior density). `None` if the position
+/// lies behind the camera or the numbers fail.
+pub(crate) fn updated(
+    prior: &KinematicState,
+    line: &SightLine,
+    time_sd_s: f64,
+) -> Option<(KinematicState, f64)> {
+    let mut mean = prior.mean;
+    let mut log_likelihood = None;
+    let ties: Matrix6x3<f64> = prior.covariance.fixed_columns::<3>(0).into_owned();
+    let mut covariance = prior.covariance;
+    for _ in 0..MAX_ITERATIONS {
+        let here = KinematicState { mean, covariance: prior.covariance };
+        let Linearised { offset, jacobian, noise } = Linearised::at(&here, line, time_sd_s)?;
+        let across = ties * jacobian.transpose();
+        let spread = jacobian * across.fixed_rows::<3>(0) + noise;
+        let determinant = spread.determinant();
+        let inverse = spread.try_inverse()?;
+        if determinant.is_nan() || determinant <= 0.0 {
+            return None;
+        }
+        if log_likelihood.is_none() {
+            let normaliser = (4.0 * std::f64::consts::PI.powi(2) * determinant).ln();
+            log_likelihood = Some(-(offset.dot(&(inverse * offset)) + normaliser) / 2.0);
+        }
+        let gain = across * inverse;
+        let already = (prior.mean - mean).fixed_rows::<3>(0).into_owned();
+        let next = prior.mean + gain * (-offset - jacobian * already);
+        let moved = (next - mean).fixed_rows::<3>(0).norm();
+        mean = next;
+        covariance = prior.covariance - gain * across.transpose();
+        if moved < SETTLED_M {
+            break;
+        }
+    }
+    let covariance = (covariance + covariance.transpose()) / 2.0;
+    let positive = covariance.diagonal().iter().all(|variance| *variance > 0.0);
+    positive.then_some((KinematicState { mean, covariance }, log_likelihood?))
 }
 
 impl Track {
-    /// A tentative track at a state.
-    pub(crate) fn start(
-        id: TrackId,
-        state: KinematicState,
-        time: Timestamp,
-        solver: Solver,
-        observability: Observability,
+    /// A tentative track at a fix of these lines.
+    pub(crate) fn start<'a>(
+        fix: &Fix,
+        lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine)>,
+        motion: &Motion,
     ) -> Self {
+        let residual = |(camera, TimedLine { line, time }): (&CameraName, &TimedLine)| {
+            let here = fix.state.predicted(time.seconds_since(fix.time), 0.0);
+            let Linearised { offset, noise, .. } = Linearised::at(&here, line, 0.0)?;
+            let nis = offset.dot(&noise.cholesky()?.solve(&offset));
+            Some((camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis }))
+        };
         Self {
-            id,
+            id: TrackId(0),
             status: TrackStatus::Tentative,
-            state,
-            time,
-            updated: time,
+            updated: fix.time,
             score: 0.0,
-            residuals: BTreeMap::new(),
-            solver,
-            observability,
+            residuals: lines.into_iter().filter_map(residual).collect(),
+            solver: fix.solver,
+            observability: fix.observability,
+            observed: fix.time,
+            held: true,
+            imm: Imm::new(fix.state.clone(), motion.models(true)),
+            detector: motion.detector(),
         }
     }
 
-    /// Moves the state on to a time.
-    pub(crate) fn time_update(&mut self, time: Timestamp, config: &Tracking) {
-        self.state.time_update(time.seconds_since(self.time), config.acceleration_density);
-        self.time = time;
+    /// Position and velocity at [`Self::updated`].
+    pub fn state(&self) -> &KinematicState {
+        self.imm.combined()
     }
 
-    /// The noise of a bearing of this target: the line's own and what its time's uncertainty adds.
-    fn measurement_noise(&self, line: &SightLine, jacobian: &Matrix2x6<f64>, time_sd_s: f64) -> Matrix2<f64> {
-        let tangent_rate = jacobian.fixed_view::<2, 3>(0, 0) * self.state.velocity();
-        with_time_uncertainty(&line.covariance, tangent_rate, time_sd_s)
+    /// Position and velocity expected at another time.
+    pub(crate) fn predicted(&self, time: Timestamp, motion: &Motion) -> KinematicState {
+        self.imm.predicted(time.seconds_since(self.updated), motion.models(self.held))
     }
 
-    /// What a bearing of the state's time is off by; `None` if the target is behind the camera.
-    pub(crate) fn innovation(&self, line: &SightLine, time_sd_s: f64) -> Option<BearingInnovation> {
-        let (offset, jacobian) = predicted_offset(&self.state, line)?;
-        let noise = self.measurement_noise(line, &jacobian, time_sd_s);
-        let covariance = jacobian * self.state.covariance * jacobian.transpose() + noise;
-        let nis = offset.dot(&covariance.cholesky()?.solve(&offset));
-        Some(BearingInnovation { value: -offset, covariance, nis })
+    /// Where the target is expected at another time: the mean alone.
+    pub(crate) fn position_at(&self, time: Timestamp) -> nalgebra::Point3<f64> {
+        let state = self.imm.combined();
+        state.position() + state.velocity() * time.seconds_since(self.updated)
     }
 
-    /// Takes a bearing of the state's time in: an iterated extended Kalman update (Gauss-Newton on
-    /// the posterior density). Leaves the track as it was if the numbers fail.
+    /// The probability of each motion model.
+    pub fn model_probabilities(&self) -> &[f64] {
+        self.imm.probabilities()
+    }
+
+    /// What a camera at `origin` should see at a time.
+    pub(crate) fn bearing_prediction(
+        &self,
+        time: Timestamp,
+        origin: nalgebra::Point3<f64>,
+        motion: &Motion,
+    ) -> Option<BearingPrediction> {
+        BearingPrediction::new(&self.imm, time.seconds_since(self.updated), motion.models(self.held), origin)
+    }
+
+    /// Takes a bearing in. Leaves the track as it was and returns `None` if the numbers fail;
+    /// otherwise whether the target has begun to manoeuvre.
     pub(crate) fn measurement_update(
         &mut self,
         camera: &CameraName,
         line: &SightLine,
-        time_sd_s: f64,
-        config: &Tracking,
-    ) -> Option<BearingInnovation> {
-        let innovation = self.innovation(line, time_sd_s)?;
-        let prior = self.state.clone();
-        let mut mean = prior.mean;
-        let mut gain = None;
-        for _ in 0..MAX_ITERATIONS {
-            let here = KinematicState { mean, covariance: prior.covariance };
-            let (offset, jacobian) = predicted_offset(&here, line)?;
-            let noise = self.measurement_noise(line, &jacobian, time_sd_s);
-            let spread = jacobian * prior.covariance * jacobian.transpose() + noise;
-            let k = prior.covariance * jacobian.transpose() * spread.try_inverse()?;
-            let next = prior.mean + k * (-offset - jacobian * (prior.mean - mean));
-            let moved = (next - mean).fixed_rows::<3>(0).norm();
-            mean = next;
-            gain = Some((k, jacobian, noise));
-            if moved < 1e-6 {
-                break;
+        (time, time_sd_s): (Timestamp, f64),
+        motion: &Motion,
+    ) -> Option<bool> {
+        let interval = time.seconds_since(self.updated);
+        let before = self.imm.predicted(interval, motion.models(self.held));
+        let Linearised { offset, jacobian, noise } = Linearised::at(&before, line, time_sd_s)?;
+        let spread = jacobian * before.position_covariance() * jacobian.transpose() + noise;
+        let nis = offset.dot(&spread.cholesky()?.solve(&offset));
+        let manoeuvre = self.detector.as_mut().is_some_and(|detector| match detector {
+            Detector::Residual(detector) => {
+                let in_deviations = line.basis * -offset / line.standard_deviation();
+                detector.see(in_deviations)
             }
+            Detector::Innovation(detector) => detector.see(nis, 2),
+        });
+        if manoeuvre {
+            self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
         }
-        let (k, jacobian, noise) = gain?;
-        let left = Matrix6::identity() - k * jacobian;
-        let covariance = left * prior.covariance * left.transpose() + k * noise * k.transpose();
-        if !mean.iter().chain(covariance.iter()).all(|v| v.is_finite()) {
-            return None;
-        }
-        self.state = KinematicState { mean, covariance: (covariance + covariance.transpose()) / 2.0 };
-        self.updated = self.time;
+        self.imm.update(interval, motion.models(self.held), |state| updated(state, line, time_sd_s))?;
+        self.updated = time;
         self.solver = Solver::Kalman;
-        let residual =
-            MeasurementResidual { time: self.time, angle: innovation.value.norm(), nis: innovation.nis };
-        self.residuals.insert(camera.clone(), residual);
-        if let Some(information) = self.state.covariance.try_inverse() {
-            self.observability = Observability::of_information(
-                &information,
-                config.max_position_sd_m,
-                crate::spatial::VAGUE_VELOCITY_SD,
-            );
+        let residual = MeasurementResidual { time, angle: offset.norm(), nis };
+        if let Some(newest) = self.residuals.get_mut(camera) {
+            *newest = residual;
+        } else {
+            self.residuals.insert(camera.clone(), residual);
         }
-        Some(innovation)
+        self.held = self.cameras_lately(motion.holding_s) >= 2;
+        if time.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
+            self.observe();
+        }
+        Some(manoeuvre)
+    }
+
+    /// Cameras that have given a bearing within the last seconds before [`Self::updated`].
+    fn cameras_lately(&self, seconds: f64) -> usize {
+        let lately = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= seconds;
+        self.residuals.values().filter(lately).count()
+    }
+
+    /// Whether two cameras have lately seen the target. One alone tells nothing of the range, and
+    /// the track may run along its sight lines.
+    pub fn is_held(&self) -> bool {
+        self.held
+    }
+
+    /// Looks at what the covariance tells apart.
+    pub(crate) fn observe(&mut self) {
+        self.observed = self.updated;
+        if let Some(information) = self.state().covariance.try_inverse() {
+            self.observability =
+                Observability::of_information(&information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
+        }
     }
 
     /// Whether it was confirmed once and is not lost.
@@ -206,8 +275,9 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
-    use crate::spatial::map;
     use crate::spatial::tests_support::{noisy_line_at, orthogonal_cameras};
+    use crate::spatial::{VelocityKnowledge, map};
+    use crate::{Manoeuvres, Tracking};
 
     /// Mean NEES after `periods` of the papers' geometry, started from the MAP fix of the first.
     #[test]
@@ -216,7 +286,9 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(11);
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
         // Next to no process noise: the truth flies straight, and the bound knows it.
-        let config = Tracking { acceleration_density: 1e-9, ..Tracking::default() };
+        let tracking =
+            Tracking { manoeuvres: Manoeuvres::None, acceleration_density: 1e-9, ..Tracking::default() };
+        let motion = Motion::new(&tracking).unwrap();
         let name: CameraName = "a".parse().unwrap();
         let (mut nees, mut square) = (0.0, 0.0);
         for _ in 0..RUNS {
@@ -231,16 +303,21 @@ mod tests {
                 }
             }
             let first = map(&lines[..3], lines[2].time, 15.6).unwrap();
-            let mut track =
-                Track::start(TrackId(0), first.state, lines[2].time, Solver::Map, first.observability);
+            let fix = Fix {
+                time: lines[2].time,
+                state: first.state,
+                velocity: VelocityKnowledge::Solved,
+                solver: Solver::Map,
+                observability: first.observability,
+            };
+            let mut track = Track::start(&fix, [], &motion);
             for timed in &lines[3..] {
-                track.time_update(timed.time, &config);
-                track.measurement_update(&name, &timed.line, 0.0, &config).unwrap();
+                track.measurement_update(&name, &timed.line, (timed.time, 0.0), &motion).unwrap();
             }
-            let t = track.time.seconds();
+            let t = track.updated.seconds();
             let truth = Vector6::from_iterator(at(t).iter().chain(velocity.iter()).copied());
-            let error = track.state.mean - truth;
-            nees += (error.transpose() * track.state.covariance.try_inverse().unwrap() * error).x;
+            let error = track.state().mean - truth;
+            nees += (error.transpose() * track.state().covariance.try_inverse().unwrap() * error).x;
             square += error.fixed_rows::<3>(0).norm_squared();
         }
         let nees = nees / f64::from(RUNS);

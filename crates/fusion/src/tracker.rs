@@ -3,13 +3,14 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_filter::Gate;
+use crossfix_filter::{Gate, KinematicState};
 use crossfix_geometry::Camera;
 use crossfix_message::{Timestamp, TrackEventKind};
 
-use crate::assignment::assign;
-use crate::initiation::{starting_point, vague_velocity};
-use crate::temporal::Group;
+use crate::assignment::{Candidate, assign};
+use crate::initiation::Start;
+use crate::motion::Motion;
+use crate::prediction::Fit;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::{Exposure, Sighting, Tracking};
 
@@ -18,6 +19,8 @@ const DROP_SCORE: f64 = -4.6;
 /// Two positions that differ by less than this (squared Mahalanobis, three degrees of freedom,
 /// P = 0.99) are one target if one of the tracks is coasting.
 const MERGE_GATE: f64 = 11.34;
+/// A score beyond this counts no more: a track that has long been good can still be doubted.
+const MAX_SCORE: f64 = 100.0;
 
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,15 +40,26 @@ impl Happening {
 #[derive(Debug)]
 pub(crate) struct Tracker {
     config: Tracking,
+    motion: Motion,
     gate: Gate,
     tracks: BTreeMap<TrackId, Track>,
     next_id: u64,
 }
 
+/// What an exposure has done.
+#[derive(Debug)]
+pub(crate) struct Step {
+    /// The sightings that belong to no track, or to one that cannot hold its place alone.
+    pub(crate) free: Vec<Sighting>,
+    /// Which of them (by index) such a track has used.
+    pub(crate) claims: Vec<(usize, TrackId)>,
+    pub(crate) happenings: Vec<Happening>,
+}
+
 impl Tracker {
-    pub(crate) fn new(config: Tracking) -> Self {
+    pub(crate) fn new(config: Tracking, motion: Motion) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
-        Self { config, gate, tracks: BTreeMap::new(), next_id: 1 }
+        Self { config, motion, gate, tracks: BTreeMap::new(), next_id: 1 }
     }
 
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.
@@ -53,61 +67,86 @@ impl Tracker {
         self.tracks.values()
     }
 
-    /// Takes in one exposure: what of it belongs to tracks updates them. Returns the sightings
-    /// that are nobody's, and what happened.
-    pub(crate) fn step(&mut self, exposure: &Exposure, camera: &Camera) -> (Vec<Sighting>, Vec<Happening>) {
+    /// How targets move.
+    pub(crate) fn motion(&self) -> &Motion {
+        &self.motion
+    }
+
+    /// Takes in one exposure: what of it belongs to tracks updates them.
+    pub(crate) fn step(&mut self, exposure: &Exposure, camera: &Camera) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
-        for track in self.tracks.values_mut() {
-            track.time_update(exposure.time, &self.config);
-        }
-        let mut free: Vec<Option<&Sighting>> = exposure.sightings.iter().map(Some).collect();
+        let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
+        let mut happenings = Vec::new();
         // A sure track chooses before an unsure one: a ghost must not take a target's bearings.
         for sure in [true, false] {
-            self.associate(exposure, camera, &mut free, sure);
+            happenings.extend(self.associate(exposure, camera, &mut owners, sure));
         }
-        let mut happenings = self.review(exposure.time);
-        happenings.extend(self.merge());
-        (free.into_iter().flatten().cloned().collect(), happenings)
+        let (mut free, mut claims) = (Vec::new(), Vec::new());
+        for (sighting, owner) in exposure.sightings.iter().zip(owners) {
+            // What one camera alone follows is offered as if it were nobody's: if the others see the
+            // target elsewhere, it must be found again.
+            let weak = owner.filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_held()));
+            if owner.is_none() || weak.is_some() {
+                claims.extend(weak.map(|id| (free.len(), id)));
+                free.push(sighting.clone());
+            }
+        }
+        happenings.extend(self.review(exposure.time));
+        happenings.extend(self.merge(exposure.time));
+        Step { free, claims, happenings }
     }
 
     fn associate(
         &mut self,
         exposure: &Exposure,
         camera: &Camera,
-        free: &mut [Option<&Sighting>],
+        owners: &mut [Option<TrackId>],
         sure: bool,
-    ) {
+    ) -> Vec<Happening> {
         let ids: Vec<TrackId> =
             self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
-        let innovations: Vec<Vec<Option<f64>>> = ids
-            .iter()
-            .map(|id| {
-                let nis = |sighting: &Sighting| {
-                    Some(self.tracks.get(id)?.innovation(&sighting.line, exposure.time_sd_s)?.nis)
-                };
-                free.iter().map(|sighting| sighting.and_then(nis)).collect()
-            })
-            .collect();
-        let pairs = assign(ids.len(), free.len(), self.gate.threshold(), |row, column| {
-            innovations[row][column].filter(|nis| self.gate.holds(*nis))
-        });
-        let partner: BTreeMap<usize, usize> = pairs.into_iter().collect();
+        let miss = (1.0 - self.config.detection_probability).ln();
+        let mut candidates = Vec::new();
+        for (row, id) in ids.iter().enumerate() {
+            let prediction = self.tracks.get(id).and_then(|track| {
+                track.bearing_prediction(exposure.time, camera.pose().position(), &self.motion)
+            });
+            let Some(prediction) = prediction else {
+                continue;
+            };
+            let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
+            for (column, sighting) in open {
+                if let Some(fit) = prediction.fit(&sighting.line, exposure.time_sd_s, self.gate) {
+                    let gain = log_likelihood_ratio(&fit, &self.config) - miss;
+                    candidates.push(Candidate { row, column, gain });
+                }
+            }
+        }
+        let gains: BTreeMap<(usize, usize), f64> =
+            candidates.iter().map(|c| ((c.row, c.column), c.gain)).collect();
+        let partner: BTreeMap<usize, usize> = assign(&candidates).into_iter().collect();
+        let mut happenings = Vec::new();
         for (row, id) in ids.iter().enumerate() {
             let Some(track) = self.tracks.get_mut(id) else {
                 continue;
             };
-            let sighting = partner.get(&row).and_then(|&column| free[column].take());
-            let update = sighting.and_then(|sighting| {
-                track.measurement_update(&exposure.camera, &sighting.line, exposure.time_sd_s, &self.config)
+            let column = partner.get(&row).copied();
+            let update = column.and_then(|column| {
+                owners[column] = Some(*id);
+                let sighting = &exposure.sightings[column];
+                let time = (exposure.time, exposure.time_sd_s);
+                track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)
             });
-            match update {
-                Some(innovation) => track.score += innovation.log_likelihood_ratio(&self.config),
-                None if camera.sees(track.state.position()) => {
-                    track.score += (1.0 - self.config.detection_probability).ln();
-                }
-                None => {}
+            let gain = update.and(column).and_then(|column| gains.get(&(row, column)));
+            // Outside its field of view a camera has missed nothing.
+            let expected = gain.is_some() || camera.sees(track.position_at(exposure.time));
+            let change = gain.unwrap_or(&0.0) + if expected { miss } else { 0.0 };
+            track.score = (track.score + change).min(MAX_SCORE);
+            if update == Some(true) {
+                happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
             }
         }
+        happenings
     }
 
     /// Confirms, coasts and gives up.
@@ -116,7 +155,7 @@ impl Tracker {
         for track in self.tracks.values_mut() {
             let silent_s = now.seconds_since(track.updated);
             let hopeless = silent_s > self.config.lost_after_s
-                || track.state.worst_position_sd() > self.config.max_position_sd_m;
+                || position_sd(track, now, &self.motion) > self.config.max_position_sd_m;
             match track.status {
                 TrackStatus::Tentative if hopeless || track.score < DROP_SCORE => {
                     track.status = TrackStatus::Lost;
@@ -144,15 +183,15 @@ impl Tracker {
     }
 
     /// A coasting track beside a live one was the same target: the live one goes on.
-    fn merge(&mut self) -> Vec<Happening> {
+    fn merge(&mut self, now: Timestamp) -> Vec<Happening> {
         let coasting = self.tracks.values().filter(|t| t.status == TrackStatus::Coasting);
+        let live: Vec<&Track> = self.tracks.values().filter(|t| t.status == TrackStatus::Confirmed).collect();
         let merged: Vec<(TrackId, TrackId)> = coasting
             .filter_map(|old| {
-                let live = self
-                    .tracks
-                    .values()
-                    .find(|new| new.status == TrackStatus::Confirmed && same_target(old, new))?;
-                Some((old.id, live.id))
+                let old_state = old.predicted(now, &self.motion);
+                let same =
+                    live.iter().find(|new| same_target(&old_state, &new.predicted(now, &self.motion)))?;
+                Some((old.id, same.id))
             })
             .collect();
         merged
@@ -166,26 +205,43 @@ impl Tracker {
             .collect()
     }
 
-    /// Starts a tentative track from a group of fixes, at the time `now` of the newest exposure.
-    pub(crate) fn start(&mut self, group: &Group, now: Timestamp) -> Option<Happening> {
-        let (fix, later) = starting_point(group)?;
-        let id = TrackId(self.next_id);
-        let state = vague_velocity(fix);
-        let mut track = Track::start(id, state, fix.time, fix.solver, fix.observability);
-        for ((camera, ..), timed) in later {
-            track.time_update(timed.time, &self.config);
-            track.measurement_update(camera, &timed.line, 0.0, &self.config)?;
+    /// Takes a track over that the initiation has found, and numbers it. Where it has used the
+    /// bearings of a track that one camera alone was following, that is the same target found again:
+    /// it goes on under the old number.
+    pub(crate) fn adopt(&mut self, Start { mut track, found_again }: Start) -> Vec<Happening> {
+        let old = found_again.and_then(|id| self.tracks.get(&id));
+        if let Some(old) = old.filter(|old| old.is_confirmed() && !old.is_held()) {
+            track.id = old.id;
+            track.score = track.score.max(old.score);
+            self.tracks.insert(track.id, track);
+            return Vec::new();
         }
-        track.solver = fix.solver;
-        track.time_update(now, &self.config);
+        let id = TrackId(self.next_id);
         self.next_id += 1;
+        track.id = id;
+        let mut happenings = vec![Happening::new(TrackEventKind::Born, id)];
+        if track.is_confirmed() {
+            happenings.push(Happening::new(TrackEventKind::Confirmed, id));
+        }
         self.tracks.insert(id, track);
-        Some(Happening::new(TrackEventKind::Born, id))
+        happenings
     }
 }
 
-fn same_target(one: &Track, other: &Track) -> bool {
-    let difference = one.state.position() - other.state.position();
-    let spread = one.state.position_covariance() + other.state.position_covariance();
+/// Log-likelihood ratio of a bearing being a target's against being clutter.
+pub(crate) fn log_likelihood_ratio(fit: &Fit, config: &Tracking) -> f64 {
+    config.detection_probability.ln() + fit.log_density - config.clutter_per_sr.ln()
+}
+
+/// Root of the sum of the position's variances, m: not less than the standard deviation along any axis.
+fn position_sd(track: &Track, now: Timestamp, motion: &Motion) -> f64 {
+    let state = track.predicted(now, motion);
+    state.covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
+}
+
+/// Whether two states of one time may be one target's.
+pub(crate) fn same_target(one: &KinematicState, other: &KinematicState) -> bool {
+    let difference = one.position() - other.position();
+    let spread = one.position_covariance() + other.position_covariance();
     spread.cholesky().is_some_and(|c| difference.dot(&c.solve(&difference)) < MERGE_GATE)
 }

@@ -6,6 +6,8 @@ use crate::{Bearing, GeometryError, Pose, SightLine, fisheye, tangent_basis};
 
 /// Steps of the fixed-point inversion of Brown-Conrady: the widest lens measured needs 40.
 const FIXED_POINT_STEPS: usize = 100;
+/// A direction that comes back from its pixel farther off than this was folded into the image, rad.
+const FOLDED_RAD: f64 = 1e-3;
 
 /// A place in the recorded (distorted) image, pixels; (0, 0) is the middle of the top left pixel,
 /// x right, y down.
@@ -264,6 +266,21 @@ impl Camera {
         self.model.project(&self.pose.camera_from_world(point))
     }
 
+    /// The sight line on which this camera sees a world point whose place in the image has this
+    /// covariance; `None` if it is not in the image.
+    ///
+    /// Unlike [`Camera::sees`] it is not deceived by a lens polynomial that folds directions far
+    /// outside the field of view back into the image.
+    pub fn sight_line_to(&self, point: Point3<f64>, covariance: PixelCovariance) -> Option<SightLine> {
+        let place = self.pose.camera_from_world(point);
+        if !self.model.sees(&place) {
+            return None;
+        }
+        let bearing = self.model.bearing(self.model.project(&place)?, covariance).ok()?;
+        let across = bearing.direction().cross(&place).norm();
+        (across < FOLDED_RAD * place.norm()).then(|| self.sight_line(&bearing))
+    }
+
     /// Whether a world point falls inside the image.
     pub fn sees(&self, point: Point3<f64>) -> bool {
         self.model.sees(&self.pose.camera_from_world(point))
@@ -337,6 +354,20 @@ mod tests {
             .unwrap();
         assert!((bearing.covariance().m11.sqrt() - 1.0 / 1400.0).abs() < 1e-9);
         assert!((bearing.covariance().m22.sqrt() - 1.0 / 1405.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_sight_line_goes_to_its_point_and_to_none_that_the_lens_folds_in() {
+        let pose = Pose::looking_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0)).unwrap();
+        let lens = *model(Distortion::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0])).intrinsics();
+        let camera = Camera::new(lens, pose).unwrap();
+        let seen = Point3::new(20.0, 100.0, -10.0);
+        let line = camera.sight_line_to(seen, PixelCovariance::isotropic(0.5)).unwrap();
+        assert!(line.miss_distance(seen) < 1e-3);
+        // r (1 - 0.3 r^2) comes back to 0 at r = 1.83.
+        let folded = Point3::new(180.0, 100.0, 0.0);
+        assert!(camera.sees(folded));
+        assert!(camera.sight_line_to(folded, PixelCovariance::isotropic(0.5)).is_none());
     }
 
     #[test]

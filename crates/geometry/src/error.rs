@@ -49,6 +49,16 @@ pub enum GeometryError {
         /// What it must be.
         must: &'static str,
     },
+    /// A latitude, longitude or height that is on no map.
+    #[error("{what} is {value}: it must be {must}")]
+    Geodetic {
+        /// Which number.
+        what: &'static str,
+        /// What it is.
+        value: f64,
+        /// What it must be.
+        must: &'static str,
+    },
     /// A pixel at which the distortion cannot be undone.
     #[error("the lens model cannot be inverted at pixel ({x:.1}, {y:.1})")]
     NoInverse {

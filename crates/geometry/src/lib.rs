@@ -1,5 +1,6 @@
 //! Frames, poses, camera models and bearings: how a pixel becomes a sight
-//! line in the world, with its uncertainty, and back.
+//! line in the world, with its uncertainty, and back; and where on Earth the
+//! world frame lies.
 //!
 //! Frames: the world is local ENU, right-handed; a camera is x right, y down,
 //! z forward. Metres and radians.
@@ -27,11 +28,13 @@ mod bearing;
 mod camera;
 mod error;
 mod fisheye;
+mod geodetic;
 mod pose;
 mod scanning;
 
 pub use bearing::{Bearing, SightLine, tangent_basis};
 pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
+pub use geodetic::{Geodetic, LocalFrame};
 pub use pose::Pose;
 pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};

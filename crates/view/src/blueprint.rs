@@ -2,7 +2,7 @@ use nalgebra::{Point3, Vector3};
 use rerun::blueprint::components::{BackgroundKind, Eye3DKind, PanelState, PlayState};
 use rerun::blueprint::{
     Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
-    Spatial2DView, Spatial3DView, TextLogView, TimePanel, TimeSeriesView, Vertical,
+    Spatial2DView, Spatial3DView, TextDocumentView, TextLogView, TimePanel, TimeSeriesView, Vertical,
 };
 use rerun::external::re_log_types::BlueprintActivationCommand;
 use rerun::external::re_sdk_types::blueprint::archetypes::{Background, EyeControls3D};
@@ -20,11 +20,7 @@ pub(crate) type NamedPlace = (String, Point3<f64>);
 
 /// Lays the picture out: the site on the left, cameras, plots and events on the right.
 pub(crate) fn send(stream: &RecordingStream, cameras: &[NamedPlace]) -> Result<(), ViewError> {
-    let site: ContainerLike = Spatial3DView::new("site").with_origin("/world").into();
-    let site_path = match &site {
-        ContainerLike::View(view) => Some(view.blueprint_path()),
-        _ => None,
-    };
+    let (site, site_path) = site_view();
     let images: Vec<ContainerLike> = cameras
         .iter()
         .map(|(name, _)| Spatial2DView::new(name.clone()).with_origin(image_path(name)).into())
@@ -51,13 +47,51 @@ pub(crate) fn send(stream: &RecordingStream, cameras: &[NamedPlace]) -> Result<(
                 .with_timeline(TIMELINE)
                 .with_play_state(PlayState::Following),
         );
-    let (eye, background) = (eye_on(cameras), Background::new(BackgroundKind::SolidColor));
-    let background = background.with_color(Color::from_rgb(18, 20, 28));
-    let part = |name: &str| site_path.as_ref().map(|path| EntityPath::from(format!("{path}/{name}")));
+    let places: Vec<Point3<f64>> = cameras.iter().map(|(_, place)| *place).collect();
+    send_site(stream, &blueprint, site_path.as_ref(), &eye_on(&places))
+}
+
+/// Lays a volume out: the site on the left, the scale of colours and the words on the right.
+pub(crate) fn send_volume(stream: &RecordingStream, places: &[Point3<f64>]) -> Result<(), ViewError> {
+    let (site, site_path) = site_view();
+    let right = Horizontal::new([
+        ContainerLike::from(Spatial2DView::new("SD [m]").with_origin("/scale")),
+        ContainerLike::from(TextDocumentView::new("legend").with_origin("/legend")),
+    ])
+    .with_column_shares([0.4, 1.0]);
+    let root = Horizontal::new([site, right.into()]).with_column_shares([1.8, 1.0]);
+    let blueprint = Blueprint::new(root)
+        .with_auto_views(false)
+        .with_auto_layout(false)
+        .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
+        .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
+        .with_time_panel(TimePanel::new().with_state(PanelState::Collapsed));
+    send_site(stream, &blueprint, site_path.as_ref(), &eye_on(places))
+}
+
+/// The view of the world, and where its properties are written.
+fn site_view() -> (ContainerLike, Option<EntityPath>) {
+    let site: ContainerLike = Spatial3DView::new("site").with_origin("/world").into();
+    let path = match &site {
+        ContainerLike::View(view) => Some(view.blueprint_path()),
+        _ => None,
+    };
+    (site, path)
+}
+
+/// Sends a blueprint whose view of the world has this eye, and a dark background.
+fn send_site(
+    stream: &RecordingStream,
+    blueprint: &Blueprint,
+    site_path: Option<&EntityPath>,
+    eye: &EyeControls3D,
+) -> Result<(), ViewError> {
+    let background = Background::new(BackgroundKind::SolidColor).with_color(Color::from_rgb(18, 20, 28));
+    let part = |name: &str| site_path.map(|path| EntityPath::from(format!("{path}/{name}")));
     let mut properties: Vec<(EntityPath, &dyn AsComponents)> = Vec::new();
-    properties.extend(part("EyeControls3D").map(|path| (path, &eye as &dyn AsComponents)));
+    properties.extend(part("EyeControls3D").map(|path| (path, eye as &dyn AsComponents)));
     properties.extend(part("Background").map(|path| (path, &background as &dyn AsComponents)));
-    send_with(stream, &blueprint, &properties)
+    send_with(stream, blueprint, &properties)
 }
 
 /// Lays an image tracker's work out: the video on the left, the curves on the right.
@@ -78,12 +112,12 @@ pub(crate) fn send_tracking(stream: &RecordingStream) -> Result<(), ViewError> {
     send_with(stream, &blueprint, &[])
 }
 
-/// An eye that has all cameras and the air above them in view.
-fn eye_on(cameras: &[NamedPlace]) -> EyeControls3D {
-    let count = cameras.len().max(1) as f64;
-    let sum = cameras.iter().map(|(_, place)| place.coords).sum::<Vector3<f64>>();
+/// An eye that has all cameras, or other places, and the air above them in view.
+fn eye_on(places: &[Point3<f64>]) -> EyeControls3D {
+    let count = places.len().max(1) as f64;
+    let sum = places.iter().map(|place| place.coords).sum::<Vector3<f64>>();
     let middle = sum / count + Vector3::z() * AIR_M;
-    let reach = cameras.iter().map(|(_, place)| (place.coords - middle).norm()).fold(50.0, f64::max);
+    let reach = places.iter().map(|place| (place.coords - middle).norm()).fold(50.0, f64::max);
     let eye = middle + Vector3::new(-0.75, -1.5, 1.05) * reach;
     let f32s = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
     EyeControls3D::new()

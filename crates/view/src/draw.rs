@@ -48,10 +48,6 @@ pub(crate) fn camera(
             .with_colors([colour::of(index)])
             .with_radii([Radius::new_ui_points(3.0)]),
     )?;
-    stream.log_static(
-        format!("plots/residual/{name}"),
-        &SeriesLines::new().with_names([name]).with_colors([colour::of(index)]),
-    )?;
     let lens = camera.model().intrinsics();
     let ImageSize { width, height } = lens.size;
     let scaled = |value: f64| (value * scale) as f32;
@@ -66,6 +62,15 @@ pub(crate) fn camera(
             .with_image_plane_distance(FRUSTUM_M)
             .with_color(colour::of(index))
             .with_line_width(Radius::new_ui_points(1.0)),
+    )?;
+    Ok(())
+}
+
+/// What the plot of a camera's residuals looks like.
+pub(crate) fn residual_plot(stream: &RecordingStream, name: &str, index: u64) -> Result<(), ViewError> {
+    stream.log_static(
+        format!("plots/residual/{name}"),
+        &SeriesLines::new().with_names([name]).with_colors([colour::of(index)]),
     )?;
     Ok(())
 }

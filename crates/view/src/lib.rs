@@ -14,7 +14,9 @@ mod paths;
 mod picture;
 mod sink;
 mod tracking;
+mod volume;
 
 pub use picture::Picture;
 pub use sink::{ViewError, connect, save, spawn_viewer};
 pub use tracking::{FollowedTarget, ImageBox, Sight, TrackingPicture};
+pub use volume::{Landmark, VolumeCell, VolumePicture};

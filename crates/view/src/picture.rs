@@ -116,6 +116,7 @@ impl Picture {
         view.camera = parsed.camera;
         if new {
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
+            draw::residual_plot(&self.stream, &name, view.index)?;
             let place = |(name, view): (&String, &CameraView)| (name.clone(), view.camera.pose().position());
             let cameras: Vec<blueprint::NamedPlace> = self.cameras.iter().map(place).collect();
             blueprint::send(&self.stream, &cameras)?;

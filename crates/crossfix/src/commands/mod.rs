@@ -8,6 +8,7 @@ pub mod export;
 pub mod fuse;
 pub mod import;
 pub mod info;
+pub mod plan;
 pub mod record;
 pub mod rejections;
 pub mod replay;

@@ -5,6 +5,7 @@ use crossfix_calibration::intrinsics_from_yaml;
 use crossfix_geometry::{Camera, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 use crossfix_recording::RecordingReader;
+use crossfix_simulation::{Scene, SceneCamera};
 use crossfix_vision::{PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
@@ -176,6 +177,13 @@ impl CameraFile {
     /// Checks everything that can be checked without starting, and returns the camera.
     pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
+        self.check().and_then(|()| self.check_source()).with_context(wrong)?;
+        self.described(path)
+    }
+
+    /// The camera that the file describes, whether or not its pictures are there yet.
+    pub fn described(&self, path: &Path) -> anyhow::Result<Camera> {
+        let wrong = || format!("the configuration file {} has an error", path.display());
         self.check().with_context(wrong)?;
         match (&self.intrinsics, &self.pose, &self.source) {
             (Some(intrinsics), Some(pose), _) => {
@@ -226,6 +234,10 @@ impl CameraFile {
                 "key `boxes`: a box must have sides of 1 to 1000 pixels, not {place:?}"
             );
         }
+        Ok(())
+    }
+
+    fn check_source(&self) -> anyhow::Result<()> {
         let (key, file) = match &self.source {
             SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => ("source.path", path),
             SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
@@ -242,6 +254,19 @@ impl CameraFile {
                 recorded_calibration(path, &self.name)
             }
             _ => Ok(CameraCalibration::new(&self.name, camera, Timestamp::EPOCH)),
+        }
+    }
+
+    /// Frames a second, where the file or its scene says so.
+    pub fn rate_hz(&self) -> anyhow::Result<Option<f64>> {
+        match &self.source {
+            SourceConfig::Video { rate_hz, .. } => Ok(Some(*rate_hz)),
+            SourceConfig::Simulation { scene, .. } => {
+                let scene: Scene = super::load(scene, &[])?;
+                let named = |camera: &&SceneCamera| camera.name == self.name;
+                Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
+            }
+            SourceConfig::Recording { .. } => Ok(None),
         }
     }
 

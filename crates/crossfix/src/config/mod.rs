@@ -8,4 +8,4 @@ mod site;
 pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
 pub use file::{load, parse};
 pub use fusion::FusionFile;
-pub use site::{Site, load_network};
+pub use site::{Site, load_cameras, load_network};

@@ -14,6 +14,39 @@ pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
     Ok(network)
 }
 
+/// The TOML files of a folder by name, with their keys.
+fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
+        .with_context(|| format!("cannot list {}", folder.display()))?
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+        .collect();
+    files.sort();
+    let read = |path: PathBuf| {
+        let text =
+            std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let keys = toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
+        Ok((path, keys))
+    };
+    files.into_iter().map(read).collect()
+}
+
+fn is_camera(keys: &toml::Table) -> bool {
+    keys.contains_key("source")
+}
+
+/// The camera files of a folder, whether or not the rest of the site is there yet.
+pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
+    let files = toml_files(folder)?.into_iter().filter(|(_, keys)| is_camera(keys));
+    let load = |(path, _): (PathBuf, toml::Table)| {
+        let file = CameraFile::load(&path, &[])?;
+        Ok((path, file))
+    };
+    let cameras = files.map(load).collect::<anyhow::Result<Vec<_>>>()?;
+    ensure!(!cameras.is_empty(), "{} holds no camera file", folder.display());
+    Ok(cameras)
+}
+
 /// A folder with the files of a site: what `check` looks at as a whole.
 pub struct Site {
     pub cameras: BTreeMap<CameraName, PathBuf>,
@@ -24,18 +57,8 @@ impl Site {
     /// Reads every TOML file of a folder and checks that they fit together.
     pub fn load(folder: &Path) -> anyhow::Result<Self> {
         let mut site = Self { cameras: BTreeMap::new(), fusion: Vec::new() };
-        let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
-            .with_context(|| format!("cannot list {}", folder.display()))?
-            .filter_map(|entry| Some(entry.ok()?.path()))
-            .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
-            .collect();
-        files.sort();
-        for path in files {
-            let text =
-                std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-            let keys: toml::Table =
-                toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
-            if keys.contains_key("source") {
+        for (path, keys) in toml_files(folder)? {
+            if is_camera(&keys) {
                 site.add_camera(&path)?;
             } else if keys.contains_key("fusion") {
                 load_network(&path)?;

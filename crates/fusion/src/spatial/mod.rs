@@ -29,6 +29,7 @@ use crossfix_filter::KinematicState;
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Point3, Vector3};
+use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 pub use accuracy::{pair_range_covariance, triple_range_covariance};
 pub use map::{MapSolution, map};
@@ -89,6 +90,12 @@ pub enum VelocityKnowledge {
 
 /// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s an axis.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
+
+/// The squared distance that a true value of `dimensions` stays within with probability `p`.
+pub(crate) fn chi_square(p: f64, dimensions: usize) -> f64 {
+    // A positive number of degrees of freedom is all that the distribution asks for.
+    ChiSquared::new(dimensions as f64).map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(p))
+}
 
 #[cfg(test)]
 pub(crate) mod tests_support {

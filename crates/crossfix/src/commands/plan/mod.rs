@@ -1,0 +1,189 @@
+mod geojson;
+mod picture;
+mod report;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume};
+use crossfix_geometry::{Camera, Geodetic};
+use nalgebra::Point3;
+
+use self::report::Report;
+use crate::{config, output};
+
+/// Frames a second of a camera whose file does not say.
+const DEFAULT_RATE_HZ: f64 = 30.0;
+
+/// Predict how well a site's cameras can do over a volume, and where one more would help most.
+///
+/// The Cramer-Rao bound of position and velocity at the end of a window in which a target flew
+/// straight: no tracker is better, and a good one is near it. Only the cameras' files and their
+/// intrinsics are read; neither videos nor a network need be there.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix plan configs/site --target-size 1\n  crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd\n  crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490"
+)]
+pub struct Args {
+    /// The site's folder, with a file a camera (TOML).
+    #[arg(value_name = "SITE_FOLDER")]
+    site: PathBuf,
+    /// The volume's low corner, local ENU, metres. Default: a box round where the optical axes cross.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "max")]
+    min: Option<[f64; 3]>,
+    /// The volume's high corner, local ENU, metres.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "min")]
+    max: Option<[f64; 3]>,
+    /// Side of a cell, metres. Default: a twelfth of the volume's longest side, made round.
+    #[arg(long, value_name = "METRES", value_parser = positive)]
+    step: Option<f64>,
+    /// How long a target has been seen, flying straight, seconds (at most 60).
+    #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
+    window: f64,
+    /// Standard deviation of a target's place in the image, pixels an axis.
+    #[arg(long, default_value_t = 0.5, value_name = "PIXELS", value_parser = positive)]
+    pixel_sd: f64,
+    /// Standard deviation of the cameras' rotation, degrees an axis.
+    #[arg(long, default_value_t = 0.02, value_name = "DEGREES", value_parser = not_negative)]
+    rotation_sd_deg: f64,
+    /// Standard deviation of the cameras' positions, metres an axis.
+    #[arg(long, default_value_t = 0.05, value_name = "METRES", value_parser = not_negative)]
+    position_sd: f64,
+    /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its file.
+    #[arg(long, value_name = "SECONDS", value_parser = not_negative)]
+    clock_sd: Option<f64>,
+    /// How fast targets fly, metres a second: what an error of a clock is worth.
+    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
+    speed: f64,
+    /// What is known of a target's velocity beforehand: standard deviation, metres a second an axis; 0 is nothing.
+    #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
+    velocity_prior_sd: f64,
+    /// Size of the target, metres: how far it is seen; 0 is from anywhere.
+    #[arg(long, default_value_t = 0.4, value_name = "METRES", value_parser = not_negative)]
+    target_size: f64,
+    /// Pixels that the target must span to be seen.
+    #[arg(long, default_value_t = 6.0, value_name = "PIXELS", value_parser = positive)]
+    min_pixels: f64,
+    /// Farther than this nothing is seen, metres.
+    #[arg(long, value_name = "METRES", value_parser = positive)]
+    max_range: Option<f64>,
+    /// Print JSON, with every cell and every candidate.
+    #[arg(long)]
+    json: bool,
+    /// Write the cells, the cameras and the candidates as GeoJSON (WGS84); needs --anchor.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    geojson: Option<PathBuf>,
+    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84 ellipsoid.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = anchor, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    /// Write the coloured volume as a picture for Rerun (.rrd).
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+}
+
+fn number(text: &str) -> Result<f64, String> {
+    let number: f64 = text.trim().parse().map_err(|_| format!("`{text}` is no number"))?;
+    if number.is_finite() { Ok(number) } else { Err(format!("`{text}` is not finite")) }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    number(text).and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
+}
+
+fn not_negative(text: &str) -> Result<f64, String> {
+    number(text).and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
+}
+
+fn window(text: &str) -> Result<f64, String> {
+    positive(text).and_then(|n| if n <= 60.0 { Ok(n) } else { Err("it must be at most 60 s".to_owned()) })
+}
+
+fn triple(text: &str) -> Result<[f64; 3], String> {
+    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
+    numbers
+        .try_into()
+        .map_err(|_| "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned())
+}
+
+fn anchor(text: &str) -> Result<Geodetic, String> {
+    let [latitude, longitude, height] = triple(text)?;
+    Geodetic::from_degrees(latitude, longitude, height).map_err(|error| error.to_string())
+}
+
+impl Args {
+    fn assumptions(&self) -> Assumptions {
+        let some = |value: f64| (value > 0.0).then_some(value);
+        Assumptions {
+            window_s: self.window,
+            pixel_sd_px: self.pixel_sd,
+            rotation_sd_rad: self.rotation_sd_deg.to_radians(),
+            position_sd_m: self.position_sd,
+            speed_mps: self.speed,
+            velocity_prior_sd_mps: some(self.velocity_prior_sd),
+            target: some(self.target_size).map(|size_m| TargetSize { size_m, least_px: self.min_pixels }),
+            max_range_m: self.max_range,
+        }
+    }
+
+    fn volume(&self, cameras: &[PlannedCamera]) -> anyhow::Result<Volume> {
+        if let (Some(min), Some(max)) = (self.min, self.max) {
+            return Ok(Volume::new(Point3::from(min), Point3::from(max), self.step)?);
+        }
+        let cameras: Vec<Camera> = cameras.iter().map(|planned| planned.camera.clone()).collect();
+        Volume::where_axes_cross(&cameras, self.step)
+            .context("there is no default volume: give --min and --max")
+    }
+}
+
+fn cameras(site: &Path, clock_sd_s: Option<f64>) -> anyhow::Result<Vec<PlannedCamera>> {
+    let planned = |(path, file): (PathBuf, config::CameraFile)| {
+        let rate_hz = file.rate_hz()?.unwrap_or(DEFAULT_RATE_HZ);
+        ensure!(
+            (0.01..=1000.0).contains(&rate_hz),
+            "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
+            path.display()
+        );
+        Ok(PlannedCamera {
+            name: file.name.to_string(),
+            camera: file.described(&path)?,
+            rate_hz,
+            clock_sd_s: clock_sd_s.unwrap_or(file.clock.sd_s),
+        })
+    };
+    config::load_cameras(site)?.into_iter().map(planned).collect()
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let cameras = cameras(&args.site, args.clock_sd)?;
+    let volume = args.volume(&cameras)?;
+    let report = Report::new(&cameras, &volume, args.assumptions());
+    if args.json {
+        output::json(&report)?;
+    } else {
+        output::line(report::render(&report));
+    }
+    if let (Some(path), Some(anchor)) = (&args.geojson, args.anchor) {
+        let json = serde_json::to_vec(&geojson::collection(&report, &cameras, anchor))?;
+        std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
+        tracing::info!("map written to {}", path.display());
+    }
+    if let Some(path) = &args.save {
+        picture::draw(&report, &cameras, path)?;
+        tracing::info!("picture written to {0}; look at it with: rerun {0}", path.display());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_read_or_refused() {
+        assert_eq!(triple("-80, -80,10"), Ok([-80.0, -80.0, 10.0]));
+        assert!(triple("1,2").is_err() && triple("1,2,x").is_err() && triple("1,2,NaN").is_err());
+        assert!(positive("0").is_err() && not_negative("0").is_ok() && not_negative("-1").is_err());
+        assert!(window("61").is_err());
+        assert!(anchor("95,0,0").unwrap_err().contains("latitude"));
+    }
+}

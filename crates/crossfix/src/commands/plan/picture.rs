@@ -1,0 +1,49 @@
+//! A plan as a coloured volume.
+
+use std::path::Path;
+
+use anyhow::Context;
+use crossfix_evaluation::bound::{Candidate, PlannedCamera};
+use crossfix_view::{Landmark, VolumeCell, VolumePicture};
+use nalgebra::Point3;
+
+use super::report::{self, Report};
+
+fn legend(report: &Report) -> String {
+    let assumed = report::assumed(report).replace('\n', "\n\n");
+    let conclusion = report::conclusion(report).unwrap_or_default();
+    format!(
+        "**Predicted SD of a target's position**\n\n\
+         A cube is a cell with a fix, in the colours of the scale; bright is good. No cube: fewer than two \
+         cameras see it. A layer can be switched off under `world/volume`.\n\n\
+         The dots are places for one more camera, coloured by the median SD over the volume with it; the \
+         best are named.\n\n{assumed}\n\n**{conclusion}**"
+    )
+}
+
+fn landmark(report: &Report, candidate: &Candidate) -> Landmark {
+    let rank = report.best.iter().position(|best| best == candidate);
+    let sd = candidate.score.median_sd_m;
+    Landmark {
+        place: Point3::from(candidate.position_m),
+        sd_m: sd,
+        label: rank.map(|rank| format!("choice {}: {sd:.3} m", rank + 1)),
+    }
+}
+
+/// Writes the picture to a file.
+pub fn draw(report: &Report, cameras: &[PlannedCamera], path: &Path) -> anyhow::Result<()> {
+    let cell = |cell: &crossfix_evaluation::bound::Cell| {
+        let sd_m = cell.accuracy.as_ref()?.position_sd_m;
+        Some(VolumeCell { centre: Point3::from(cell.centre_m), sd_m })
+    };
+    let candidates = report.advice.iter().flat_map(|advice| &advice.candidates);
+    let picture = VolumePicture {
+        cameras: cameras.iter().map(|planned| (planned.name.clone(), &planned.camera)).collect(),
+        cells: report.cells.iter().filter_map(cell).collect(),
+        side_m: report.step_m,
+        landmarks: candidates.map(|candidate| landmark(report, candidate)).collect(),
+        legend: legend(report),
+    };
+    picture.draw(&crossfix_view::save(path)?).context("the picture is not complete")
+}

@@ -1,0 +1,395 @@
+//! Fisher information of bearings about a target's position and velocity.
+
+use std::ops::AddAssign;
+
+use crossfix_geometry::{SightLine, tangent_basis};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3x2, Matrix6, Point3, Unit, Vector3, Vector6};
+
+/// Information whose scaled eigenvalues fall below this share of the mean is singular but for rounding.
+const SINGULAR: f64 = 1e-12;
+
+/// A sight line to a target: its direction, the tangents across it, its length. World, metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LineGeometry {
+    direction: Unit<Vector3<f64>>,
+    tangents: Matrix3x2<f64>,
+    range_m: f64,
+}
+
+impl LineGeometry {
+    /// The line from a camera's centre to a target, with the world's tangents ([`tangent_basis`]).
+    ///
+    /// `None` if they are in one place, or nowhere.
+    pub fn between(camera: Point3<f64>, target: Point3<f64>) -> Option<Self> {
+        let (direction, range_m) = Unit::try_new_and_get(target - camera, 1e-9)?;
+        let tangents = tangent_basis(&direction);
+        range_m.is_finite().then_some(Self { direction, tangents, range_m })
+    }
+
+    /// A measured line, with the tangents in which its covariance is, to a target at a range in metres.
+    ///
+    /// `None` if the range is not a positive number.
+    pub fn of(line: &SightLine, range_m: f64) -> Option<Self> {
+        let possible = range_m > 1e-9 && range_m.is_finite();
+        possible.then_some(Self { direction: line.direction, tangents: line.basis, range_m })
+    }
+
+    /// Metres from camera to target.
+    pub fn range_m(&self) -> f64 {
+        self.range_m
+    }
+
+    /// Bearing by displacement across the line, `E' / r`, rad/m.
+    fn by_displacement(&self) -> Matrix2x3<f64> {
+        self.tangents.transpose() / self.range_m
+    }
+
+    /// Bearing by the camera's errors: a turn (rad) of the direction, `E' [u]x`, and a displacement (m).
+    fn by_errors(&self) -> Matrix2x6<f64> {
+        let turn = self.tangents.transpose() * self.direction.cross_matrix();
+        let displacement = self.by_displacement();
+        Matrix2x6::from_fn(|row, column| match column {
+            0..3 => turn[(row, column)],
+            _ => displacement[(row, column - 3)],
+        })
+    }
+}
+
+/// The noise of one bearing, independent of the next one's: the inverse of its covariance, 1/rad^2.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BearingNoise(Matrix2<f64>);
+
+impl BearingNoise {
+    /// Noise of a covariance, rad^2, in the tangents of its line.
+    ///
+    /// `None` if it is not positive definite.
+    pub fn new(covariance: &Matrix2<f64>) -> Option<Self> {
+        let good = covariance.m11 > 0.0 && covariance.determinant() > 0.0;
+        let inverse = good.then(|| covariance.try_inverse()).flatten()?;
+        inverse.iter().all(|v| v.is_finite()).then_some(Self(inverse))
+    }
+
+    /// Noise of one standard deviation, rad, on both tangents.
+    ///
+    /// `None` if it is not a positive number.
+    pub fn isotropic(sd_rad: f64) -> Option<Self> {
+        Self::new(&(Matrix2::identity() * sd_rad.powi(2)))
+    }
+}
+
+/// When bearings along one line were measured, s from the reference time (before it is negative):
+/// their number, the sum and the sum of squares.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TimeOffsets {
+    count: f64,
+    sum_s: f64,
+    squares_s2: f64,
+}
+
+impl FromIterator<f64> for TimeOffsets {
+    fn from_iter<T: IntoIterator<Item = f64>>(offsets_s: T) -> Self {
+        offsets_s.into_iter().fold(Self::default(), |all, dt| Self {
+            count: all.count + 1.0,
+            sum_s: all.sum_s + dt,
+            squares_s2: all.squares_s2 + dt * dt,
+        })
+    }
+}
+
+/// What is known of a target's position and velocity at a reference time.
+///
+/// A bearing at time `dt` from it, along a line of tangents E and range r, with noise R, adds
+/// `H' R^-1 H`, `H = [E'/r, E' dt/r]`. The inverse of the sum is the Cramer-Rao bound: no unbiased
+/// estimator of `[p, v]` has a smaller covariance.
+///
+/// ```
+/// use crossfix_evaluation::bound::{BearingNoise, FisherInformation, LineGeometry};
+/// use nalgebra::Point3;
+///
+/// let target = Point3::new(0.0, 0.0, 50.0);
+/// let noise = BearingNoise::isotropic(1e-3).ok_or("noise")?;
+/// let mut information = FisherInformation::default();
+/// for (camera, phase) in [(Point3::new(100.0, 0.0, 0.0), 0.0), (Point3::new(0.0, 100.0, 0.0), 0.1)] {
+///     for period in 0..5 {
+///         // Of a target that moves, the place at that time.
+///         let line = LineGeometry::between(camera, target).ok_or("at the camera")?;
+///         information.add(&line, &noise, f64::from(period) + phase - 4.1);
+///     }
+/// }
+/// let covariance = information.covariance().ok_or("not observable")?;
+/// assert!(covariance[(2, 2)].sqrt() < 0.1);
+/// # Ok::<(), &str>(())
+/// ```
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FisherInformation(Matrix6<f64>);
+
+impl FisherInformation {
+    /// Nothing but a prior on the velocity: its standard deviation, m/s an axis.
+    pub fn velocity_prior(sd_mps: f64) -> Self {
+        let known = sd_mps.powi(-2);
+        Self(Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, known, known, known)))
+    }
+
+    /// Adds a bearing at `dt_s` from the reference time.
+    pub fn add(&mut self, line: &LineGeometry, noise: &BearingNoise, dt_s: f64) {
+        self.add_all(line, noise, &[dt_s].into_iter().collect());
+    }
+
+    /// Adds bearings that differ in nothing but their times.
+    pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
+        let across = line.by_displacement();
+        let position = across.transpose() * noise.0 * across;
+        for (row, column, weight) in
+            [(0, 0, times.count), (0, 3, times.sum_s), (3, 0, times.sum_s), (3, 3, times.squares_s2)]
+        {
+            let mut block = self.0.fixed_view_mut::<3, 3>(row, column);
+            block += position * weight;
+        }
+    }
+
+    /// The information matrix of `[p, v]`, 1/m^2, s/m^2 and s^2/m^2.
+    pub fn matrix(&self) -> &Matrix6<f64> {
+        &self.0
+    }
+
+    /// The bound: the covariance of `[p, v]`, m and m/s; `None` if some direction is not known at all.
+    pub fn covariance(&self) -> Option<Matrix6<f64>> {
+        // Positions and velocities have scales of their own: a unit diagonal makes them alike.
+        let scale = self.0.diagonal().map(|v| v.sqrt().recip());
+        if !scale.iter().all(|v| v.is_finite()) {
+            return None;
+        }
+        let scaled = Matrix6::from_fn(|row, column| self.0[(row, column)] * scale[row] * scale[column]);
+        let eigen = scaled.symmetric_eigen();
+        if eigen.eigenvalues.min() < SINGULAR {
+            return None;
+        }
+        let weights = Matrix6::from_diagonal(&eigen.eigenvalues.map(f64::recip));
+        let inverse = eigen.eigenvectors * weights * eigen.eigenvectors.transpose();
+        Some(Matrix6::from_fn(|row, column| inverse[(row, column)] * scale[row] * scale[column]))
+    }
+}
+
+impl AddAssign<&FisherInformation> for FisherInformation {
+    fn add_assign(&mut self, other: &FisherInformation) {
+        self.0 += other.0;
+    }
+}
+
+/// Errors that all bearings of one camera share for as long as the target is looked at: more
+/// bearings do not average them away.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CommonErrors {
+    /// Standard deviation of the camera's rotation about each axis, rad.
+    pub rotation_sd_rad: f64,
+    /// Standard deviation of a displacement of the camera against the target on each axis, m.
+    pub displacement_sd_m: f64,
+}
+
+impl CommonErrors {
+    /// Errors of the camera's rotation (rad an axis), position (m an axis) and clock (s).
+    ///
+    /// A wrong clock shows a target of `speed_mps` where it was or will be: for a direction of flight
+    /// that nobody knows beforehand, a displacement of `speed * clock / root 3` on each axis.
+    pub fn new(rotation_sd_rad: f64, position_sd_m: f64, clock_sd_s: f64, speed_mps: f64) -> Self {
+        let flown = speed_mps * clock_sd_s / 3.0_f64.sqrt();
+        Self { rotation_sd_rad, displacement_sd_m: position_sd_m.hypot(flown) }
+    }
+}
+
+/// The information of one camera's bearings about a target *and* about the camera's own errors.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CameraInformation {
+    target: FisherInformation,
+    /// Between `[p, v]` and the errors (rotation, displacement).
+    cross: Matrix6<f64>,
+    errors: Matrix6<f64>,
+}
+
+impl CameraInformation {
+    /// Adds a bearing at `dt_s` from the reference time.
+    pub fn add(&mut self, line: &LineGeometry, noise: &BearingNoise, dt_s: f64) {
+        self.add_all(line, noise, &[dt_s].into_iter().collect());
+    }
+
+    /// Adds bearings that differ in nothing but their times.
+    pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
+        self.target.add_all(line, noise, times);
+        let by_errors = line.by_errors();
+        let weighted = noise.0 * by_errors;
+        let position = line.by_displacement().transpose() * weighted;
+        for (row, weight) in [(0, times.count), (3, times.sum_s)] {
+            let mut block = self.cross.fixed_view_mut::<3, 6>(row, 0);
+            block += position * weight;
+        }
+        self.errors += by_errors.transpose() * weighted * times.count;
+    }
+
+    /// What remains about the target where the camera's errors are not known but for their priors.
+    ///
+    /// The Schur complement `A - B (C + P^-1)^-1 B'`, written with the roots D of P,
+    /// `D (I + D C D)^-1 D`, so that errors of zero are allowed.
+    pub fn marginal(&self, errors: &CommonErrors) -> FisherInformation {
+        let (turn, shift) = (errors.rotation_sd_rad, errors.displacement_sd_m);
+        let roots = Matrix6::from_diagonal(&Vector6::new(turn, turn, turn, shift, shift, shift));
+        let unexplained = Matrix6::identity() + roots * self.errors * roots;
+        // At least the identity: it has an inverse unless a number is not finite.
+        let Some(factor) = unexplained.cholesky() else {
+            return FisherInformation::default();
+        };
+        let lost = self.cross * roots;
+        FisherInformation(self.target.0 - lost * factor.solve(&lost.transpose()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix3;
+    use proptest::prelude::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    fn position(covariance: &Matrix6<f64>) -> Matrix3<f64> {
+        covariance.fixed_view::<3, 3>(0, 0).into_owned()
+    }
+
+    /// Two cameras at 100 m from the target whose lines cross at an angle; SD of the range along the first.
+    fn range_sd(angle: f64, first_sd: f64, second_sd: f64) -> f64 {
+        let towards = [Vector3::x(), Vector3::new(angle.cos(), angle.sin(), 0.0)];
+        let mut information = FisherInformation::velocity_prior(1.0);
+        for (u, sd) in towards.into_iter().zip([first_sd, second_sd]) {
+            let line = LineGeometry::between(Point3::from(u * -100.0), Point3::origin()).unwrap();
+            information.add(&line, &BearingNoise::isotropic(sd / 100.0).unwrap(), 0.0);
+        }
+        let covariance = position(&information.covariance().unwrap());
+        covariance.m11.sqrt()
+    }
+
+    #[test]
+    fn the_range_along_a_known_line_is_one_over_the_sine() {
+        // (12) of the fusion paper: sigma_r = sigma_e / |sin alpha|, where the first line is exact.
+        for angle in [0.1, 0.5, 1.0, std::f64::consts::FRAC_PI_2, 2.5] {
+            let expected = 0.1 / angle.sin();
+            let sd = range_sd(angle, 1e-5, 0.1);
+            assert!((sd / expected - 1.0).abs() < 1e-4, "{angle}: {sd} against {expected}");
+            // With noise on both lines the second one's place is unsure across itself as well.
+            let both = range_sd(angle, 0.1, 0.1);
+            assert!((both / (expected * (1.0 + angle.cos().powi(2)).sqrt()) - 1.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn one_line_and_two_alike_fix_nothing() {
+        let line = LineGeometry::between(Point3::new(0.0, -50.0, 0.0), Point3::origin()).unwrap();
+        let behind = LineGeometry::between(Point3::new(0.0, -90.0, 0.0), Point3::origin()).unwrap();
+        let noise = BearingNoise::isotropic(1e-3).unwrap();
+        let mut information = FisherInformation::velocity_prior(15.0);
+        for line in [line, behind] {
+            for dt in [-0.2, -0.1, 0.0] {
+                information.add(&line, &noise, dt);
+            }
+            assert_eq!(information.covariance(), None);
+        }
+    }
+
+    /// The orthogonal geometry of the fusion notes: mean bound of five periods at camera 1's last time.
+    fn orthogonal_bound(delays: [f64; 3]) -> (f64, f64) {
+        const RUNS: usize = 2000;
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let velocity = Normal::new(0.0, 15.6).unwrap();
+        let noise = BearingNoise::isotropic(0.1 / 150.0).unwrap();
+        let elevation = 35.264_389_68_f64.to_radians();
+        let (mut position_trace, mut velocity_trace) = (0.0, 0.0);
+        for _ in 0..RUNS {
+            let middle = loop {
+                let place = Vector3::from_fn(|_, _| rng.random_range(-10.0..10.0));
+                if place.norm() < 10.0 {
+                    break place;
+                }
+            };
+            let speed = Vector3::from_fn(|_, _| velocity.sample(&mut rng));
+            let mut information = FisherInformation::default();
+            for (azimuth, delay) in [0.0_f64, 120.0, 240.0].map(f64::to_radians).into_iter().zip(delays) {
+                let (sin, cos) = azimuth.sin_cos();
+                let u = Vector3::new(elevation.cos() * cos, elevation.cos() * sin, elevation.sin());
+                for period in 0..5 {
+                    let time = f64::from(period) + delay;
+                    let place = Point3::from(middle + speed * (time - 2.0));
+                    let line = LineGeometry::between(Point3::from(u * -150.0), place).unwrap();
+                    information.add(&line, &noise, time - 4.0);
+                }
+            }
+            let covariance = information.covariance().unwrap();
+            position_trace += position(&covariance).trace();
+            velocity_trace += covariance.fixed_view::<3, 3>(3, 3).trace();
+        }
+        ((position_trace / RUNS as f64).sqrt(), (velocity_trace / RUNS as f64).sqrt())
+    }
+
+    #[test]
+    fn the_limit_of_five_periods_is_the_reference_implementations() {
+        for (delays, expected) in [([0.0, 0.1, 0.2], (0.093, 0.040)), ([0.0, 0.3, 0.4], (0.090, 0.040))] {
+            let (position, velocity) = orthogonal_bound(delays);
+            assert!((position / expected.0 - 1.0).abs() < 0.03, "{delays:?}: {position} m");
+            assert!((velocity / expected.1 - 1.0).abs() < 0.03, "{delays:?}: {velocity} m/s");
+        }
+    }
+
+    /// Three orthogonal cameras at 100 m, each with `count` bearings of 1 mrad, and errors in common.
+    fn position_sd(count: usize, errors: &CommonErrors) -> f64 {
+        let mut information = FisherInformation::velocity_prior(15.0);
+        for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
+            let line = LineGeometry::between(Point3::from(axis * 100.0), Point3::origin()).unwrap();
+            let times: TimeOffsets = (0..count).map(|n| -(n as f64) / count as f64).collect();
+            let mut camera = CameraInformation::default();
+            camera.add_all(&line, &BearingNoise::isotropic(1e-3).unwrap(), &times);
+            information += &camera.marginal(errors);
+        }
+        position(&information.covariance().unwrap()).trace().sqrt()
+    }
+
+    #[test]
+    fn more_bearings_do_not_average_a_pose_error_away() {
+        let none = CommonErrors::default();
+        assert!((position_sd(400, &none) / position_sd(40_000, &none) - 10.0).abs() < 0.1);
+        // Each axis is seen by two cameras: the floor is root(3/2) of one camera's error at 100 m.
+        for errors in [CommonErrors::new(5e-4, 0.0, 0.0, 0.0), CommonErrors::new(0.0, 0.05, 0.0, 0.0)] {
+            let sd = position_sd(1_000_000, &errors);
+            assert!((sd / (0.05 * 1.5_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
+        }
+        // A clock of 10 ms at 15 m/s: 0.15 m, shared among three axes.
+        let sd = position_sd(1_000_000, &CommonErrors::new(0.0, 0.0, 0.01, 15.0));
+        assert!((sd / (0.15 / 2.0_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
+    }
+
+    proptest! {
+        #[test]
+        fn the_marginal_is_the_block_of_the_whole_inverse(
+            x in -80.0..80.0, y in 20.0..150.0, z in -40.0..40.0, rotation in 1e-5..1e-2, shift in 0.01..1.0,
+        ) {
+            let line = LineGeometry::between(Point3::origin(), Point3::new(x, y, z)).unwrap();
+            let noise = BearingNoise::new(&Matrix2::new(4e-6, 1e-6, 1e-6, 2e-6)).unwrap();
+            let mut camera = CameraInformation::default();
+            for dt in [-0.9, -0.4, 0.0] {
+                camera.add(&line, &noise, dt);
+            }
+            // Something is known of the target besides, or the whole would have no inverse.
+            let known = Matrix6::from_diagonal(&Vector6::new(0.1, 0.1, 0.1, 0.01, 0.01, 0.01));
+            let mut whole = nalgebra::SMatrix::<f64, 12, 12>::zeros();
+            let priors = [rotation, rotation, rotation, shift, shift, shift].map(|sd: f64| sd.powi(-2));
+            whole.fixed_view_mut::<6, 6>(0, 0).copy_from(&(camera.target.0 + known));
+            whole.fixed_view_mut::<6, 6>(0, 6).copy_from(&camera.cross);
+            whole.fixed_view_mut::<6, 6>(6, 0).copy_from(&camera.cross.transpose());
+            let errors = camera.errors + Matrix6::from_diagonal(&Vector6::from(priors));
+            whole.fixed_view_mut::<6, 6>(6, 6).copy_from(&errors);
+            let expected = whole.try_inverse().unwrap().fixed_view::<6, 6>(0, 0).into_owned();
+            let mut marginal = camera.marginal(&CommonErrors { rotation_sd_rad: rotation, displacement_sd_m: shift });
+            marginal += &FisherInformation(known);
+            let ours = marginal.covariance().unwrap();
+            prop_assert!((ours - expected).norm() < 1e-6 * expected.norm());
+        }
+    }
+}

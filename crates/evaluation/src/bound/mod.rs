@@ -1,0 +1,18 @@
+//! How well a site's cameras can tell where a target is and how fast it flies: the Cramer-Rao bound
+//! of their bearings, over a volume.
+
+mod advice;
+mod information;
+mod plan;
+mod summary;
+mod volume;
+
+pub use advice::{Advice, Candidate, Score, advise};
+pub use information::{
+    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
+};
+pub use plan::{
+    Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict, smallest_target,
+};
+pub use summary::{Contribution, Summary, contributions, layers};
+pub use volume::{Volume, VolumeError};

@@ -1,0 +1,317 @@
+//! The bound over a volume, for cameras in their places.
+
+use crossfix_geometry::{Camera, PixelCovariance};
+use nalgebra::{Matrix6, Point3};
+use serde::Serialize;
+
+use super::{
+    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets, Volume,
+};
+
+/// A fix whose worst axis is more than so many times its best one is degenerate.
+pub const DEGENERATE_RATIO: f64 = 10.0;
+
+/// A camera that stands somewhere, or might.
+#[derive(Clone, Debug)]
+pub struct PlannedCamera {
+    /// Its name.
+    pub name: String,
+    /// Its model and place.
+    pub camera: Camera,
+    /// Frames a second.
+    pub rate_hz: f64,
+    /// Standard deviation of its capture times, the same for all of a window, s.
+    pub clock_sd_s: f64,
+}
+
+/// What is to be seen, and how large it must be for that.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct TargetSize {
+    /// The target's size, m.
+    pub size_m: f64,
+    /// Pixels that it must span.
+    pub least_px: f64,
+}
+
+/// What is taken for granted.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Assumptions {
+    /// How long a target has been seen, s; it flies straight for so long.
+    pub window_s: f64,
+    /// Standard deviation of a place in the image, pixels an axis, independent from frame to frame.
+    pub pixel_sd_px: f64,
+    /// Standard deviation of a camera's rotation, rad an axis.
+    pub rotation_sd_rad: f64,
+    /// Standard deviation of a camera's position, m an axis.
+    pub position_sd_m: f64,
+    /// How fast a target flies, m/s: what an error of the clock is worth.
+    pub speed_mps: f64,
+    /// What is known of a target's velocity beforehand: standard deviation, m/s an axis; none is nothing.
+    pub velocity_prior_sd_mps: Option<f64>,
+    /// How small a target must be seen; none is however small.
+    pub target: Option<TargetSize>,
+    /// Farther than this no camera sees a target, m.
+    pub max_range_m: Option<f64>,
+}
+
+impl Assumptions {
+    /// As far as a camera sees the target, m; none is without limit.
+    pub fn reach_m(&self, camera: &Camera) -> Option<f64> {
+        let lens = camera.model().intrinsics();
+        let focal = (lens.fx * lens.fy).sqrt();
+        let by_size = self.target.map(|target| target.size_m * focal / target.least_px);
+        [by_size, self.max_range_m].into_iter().flatten().reduce(f64::min)
+    }
+}
+
+/// How well a target is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Accuracy {
+    /// Standard deviation of the position in space, root of the trace, m.
+    pub position_sd_m: f64,
+    /// The same along the axis that is known best, m.
+    pub best_axis_sd_m: f64,
+    /// The same along the axis that is known worst, m.
+    pub worst_axis_sd_m: f64,
+    /// That axis, ENU, upwards.
+    pub worst_axis: [f64; 3],
+    /// Standard deviation of the velocity in space, root of the trace, m/s.
+    pub velocity_sd_mps: f64,
+}
+
+impl Accuracy {
+    /// What a covariance of `[p, v]` (m, m/s) says.
+    pub fn of(covariance: &Matrix6<f64>) -> Self {
+        let position = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let eigen = position.symmetric_eigen();
+        let worst = eigen.eigenvalues.imax();
+        let axis = eigen.eigenvectors.column(worst).into_owned();
+        let axis = if axis.z < 0.0 { -axis } else { axis };
+        Self {
+            position_sd_m: position.trace().sqrt(),
+            best_axis_sd_m: eigen.eigenvalues.min().max(0.0).sqrt(),
+            worst_axis_sd_m: eigen.eigenvalues.max().sqrt(),
+            worst_axis: axis.into(),
+            velocity_sd_mps: covariance.fixed_view::<3, 3>(3, 3).trace().sqrt(),
+        }
+    }
+
+    /// Whether one axis is known so much worse than another that the fix is hardly one.
+    pub fn is_degenerate(&self) -> bool {
+        self.worst_axis_sd_m > DEGENERATE_RATIO * self.best_axis_sd_m
+    }
+}
+
+/// What is predicted for one cube.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Cell {
+    /// The layer it lies in, from below.
+    pub layer: usize,
+    /// Its middle, ENU, m.
+    pub centre_m: [f64; 3],
+    /// The cameras that see it, by their places in the list.
+    pub cameras: Vec<usize>,
+    /// How well a target there is known; none if fewer than two cameras see it, or two along one line.
+    pub accuracy: Option<Accuracy>,
+}
+
+/// A camera with the times of its bearings.
+pub(super) struct Observer<'a> {
+    camera: &'a Camera,
+    times: TimeOffsets,
+    reach_m: f64,
+    errors: CommonErrors,
+    assumptions: &'a Assumptions,
+}
+
+impl<'a> Observer<'a> {
+    /// A camera whose newest bearing is `phase` of its interval old; at least one lies in the window.
+    pub(super) fn new(planned: &'a PlannedCamera, phase: f64, assumptions: &'a Assumptions) -> Self {
+        let count = (assumptions.window_s * planned.rate_hz).floor().max(1.0) as usize;
+        let times = (0..count).map(|n| -(n as f64 + phase) / planned.rate_hz).collect();
+        let Assumptions { rotation_sd_rad, position_sd_m, speed_mps, .. } = *assumptions;
+        Self {
+            camera: &planned.camera,
+            times,
+            reach_m: assumptions.reach_m(&planned.camera).unwrap_or(f64::INFINITY),
+            errors: CommonErrors::new(rotation_sd_rad, position_sd_m, planned.clock_sd_s, speed_mps),
+            assumptions,
+        }
+    }
+
+    /// What it says of a target at a point; none if it does not see it.
+    pub(super) fn information(&self, point: Point3<f64>) -> Option<FisherInformation> {
+        let range = (point - self.camera.pose().position()).norm();
+        if range > self.reach_m {
+            return None;
+        }
+        let covariance = PixelCovariance::isotropic(self.assumptions.pixel_sd_px);
+        let sight_line = self.camera.sight_line_to(point, covariance)?;
+        let line = LineGeometry::of(&sight_line, range)?;
+        let mut information = CameraInformation::default();
+        information.add_all(&line, &BearingNoise::new(&sight_line.covariance)?, &self.times);
+        Some(information.marginal(&self.errors))
+    }
+}
+
+/// What is known before anything is seen.
+pub(super) fn prior(assumptions: &Assumptions) -> FisherInformation {
+    assumptions
+        .velocity_prior_sd_mps
+        .map_or_else(FisherInformation::default, FisherInformation::velocity_prior)
+}
+
+/// The accuracy of what so many cameras know together.
+pub(super) fn accuracy(cameras: usize, information: &FisherInformation) -> Option<Accuracy> {
+    // One camera and a prior on the velocity can have an inverse by rounding, but no fix.
+    let covariance = if cameras < 2 { None } else { information.covariance() };
+    covariance.as_ref().map(Accuracy::of)
+}
+
+/// The bound in each cube of a volume, of the state at the end of the window: what a tracker can say now.
+///
+/// A target flies straight, its direction from the cameras taken as constant over the window. The
+/// cameras are not synchronised: their phases are spread evenly.
+pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Cell> {
+    let phase = |index: usize| index as f64 / cameras.len() as f64;
+    let observers: Vec<Observer> = cameras
+        .iter()
+        .enumerate()
+        .map(|(index, camera)| Observer::new(camera, phase(index), assumptions))
+        .collect();
+    let cell = |(layer, centre): (usize, Point3<f64>)| {
+        let mut information = prior(assumptions);
+        let mut seen = Vec::new();
+        for (index, observer) in observers.iter().enumerate() {
+            if let Some(theirs) = observer.information(centre) {
+                information += &theirs;
+                seen.push(index);
+            }
+        }
+        let accuracy = accuracy(seen.len(), &information);
+        Cell { layer, centre_m: centre.into(), cameras: seen, accuracy }
+    };
+    volume.centres().map(cell).collect()
+}
+
+/// The smallest target, m, that two cameras see at a point when it must span so many pixels; none if
+/// fewer than two have the point in their images.
+pub fn smallest_target(cameras: &[PlannedCamera], point: Point3<f64>, least_px: f64) -> Option<f64> {
+    let size = |planned: &PlannedCamera| {
+        let lens = planned.camera.model().intrinsics();
+        let range = (point - planned.camera.pose().position()).norm();
+        planned.camera.sees(point).then(|| least_px * range / (lens.fx * lens.fy).sqrt())
+    };
+    let mut sizes: Vec<f64> = cameras.iter().filter_map(size).collect();
+    sizes.sort_by(f64::total_cmp);
+    sizes.get(1).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_geometry::{Distortion, ImageSize, Intrinsics, Pose};
+
+    use super::*;
+
+    fn assumptions() -> Assumptions {
+        Assumptions {
+            window_s: 1.0,
+            pixel_sd_px: 0.5,
+            rotation_sd_rad: 0.0,
+            position_sd_m: 0.0,
+            speed_mps: 15.0,
+            velocity_prior_sd_mps: Some(15.0),
+            target: None,
+            max_range_m: None,
+        }
+    }
+
+    fn planned(position: [f64; 3], target: [f64; 3]) -> PlannedCamera {
+        let size = ImageSize { width: 1001, height: 801 };
+        let lens =
+            Intrinsics { size, fx: 1000.0, fy: 1000.0, cx: 500.0, cy: 400.0, distortion: Distortion::None };
+        let pose = Pose::looking_at(position.into(), target.into()).unwrap();
+        let camera = Camera::new(lens, pose).unwrap();
+        PlannedCamera { name: String::new(), camera, rate_hz: 30.0, clock_sd_s: 0.0 }
+    }
+
+    /// One cube of 2 m round a point.
+    fn cell(cameras: &[PlannedCamera], point: [f64; 3], assumptions: &Assumptions) -> Cell {
+        let point = Point3::from(point);
+        let half = nalgebra::Vector3::repeat(1.0);
+        let volume = Volume::new(point - half, point + half, Some(2.0)).unwrap();
+        predict(cameras, &volume, assumptions).into_iter().next().unwrap()
+    }
+
+    #[test]
+    fn a_window_of_bearings_is_the_line_fitted_to_them() {
+        let target = [0.0, 0.0, 50.0];
+        let cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
+        let without = Assumptions { velocity_prior_sd_mps: None, ..assumptions() };
+        let accuracy = cell(&cameras, target, &without).accuracy.unwrap();
+        // North and east are seen by one camera each, up by both: sigma = 0.5 px / 1000 px * 100 m. A
+        // straight line through n points, read at the last: sigma^2 (4n - 2) / (n (n + 1)).
+        let n = 30.0;
+        let single = 0.05_f64.powi(2) * (4.0 * n - 2.0) / (n * (n + 1.0));
+        let sd = (2.5 * single).sqrt();
+        // The second camera's newest bearing is half an interval old.
+        assert!((accuracy.position_sd_m / sd - 1.0).abs() < 0.04, "{} against {sd}", accuracy.position_sd_m);
+        let slope = 0.05 * 30.0 * (12.0 / (n * (n * n - 1.0))).sqrt();
+        assert!((accuracy.velocity_sd_mps / (slope * 2.5_f64.sqrt()) - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn one_camera_is_no_fix_and_behind_is_not_seen() {
+        let target = [0.0, 0.0, 50.0];
+        let cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
+        let beside = cell(&cameras, [60.0, 0.0, 50.0], &assumptions());
+        assert_eq!(beside.cameras, [0]);
+        assert_eq!(beside.accuracy, None);
+        assert_eq!(cell(&cameras, [-150.0, -150.0, 50.0], &assumptions()).cameras, [0; 0]);
+    }
+
+    #[test]
+    fn a_small_target_is_not_seen_from_afar() {
+        let target = [0.0, 0.0, 50.0];
+        let cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -60.0, 50.0], target)];
+        let small = TargetSize { size_m: 0.4, least_px: 6.0 };
+        let assumptions = Assumptions { target: Some(small), ..assumptions() };
+        // 0.4 m * 1000 px / 6 px.
+        assert!((assumptions.reach_m(&cameras[0].camera).unwrap() - 66.7).abs() < 0.1);
+        assert_eq!(cell(&cameras, target, &assumptions).cameras, [1]);
+        // The farther camera is the second: 100 m * 6 px / 1000 px.
+        assert!((smallest_target(&cameras, target.into(), 6.0).unwrap() - 0.6).abs() < 1e-9);
+        assert_eq!(smallest_target(&cameras[..1], target.into(), 6.0), None);
+        let near = Assumptions { target: None, max_range_m: Some(50.0), ..assumptions };
+        assert_eq!(cell(&cameras, target, &near).cameras, [0; 0]);
+    }
+
+    #[test]
+    fn a_shallow_crossing_is_degenerate_along_the_lines() {
+        let target = [0.0, 0.0, 50.0];
+        let cameras = [planned([-100.0, -3.0, 50.0], target), planned([-100.0, 3.0, 50.0], target)];
+        let accuracy = cell(&cameras, target, &assumptions()).accuracy.unwrap();
+        assert!(accuracy.is_degenerate());
+        assert!(accuracy.worst_axis[0].abs() > 0.999, "{accuracy:?}");
+        // 1 / sin of 3.4 degrees, over root 2 times what lies across.
+        let ratio = accuracy.worst_axis_sd_m / accuracy.best_axis_sd_m;
+        assert!((ratio - 100.0 / 3.0).abs() < 1.0, "{ratio}");
+    }
+
+    #[test]
+    fn what_a_camera_does_wrong_all_the_time_stays() {
+        let target = [0.0, 0.0, 50.0];
+        let mut cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
+        let sd = |cameras: &[PlannedCamera], assumptions: &Assumptions| {
+            cell(cameras, target, assumptions).accuracy.unwrap().position_sd_m
+        };
+        let exact = sd(&cameras, &assumptions());
+        let turned = Assumptions { rotation_sd_rad: 1e-3, ..assumptions() };
+        // 0.1 m on two axes, on the third over root 2.
+        let floor = 0.1 * 2.5_f64.sqrt();
+        assert!((sd(&cameras, &turned) / floor.hypot(exact) - 1.0).abs() < 0.01);
+        cameras.iter_mut().for_each(|camera| camera.clock_sd_s = 0.01);
+        let floor = 0.15 / 3.0_f64.sqrt() * 2.5_f64.sqrt();
+        assert!((sd(&cameras, &assumptions()) / floor.hypot(exact) - 1.0).abs() < 0.01);
+    }
+}

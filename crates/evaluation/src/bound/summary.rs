@@ -1,0 +1,147 @@
+//! The cubes of a volume in few figures.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::{Accuracy, Assumptions, Cell, PlannedCamera, Volume, predict};
+
+/// A layer of the volume, or all of it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Summary {
+    /// Its middle's height, ENU, m.
+    pub altitude_m: f64,
+    /// Cubes.
+    pub cells: usize,
+    /// Share of the cubes with a fix.
+    pub fixed: f64,
+    /// Median of the position's standard deviation, m, where there is a fix.
+    pub position_sd_median_m: Option<f64>,
+    /// 90 % of the cubes with a fix are at least as good, m.
+    pub position_sd_90_m: Option<f64>,
+    /// Median of the velocity's standard deviation, m/s, where there is a fix.
+    pub velocity_sd_median_mps: Option<f64>,
+    /// Share of the cubes with a fix in which it is degenerate.
+    pub degenerate: Option<f64>,
+}
+
+/// The value below which a share of the sorted values lies.
+fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    let index = (share * sorted.len() as f64).ceil() as usize;
+    sorted.get(index.saturating_sub(1)).copied()
+}
+
+impl Summary {
+    /// The figures of some cubes.
+    pub fn of<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> Self {
+        let cells: Vec<&Cell> = cells.into_iter().collect();
+        let fixes: Vec<&Accuracy> = cells.iter().filter_map(|cell| cell.accuracy.as_ref()).collect();
+        let sorted = |value: fn(&Accuracy) -> f64| {
+            let mut values: Vec<f64> = fixes.iter().map(|fix| value(fix)).collect();
+            values.sort_by(f64::total_cmp);
+            values
+        };
+        let positions = sorted(|fix| fix.position_sd_m);
+        let velocities = sorted(|fix| fix.velocity_sd_mps);
+        let degenerate = fixes.iter().filter(|fix| fix.is_degenerate()).count();
+        let heights: f64 = cells.iter().map(|Cell { centre_m: [_, _, up], .. }| up).sum();
+        let share = |part: usize, whole: usize| part as f64 / whole as f64;
+        Self {
+            altitude_m: heights / cells.len().max(1) as f64,
+            cells: cells.len(),
+            fixed: share(fixes.len(), cells.len().max(1)),
+            position_sd_median_m: quantile(&positions, 0.5),
+            position_sd_90_m: quantile(&positions, 0.9),
+            velocity_sd_median_mps: quantile(&velocities, 0.5),
+            degenerate: (!fixes.is_empty()).then(|| share(degenerate, fixes.len())),
+        }
+    }
+}
+
+/// The figures of each layer, from below.
+pub fn layers(cells: &[Cell]) -> Vec<Summary> {
+    let mut layers: BTreeMap<usize, Vec<&Cell>> = BTreeMap::new();
+    for cell in cells {
+        layers.entry(cell.layer).or_default().push(cell);
+    }
+    layers.into_values().map(Summary::of).collect()
+}
+
+/// What one camera does for the others.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Contribution {
+    /// The camera.
+    pub name: String,
+    /// Frames a second.
+    pub rate_hz: f64,
+    /// Standard deviation of its capture times, s.
+    pub clock_sd_s: f64,
+    /// As far as it sees the target, m; none is without limit.
+    pub reach_m: Option<f64>,
+    /// Standard deviation of one bearing on the optical axis, rad.
+    pub bearing_sd_rad: f64,
+    /// Share of the volume that it sees.
+    pub sees: f64,
+    /// The figures of the volume without it.
+    pub without: Summary,
+}
+
+/// What each camera does for the others: what it sees, and what would be left without it.
+pub fn contributions(
+    cameras: &[PlannedCamera],
+    volume: &Volume,
+    assumptions: &Assumptions,
+    cells: &[Cell],
+) -> Vec<Contribution> {
+    let of = |(index, camera): (usize, &PlannedCamera)| {
+        let others: Vec<PlannedCamera> =
+            cameras.iter().enumerate().filter(|(other, _)| *other != index).map(|(_, c)| c.clone()).collect();
+        let lens = camera.camera.model().intrinsics();
+        let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
+        Contribution {
+            name: camera.name.clone(),
+            rate_hz: camera.rate_hz,
+            clock_sd_s: camera.clock_sd_s,
+            reach_m: assumptions.reach_m(&camera.camera),
+            bearing_sd_rad: assumptions.pixel_sd_px / (lens.fx * lens.fy).sqrt(),
+            sees: seen as f64 / cells.len().max(1) as f64,
+            without: Summary::of(&predict(&others, volume, assumptions)),
+        }
+    };
+    cameras.iter().enumerate().map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(layer: usize, sd: Option<f64>) -> Cell {
+        let accuracy = sd.map(|sd| Accuracy {
+            position_sd_m: sd,
+            best_axis_sd_m: 0.05,
+            worst_axis_sd_m: sd,
+            worst_axis: [0.0, 0.0, 1.0],
+            velocity_sd_mps: 2.0 * sd,
+        });
+        Cell { layer, centre_m: [0.0, 0.0, 10.0 * layer as f64], cameras: vec![], accuracy }
+    }
+
+    #[test]
+    fn shares_and_quantiles_by_hand() {
+        let mut cells: Vec<Cell> = (1..=10).map(|n| cell(1, Some(0.1 * f64::from(n)))).collect();
+        cells.extend((0..30).map(|_| cell(2, None)));
+        let all = Summary::of(&cells);
+        assert_eq!((all.cells, all.fixed), (40, 0.25));
+        assert_eq!(all.position_sd_median_m, Some(0.5));
+        assert_eq!(all.position_sd_90_m, Some(0.9));
+        assert_eq!(all.velocity_sd_median_mps, Some(1.0));
+        // Worse than ten times 0.05 m: 0.6 to 1.0 m.
+        assert_eq!(all.degenerate, Some(0.5));
+        let layers = layers(&cells);
+        assert_eq!(layers.iter().map(|layer| layer.altitude_m).collect::<Vec<_>>(), [10.0, 20.0]);
+        assert_eq!(
+            (layers[1].fixed, layers[1].position_sd_median_m, layers[1].degenerate),
+            (0.0, None, None)
+        );
+    }
+}

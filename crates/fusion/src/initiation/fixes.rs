@@ -1,0 +1,150 @@
+//! The fixes of one period: what the papers' spatial processing answers.
+
+use std::collections::BTreeMap;
+
+use crossfix_geometry::Camera;
+use crossfix_message::{CameraName, Solver, Timestamp};
+
+use super::seeds::SeedFinder;
+use super::{NamedLine, lines_of};
+use crate::spatial::{
+    Fix, MapSolution, RangeSolution, TimedLine, VelocityKnowledge, map, pair, stacked, triple,
+};
+use crate::temporal::PeriodFix;
+use crate::{Exposure, FusionConfig, Initiation, SpatialSolver};
+
+/// A target is not faster than this many standard deviations of the velocity prior.
+pub(super) const SPEED_SIGMAS: f64 = 4.0;
+
+/// Solves periods for fixes by the solver that the configuration names.
+#[derive(Debug)]
+pub(super) struct FixFinder {
+    config: Initiation,
+    seeds: SeedFinder,
+}
+
+impl FixFinder {
+    pub(super) fn new(config: &FusionConfig) -> Self {
+        Self { config: config.initiation.clone(), seeds: SeedFinder::new(config, 3) }
+    }
+
+    /// Every fix that the exposures of one period can make.
+    pub(super) fn fixes(
+        &self,
+        exposures: &[&Exposure],
+        cameras: &BTreeMap<CameraName, Camera>,
+    ) -> Vec<PeriodFix> {
+        match self.config.solver {
+            SpatialSolver::Pair => self.pair_fixes(exposures),
+            SpatialSolver::Triple => self.triple_fixes(exposures),
+            SpatialSolver::Stacked => {
+                let sets = self.seeds.find(exposures, cameras).into_iter();
+                sets.filter_map(|seed| self.stacked_fix(seed.lines)).collect()
+            }
+            SpatialSolver::Map => {
+                let sets = self.seeds.find(exposures, cameras).into_iter();
+                sets.filter_map(|seed| {
+                    let MapSolution { state, observability, .. } = seed.solution.clone();
+                    let (time, velocity) = (seed.time()?, VelocityKnowledge::Solved);
+                    let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
+                    Some(PeriodFix { fix, lines: seed.lines })
+                })
+                .collect()
+            }
+        }
+    }
+
+    /// 002, alternative algorithm: all pairs of the first two cameras with `J <= beta`.
+    fn pair_fixes(&self, exposures: &[&Exposure]) -> Vec<PeriodFix> {
+        let [first, second, ..] = exposures else {
+            return Vec::new();
+        };
+        let mut fixes = Vec::new();
+        for one in lines_of(first) {
+            for two in lines_of(second) {
+                let Some(solution) = pair(&one.1, &two.1, nalgebra::Vector3::zeros()) else {
+                    continue;
+                };
+                let ranges = [solution.first_range, solution.second_range];
+                if solution.indicator > self.config.pair_gate_m2 || !self.in_range(&ranges) {
+                    continue;
+                }
+                let lines = vec![one.clone(), two];
+                if let Some(mut fix) =
+                    self.fix_at(&lines, one.1.time, Solver::Pair, VelocityKnowledge::Unknown)
+                {
+                    fix.state.mean.fixed_rows_mut::<3>(0).copy_from(&solution.position.coords);
+                    fix.state.mean.fixed_rows_mut::<3>(3).fill(0.0);
+                    fixes.push(PeriodFix { fix, lines });
+                }
+            }
+        }
+        fixes
+    }
+
+    /// 002, proposed algorithm: all triples of the first three cameras.
+    fn triple_fixes(&self, exposures: &[&Exposure]) -> Vec<PeriodFix> {
+        let [first, second, third, ..] = exposures else {
+            return Vec::new();
+        };
+        let mut fixes = Vec::new();
+        for one in lines_of(first) {
+            for two in lines_of(second) {
+                for three in lines_of(third) {
+                    let lines = vec![one.clone(), two.clone(), three];
+                    let timed = [&lines[0].1, &lines[1].1, &lines[2].1];
+                    if let Some(solution) = triple(timed, self.config.velocity_prior_sd_mps) {
+                        fixes.extend(self.range_fix(lines, &solution, Solver::Triple));
+                    }
+                }
+            }
+        }
+        fixes
+    }
+
+    fn stacked_fix(&self, lines: Vec<NamedLine>) -> Option<PeriodFix> {
+        let timed: Vec<TimedLine> = lines.iter().map(|(_, line)| line.clone()).collect();
+        let solution = stacked(&timed, self.config.velocity_prior_sd_mps)?;
+        self.range_fix(lines, &solution, Solver::Stacked)
+    }
+
+    /// The fix of a solution for ranges and velocity, if it is possible.
+    fn range_fix(
+        &self,
+        lines: Vec<NamedLine>,
+        solution: &RangeSolution,
+        solver: Solver,
+    ) -> Option<PeriodFix> {
+        let max_speed = SPEED_SIGMAS * self.config.velocity_prior_sd_mps;
+        if !self.in_range(&solution.ranges) || solution.velocity.norm() > max_speed {
+            return None;
+        }
+        let solver = if solution.observability.is_full() { solver } else { Solver::PseudoInverse };
+        let mut fix = self.fix_at(&lines, lines.first()?.1.time, solver, VelocityKnowledge::Solved)?;
+        fix.state.mean.fixed_rows_mut::<3>(0).copy_from(&solution.position.coords);
+        fix.state.mean.fixed_rows_mut::<3>(3).copy_from(&solution.velocity);
+        fix.observability = solution.observability;
+        Some(PeriodFix { fix, lines })
+    }
+
+    /// A fix with the covariance that the lines' noise and the velocity prior give at `time`.
+    fn fix_at(
+        &self,
+        lines: &[NamedLine],
+        time: Timestamp,
+        solver: Solver,
+        velocity: VelocityKnowledge,
+    ) -> Option<Fix> {
+        let MapSolution { state, observability, .. } = self.solve(lines, time)?;
+        Some(Fix { time, state, velocity, solver, observability })
+    }
+
+    fn solve(&self, lines: &[NamedLine], time: Timestamp) -> Option<MapSolution> {
+        let timed: Vec<TimedLine> = lines.iter().map(|(_, line)| line.clone()).collect();
+        map(&timed, time, self.config.velocity_prior_sd_mps)
+    }
+
+    fn in_range(&self, ranges: &[f64]) -> bool {
+        ranges.iter().all(|range| (0.0..self.config.max_range_m).contains(range))
+    }
+}

@@ -1,0 +1,88 @@
+//! 002's temporal processing on the fixes of each period.
+
+use std::collections::BTreeMap;
+
+use crossfix_geometry::Camera;
+use crossfix_message::CameraName;
+
+use super::fixes::{FixFinder, SPEED_SIGMAS};
+use super::{NamedLine, Start};
+use crate::motion::Motion;
+use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
+use crate::temporal::{Group, Grouping, GroupingRules, TemporalGate};
+use crate::track::Track;
+use crate::{Exposure, FusionConfig};
+
+/// Solves periods for fixes and groups the fixes.
+#[derive(Debug)]
+pub(super) struct Grouped {
+    finder: FixFinder,
+    grouping: Grouping,
+}
+
+impl Grouped {
+    pub(super) fn new(config: &FusionConfig) -> Self {
+        let initiation = &config.initiation;
+        let gate = match initiation.temporal_gate_m {
+            Some(beta) => TemporalGate::Distance(beta),
+            None => TemporalGate::Covariance {
+                threshold: chi_square(initiation.spatial_gate_probability, 3),
+                density: config.tracking.acceleration_density,
+            },
+        };
+        let rules = GroupingRules {
+            periods: initiation.periods,
+            fixes: initiation.fixes,
+            gate,
+            max_speed: SPEED_SIGMAS * initiation.velocity_prior_sd_mps,
+            shared_lines: initiation.shared_lines,
+        };
+        Self { finder: FixFinder::new(config), grouping: Grouping::new(rules) }
+    }
+
+    /// Takes one period in and returns a tentative track for every group that is good enough.
+    pub(super) fn advance(
+        &mut self,
+        exposures: &[&Exposure],
+        cameras: &BTreeMap<CameraName, Camera>,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
+        let tracks = groups.iter().filter_map(|group| start(group, motion));
+        tracks.map(|track| Start { track, found_again: None }).collect()
+    }
+}
+
+/// A tentative track from a group of fixes: from the first fix, with the lines of the later ones.
+fn start(group: &Group, motion: &Motion) -> Option<Track> {
+    let (fix, later) = starting_point(group)?;
+    let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
+    let named = group.fixes.first()?.lines.iter().map(|((camera, ..), line)| (camera, line));
+    let mut track = Track::start(&vague, named, motion);
+    for ((camera, ..), timed) in later {
+        track.measurement_update(camera, &timed.line, (timed.time, 0.0), motion)?;
+    }
+    track.solver = fix.solver;
+    Some(track)
+}
+
+/// The fix that a new track starts from, and the lines of the group's later fixes to take in.
+fn starting_point(group: &Group) -> Option<(&Fix, Vec<&NamedLine>)> {
+    let (first, later) = group.fixes.split_first()?;
+    let mut lines: Vec<&NamedLine> = later.iter().flat_map(|fix| &fix.lines).collect();
+    lines.sort_by(|a, b| a.1.time.cmp(&b.1.time).then_with(|| a.0.cmp(&b.0)));
+    Some((&first.fix, lines))
+}
+
+/// The covariance of a fix without a velocity says so: the prior is replaced by a vague one.
+fn vague_velocity(fix: &Fix) -> crossfix_filter::KinematicState {
+    let mut state = fix.state.clone();
+    if fix.velocity == VelocityKnowledge::Unknown {
+        state.covariance.fixed_view_mut::<3, 3>(0, 3).fill(0.0);
+        state.covariance.fixed_view_mut::<3, 3>(3, 0).fill(0.0);
+        let mut velocity = state.covariance.fixed_view_mut::<3, 3>(3, 3);
+        velocity.fill_with_identity();
+        velocity.scale_mut(VAGUE_VELOCITY_SD.powi(2) / 9.0);
+    }
+    state
+}

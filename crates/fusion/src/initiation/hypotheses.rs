@@ -1,0 +1,253 @@
+//! Targets to be, followed in every way that the bearings allow until one way is by far the best.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crossfix_filter::Gate;
+use crossfix_geometry::Camera;
+use crossfix_message::{CameraName, Solver, Timestamp};
+
+use super::seeds::{Seed, SeedFinder};
+use super::{NamedLine, Start, lines_of};
+use crate::motion::Motion;
+use crate::spatial::{Fix, MapSolution, VelocityKnowledge};
+use crate::temporal::LineId;
+use crate::track::{Track, TrackId, TrackStatus};
+use crate::tracker::{log_likelihood_ratio, same_target};
+use crate::{Exposure, FusionConfig, Tracking};
+
+/// Bearings of one exposure that continue one hypothesis, the best first.
+const MAX_BRANCHES: usize = 3;
+/// Ways to go on that are kept of one beginning.
+const MAX_FAMILY: usize = 6;
+/// A way this much less likely than its family's best (log-likelihood) is given up.
+const FAMILY_MARGIN: f64 = 10.0;
+/// A hypothesis less likely than this is clutter.
+const LEAST_SCORE: f64 = -12.0;
+/// While another reading of the same bearings is within this of the best (a chance of 1 in 20),
+/// nothing is confirmed.
+const RIVAL_MARGIN: f64 = 3.0;
+/// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
+const MAX_HYPOTHESES: usize = 3_000;
+
+/// One reading of the bearings: these are one target's.
+#[derive(Clone, Debug)]
+struct Hypothesis {
+    /// What began alike belongs to one family.
+    family: u64,
+    track: Track,
+    /// Its lines of the last periods with the number of the period, in order of time.
+    lines: Vec<(u64, LineId)>,
+    /// Periods that gave it a line.
+    periods: usize,
+}
+
+/// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
+/// log-likelihood ratio; the best set without common bearings is what there is.
+#[derive(Debug)]
+pub(super) struct Hypotheses {
+    finder: SeedFinder,
+    tracking: Tracking,
+    gate: Gate,
+    span: u64,
+    needed: usize,
+    shared_lines: usize,
+    hypotheses: Vec<Hypothesis>,
+    /// Lines that a track has used which cannot hold its place alone.
+    claims: BTreeMap<LineId, TrackId>,
+    period: u64,
+    families: u64,
+}
+
+impl Hypothesis {
+    fn shares(&self, lines: &BTreeSet<&LineId>) -> usize {
+        self.lines.iter().filter(|(_, id)| lines.contains(id)).count()
+    }
+
+    fn newest(&self, period: u64) -> Vec<&LineId> {
+        self.lines.iter().filter(|(p, _)| *p == period).map(|(_, id)| id).collect()
+    }
+}
+
+impl Hypotheses {
+    pub(super) fn new(config: &FusionConfig) -> Self {
+        Self {
+            finder: SeedFinder::new(config, 2),
+            gate: Gate::with_probability(config.tracking.gate_probability),
+            tracking: config.tracking.clone(),
+            span: config.initiation.periods as u64,
+            needed: config.initiation.fixes,
+            shared_lines: config.initiation.shared_lines,
+            hypotheses: Vec::new(),
+            claims: BTreeMap::new(),
+            period: 0,
+            families: 0,
+        }
+    }
+
+    /// Notes which lines of an exposure (by index) a track has used already.
+    pub(super) fn claim(&mut self, exposure: &Exposure, claims: &[(usize, TrackId)]) {
+        for &(index, track) in claims {
+            self.claims.insert((exposure.camera.clone(), exposure.sequence, index), track);
+        }
+    }
+
+    /// Takes one period in (exposures in order of time) and returns the tracks that are sure now.
+    pub(super) fn advance(
+        &mut self,
+        exposures: &[&Exposure],
+        cameras: &BTreeMap<CameraName, Camera>,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        self.period += 1;
+        for exposure in exposures {
+            if let Some(camera) = cameras.get(&exposure.camera) {
+                self.extend(exposure, camera, motion);
+            }
+        }
+        let span = self.span;
+        for hypothesis in &mut self.hypotheses {
+            let period = self.period;
+            hypothesis.lines.retain(|(p, _)| p + span > period);
+            if hypothesis.lines.last().is_some_and(|(p, _)| *p == period) {
+                hypothesis.periods += 1;
+            }
+        }
+        self.hypotheses.retain(|h| !h.lines.is_empty());
+        let seeds = self.finder.find(exposures, cameras);
+        self.begin(seeds, motion);
+        self.prune();
+        let now = exposures.last().map(|exposure| exposure.time);
+        now.map_or_else(Vec::new, |now| self.confirm(now, motion))
+    }
+
+    /// Lets every hypothesis go on with each bearing in its gate, and without any.
+    fn extend(&mut self, exposure: &Exposure, camera: &Camera, motion: &Motion) {
+        let lines: Vec<NamedLine> = lines_of(exposure).collect();
+        let miss = (1.0 - self.tracking.detection_probability).ln();
+        let mut next = Vec::with_capacity(self.hypotheses.len());
+        for mut hypothesis in self.hypotheses.drain(..) {
+            let expected = camera.sees(hypothesis.track.position_at(exposure.time));
+            let prediction =
+                hypothesis.track.bearing_prediction(exposure.time, camera.pose().position(), motion);
+            let ratio = |(i, (_, line)): (usize, &NamedLine)| {
+                let fit = prediction.as_ref()?.fit(&line.line, exposure.time_sd_s, self.gate)?;
+                Some((log_likelihood_ratio(&fit, &self.tracking), i))
+            };
+            let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
+            near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+            for &(ratio, i) in near.iter().take(MAX_BRANCHES).filter(|(ratio, _)| *ratio > miss) {
+                let mut child = hypothesis.clone();
+                let (id, line) = &lines[i];
+                let time = (exposure.time, exposure.time_sd_s);
+                if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
+                    child.track.score += ratio;
+                    child.lines.push((self.period, id.clone()));
+                    next.push(child);
+                }
+            }
+            if expected {
+                hypothesis.track.score += miss;
+            }
+            next.push(hypothesis);
+        }
+        self.hypotheses = next;
+        self.prune_families();
+    }
+
+    /// Keeps the best few of each family.
+    fn prune_families(&mut self) {
+        self.sort();
+        let mut families: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
+        self.hypotheses.retain(|h| {
+            let (best, count) = families.entry(h.family).or_insert((h.track.score, 0));
+            *count += 1;
+            *count <= MAX_FAMILY && h.track.score > *best - FAMILY_MARGIN && h.track.score > LEAST_SCORE
+        });
+        self.hypotheses.truncate(MAX_HYPOTHESES);
+    }
+
+    fn sort(&mut self) {
+        self.hypotheses
+            .sort_by(|a, b| b.track.score.total_cmp(&a.track.score).then_with(|| a.lines.cmp(&b.lines)));
+    }
+
+    /// Begins a hypothesis with every seed whose lines no older one has taken together already.
+    fn begin(&mut self, seeds: Vec<Seed>, motion: &Motion) {
+        let known: BTreeSet<Vec<LineId>> =
+            self.hypotheses.iter().map(|h| h.newest(self.period).into_iter().cloned().collect()).collect();
+        for seed in seeds {
+            let lines: Vec<LineId> = seed.lines.iter().map(|(id, _)| id.clone()).collect();
+            let Some(time) = seed.time().filter(|_| seed.score > LEAST_SCORE && !known.contains(&lines))
+            else {
+                continue;
+            };
+            self.families += 1;
+            let MapSolution { state, observability, .. } = seed.solution;
+            let velocity = VelocityKnowledge::Solved;
+            let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
+            let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
+            let mut track = Track::start(&fix, named, motion);
+            track.score = seed.score;
+            let lines = lines.into_iter().map(|id| (self.period, id)).collect();
+            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1 });
+        }
+    }
+
+    /// Of hypotheses that have the same lines in this period the best goes on.
+    fn prune(&mut self) {
+        self.sort();
+        let mut seen: BTreeSet<Vec<LineId>> = BTreeSet::new();
+        let period = self.period;
+        self.hypotheses.retain(|h| {
+            let newest: Vec<LineId> = h.newest(period).into_iter().cloned().collect();
+            newest.len() < 3 || seen.insert(newest)
+        });
+        self.hypotheses.truncate(MAX_HYPOTHESES);
+    }
+
+    /// The best hypotheses without common lines that are likely enough and have no rival.
+    fn confirm(&mut self, now: Timestamp, motion: &Motion) -> Vec<Start> {
+        let mut taken: BTreeSet<&LineId> = BTreeSet::new();
+        let mut sure: Vec<usize> = Vec::new();
+        for (i, hypothesis) in self.hypotheses.iter().enumerate() {
+            if hypothesis.shares(&taken) > self.shared_lines {
+                continue;
+            }
+            taken.extend(hypothesis.lines.iter().map(|(_, id)| id));
+            let likely = hypothesis.track.score >= self.tracking.confirm_score;
+            if likely && hypothesis.periods >= self.needed && !self.has_rival(i, now, motion) {
+                sure.push(i);
+            }
+        }
+        let lines: BTreeSet<LineId> =
+            sure.iter().flat_map(|&i| &self.hypotheses[i].lines).map(|(_, id)| id.clone()).collect();
+        let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
+        let claimed: BTreeSet<&LineId> = lines.iter().collect();
+        self.hypotheses.retain(|h| h.shares(&claimed) == 0);
+        let alive: BTreeSet<&LineId> =
+            self.hypotheses.iter().flat_map(|h| &h.lines).map(|(_, id)| id).collect();
+        self.claims.retain(|id, _| alive.contains(id));
+        starts
+    }
+
+    fn start(&self, hypothesis: &Hypothesis) -> Start {
+        let mut track = hypothesis.track.clone();
+        track.status = TrackStatus::Confirmed;
+        track.observe();
+        let found_again = hypothesis.lines.iter().rev().find_map(|(_, id)| self.claims.get(id)).copied();
+        Start { track, found_again }
+    }
+
+    /// Whether another reading of the same lines, of another target, is nearly as likely.
+    fn has_rival(&self, i: usize, now: Timestamp, motion: &Motion) -> bool {
+        let hypothesis = &self.hypotheses[i];
+        let lines: BTreeSet<&LineId> = hypothesis.lines.iter().map(|(_, id)| id).collect();
+        let state = hypothesis.track.predicted(now, motion);
+        self.hypotheses.iter().enumerate().any(|(k, other)| {
+            k != i
+                && other.track.score > hypothesis.track.score - RIVAL_MARGIN
+                && other.shares(&lines) > self.shared_lines
+                && !same_target(&state, &other.track.predicted(now, motion))
+        })
+    }
+}

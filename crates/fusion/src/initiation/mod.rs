@@ -1,0 +1,93 @@
+//! New tracks from the bearings that no track claims: they are gathered into
+//! observation periods ([`Periods`]), and what of several periods belongs
+//! together is found either by following hypotheses ([`Hypotheses`]) or, as in
+//! 002, by solving each period for fixes and grouping these ([`Grouped`]).
+
+mod fixes;
+mod grouped;
+mod hypotheses;
+mod period;
+mod seeds;
+
+use std::collections::BTreeMap;
+
+use crossfix_geometry::Camera;
+use crossfix_message::CameraName;
+
+use crate::motion::Motion;
+use crate::spatial::TimedLine;
+use crate::temporal::LineId;
+use crate::track::{Track, TrackId};
+use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
+
+use grouped::Grouped;
+use hypotheses::Hypotheses;
+use period::Periods;
+
+/// A sight line with its name.
+type NamedLine = (LineId, TimedLine);
+
+/// A track that begins.
+#[derive(Clone, Debug)]
+pub(crate) struct Start {
+    pub(crate) track: Track,
+    /// The track whose bearings it has used, where that could not hold its place alone.
+    pub(crate) found_again: Option<TrackId>,
+}
+
+/// Finds new targets among the bearings that no track claims.
+#[derive(Debug)]
+pub(crate) struct Initiator {
+    periods: Periods,
+    method: Method,
+}
+
+#[derive(Debug)]
+enum Method {
+    Hypotheses(Hypotheses),
+    Grouped(Grouped),
+}
+
+impl Initiator {
+    pub(crate) fn new(config: &FusionConfig) -> Self {
+        let initiation = &config.initiation;
+        let pairs =
+            initiation.method == InitiationMethod::Hypotheses || initiation.solver == SpatialSolver::Pair;
+        let method = match initiation.method {
+            InitiationMethod::Hypotheses => Method::Hypotheses(Hypotheses::new(config)),
+            InitiationMethod::Grouping => Method::Grouped(Grouped::new(config)),
+        };
+        Self { periods: Periods::new(initiation.period_s, if pairs { 2 } else { 3 }), method }
+    }
+
+    /// Takes in what an exposure has left over, with what of it (by index) a track has used that
+    /// cannot hold its place alone, and returns the tracks that begin with it.
+    pub(crate) fn add(
+        &mut self,
+        exposure: Exposure,
+        claims: &[(usize, TrackId)],
+        cameras: &BTreeMap<CameraName, Camera>,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        if let Method::Hypotheses(hypotheses) = &mut self.method {
+            hypotheses.claim(&exposure, claims);
+        }
+        let Some(period) = self.periods.add(exposure) else {
+            return Vec::new();
+        };
+        let mut exposures: Vec<&Exposure> = period.values().collect();
+        exposures.sort_by(|a, b| a.time.cmp(&b.time).then_with(|| a.camera.cmp(&b.camera)));
+        match &mut self.method {
+            Method::Hypotheses(hypotheses) => hypotheses.advance(&exposures, cameras, motion),
+            Method::Grouped(grouped) => grouped.advance(&exposures, cameras, motion),
+        }
+    }
+}
+
+/// An exposure's sight lines with their names.
+fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
+    exposure.sightings.iter().enumerate().map(|(index, Sighting { line, .. })| {
+        let id = (exposure.camera.clone(), exposure.sequence, index);
+        (id, TimedLine { line: *line, time: exposure.time })
+    })
+}

@@ -1,0 +1,284 @@
+//! Sets of lines of one period, one a camera, that may be one target's.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::PI;
+
+use crossfix_geometry::{Camera, SightLine};
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::{Matrix2x6, Vector2};
+
+use super::{NamedLine, lines_of};
+use crate::spatial::{MapSolution, TimedLine, chi_square, map};
+use crate::temporal::LineId;
+use crate::{Exposure, FusionConfig, Initiation};
+
+/// Lines pass each other within this many standard deviations of noise and motion.
+const SIGMAS: f64 = 3.0;
+/// Lines of one camera that are tried beside a pair, the best first.
+const MAX_BRANCHES: usize = 5;
+/// Lines that as many cameras as this agree on need not be tried in other sets.
+const SETTLED_CAMERAS: usize = 4;
+/// Most sets kept of one period, the most likely ones: clutter cannot fill the memory.
+const MAX_SEEDS: usize = 2_000;
+/// Most pairs of lines tried of two cameras: time is bounded, whatever a camera reports.
+const MAX_PAIRS: usize = 250_000;
+
+/// A set of lines that may be one target's.
+#[derive(Clone, Debug)]
+pub(super) struct Seed {
+    /// One a camera, in order of time.
+    pub(super) lines: Vec<NamedLine>,
+    /// Position and velocity at the newest line's time.
+    pub(super) solution: MapSolution,
+    /// Log-likelihood ratio of being a new target's against being clutter.
+    pub(super) score: f64,
+}
+
+impl Seed {
+    pub(super) fn time(&self) -> Option<Timestamp> {
+        self.lines.iter().map(|(_, line)| line.time).max()
+    }
+}
+
+/// What finds seeds.
+#[derive(Clone, Debug)]
+pub(super) struct SeedFinder {
+    initiation: Initiation,
+    detection_probability: f64,
+    clutter_per_sr: f64,
+    line_gate: f64,
+    least_cameras: usize,
+}
+
+/// A pair of lines that pass each other closely, as they are extended.
+struct Growing<'a> {
+    exposures: &'a [&'a Exposure],
+    cameras: &'a BTreeMap<CameraName, Camera>,
+    lines: &'a [Vec<NamedLine>],
+}
+
+impl SeedFinder {
+    pub(super) fn new(config: &FusionConfig, least_cameras: usize) -> Self {
+        let initiation = config.initiation.clone();
+        let line_gate = chi_square(initiation.spatial_gate_probability, 2);
+        Self {
+            initiation,
+            detection_probability: config.tracking.detection_probability,
+            clutter_per_sr: config.tracking.clutter_per_sr,
+            line_gate,
+            least_cameras,
+        }
+    }
+
+    /// Every set of lines of one period that may be one target's, the most likely first.
+    pub(super) fn find(&self, exposures: &[&Exposure], cameras: &BTreeMap<CameraName, Camera>) -> Vec<Seed> {
+        let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_of(e).collect()).collect();
+        let growing = Growing { exposures, cameras, lines: &lines };
+        let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
+        let mut seeds = Vec::new();
+        for (a, b) in self.pairs_of_cameras(&growing) {
+            let mut tried = 0;
+            for i in 0..lines[a].len() {
+                for j in 0..lines[b].len() {
+                    tried += 1;
+                    if settled[a][i] || settled[b][j] || tried > MAX_PAIRS {
+                        continue;
+                    }
+                    for (places, seed) in self.sets_of(&growing, (a, i), (b, j)) {
+                        if places.len() >= SETTLED_CAMERAS {
+                            for (camera, line) in places {
+                                settled[camera][line] = true;
+                            }
+                        }
+                        seeds.push(seed);
+                    }
+                }
+            }
+        }
+        self.best(seeds)
+    }
+
+    /// The most likely, each set once.
+    fn best(&self, mut seeds: Vec<Seed>) -> Vec<Seed> {
+        seeds.sort_by(|a, b| b.score.total_cmp(&a.score).then_with(|| ids(a).cmp(&ids(b))));
+        let mut seen = BTreeSet::new();
+        seeds.retain(|seed| seen.insert(ids(seed)));
+        seeds.truncate(MAX_SEEDS);
+        seeds
+    }
+
+    /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first
+    /// (002, equation 12).
+    fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
+        let camera = |i: usize| growing.cameras.get(&growing.exposures[i].camera);
+        let mut pairs = Vec::new();
+        for a in 0..growing.exposures.len() {
+            for b in a + 1..growing.exposures.len() {
+                let (Some(one), Some(other)) = (camera(a), camera(b)) else {
+                    continue;
+                };
+                let (one, other) = (one.pose(), other.pose());
+                let apart = (one.position() - other.position()).norm();
+                let any = !growing.lines[a].is_empty() && !growing.lines[b].is_empty();
+                if any && apart <= 2.0 * self.initiation.max_range_m {
+                    let axis =
+                        |pose: &crossfix_geometry::Pose| pose.rotation().matrix().column(2).into_owned();
+                    pairs.push((axis(one).cross(&axis(other)).norm(), (a, b)));
+                }
+            }
+        }
+        pairs.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
+        pairs.into_iter().map(|(_, pair)| pair).collect()
+    }
+
+    /// The sets that two lines begin, with the places (camera, line) of their lines.
+    fn sets_of(
+        &self,
+        growing: &Growing<'_>,
+        (a, i): (usize, usize),
+        (b, j): (usize, usize),
+    ) -> Vec<(Vec<(usize, usize)>, Seed)> {
+        let (first, second) = (&growing.lines[a][i], &growing.lines[b][j]);
+        if !self.pass_closely(&first.1, &second.1) {
+            return Vec::new();
+        }
+        let Some(pair) = self.solve(&[first.1.clone(), second.1.clone()]) else {
+            return Vec::new();
+        };
+        let mut open = vec![(vec![(a, i), (b, j)], pair)];
+        let mut branched = false;
+        for c in (0..growing.exposures.len()).filter(|&c| c != a && c != b) {
+            let mut next = Vec::new();
+            for (places, solution) in open {
+                let near = self.near(growing, &places, &solution, c);
+                let most = if branched { 1 } else { MAX_BRANCHES };
+                for line in near.iter().take(most) {
+                    let mut longer = places.clone();
+                    longer.push((c, *line));
+                    let timed: Vec<TimedLine> =
+                        longer.iter().map(|&(k, l)| growing.lines[k][l].1.clone()).collect();
+                    if let Some(solution) = self.solve(&timed).filter(|s| self.agrees(s, longer.len())) {
+                        next.push((longer, solution));
+                    }
+                }
+                // While nothing is sure, the camera may also have missed the target.
+                if !branched || near.is_empty() || next.is_empty() {
+                    next.push((places, solution));
+                }
+            }
+            branched |= next.len() > 1;
+            open = next;
+        }
+        let mut found = Vec::new();
+        for (places, solution) in open {
+            if let Some(seed) = self.seed(growing, &places, solution) {
+                found.push((places, seed));
+            }
+        }
+        found
+    }
+
+    fn solve(&self, lines: &[TimedLine]) -> Option<MapSolution> {
+        let newest = lines.iter().map(|l| l.time).max()?;
+        map(lines, newest, self.initiation.velocity_prior_sd_mps)
+    }
+
+    /// Whether a solution of n lines is as good as a true one's is with the gate's probability.
+    fn agrees(&self, solution: &MapSolution, lines: usize) -> bool {
+        solution.chi_square <= chi_square(self.initiation.spatial_gate_probability, 2 * lines - 3)
+    }
+
+    /// Whether two lines pass each other as closely as one moving target's may, in front of both.
+    fn pass_closely(&self, first: &TimedLine, second: &TimedLine) -> bool {
+        let (u, v) = (&first.line.direction, &second.line.direction);
+        let base = second.line.origin - first.line.origin;
+        let cosine = u.dot(v);
+        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
+        let (along_u, along_v) = (u.dot(&base), v.dot(&base));
+        let r1 = (along_u - cosine * along_v) / sine_squared;
+        let r2 = (cosine * along_u - along_v) / sine_squared;
+        let in_range = |r: f64| r > 0.0 && r < self.initiation.max_range_m;
+        if !(in_range(r1) && in_range(r2)) {
+            return false;
+        }
+        let apart = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
+        let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
+        let motion = self.initiation.velocity_prior_sd_mps * second.time.seconds_since(first.time).abs();
+        apart <= SIGMAS * (noise + motion)
+    }
+
+    /// The lines of camera `c` in the gate of a solution, the nearest first.
+    fn near(
+        &self,
+        growing: &Growing<'_>,
+        places: &[(usize, usize)],
+        solution: &MapSolution,
+        c: usize,
+    ) -> Vec<usize> {
+        let times = places.iter().map(|&(k, l)| growing.lines[k][l].1.time);
+        let Some(reference) = times.max() else {
+            return Vec::new();
+        };
+        let distance = |(l, (_, line)): (usize, &NamedLine)| {
+            let distance = gate_distance(solution, reference, line)?;
+            (distance <= self.line_gate).then_some((distance, l))
+        };
+        let mut near: Vec<(f64, usize)> = growing.lines[c].iter().enumerate().filter_map(distance).collect();
+        near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+        near.into_iter().map(|(_, l)| l).collect()
+    }
+
+    /// The seed of a set, if it is possible at all.
+    fn seed(&self, growing: &Growing<'_>, places: &[(usize, usize)], solution: MapSolution) -> Option<Seed> {
+        if places.len() < self.least_cameras {
+            return None;
+        }
+        let mut lines: Vec<NamedLine> = places.iter().map(|&(k, l)| growing.lines[k][l].clone()).collect();
+        lines.sort_by(|x, y| x.1.time.cmp(&y.1.time).then_with(|| x.0.cmp(&y.0)));
+        let position = solution.state.position();
+        let in_range = |(_, l): &NamedLine| (position - l.line.origin).norm() < self.initiation.max_range_m;
+        if !(lines.iter().all(in_range) && self.agrees(&solution, lines.len())) {
+            return None;
+        }
+        let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
+            let missed = places.iter().all(|(camera, _)| camera != k);
+            missed && growing.cameras.get(&exposure.camera).is_some_and(|camera| camera.sees(position))
+        });
+        let score = self.log_evidence(&lines, &solution)?
+            + silent.count() as f64 * (1.0 - self.detection_probability).ln();
+        Some(Seed { lines, solution, score })
+    }
+
+    /// Log-likelihood ratio of the lines being a new target's against their being clutter: the
+    /// density of new targets times the integral over all positions and velocities.
+    fn log_evidence(&self, lines: &[NamedLine], solution: &MapSolution) -> Option<f64> {
+        let factor = solution.state.covariance.cholesky()?;
+        let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
+        let velocity = 3.0 * self.initiation.velocity_prior_sd_mps.ln();
+        let mut evidence = self.initiation.birth_density_per_m3.ln() + 1.5 * (2.0 * PI).ln() + log_root
+            - velocity
+            - solution.chi_square / 2.0;
+        for (_, TimedLine { line, .. }) in lines {
+            let density = (2.0 * PI).ln() + line.covariance.determinant().ln() / 2.0;
+            evidence += (self.detection_probability / self.clutter_per_sr).ln() - density;
+        }
+        evidence.is_finite().then_some(evidence)
+    }
+}
+
+fn ids(seed: &Seed) -> Vec<LineId> {
+    seed.lines.iter().map(|(id, _)| id.clone()).collect()
+}
+
+/// Squared Mahalanobis distance of a line from a solution, two degrees of freedom.
+fn gate_distance(solution: &MapSolution, reference: Timestamp, line: &TimedLine) -> Option<f64> {
+    let dt = line.time.seconds_since(reference);
+    let state = solution.state.predicted(dt, 0.0);
+    let SightLine { origin, basis, covariance, .. } = line.line;
+    let range = (state.position() - origin).norm();
+    let offset: Vector2<f64> = line.line.tangent_offset(state.position())?;
+    let mut jacobian = Matrix2x6::zeros();
+    jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(basis.transpose() / range));
+    let spread = jacobian * state.covariance * jacobian.transpose() + covariance;
+    Some(offset.dot(&spread.cholesky()?.solve(&offset)))
+}

@@ -1,0 +1,74 @@
+//! How targets move between bearings, and what is done when one turns.
+
+use crossfix_filter::{MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual};
+
+use crate::{ConfigError, Manoeuvres, Tracking};
+
+/// What a track's velocity may have become after a manoeuvre that a detector saw, m/s an axis.
+pub(crate) const REINITIALISED_VELOCITY_SD: f64 = 15.0;
+/// How far the position may be off by then, m an axis.
+pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
+
+/// The motion models of all tracks, and the detector that a new track gets.
+#[derive(Clone, Debug)]
+pub(crate) struct Motion {
+    /// Of tracks that several cameras hold in their place.
+    models: MotionModels,
+    /// Of tracks that one camera alone follows: what the target does along its sight line nobody
+    /// sees, so every model is as uncertain as the liveliest.
+    unheld: MotionModels,
+    /// A camera's bearing holds a track for so long, s.
+    pub(crate) holding_s: f64,
+    detector: Option<Detector>,
+}
+
+/// A detector of manoeuvres (004).
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Detector {
+    /// The paper's.
+    Residual(SmoothedResidual),
+    /// On the normalised innovation squared.
+    Innovation(NormalisedInnovation),
+}
+
+impl Motion {
+    pub(crate) fn new(config: &Tracking) -> Result<Self, ConfigError> {
+        let single = MotionModels::single(config.acceleration_density);
+        let (models, detector) = match config.manoeuvres {
+            Manoeuvres::Models => {
+                let model =
+                    |m: &crate::FlightModel| MotionModel { density: m.acceleration_density, share: m.share };
+                let models: Vec<MotionModel> = config.models.iter().map(model).collect();
+                (MotionModels::new(&models, config.switching_rate_per_s), None)
+            }
+            Manoeuvres::None => (single, None),
+            Manoeuvres::SmoothedResidual => {
+                let detector = SmoothedResidual::new(config.residual_window, config.residual_scale);
+                (single, Some(Detector::Residual(detector)))
+            }
+            Manoeuvres::Innovation => {
+                let detector =
+                    NormalisedInnovation::new(config.innovation_window, config.innovation_false_alarm);
+                (single, Some(Detector::Innovation(detector)))
+            }
+        };
+        let models = models.ok_or(ConfigError {
+            key: "tracking.models",
+            value: config.models.len() as f64,
+            must: "one to four models with densities of 0 and more and positive shares",
+        })?;
+        let wide: Vec<MotionModel> =
+            models.models().iter().map(|m| MotionModel { density: models.widest(), ..*m }).collect();
+        let unheld = MotionModels::new(&wide, models.switching_rate()).unwrap_or_else(|| models.clone());
+        Ok(Self { models, unheld, holding_s: config.coasting_after_s, detector })
+    }
+
+    /// The models of a track that is held in its place, or is not.
+    pub(crate) fn models(&self, held: bool) -> &MotionModels {
+        if held { &self.models } else { &self.unheld }
+    }
+
+    pub(crate) fn detector(&self) -> Option<Detector> {
+        self.detector.clone()
+    }
+}
