@@ -10,17 +10,30 @@ use crossfix_message::{
 };
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
+use crate::bound::{BearingNoise, FisherInformation, LineGeometry};
+
 use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
 use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
-use super::bound::bound;
-use super::site::{LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
+use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
 
 /// Standard deviation of the batch solution's prior on the velocity, m/s: the fusion's default.
 const PRIOR_SD: f64 = 15.0;
 /// An error of so many of its own standard deviations, or of so many metres, has diverged.
 const DIVERGED_SDS: f64 = 10.0;
 const DIVERGED_M: f64 = 100.0;
+
+/// The least covariance of position and velocity at a time that any unbiased estimator can have from
+/// bearings of a target: the Cramer-Rao bound at the truth. `None` if they do not determine the six.
+fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<Matrix6<f64>> {
+    let mut information = FisherInformation::default();
+    let noise = BearingNoise::isotropic(BEARING_SD)?;
+    for TimedLine { line, time } in lines {
+        let geometry = LineGeometry::between(line.origin, target.at(time.seconds()))?;
+        information.add(&geometry, &noise, time.seconds_since(reference));
+    }
+    information.covariance()
+}
 
 /// One bearing of one camera.
 struct Seen {

@@ -1,6 +1,5 @@
 //! The fusion of 002 and the manoeuvres of 004.
 
-mod bound;
 mod degenerate;
 mod detection;
 mod limit;
