@@ -7,6 +7,7 @@ use crossfix_geometry::Camera;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::seeds::{Seed, SeedFinder};
+use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::motion::Motion;
 use crate::spatial::{Fix, MapSolution, VelocityKnowledge};
@@ -18,14 +19,16 @@ use crate::{Exposure, FusionConfig, Tracking};
 /// Bearings of one exposure that continue one hypothesis, the best first.
 const MAX_BRANCHES: usize = 3;
 /// Ways to go on that are kept of one beginning.
-const MAX_FAMILY: usize = 6;
+const MAX_FAMILY: usize = 100;
+/// Hypotheses that are kept of those with the same lines in the newest period.
+const MAX_ALIKE: usize = 20;
 /// A way this much less likely than its family's best (log-likelihood) is given up.
-const FAMILY_MARGIN: f64 = 10.0;
+const FAMILY_MARGIN: f64 = 15.0;
 /// A hypothesis less likely than this is clutter.
 const LEAST_SCORE: f64 = -12.0;
-/// While another reading of the same bearings is within this of the best (a chance of 1 in 20),
+/// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
-const RIVAL_MARGIN: f64 = 3.0;
+const RIVAL_MARGIN: f64 = 8.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
 const MAX_HYPOTHESES: usize = 3_000;
 
@@ -171,14 +174,10 @@ impl Hypotheses {
             .sort_by(|a, b| b.track.score.total_cmp(&a.track.score).then_with(|| a.lines.cmp(&b.lines)));
     }
 
-    /// Begins a hypothesis with every seed whose lines no older one has taken together already.
+    /// Begins a hypothesis with every seed.
     fn begin(&mut self, seeds: Vec<Seed>, motion: &Motion) {
-        let known: BTreeSet<Vec<LineId>> =
-            self.hypotheses.iter().map(|h| h.newest(self.period).into_iter().cloned().collect()).collect();
         for seed in seeds {
-            let lines: Vec<LineId> = seed.lines.iter().map(|(id, _)| id.clone()).collect();
-            let Some(time) = seed.time().filter(|_| seed.score > LEAST_SCORE && !known.contains(&lines))
-            else {
+            let Some(time) = seed.time().filter(|_| seed.score > LEAST_SCORE) else {
                 continue;
             };
             self.families += 1;
@@ -188,37 +187,44 @@ impl Hypotheses {
             let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
             let mut track = Track::start(&fix, named, motion);
             track.score = seed.score;
-            let lines = lines.into_iter().map(|id| (self.period, id)).collect();
+            let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
             self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1 });
         }
     }
 
-    /// Of hypotheses that have the same lines in this period the best goes on.
+    /// Of hypotheses that have the same lines in this period the best few go on.
     fn prune(&mut self) {
         self.sort();
-        let mut seen: BTreeSet<Vec<LineId>> = BTreeSet::new();
+        let mut seen: BTreeMap<Vec<LineId>, usize> = BTreeMap::new();
         let period = self.period;
         self.hypotheses.retain(|h| {
             let newest: Vec<LineId> = h.newest(period).into_iter().cloned().collect();
-            newest.len() < 3 || seen.insert(newest)
+            newest.is_empty() || {
+                let count = seen.entry(newest).or_default();
+                *count += 1;
+                *count <= MAX_ALIKE
+            }
         });
         self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     /// The best hypotheses without common lines that are likely enough and have no rival.
     fn confirm(&mut self, now: Timestamp, motion: &Motion) -> Vec<Start> {
-        let mut taken: BTreeSet<&LineId> = BTreeSet::new();
-        let mut sure: Vec<usize> = Vec::new();
-        for (i, hypothesis) in self.hypotheses.iter().enumerate() {
-            if hypothesis.shares(&taken) > self.shared_lines {
-                continue;
-            }
-            taken.extend(hypothesis.lines.iter().map(|(_, id)| id));
-            let likely = hypothesis.track.score >= self.tracking.confirm_score;
-            if likely && hypothesis.periods >= self.needed && !self.has_rival(i, now, motion) {
-                sure.push(i);
-            }
-        }
+        let scored = self.hypotheses.iter().map(|h| (h.track.score, h.lines.as_slice()));
+        let selection = Selection::new(scored, self.shared_lines);
+        let sure: Vec<usize> = selection
+            .chosen()
+            .filter(|&i| {
+                let hypothesis = &self.hypotheses[i];
+                let likely = hypothesis.track.score >= self.tracking.confirm_score;
+                likely && hypothesis.periods >= self.needed && {
+                    let state = hypothesis.track.predicted(now, motion);
+                    let alike =
+                        |k: usize| same_target(&state, &self.hypotheses[k].track.predicted(now, motion));
+                    selection.loss_without(i, alike) >= RIVAL_MARGIN
+                }
+            })
+            .collect();
         let lines: BTreeSet<LineId> =
             sure.iter().flat_map(|&i| &self.hypotheses[i].lines).map(|(_, id)| id.clone()).collect();
         let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
@@ -236,18 +242,5 @@ impl Hypotheses {
         track.observe();
         let found_again = hypothesis.lines.iter().rev().find_map(|(_, id)| self.claims.get(id)).copied();
         Start { track, found_again }
-    }
-
-    /// Whether another reading of the same lines, of another target, is nearly as likely.
-    fn has_rival(&self, i: usize, now: Timestamp, motion: &Motion) -> bool {
-        let hypothesis = &self.hypotheses[i];
-        let lines: BTreeSet<&LineId> = hypothesis.lines.iter().map(|(_, id)| id).collect();
-        let state = hypothesis.track.predicted(now, motion);
-        self.hypotheses.iter().enumerate().any(|(k, other)| {
-            k != i
-                && other.track.score > hypothesis.track.score - RIVAL_MARGIN
-                && other.shares(&lines) > self.shared_lines
-                && !same_target(&state, &other.track.predicted(now, motion))
-        })
     }
 }

@@ -8,6 +8,7 @@ mod grouped;
 mod hypotheses;
 mod period;
 mod seeds;
+mod selection;
 
 use std::collections::BTreeMap;
 

@@ -1,0 +1,187 @@
+//! Which readings of the bearings go together: the set of greatest total score without common lines.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::temporal::LineId;
+
+/// Passes of the local search; each makes the total greater, and few are ever needed.
+const MAX_PASSES: usize = 20;
+
+/// A reading of the bearings and what it is worth.
+#[derive(Clone, Debug)]
+struct Reading {
+    score: f64,
+    /// Numbers of its lines, ascending.
+    lines: Vec<usize>,
+}
+
+/// All readings with what they have in common.
+#[derive(Clone, Debug)]
+pub(super) struct Selection {
+    readings: Vec<Reading>,
+    /// The readings that use a line, by the line's number.
+    users: Vec<Vec<usize>>,
+    shared_lines: usize,
+    chosen: BTreeSet<usize>,
+}
+
+impl Selection {
+    /// The best set found of readings, given as scores with lines; `shared_lines` is how many lines
+    /// two chosen ones may have in common. Readings of score 0 and less are never chosen.
+    ///
+    /// Choosing the best first lets a reading of several targets' bearings shut them all out. So the
+    /// choice is improved by exchange: one goes out if those that it kept out are worth more.
+    pub(super) fn new<'a>(
+        scored: impl Iterator<Item = (f64, &'a [(u64, LineId)])>,
+        shared_lines: usize,
+    ) -> Self {
+        let mut numbers: BTreeMap<&LineId, usize> = BTreeMap::new();
+        let mut readings = Vec::new();
+        for (score, lines) in scored {
+            let mut own: Vec<usize> = Vec::with_capacity(lines.len());
+            for (_, id) in lines {
+                let next = numbers.len();
+                own.push(*numbers.entry(id).or_insert(next));
+            }
+            own.sort_unstable();
+            readings.push(Reading { score, lines: own });
+        }
+        let mut users = vec![Vec::new(); numbers.len()];
+        for (i, reading) in readings.iter().enumerate() {
+            for &line in &reading.lines {
+                users[line].push(i);
+            }
+        }
+        let mut selection = Self { readings, users, shared_lines, chosen: BTreeSet::new() };
+        selection.fill(&(0..selection.readings.len()).collect::<Vec<_>>());
+        selection.exchange();
+        selection
+    }
+
+    /// The chosen readings, ascending.
+    pub(super) fn chosen(&self) -> impl Iterator<Item = usize> + '_ {
+        self.chosen.iter().copied()
+    }
+
+    /// What the total would lose if a chosen reading were wrong, and every other of its lines that
+    /// `alike` holds for with it.
+    pub(super) fn loss_without(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
+        let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
+        let mut without = self.chosen.clone();
+        without.remove(&chosen);
+        let gained: f64 = self.additions(&without, &others).iter().map(|&i| self.readings[i].score).sum();
+        self.readings[chosen].score - gained
+    }
+
+    /// Readings that have a line in common with one.
+    fn neighbours(&self, of: usize) -> impl Iterator<Item = usize> {
+        let lines = &self.readings[of].lines;
+        let all: BTreeSet<usize> = lines.iter().flat_map(|&line| self.users[line].iter().copied()).collect();
+        all.into_iter().filter(move |&i| i != of)
+    }
+
+    fn clash(&self, one: usize, other: usize) -> bool {
+        let (a, b) = (&self.readings[one].lines, &self.readings[other].lines);
+        a.iter().filter(|line| b.binary_search(line).is_ok()).count() > self.shared_lines
+    }
+
+    fn fits(&self, reading: usize, choice: &BTreeSet<usize>) -> bool {
+        let lines = &self.readings[reading].lines;
+        let near = lines.iter().flat_map(|&line| &self.users[line]);
+        near.filter(|i| choice.contains(i)).all(|&i| i != reading && !self.clash(reading, i))
+    }
+
+    /// Those of some readings that fit beside a choice and each other, the best first.
+    fn additions(&self, choice: &BTreeSet<usize>, among: &[usize]) -> Vec<usize> {
+        let mut by_score: Vec<usize> = among.to_vec();
+        by_score.sort_by(|&a, &b| self.readings[b].score.total_cmp(&self.readings[a].score).then(a.cmp(&b)));
+        let mut choice = choice.clone();
+        let mut added = Vec::new();
+        for i in by_score {
+            if self.readings[i].score > 0.0 && self.fits(i, &choice) {
+                choice.insert(i);
+                added.push(i);
+            }
+        }
+        added
+    }
+
+    fn fill(&mut self, among: &[usize]) {
+        let added = self.additions(&self.chosen, among);
+        self.chosen.extend(added);
+    }
+
+    /// Puts one out for those that it kept out, or one in for those that it keeps out, while the
+    /// total grows.
+    fn exchange(&mut self) {
+        for _ in 0..MAX_PASSES {
+            let mut better = false;
+            for out in self.chosen.clone() {
+                let others: Vec<usize> = self.neighbours(out).collect();
+                let mut without = self.chosen.clone();
+                without.remove(&out);
+                let added = self.additions(&without, &others);
+                let gained: f64 = added.iter().map(|&i| self.readings[i].score).sum();
+                if gained > self.readings[out].score + 1e-9 {
+                    self.chosen = without;
+                    self.chosen.extend(added);
+                    better = true;
+                }
+            }
+            for i in 0..self.readings.len() {
+                if self.chosen.contains(&i) {
+                    continue;
+                }
+                let against: Vec<usize> =
+                    self.neighbours(i).filter(|k| self.chosen.contains(k) && self.clash(i, *k)).collect();
+                let lost: f64 = against.iter().map(|&k| self.readings[k].score).sum();
+                if self.readings[i].score > lost + 1e-9 {
+                    against.iter().for_each(|k| {
+                        self.chosen.remove(k);
+                    });
+                    self.chosen.insert(i);
+                    better = true;
+                }
+            }
+            if !better {
+                return;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn select(readings: &[(f64, &[usize])], shared: usize) -> Selection {
+        let lines = |ids: &[usize]| -> Vec<(u64, LineId)> {
+            ids.iter().map(|&i| (0, ("a".parse().unwrap(), 0, i))).collect()
+        };
+        let owned: Vec<(f64, Vec<(u64, LineId)>)> = readings.iter().map(|(s, l)| (*s, lines(l))).collect();
+        Selection::new(owned.iter().map(|(s, l)| (*s, l.as_slice())), shared)
+    }
+
+    #[test]
+    fn two_targets_beat_the_better_ghost_of_both() {
+        let selection = select(&[(12.0, &[0, 1, 4]), (10.0, &[0, 2]), (9.0, &[1, 3])], 0);
+        assert_eq!(selection.chosen().collect::<Vec<_>>(), [1, 2]);
+        // Without the first target the ghost is as good as what is left of both.
+        assert!((selection.loss_without(1, |_| false) - 10.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_rival_takes_the_certainty_and_a_twin_does_not() {
+        let selection = select(&[(12.0, &[0, 1]), (11.0, &[1, 2]), (-1.0, &[5])], 0);
+        assert_eq!(selection.chosen().collect::<Vec<_>>(), [0]);
+        assert!((selection.loss_without(0, |_| false) - 1.0).abs() < 1e-9);
+        assert!((selection.loss_without(0, |i| i == 1) - 12.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_crossing_may_be_allowed() {
+        let crossing: [(f64, &[usize]); 2] = [(12.0, &[0, 1, 2]), (11.0, &[2, 3, 4])];
+        assert_eq!(select(&crossing, 0).chosen().count(), 1);
+        assert_eq!(select(&crossing, 1).chosen().count(), 2);
+    }
+}
