@@ -29,6 +29,7 @@ const POSITION_SD: f64 = 0.1;
 const PAIR_GATE: f64 = 4.0 * 3.9 * 4.0 * 3.9;
 
 /// The scale that the rank is decided against, m/s: the paper knows nothing of velocities beforehand.
+/// With 15.6, as the targets have, half a per cent of exact periods would pass for degenerate.
 const VELOCITY_SCALE: f64 = 100.0;
 
 /// What the noise is added to.

@@ -84,7 +84,8 @@ pub(super) struct Target {
 
 impl Target {
     /// Uniform within 10 m of the origin on each axis in the middle of the periods, with a velocity of
-    /// [`VELOCITY_SD`].
+    /// [`VELOCITY_SD`]. The reference says no more than "within 10 m"; a ball, or another middle, leaves
+    /// all but coplanar lines as they are, and takes those further from its figures.
     pub fn random(noise: &mut Noise) -> Self {
         let middle_time = PERIODS as f64 / 2.0;
         let middle = Point3::from(Vector3::from_fn(|_, _| 20.0 * noise.uniform() - 10.0));
