@@ -10,6 +10,9 @@ use crate::{EventTime, Exposure, RejectionReason};
 /// More exposures than this are not held back, whatever the clocks say: memory is bounded.
 const MAX_HELD: usize = 20_000;
 
+/// A camera that has been silent for so many times the lateness is not waited for.
+const PATIENCES: f64 = 4.0;
+
 type Order = (Timestamp, CameraName);
 
 /// An exposure that waits, and whether its time has been compared with another camera's.
@@ -41,6 +44,10 @@ pub(crate) struct EventBuffer {
     /// The newest time of each camera that agreed with another camera's.
     trusted: BTreeMap<CameraName, Timestamp>,
     ended: BTreeSet<CameraName>,
+    /// Cameras that should be heard soon.
+    expected: BTreeSet<CameraName>,
+    /// The oldest time heard.
+    first: Option<Timestamp>,
     released: Timestamp,
 }
 
@@ -52,8 +59,15 @@ impl EventBuffer {
             newest: BTreeMap::new(),
             trusted: BTreeMap::new(),
             ended: BTreeSet::new(),
+            expected: BTreeSet::new(),
+            first: None,
             released: Timestamp::MIN,
         }
+    }
+
+    /// Says that a camera should be heard soon: in the beginning it is waited for as for the others.
+    pub(crate) fn expect(&mut self, camera: &CameraName) {
+        self.expected.insert(camera.clone());
     }
 
     /// Takes an exposure in; nothing comes out before [`Self::release`] says so.
@@ -62,6 +76,7 @@ impl EventBuffer {
         self.ended.remove(&exposure.camera);
         let previous = self.newest.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
         self.newest.insert(exposure.camera.clone(), previous.max(time));
+        self.first = Some(self.first.map_or(time, |first| first.min(time)));
         let reference = self.second_newest();
         if let Some(reference) = reference {
             // A camera that goes on by itself, step by step, is not from the future.
@@ -124,12 +139,15 @@ impl EventBuffer {
     fn watermark(&self) -> Option<Timestamp> {
         let reference = self.second_newest()?;
         let patience = reference.plus_seconds(-self.config.lateness_s);
-        let slowest = self
-            .newest
-            .iter()
-            .filter(|(camera, _)| !self.ended.contains(camera))
-            .map(|(_, &time)| time)
-            .min();
+        let forgotten = reference.plus_seconds(-PATIENCES * self.config.lateness_s);
+        let never_heard = |camera: &CameraName| !self.newest.contains_key(camera);
+        let waits_for_new = self.first.is_some_and(|first| first > forgotten)
+            && self.expected.iter().any(|camera| never_heard(camera) && !self.ended.contains(camera));
+        if waits_for_new {
+            return Some(patience);
+        }
+        let heard = self.newest.iter().filter(|(camera, _)| !self.ended.contains(camera));
+        let slowest = heard.map(|(_, &time)| time).filter(|&time| time > forgotten).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before `slowest`.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }
@@ -188,6 +206,25 @@ mod tests {
         let released = drain(&mut buffer);
         assert!(*released.last().unwrap() > 1.3, "{released:?}");
         assert!(matches!(buffer.insert(exposure("c", 0.5)), Err(RejectionReason::Late { .. })));
+    }
+
+    #[test]
+    fn a_camera_that_should_be_heard_is_waited_for_in_the_beginning_and_not_for_ever() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        for camera in ["a", "b", "c"] {
+            buffer.expect(&camera.parse().unwrap());
+        }
+        buffer.insert(exposure("a", 0.0)).unwrap();
+        buffer.insert(exposure("b", 0.0)).unwrap();
+        assert_eq!(drain(&mut buffer), []);
+        buffer.insert(exposure("c", 0.0)).unwrap();
+        assert_eq!(drain(&mut buffer), [0.0, 0.0, 0.0]);
+        for i in 1..40 {
+            buffer.insert(exposure("a", f64::from(i) * 0.1)).unwrap();
+            buffer.insert(exposure("b", f64::from(i) * 0.1)).unwrap();
+        }
+        // `c` is silent: after two seconds only the two others count.
+        assert!(drain(&mut buffer).last().is_some_and(|&time| time > 3.85));
     }
 
     #[test]

@@ -62,6 +62,7 @@ impl Fusion {
     /// [`CalibrationError`] if the message describes no camera; what was known stays.
     pub fn calibrate(&mut self, message: &CameraCalibration) -> Result<(), CalibrationError> {
         let calibration = message.parse()?;
+        self.buffer.expect(&calibration.name);
         self.cameras.insert(calibration.name, calibration.camera);
         Ok(())
     }

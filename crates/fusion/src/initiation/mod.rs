@@ -73,7 +73,7 @@ impl Initiator {
         if let Method::Hypotheses(hypotheses) = &mut self.method {
             hypotheses.claim(&exposure, claims);
         }
-        let Some(period) = self.periods.add(exposure) else {
+        let Some(period) = self.periods.add(exposure, cameras.len()) else {
             return Vec::new();
         };
         let mut exposures: Vec<&Exposure> = period.values().collect();

@@ -21,6 +21,8 @@ pub(crate) struct Periods {
     /// How far apart the cameras' newest exposures lay, s, at each of the last exposures.
     spreads: VecDeque<f64>,
     closed: Option<Timestamp>,
+    /// Whether a camera has been heard twice: by then the others have been heard once.
+    repeated: bool,
 }
 
 impl Periods {
@@ -33,11 +35,13 @@ impl Periods {
             heard: BTreeMap::new(),
             spreads: VecDeque::new(),
             closed: None,
+            repeated: false,
         }
     }
 
-    /// Takes an exposure in, and returns the period if it ends with it.
-    pub(crate) fn add(&mut self, exposure: Exposure) -> Option<BTreeMap<CameraName, Exposure>> {
+    /// Takes an exposure in, and returns the period if it ends with it; `known` is the number of
+    /// cameras that may be heard.
+    pub(crate) fn add(&mut self, exposure: Exposure, known: usize) -> Option<BTreeMap<CameraName, Exposure>> {
         let now = exposure.time;
         let before = self.heard.len();
         let previous = self.heard.insert(exposure.camera.clone(), now);
@@ -45,12 +49,13 @@ impl Periods {
         if let Some(interval) = previous.map(|time| now.seconds_since(time)) {
             self.heard.retain(|_, time| now.seconds_since(*time) <= SILENT_INTERVALS * interval);
         }
+        self.repeated |= previous.is_some();
         if self.heard.len() != before {
             // Other cameras lie otherwise.
             self.spreads.clear();
         }
         let spread_of = |oldest: Option<Timestamp>| oldest.map_or(0.0, |time| now.seconds_since(time));
-        if self.heard.len() < self.cameras {
+        if self.heard.len() < self.cameras || !(self.repeated || self.heard.len() >= known) {
             return None;
         }
         self.spreads.push_back(spread_of(self.heard.values().min().copied()));
