@@ -164,7 +164,7 @@ mod tests {
             camera: camera.parse().unwrap(),
             sequence: 0,
             time: Timestamp::from_seconds(time_s),
-            time_sd_s: 0.0,
+            uncertainty: crate::uncertainty::CameraUncertainty::of_time(0.0),
             sightings: vec![],
         }
     }

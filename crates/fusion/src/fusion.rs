@@ -1,13 +1,12 @@
 use std::collections::BTreeMap;
 
-use crossfix_geometry::Camera;
 use crossfix_message::{
     BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload, Timestamp,
     TrackEvent, TrackFrame, TrackState,
 };
 
 use crate::event_time::{Arrival, EventBuffer};
-use crate::ingress::{self, Exposure, Rejection, RejectionReason};
+use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::track::{Track, TrackStatus};
@@ -29,7 +28,7 @@ pub enum Output {
 #[derive(Debug)]
 pub struct Fusion {
     config: FusionConfig,
-    cameras: BTreeMap<CameraName, Camera>,
+    cameras: BTreeMap<CameraName, KnownCamera>,
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
@@ -63,7 +62,8 @@ impl Fusion {
     pub fn calibrate(&mut self, message: &CameraCalibration) -> Result<(), CalibrationError> {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
-        self.cameras.insert(calibration.name, calibration.camera);
+        let known = KnownCamera { camera: calibration.camera, pose_covariance: calibration.pose_covariance };
+        self.cameras.insert(calibration.name, known);
         Ok(())
     }
 
@@ -148,7 +148,7 @@ impl Fusion {
 
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
-        let Some(camera) = self.cameras.get(&exposure.camera) else {
+        let Some(KnownCamera { camera, .. }) = self.cameras.get(&exposure.camera) else {
             return;
         };
         self.counters.count("exposures");
@@ -198,7 +198,7 @@ fn event(happening: Happening, exposure: &Exposure) -> TrackEvent {
 impl Fusion {
     /// A track as of `time`.
     fn track_message(&self, track: &Track, time: Timestamp) -> crossfix_message::Track {
-        let now = track.predicted(time, self.tracker.motion());
+        let now = track.honest(time, self.tracker.motion());
         let state = match track.status {
             TrackStatus::Tentative => TrackState::Tentative,
             TrackStatus::Confirmed => TrackState::Confirmed,

@@ -4,8 +4,9 @@ use std::fmt;
 
 use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Matrix6};
 
+use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
 /// One measured target in one exposure.
@@ -26,10 +27,18 @@ pub struct Exposure {
     pub sequence: u64,
     /// Capture time.
     pub time: Timestamp,
-    /// Standard deviation of the capture time, s.
-    pub time_sd_s: f64,
+    /// What is uncertain of the camera as a whole.
+    pub(crate) uncertainty: CameraUncertainty,
     /// The targets, in the frame's order.
     pub sightings: Vec<Sighting>,
+}
+
+/// A camera as its calibration describes it.
+#[derive(Clone, Debug)]
+pub(crate) struct KnownCamera {
+    pub(crate) camera: Camera,
+    /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
+    pub(crate) pose_covariance: Option<Matrix6<f64>>,
 }
 
 /// Why a frame or a part of it was not used.
@@ -116,7 +125,7 @@ fn sighting(track: &BearingTrack, camera: &Camera, config: &Bearings) -> Result<
 pub(crate) fn read(
     frame: &BearingFrame,
     name: &CameraName,
-    camera: &Camera,
+    KnownCamera { camera, pose_covariance: pose }: &KnownCamera,
     config: &Bearings,
     counters: &mut Counters,
 ) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
@@ -140,18 +149,8 @@ pub(crate) fn read(
         camera: name.clone(),
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
-        time_sd_s: sd,
+        uncertainty: CameraUncertainty { time_sd_s: sd, factor: 1.0, pose: *pose },
         sightings,
     };
     Ok((exposure, rejected))
-}
-
-/// A bearing's covariance widened by the uncertainty of its time: a target that moves across the
-/// sight line at `tangent_rate` (rad/s on the tangent plane) is elsewhere a moment later.
-pub(crate) fn with_time_uncertainty(
-    covariance: &Matrix2<f64>,
-    tangent_rate: Vector2<f64>,
-    time_sd_s: f64,
-) -> Matrix2<f64> {
-    covariance + tangent_rate * tangent_rate.transpose() * time_sd_s.powi(2)
 }

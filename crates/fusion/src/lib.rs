@@ -38,6 +38,7 @@ pub mod spatial;
 pub mod temporal;
 mod track;
 mod tracker;
+mod uncertainty;
 
 pub use config::{
     Bearings, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod, Manoeuvres,

@@ -7,21 +7,20 @@ use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, Motio
 use crossfix_geometry::{SightLine, tangent_basis};
 use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2, Vector3};
 
-use crate::ingress::with_time_uncertainty;
+use crate::uncertainty::{CameraUncertainty, View};
 
 /// Where a camera should see a target, and how surely.
 #[derive(Clone, Debug)]
 pub(crate) struct BearingPrediction {
-    direction: Unit<Vector3<f64>>,
-    basis: Matrix3x2<f64>,
-    /// Covariance of the direction without the process noise of this step, rad^2.
+    view: View,
+    factor: f64,
+    /// Covariance of the direction without the process noise of this step, with what pose and clock
+    /// of the camera add, rad^2.
     steady: Matrix2<f64>,
     /// What each model's process noise adds along both tangents, rad^2, and its probability.
     added: ModelWeights,
     weights: ModelWeights,
     widest: f64,
-    /// Speed of the direction on its tangents, rad/s.
-    rate: Vector2<f64>,
 }
 
 /// How a bearing fits a prediction.
@@ -36,7 +35,13 @@ pub(crate) struct Fit {
 impl BearingPrediction {
     /// The prediction of `imm` over `interval` seconds for a camera at `origin`; `None` if the
     /// target would be at the camera itself.
-    pub(crate) fn new(imm: &Imm, interval: f64, models: &MotionModels, origin: Point3<f64>) -> Option<Self> {
+    pub(crate) fn new(
+        imm: &Imm,
+        interval: f64,
+        models: &MotionModels,
+        origin: Point3<f64>,
+        uncertainty: &CameraUncertainty,
+    ) -> Option<Self> {
         // Process noise is the same along all axes: what it adds to a direction is a multiple of
         // the identity, and only what the models share has to be projected.
         let state: KinematicState = imm.combined().predicted(interval, 0.0);
@@ -45,36 +50,34 @@ impl BearingPrediction {
         let direction = Unit::try_new(offset, 1e-6)?;
         let basis = tangent_basis(&direction);
         let across = basis / range;
-        let steady = across.transpose() * state.position_covariance() * across;
+        let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
+        let steady = across.transpose() * state.position_covariance() * across + uncertainty.common(&view);
         let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
         let mut added = [0.0; MAX_MODELS];
         for (variance, model) in added.iter_mut().zip(models.models()) {
             *variance = model.density * spread;
         }
         Some(Self {
-            direction,
-            basis,
+            view,
+            factor: uncertainty.factor,
             steady,
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * spread,
-            rate: across.transpose() * state.velocity(),
         })
     }
 
     /// How a bearing fits; `None` if it lies outside the gate.
-    pub(crate) fn fit(&self, line: &SightLine, time_sd_s: f64, gate: Gate) -> Option<Fit> {
-        let innovation = self.basis.transpose() * line.direction.into_inner();
+    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
+        let innovation = self.view.basis.transpose() * line.direction.into_inner();
         // No axis of the covariance is longer than its trace: most bearings need no more than this.
-        let moved = self.rate.norm_squared() * time_sd_s.powi(2);
-        let longest = self.steady.trace() + 2.0 * self.widest + line.covariance.trace() + moved;
-        let behind = self.direction.dot(&line.direction) <= 0.0;
+        let longest = self.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
+        let behind = self.view.direction.dot(&line.direction) <= 0.0;
         if behind || innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
-        let turn = self.basis.transpose() * line.basis;
-        let own = turn * line.covariance * turn.transpose();
-        let spread = self.steady + with_time_uncertainty(&own, self.rate, time_sd_s);
+        let turn = self.view.basis.transpose() * line.basis;
+        let spread = self.steady + turn * line.covariance * turn.transpose() * self.factor;
         let gate_distance = distance(&spread, self.widest, innovation)?.0;
         if !gate.holds(gate_distance) {
             return None;
@@ -117,9 +120,10 @@ mod tests {
         };
         let imm = Imm::new(state, &models);
         let camera = Point3::new(5.0, -100.0, 0.0);
-        let prediction = BearingPrediction::new(&imm, 1.0, &models, camera).unwrap();
+        let prediction =
+            BearingPrediction::new(&imm, 1.0, &models, camera, &CameraUncertainty::of_time(0.0)).unwrap();
         let gate = Gate::with_probability(0.9999);
-        let fit = |x: f64| prediction.fit(&line_at(camera, Point3::new(x, 0.0, 50.0), 1.0).line, 0.0, gate);
+        let fit = |x: f64| prediction.fit(&line_at(camera, Point3::new(x, 0.0, 50.0), 1.0).line, gate);
         let near = |x: f64| fit(x).unwrap();
         assert!(near(10.0).gate_distance < 1e-9);
         // Two metres aside: twelve sigma of the quiet model, 1.5 of the lively one.
@@ -127,6 +131,6 @@ mod tests {
         assert!(near(12.0).log_density < near(10.0).log_density - 3.0);
         assert!(fit(40.0).is_none());
         let behind = line_at(camera, Point3::new(0.0, -200.0, -50.0), 1.0);
-        assert!(prediction.fit(&behind.line, 0.0, gate).is_none());
+        assert!(prediction.fit(&behind.line, gate).is_none());
     }
 }

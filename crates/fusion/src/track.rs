@@ -4,12 +4,12 @@ use std::fmt;
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Solver, Timestamp};
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix6x3, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Matrix6x3, Vector2};
 
-use crate::ingress::with_time_uncertainty;
 use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
 use crate::prediction::BearingPrediction;
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
+use crate::uncertainty::{CameraUncertainty, View};
 
 /// Rounds of the iterated update; the linearisation settles in two or three.
 const MAX_ITERATIONS: usize = 5;
@@ -52,6 +52,26 @@ pub struct MeasurementResidual {
     pub angle: f64,
     /// Squared Mahalanobis distance, two degrees of freedom.
     pub nis: f64,
+    contribution: Contribution,
+}
+
+/// What a bearing says of the position, and what is common to it and to its camera's others.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Contribution {
+    jacobian: Matrix2x3<f64>,
+    /// The bearing's own noise, rad^2.
+    own: Matrix2<f64>,
+    /// Pose and clock of its camera, rad^2.
+    common: Matrix2<f64>,
+}
+
+/// A bearing that a track has taken in.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Taken {
+    /// Whether a detector has seen the target begin to manoeuvre.
+    pub(crate) manoeuvre: bool,
+    /// Squared Mahalanobis distance by the noise that the camera itself has reported.
+    pub(crate) reported_nis: f64,
 }
 
 /// A target in space, kept up from single bearings of single cameras.
@@ -83,11 +103,12 @@ struct Linearised {
     offset: Vector2<f64>,
     jacobian: Matrix2x3<f64>,
     noise: Matrix2<f64>,
+    view: View,
 }
 
 impl Linearised {
     /// `None` if the position lies behind the camera.
-    fn at(state: &KinematicState, line: &SightLine, time_sd_s: f64) -> Option<Self> {
+    fn at(state: &KinematicState, line: &SightLine, camera: &CameraUncertainty) -> Option<Self> {
         let position = state.position();
         let offset = line.tangent_offset(position)?;
         let away = position - line.origin;
@@ -95,8 +116,27 @@ impl Linearised {
         let direction = away / range;
         let across = (Matrix3::identity() - direction * direction.transpose()) / range;
         let jacobian = line.basis.transpose() * across;
-        let noise = with_time_uncertainty(&line.covariance, jacobian * state.velocity(), time_sd_s);
-        Some(Self { offset, jacobian, noise })
+        let view =
+            View { direction: line.direction, basis: line.basis, range, rate: jacobian * state.velocity() };
+        Some(Self { offset, jacobian, noise: camera.noise(&line.covariance, &view), view })
+    }
+}
+
+impl Linearised {
+    /// The note of this bearing in the track.
+    fn residual(
+        &self,
+        time: Timestamp,
+        nis: f64,
+        line: &SightLine,
+        camera: &CameraUncertainty,
+    ) -> MeasurementResidual {
+        let contribution = Contribution {
+            jacobian: self.jacobian,
+            own: line.covariance * camera.factor,
+            common: camera.common(&self.view),
+        };
+        MeasurementResidual { time, angle: self.offset.norm(), nis, contribution }
     }
 }
 
@@ -106,7 +146,7 @@ impl Linearised {
 pub(crate) fn updated(
     prior: &KinematicState,
     line: &SightLine,
-    time_sd_s: f64,
+    camera: &CameraUncertainty,
 ) -> Option<(KinematicState, f64)> {
     let mut mean = prior.mean;
     let mut log_likelihood = None;
@@ -114,7 +154,7 @@ pub(crate) fn updated(
     let mut covariance = prior.covariance;
     for _ in 0..MAX_ITERATIONS {
         let here = KinematicState { mean, covariance: prior.covariance };
-        let Linearised { offset, jacobian, noise } = Linearised::at(&here, line, time_sd_s)?;
+        let Linearised { offset, jacobian, noise, .. } = Linearised::at(&here, line, camera)?;
         let across = ties * jacobian.transpose();
         let spread = jacobian * across.fixed_rows::<3>(0) + noise;
         let determinant = spread.determinant();
@@ -150,9 +190,10 @@ impl Track {
     ) -> Self {
         let residual = |(camera, TimedLine { line, time }): (&CameraName, &TimedLine)| {
             let here = fix.state.predicted(time.seconds_since(fix.time), 0.0);
-            let Linearised { offset, noise, .. } = Linearised::at(&here, line, 0.0)?;
-            let nis = offset.dot(&noise.cholesky()?.solve(&offset));
-            Some((camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis }))
+            let uncertainty = CameraUncertainty::of_time(0.0);
+            let seen = Linearised::at(&here, line, &uncertainty)?;
+            let nis = seen.offset.dot(&seen.noise.cholesky()?.solve(&seen.offset));
+            Some((camera.clone(), seen.residual(*time, nis, line, &uncertainty)))
         };
         Self {
             id: TrackId(0),
@@ -195,9 +236,16 @@ impl Track {
         &self,
         time: Timestamp,
         origin: nalgebra::Point3<f64>,
+        camera: &CameraUncertainty,
         motion: &Motion,
     ) -> Option<BearingPrediction> {
-        BearingPrediction::new(&self.imm, time.seconds_since(self.updated), motion.models(self.held), origin)
+        BearingPrediction::new(
+            &self.imm,
+            time.seconds_since(self.updated),
+            motion.models(self.held),
+            origin,
+            camera,
+        )
     }
 
     /// Takes a bearing in. Leaves the track as it was and returns `None` if the numbers fail;
@@ -206,14 +254,17 @@ impl Track {
         &mut self,
         camera: &CameraName,
         line: &SightLine,
-        (time, time_sd_s): (Timestamp, f64),
+        (time, uncertainty): (Timestamp, &CameraUncertainty),
         motion: &Motion,
-    ) -> Option<bool> {
+    ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
         let before = self.imm.predicted(interval, motion.models(self.held));
-        let Linearised { offset, jacobian, noise } = Linearised::at(&before, line, time_sd_s)?;
-        let spread = jacobian * before.position_covariance() * jacobian.transpose() + noise;
-        let nis = offset.dot(&spread.cholesky()?.solve(&offset));
+        let seen = Linearised::at(&before, line, uncertainty)?;
+        let offset = seen.offset;
+        let known = seen.jacobian * before.position_covariance() * seen.jacobian.transpose();
+        let distance = |noise: Matrix2<f64>| Some(offset.dot(&(known + noise).cholesky()?.solve(&offset)));
+        let nis = distance(seen.noise)?;
+        let reported_nis = distance(line.covariance + uncertainty.common(&seen.view))?;
         let manoeuvre = self.detector.as_mut().is_some_and(|detector| match detector {
             Detector::Residual(detector) => {
                 let in_deviations = line.basis * -offset / line.standard_deviation();
@@ -224,10 +275,10 @@ impl Track {
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
         }
-        self.imm.update(interval, motion.models(self.held), |state| updated(state, line, time_sd_s))?;
+        self.imm.update(interval, motion.models(self.held), |state| updated(state, line, uncertainty))?;
         self.updated = time;
         self.solver = Solver::Kalman;
-        let residual = MeasurementResidual { time, angle: offset.norm(), nis };
+        let residual = seen.residual(time, nis, line, uncertainty);
         if let Some(newest) = self.residuals.get_mut(camera) {
             *newest = residual;
         } else {
@@ -237,7 +288,32 @@ impl Track {
         if time.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
             self.observe();
         }
-        Some(manoeuvre)
+        Some(Taken { manoeuvre, reported_nis })
+    }
+
+    /// Position and velocity expected at a time, with all that is uncertain: what the cameras' poses
+    /// and clocks shift all bearings by is not averaged away by more of them.
+    pub(crate) fn honest(&self, time: Timestamp, motion: &Motion) -> KinematicState {
+        let mut state = self.predicted(time, motion);
+        let recent = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        let parts: Vec<&Contribution> =
+            self.residuals.values().filter(recent).map(|r| &r.contribution).collect();
+        if parts.iter().all(|part| part.common.amax() <= 0.0) {
+            return state;
+        }
+        // The position that one bearing of each camera gives, and how each camera's shift moves it.
+        let weighed = |part: &&Contribution| Some(part.jacobian.transpose() * part.own.try_inverse()?);
+        let weights: Vec<Matrix3x2<f64>> = parts.iter().filter_map(weighed).collect();
+        let information: Matrix3<f64> =
+            weights.iter().zip(&parts).map(|(weight, part)| weight * part.jacobian).sum();
+        if let Some(spread) = information.try_inverse().filter(|_| weights.len() == parts.len()) {
+            let mut position = state.covariance.fixed_view_mut::<3, 3>(0, 0);
+            for (weight, part) in weights.iter().zip(&parts) {
+                let moves = spread * weight;
+                position += moves * part.common * moves.transpose();
+            }
+        }
+        state
     }
 
     /// Cameras that have given a bearing within the last seconds before [`Self::updated`].
@@ -312,7 +388,14 @@ mod tests {
             };
             let mut track = Track::start(&fix, [], &motion);
             for timed in &lines[3..] {
-                track.measurement_update(&name, &timed.line, (timed.time, 0.0), &motion).unwrap();
+                track
+                    .measurement_update(
+                        &name,
+                        &timed.line,
+                        (timed.time, &CameraUncertainty::of_time(0.0)),
+                        &motion,
+                    )
+                    .unwrap();
             }
             let t = track.updated.seconds();
             let truth = Vector6::from_iterator(at(t).iter().chain(velocity.iter()).copied());

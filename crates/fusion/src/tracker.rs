@@ -109,14 +109,19 @@ impl Tracker {
         let mut candidates = Vec::new();
         for (row, id) in ids.iter().enumerate() {
             let prediction = self.tracks.get(id).and_then(|track| {
-                track.bearing_prediction(exposure.time, camera.pose().position(), &self.motion)
+                track.bearing_prediction(
+                    exposure.time,
+                    camera.pose().position(),
+                    &exposure.uncertainty,
+                    &self.motion,
+                )
             });
             let Some(prediction) = prediction else {
                 continue;
             };
             let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
             for (column, sighting) in open {
-                if let Some(fit) = prediction.fit(&sighting.line, exposure.time_sd_s, self.gate) {
+                if let Some(fit) = prediction.fit(&sighting.line, self.gate) {
                     let gain = log_likelihood_ratio(&fit, &self.config) - miss;
                     candidates.push(Candidate { row, column, gain });
                 }
@@ -134,7 +139,7 @@ impl Tracker {
             let update = column.and_then(|column| {
                 owners[column] = Some(*id);
                 let sighting = &exposure.sightings[column];
-                let time = (exposure.time, exposure.time_sd_s);
+                let time = (exposure.time, &exposure.uncertainty);
                 track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)
             });
             let gain = update.and(column).and_then(|column| gains.get(&(row, column)));
@@ -142,7 +147,7 @@ impl Tracker {
             let expected = gain.is_some() || camera.sees(track.position_at(exposure.time));
             let change = gain.unwrap_or(&0.0) + if expected { miss } else { 0.0 };
             track.score = (track.score + change).min(MAX_SCORE);
-            if update == Some(true) {
+            if update.is_some_and(|taken| taken.manoeuvre) {
                 happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
             }
         }

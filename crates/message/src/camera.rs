@@ -1,5 +1,5 @@
 use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
-use nalgebra::{Matrix3, Point3};
+use nalgebra::{Matrix3, Matrix6, Point3};
 use prost::Message;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
@@ -13,6 +13,9 @@ pub struct Calibration {
     pub name: CameraName,
     /// Its model and place.
     pub camera: Camera,
+    /// Covariance of the pose in the world's axes, rotation about them (rad), then position (m);
+    /// `None`: exact.
+    pub pose_covariance: Option<Matrix6<f64>>,
     /// It holds from this time on.
     pub valid_from: Timestamp,
 }
@@ -109,8 +112,40 @@ impl CameraCalibration {
         let position = self.position.ok_or_else(|| shape("position"))?;
         let pose = Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
-        Ok(Calibration { name, camera, valid_from: Timestamp::from_nanos(self.valid_from_ns) })
+        let pose_covariance = match self.pose_covariance.as_slice() {
+            [] => None,
+            values => Some(read_pose_covariance(values, &camera).ok_or_else(|| shape("pose_covariance"))?),
+        };
+        let valid_from = Timestamp::from_nanos(self.valid_from_ns);
+        Ok(Calibration { name, camera, pose_covariance, valid_from })
     }
+
+    /// The same calibration with an uncertain pose: standard deviations of the rotation about each
+    /// of the camera's axes (rad) and of the position along each of the world's (m).
+    #[must_use]
+    pub fn with_pose_sd(mut self, rotation_sd: f64, position_sd: f64) -> Self {
+        let mut covariance = Matrix6::<f64>::zeros();
+        for axis in 0..3 {
+            covariance[(axis, axis)] = rotation_sd.powi(2);
+            covariance[(axis + 3, axis + 3)] = position_sd.powi(2);
+        }
+        self.pose_covariance = covariance.as_slice().to_vec();
+        self.hash = self.content_hash();
+        self
+    }
+}
+
+/// The covariance on the wire (rotation about the camera's axes) turned into the world's axes;
+/// `None` if it is no covariance.
+fn read_pose_covariance(values: &[f64], camera: &Camera) -> Option<Matrix6<f64>> {
+    let values: &[f64; 36] = values.try_into().ok()?;
+    let own = Matrix6::from_row_slice(values);
+    let scale = own.amax();
+    let symmetric = (own - own.transpose()).amax() <= 1e-9 * scale;
+    let possible = scale.is_finite() && symmetric && own.symmetric_eigenvalues().min() >= -1e-9 * scale;
+    let mut turn = Matrix6::identity();
+    turn.fixed_view_mut::<3, 3>(0, 0).copy_from(camera.pose().rotation().matrix());
+    possible.then(|| turn * own * turn.transpose())
 }
 
 impl From<Point3<f64>> for Vector3 {
@@ -166,6 +201,19 @@ mod tests {
             assert!((ours - theirs).abs() < 1e-12);
         }
         assert_eq!(message.hash, message.content_hash());
+    }
+
+    #[test]
+    fn an_uncertain_pose_is_read_in_the_worlds_axes_and_an_impossible_one_is_named() {
+        let uncertain = message().with_pose_sd(0.01, 0.1);
+        let covariance = uncertain.parse().unwrap().pose_covariance.unwrap();
+        assert!((covariance[(1, 1)] - 1e-4).abs() < 1e-12 && (covariance[(4, 4)] - 0.01).abs() < 1e-12);
+        let mut torn = uncertain.clone();
+        torn.pose_covariance.pop();
+        assert!(matches!(torn.parse(), Err(CalibrationError::Shape { part: "pose_covariance", .. })));
+        let mut negative = uncertain;
+        negative.pose_covariance[0] = -1.0;
+        assert!(negative.parse().is_err());
     }
 
     #[test]

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_geometry::Camera;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::seeds::SeedFinder;
 use super::{NamedLine, lines_of};
+use crate::ingress::KnownCamera;
 use crate::spatial::{
     Fix, MapSolution, RangeSolution, TimedLine, VelocityKnowledge, map, pair, stacked, triple,
 };
@@ -32,7 +32,7 @@ impl FixFinder {
     pub(super) fn fixes(
         &self,
         exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, Camera>,
+        cameras: &BTreeMap<CameraName, KnownCamera>,
     ) -> Vec<PeriodFix> {
         match self.config.solver {
             SpatialSolver::Pair => self.pair_fixes(exposures),

@@ -2,15 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_geometry::Camera;
 use crossfix_message::CameraName;
 
 use super::fixes::{FixFinder, SPEED_SIGMAS};
 use super::{NamedLine, Start};
+use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
 use crate::temporal::{Group, Grouping, GroupingRules, TemporalGate};
 use crate::track::Track;
+use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig};
 
 /// Solves periods for fixes and groups the fixes.
@@ -44,7 +45,7 @@ impl Grouped {
     pub(super) fn advance(
         &mut self,
         exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, Camera>,
+        cameras: &BTreeMap<CameraName, KnownCamera>,
         motion: &Motion,
     ) -> Vec<Start> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
@@ -60,7 +61,12 @@ fn start(group: &Group, motion: &Motion) -> Option<Track> {
     let named = group.fixes.first()?.lines.iter().map(|((camera, ..), line)| (camera, line));
     let mut track = Track::start(&vague, named, motion);
     for ((camera, ..), timed) in later {
-        track.measurement_update(camera, &timed.line, (timed.time, 0.0), motion)?;
+        track.measurement_update(
+            camera,
+            &timed.line,
+            (timed.time, &CameraUncertainty::of_time(0.0)),
+            motion,
+        )?;
     }
     track.solver = fix.solver;
     Some(track)

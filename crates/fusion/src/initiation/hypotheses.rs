@@ -9,6 +9,7 @@ use crossfix_message::{CameraName, Solver, Timestamp};
 use super::seeds::{Seed, SeedFinder};
 use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
+use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::{Fix, MapSolution, VelocityKnowledge};
 use crate::temporal::LineId;
@@ -98,13 +99,13 @@ impl Hypotheses {
     pub(super) fn advance(
         &mut self,
         exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, Camera>,
+        cameras: &BTreeMap<CameraName, KnownCamera>,
         motion: &Motion,
     ) -> Vec<Start> {
         self.period += 1;
         for exposure in exposures {
-            if let Some(camera) = cameras.get(&exposure.camera) {
-                self.extend(exposure, camera, motion);
+            if let Some(known) = cameras.get(&exposure.camera) {
+                self.extend(exposure, &known.camera, motion);
             }
         }
         let span = self.span;
@@ -130,10 +131,14 @@ impl Hypotheses {
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for mut hypothesis in self.hypotheses.drain(..) {
             let expected = camera.sees(hypothesis.track.position_at(exposure.time));
-            let prediction =
-                hypothesis.track.bearing_prediction(exposure.time, camera.pose().position(), motion);
+            let prediction = hypothesis.track.bearing_prediction(
+                exposure.time,
+                camera.pose().position(),
+                &exposure.uncertainty,
+                motion,
+            );
             let ratio = |(i, (_, line)): (usize, &NamedLine)| {
-                let fit = prediction.as_ref()?.fit(&line.line, exposure.time_sd_s, self.gate)?;
+                let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
                 Some((log_likelihood_ratio(&fit, &self.tracking), i))
             };
             let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
@@ -141,7 +146,7 @@ impl Hypotheses {
             for &(ratio, i) in near.iter().take(MAX_BRANCHES).filter(|(ratio, _)| *ratio > miss) {
                 let mut child = hypothesis.clone();
                 let (id, line) = &lines[i];
-                let time = (exposure.time, exposure.time_sd_s);
+                let time = (exposure.time, &exposure.uncertainty);
                 if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
                     child.track.score += ratio;
                     child.lines.push((self.period, id.clone()));

@@ -12,9 +12,9 @@ mod selection;
 
 use std::collections::BTreeMap;
 
-use crossfix_geometry::Camera;
 use crossfix_message::CameraName;
 
+use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::TimedLine;
 use crate::temporal::LineId;
@@ -67,7 +67,7 @@ impl Initiator {
         &mut self,
         exposure: Exposure,
         claims: &[(usize, TrackId)],
-        cameras: &BTreeMap<CameraName, Camera>,
+        cameras: &BTreeMap<CameraName, KnownCamera>,
         motion: &Motion,
     ) -> Vec<Start> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {

@@ -3,11 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::PI;
 
-use crossfix_geometry::{Camera, SightLine};
+use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2x6, Vector2};
 
 use super::{NamedLine, lines_of};
+use crate::ingress::KnownCamera;
 use crate::spatial::{MapSolution, TimedLine, chi_square, map};
 use crate::temporal::LineId;
 use crate::{Exposure, FusionConfig, Initiation};
@@ -53,7 +54,7 @@ pub(super) struct SeedFinder {
 /// A pair of lines that pass each other closely, as they are extended.
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
-    cameras: &'a BTreeMap<CameraName, Camera>,
+    cameras: &'a BTreeMap<CameraName, KnownCamera>,
     lines: &'a [Vec<NamedLine>],
 }
 
@@ -71,7 +72,11 @@ impl SeedFinder {
     }
 
     /// Every set of lines of one period that may be one target's, the most likely first.
-    pub(super) fn find(&self, exposures: &[&Exposure], cameras: &BTreeMap<CameraName, Camera>) -> Vec<Seed> {
+    pub(super) fn find(
+        &self,
+        exposures: &[&Exposure],
+        cameras: &BTreeMap<CameraName, KnownCamera>,
+    ) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_of(e).collect()).collect();
         let growing = Growing { exposures, cameras, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
@@ -110,7 +115,7 @@ impl SeedFinder {
     /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first
     /// (002, equation 12).
     fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
-        let camera = |i: usize| growing.cameras.get(&growing.exposures[i].camera);
+        let camera = |i: usize| Some(&growing.cameras.get(&growing.exposures[i].camera)?.camera);
         let mut pairs = Vec::new();
         for a in 0..growing.exposures.len() {
             for b in a + 1..growing.exposures.len() {
@@ -242,7 +247,7 @@ impl SeedFinder {
         }
         let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
             let missed = places.iter().all(|(camera, _)| camera != k);
-            missed && growing.cameras.get(&exposure.camera).is_some_and(|camera| camera.sees(position))
+            missed && growing.cameras.get(&exposure.camera).is_some_and(|known| known.camera.sees(position))
         });
         let score = self.log_evidence(&lines, &solution)?
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
