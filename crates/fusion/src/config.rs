@@ -1,3 +1,4 @@
+use crossfix_message::CameraName;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -15,6 +16,32 @@ pub struct FusionConfig {
     pub initiation: Initiation,
     /// How tracks are kept up.
     pub tracking: Tracking,
+    /// How the cameras' clocks are estimated.
+    pub clocks: Clocks,
+}
+
+/// How the cameras' clocks are estimated from the tracks. A clock's offset begins as its frames'
+/// standard deviation of the capture time says.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Clocks {
+    /// Whether they are. Default true.
+    pub estimate: bool,
+    /// Cameras whose clock is right by definition. Default none.
+    pub trusted: Vec<CameraName>,
+    /// Clocks reported to be better than this are taken at their word, s. Default 0.001.
+    pub least_sd_s: f64,
+    /// Standard deviation of a clock's drift, s/s. Default 0.0001.
+    pub drift_sd: f64,
+    /// The least power spectral density of the acceleration of a target that clocks are compared by,
+    /// m^2/s^3. Default 0.01.
+    pub least_density: f64,
+}
+
+impl Default for Clocks {
+    fn default() -> Self {
+        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 1e-4, least_density: 0.01 }
+    }
 }
 
 /// Putting frames into the order of their capture times.
@@ -247,7 +274,7 @@ impl FusionConfig {
     /// # Errors
     /// The first [`ConfigError`].
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let Self { event_time, bearings, initiation, tracking } = self;
+        let Self { event_time, bearings, initiation, tracking, clocks } = self;
         let positive = [
             ("event_time.lateness_s", event_time.lateness_s),
             ("event_time.max_ahead_s", event_time.max_ahead_s),
@@ -260,6 +287,9 @@ impl FusionConfig {
             ("tracking.acceleration_density", tracking.acceleration_density),
             ("tracking.switching_rate_per_s", tracking.switching_rate_per_s),
             ("tracking.residual_scale", tracking.residual_scale),
+            ("clocks.least_sd_s", clocks.least_sd_s),
+            ("clocks.drift_sd", clocks.drift_sd),
+            ("clocks.least_density", clocks.least_density),
             ("initiation.birth_density_per_m3", initiation.birth_density_per_m3),
             ("tracking.clutter_per_sr", tracking.clutter_per_sr),
             ("tracking.confirm_score", tracking.confirm_score),

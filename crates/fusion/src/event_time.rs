@@ -165,6 +165,7 @@ mod tests {
             sequence: 0,
             time: Timestamp::from_seconds(time_s),
             uncertainty: crate::uncertainty::CameraUncertainty::of_time(0.0),
+            correction_s: 0.0,
             sightings: vec![],
         }
     }

@@ -5,12 +5,15 @@ use crossfix_message::{
     TrackEvent, TrackFrame, TrackState,
 };
 
+use crate::clocks::{ClockEstimate, ClockFilter};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
+use crate::standing::CameraStanding;
+use crate::standing::Standings;
 use crate::track::{Track, TrackStatus};
-use crate::tracker::{Happening, Step, Tracker};
+use crate::tracker::{Happening, Tracker};
 use crate::{ConfigError, Counters, FusionConfig};
 
 /// What comes out of the fusion centre.
@@ -22,6 +25,21 @@ pub enum Output {
     Event(TrackEvent),
     /// Something was not used.
     Rejected(Rejection),
+    /// A camera is left out, or used again.
+    Camera(CameraName, CameraStanding),
+}
+
+/// What the fusion centre thinks of a camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraReport {
+    /// The camera.
+    pub camera: CameraName,
+    /// Whether it is believed.
+    pub standing: CameraStanding,
+    /// How many times its reported covariances count.
+    pub noise_factor: f64,
+    /// Its clock; `None` as long as it has not been heard.
+    pub clock: Option<ClockEstimate>,
 }
 
 /// The fusion centre as a state machine: frames in, tracks out; no clock, no thread, no socket.
@@ -32,6 +50,10 @@ pub struct Fusion {
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
+    clocks: ClockFilter,
+    standings: Standings,
+    /// Exposures in the order of their corrected times, until nothing can come before them.
+    corrected: BTreeMap<(Timestamp, CameraName), Exposure>,
     counters: Counters,
     sequence: u64,
 }
@@ -49,6 +71,9 @@ impl Fusion {
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), motion),
             initiator: Initiator::new(&config),
+            clocks: ClockFilter::new(config.clocks.clone()),
+            standings: Standings::default(),
+            corrected: BTreeMap::new(),
             counters: Counters::default(),
             sequence: 0,
             config,
@@ -102,7 +127,20 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, &mut outputs);
         }
+        while let Some((_, exposure)) = self.corrected.pop_first() {
+            self.process(&exposure, &mut outputs);
+        }
         outputs
+    }
+
+    /// What is thought of each camera, ordered by name.
+    pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
+        self.cameras.keys().map(|camera| CameraReport {
+            camera: camera.clone(),
+            standing: self.standings.of(camera),
+            noise_factor: self.standings.factor(camera),
+            clock: self.clocks.estimate(camera),
+        })
     }
 
     /// What has been handled and refused so far.
@@ -134,7 +172,7 @@ impl Fusion {
 
     fn handle(&mut self, next: Result<Exposure, (Exposure, RejectionReason)>, outputs: &mut Vec<Output>) {
         match next {
-            Ok(exposure) => self.process(&exposure, outputs),
+            Ok(exposure) => self.correct(exposure, outputs),
             Err((exposure, reason)) => {
                 self.counters.count(reason.counter());
                 outputs.push(Output::Rejected(Rejection {
@@ -146,17 +184,81 @@ impl Fusion {
         }
     }
 
+    /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
+    /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to come.
+    fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
+        self.clocks.see(&exposure.camera, exposure.uncertainty.time_sd_s);
+        let Some(clock) = self.clocks.estimate(&exposure.camera).filter(|_| self.clocks.is_needed()) else {
+            return self.process(&exposure, outputs);
+        };
+        let reported = exposure.time;
+        exposure.correction_s = clock.offset_s;
+        exposure.time = reported.plus_seconds(-clock.offset_s);
+        exposure.uncertainty.time_sd_s = clock.relative_sd_s;
+        self.corrected.insert((exposure.time, exposure.camera.clone()), exposure);
+        let settled = reported.plus_seconds(-self.clocks.largest_offset());
+        while let Some(entry) = self.corrected.first_entry().filter(|entry| entry.key().0 <= settled) {
+            let next = entry.remove();
+            self.process(&next, outputs);
+        }
+    }
+
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
         let Some(KnownCamera { camera, .. }) = self.cameras.get(&exposure.camera) else {
             return;
         };
         self.counters.count("exposures");
-        let Step { free, claims, mut happenings } = self.tracker.step(exposure, camera);
-        let rest = Exposure { sightings: free, ..exposure.clone() };
-        for start in self.initiator.add(rest, &claims, &self.cameras, self.tracker.motion()) {
-            happenings.extend(self.tracker.adopt(start));
+        let mut exposure = exposure.clone();
+        exposure.uncertainty.factor = self.standings.factor(&exposure.camera);
+        let excluded = self.standings.of(&exposure.camera) == CameraStanding::Excluded;
+        let mut happenings = Vec::new();
+        let evidence = if excluded {
+            self.counters.count("exposures_of_excluded_cameras");
+            self.tracker.compare(&exposure, camera)
+        } else {
+            let step = self.tracker.step(&exposure, camera);
+            happenings = step.happenings;
+            if self.clocks.is_needed() {
+                self.clocks.advance(exposure.time, &self.tracker);
+                for (index, id) in step.used {
+                    if let (Some(track), Some(sighting)) =
+                        (self.tracker.track(id), exposure.sightings.get(index))
+                    {
+                        self.clocks.update(track, &exposure.camera, &sighting.line, exposure.correction_s);
+                    }
+                }
+            }
+            let rest = Exposure { sightings: step.free, ..exposure.clone() };
+            for start in self.initiator.add(rest, &step.claims, &self.cameras, self.tracker.motion()) {
+                happenings.extend(self.tracker.adopt(start));
+            }
+            step.evidence
+        };
+        self.judge(&exposure, &evidence, outputs);
+        self.say(&exposure, happenings, outputs);
+    }
+
+    /// Learns from an exposure how far its camera can be believed.
+    fn judge(&mut self, exposure: &Exposure, evidence: &[Option<f64>], outputs: &mut Vec<Output>) {
+        // A camera that sees nothing at all says nothing of its pose or clock.
+        if exposure.sightings.is_empty() {
+            return;
         }
+        for nis in evidence {
+            self.standings.learn(&exposure.camera, *nis);
+        }
+        if let Some(standing) = self.standings.review(&exposure.camera) {
+            self.counters.count(match standing {
+                CameraStanding::Excluded => "cameras_excluded",
+                _ => "cameras_readmitted",
+            });
+            outputs.push(Output::Camera(exposure.camera.clone(), standing));
+        }
+    }
+
+    /// Tells what has happened, and where all tracks are now.
+    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
         for happening in happenings {
             self.counters.count(match happening.kind {
                 crossfix_message::TrackEventKind::Born => "tracks_born",

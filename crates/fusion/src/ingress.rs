@@ -29,6 +29,8 @@ pub struct Exposure {
     pub time: Timestamp,
     /// What is uncertain of the camera as a whole.
     pub(crate) uncertainty: CameraUncertainty,
+    /// What has been taken off the reported time for the clock's offset, s.
+    pub(crate) correction_s: f64,
     /// The targets, in the frame's order.
     pub sightings: Vec<Sighting>,
 }
@@ -150,6 +152,7 @@ pub(crate) fn read(
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty { time_sd_s: sd, factor: 1.0, pose: *pose },
+        correction_s: 0.0,
         sightings,
     };
     Ok((exposure, rejected))

@@ -26,6 +26,7 @@
 //! [`BearingFrame`]: crossfix_message::BearingFrame
 
 mod assignment;
+mod clocks;
 mod config;
 mod counters;
 mod event_time;
@@ -35,16 +36,19 @@ mod initiation;
 mod motion;
 mod prediction;
 pub mod spatial;
+mod standing;
 pub mod temporal;
 mod track;
 mod tracker;
 mod uncertainty;
 
+pub use clocks::ClockEstimate;
 pub use config::{
-    Bearings, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod, Manoeuvres,
-    SpatialSolver, Tracking, Weighting,
+    Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod,
+    Manoeuvres, SpatialSolver, Tracking, Weighting,
 };
 pub use counters::Counters;
-pub use fusion::{Fusion, Output};
+pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
+pub use standing::CameraStanding;
 pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};

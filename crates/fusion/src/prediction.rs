@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2, Vector3};
+use nalgebra::{Matrix2, Point3, Unit, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, View};
 

@@ -188,9 +188,9 @@ impl Track {
         lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine)>,
         motion: &Motion,
     ) -> Self {
-        let residual = |(camera, TimedLine { line, time }): (&CameraName, &TimedLine)| {
+        let residual = |(camera, TimedLine { line, time, time_sd_s }): (&CameraName, &TimedLine)| {
             let here = fix.state.predicted(time.seconds_since(fix.time), 0.0);
-            let uncertainty = CameraUncertainty::of_time(0.0);
+            let uncertainty = CameraUncertainty::of_time(*time_sd_s);
             let seen = Linearised::at(&here, line, &uncertainty)?;
             let nis = seen.offset.dot(&seen.noise.cholesky()?.solve(&seen.offset));
             Some((camera.clone(), seen.residual(*time, nis, line, &uncertainty)))
@@ -229,6 +229,18 @@ impl Track {
     /// The probability of each motion model.
     pub fn model_probabilities(&self) -> &[f64] {
         self.imm.probabilities()
+    }
+
+    /// Power spectral density of the acceleration over all models, m^2/s^3.
+    pub(crate) fn mean_density(&self, motion: &Motion) -> f64 {
+        let models = motion.models(self.held).models();
+        models.iter().zip(self.imm.probabilities()).map(|(model, weight)| model.density * weight).sum()
+    }
+
+    /// Whether two other cameras than this one have lately seen the target.
+    pub(crate) fn is_held_without(&self, camera: &CameraName, motion: &Motion) -> bool {
+        let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        self.residuals.iter().filter(|(name, r)| *name != camera && lately(r)).count() >= 2
     }
 
     /// What a camera at `origin` should see at a time.

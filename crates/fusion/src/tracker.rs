@@ -53,6 +53,11 @@ pub(crate) struct Step {
     pub(crate) free: Vec<Sighting>,
     /// Which of them (by index) such a track has used.
     pub(crate) claims: Vec<(usize, TrackId)>,
+    /// Which sighting (by index) each track has taken in.
+    pub(crate) used: Vec<(usize, TrackId)>,
+    /// For every sure track that two other cameras hold and this one should see: the squared
+    /// distance of its bearing by the reported noise, or `None` if none came.
+    pub(crate) evidence: Vec<Option<f64>>,
     pub(crate) happenings: Vec<Happening>,
 }
 
@@ -67,6 +72,29 @@ impl Tracker {
         self.tracks.values()
     }
 
+    /// A track by its number.
+    pub(crate) fn track(&self, id: TrackId) -> Option<&Track> {
+        self.tracks.get(&id)
+    }
+
+    /// Compares an exposure with the sure tracks that other cameras hold, and uses nothing of it:
+    /// what [`Step::evidence`] is.
+    pub(crate) fn compare(&self, exposure: &Exposure, camera: &Camera) -> Vec<Option<f64>> {
+        let seen = self.tracks.values().filter(|track| {
+            track.is_confirmed()
+                && track.is_held_without(&exposure.camera, &self.motion)
+                && camera.sees(track.position_at(exposure.time))
+        });
+        let nearest = |track: &Track| {
+            let origin = camera.pose().position();
+            let prediction =
+                track.bearing_prediction(exposure.time, origin, &exposure.uncertainty, &self.motion)?;
+            let fits = exposure.sightings.iter().filter_map(|s| prediction.fit(&s.line, self.gate));
+            fits.map(|fit| fit.gate_distance).min_by(f64::total_cmp)
+        };
+        seen.map(nearest).collect()
+    }
+
     /// How targets move.
     pub(crate) fn motion(&self) -> &Motion {
         &self.motion
@@ -77,10 +105,12 @@ impl Tracker {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
         let mut happenings = Vec::new();
+        let mut evidence = Vec::new();
         // A sure track chooses before an unsure one: a ghost must not take a target's bearings.
         for sure in [true, false] {
-            happenings.extend(self.associate(exposure, camera, &mut owners, sure));
+            happenings.extend(self.associate(exposure, camera, &mut owners, sure, &mut evidence));
         }
+        let used = owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
             // What one camera alone follows is offered as if it were nobody's: if the others see the
@@ -93,7 +123,7 @@ impl Tracker {
         }
         happenings.extend(self.review(exposure.time));
         happenings.extend(self.merge(exposure.time));
-        Step { free, claims, happenings }
+        Step { free, claims, used, evidence, happenings }
     }
 
     fn associate(
@@ -102,6 +132,7 @@ impl Tracker {
         camera: &Camera,
         owners: &mut [Option<TrackId>],
         sure: bool,
+        evidence: &mut Vec<Option<f64>>,
     ) -> Vec<Happening> {
         let ids: Vec<TrackId> =
             self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
@@ -143,8 +174,12 @@ impl Tracker {
                 track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)
             });
             let gain = update.and(column).and_then(|column| gains.get(&(row, column)));
+            let sees = camera.sees(track.position_at(exposure.time));
+            if sure && (update.is_some() || sees) && track.is_held_without(&exposure.camera, &self.motion) {
+                evidence.push(update.map(|taken| taken.reported_nis));
+            }
             // Outside its field of view a camera has missed nothing.
-            let expected = gain.is_some() || camera.sees(track.position_at(exposure.time));
+            let expected = gain.is_some() || sees;
             let change = gain.unwrap_or(&0.0) + if expected { miss } else { 0.0 };
             track.score = (track.score + change).min(MAX_SCORE);
             if update.is_some_and(|taken| taken.manoeuvre) {

@@ -78,7 +78,7 @@ fn three_scanning_receivers_make_a_track_of_angles_met_at_different_times() {
     outputs.extend(fusion.flush());
     let mut frames = outputs.iter().filter_map(|output| match output {
         Output::Tracks(frame) => Some(frame),
-        Output::Event(_) | Output::Rejected(_) => None,
+        _ => None,
     });
     let last = frames.next_back().unwrap();
     let [track] = last.tracks.as_slice() else { panic!("{:?}", last.tracks) };

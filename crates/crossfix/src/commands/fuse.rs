@@ -9,7 +9,7 @@ use crossfix_message::{
 };
 use crossfix_transport::{Delivery, GapCounter, Link, LinkPublisher, Received, Role};
 
-use crate::commands::rejections::RejectionLog;
+use crate::commands::rejections::{RejectionLog, camera_health, report_camera};
 use crate::config::{self, FusionFile};
 use crate::output;
 use crate::shutdown::Shutdown;
@@ -175,6 +175,7 @@ impl Centre {
                     self.events.put(event.encode())?;
                 }
                 Output::Rejected(rejection) => self.rejections.report(&rejection),
+                Output::Camera(camera, standing) => report_camera(&camera, standing),
             }
         }
         Ok(())
@@ -199,6 +200,7 @@ impl Centre {
             time_ns: self.now.nanos(),
             handled: self.frames,
             counters,
+            cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
             ended,
             ..Default::default()
         };

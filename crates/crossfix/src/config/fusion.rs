@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use crossfix_fusion::{Bearings, EventTime, FusionConfig, Initiation, Tracking};
+use crossfix_fusion::{Bearings, Clocks, EventTime, FusionConfig, Initiation, Tracking};
 use crossfix_message::CameraName;
 use serde::{Deserialize, Serialize};
 
@@ -21,6 +21,8 @@ pub struct FusionFile {
     pub initiation: Initiation,
     /// How tracks are kept up.
     pub tracking: Tracking,
+    /// How the cameras' clocks are estimated.
+    pub clocks: Clocks,
 }
 
 impl FusionFile {
@@ -45,6 +47,7 @@ impl FusionFile {
             bearings: self.bearings.clone(),
             initiation: self.initiation.clone(),
             tracking: self.tracking.clone(),
+            clocks: self.clocks.clone(),
         }
     }
 }

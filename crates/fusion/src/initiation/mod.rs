@@ -12,6 +12,7 @@ mod selection;
 
 use std::collections::BTreeMap;
 
+use crossfix_geometry::SightLine;
 use crossfix_message::CameraName;
 
 use crate::ingress::KnownCamera;
@@ -89,6 +90,7 @@ impl Initiator {
 fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
-        (id, TimedLine { line: *line, time: exposure.time })
+        let line = SightLine { covariance: line.covariance * exposure.uncertainty.factor, ..*line };
+        (id, TimedLine { line, time: exposure.time, time_sd_s: exposure.uncertainty.time_sd_s })
     })
 }

@@ -208,7 +208,8 @@ impl SeedFinder {
         }
         let apart = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
         let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
-        let motion = self.initiation.velocity_prior_sd_mps * second.time.seconds_since(first.time).abs();
+        let between = second.time.seconds_since(first.time).abs() + first.time_sd_s + second.time_sd_s;
+        let motion = self.initiation.velocity_prior_sd_mps * between;
         apart <= SIGMAS * (noise + motion)
     }
 
@@ -225,7 +226,7 @@ impl SeedFinder {
             return Vec::new();
         };
         let distance = |(l, (_, line)): (usize, &NamedLine)| {
-            let distance = gate_distance(solution, reference, line)?;
+            let distance = gate_distance(solution, reference, line, self.initiation.velocity_prior_sd_mps)?;
             (distance <= self.line_gate).then_some((distance, l))
         };
         let mut near: Vec<(f64, usize)> = growing.lines[c].iter().enumerate().filter_map(distance).collect();
@@ -263,8 +264,10 @@ impl SeedFinder {
         let mut evidence = self.initiation.birth_density_per_m3.ln() + 1.5 * (2.0 * PI).ln() + log_root
             - velocity
             - solution.chi_square / 2.0;
-        for (_, TimedLine { line, .. }) in lines {
-            let density = (2.0 * PI).ln() + line.covariance.determinant().ln() / 2.0;
+        let (position, speed) = (solution.state.position(), self.initiation.velocity_prior_sd_mps);
+        for (_, timed) in lines {
+            let noise = timed.noise_at((position - timed.line.origin).norm(), speed);
+            let density = (2.0 * PI).ln() + noise.determinant().ln() / 2.0;
             evidence += (self.detection_probability / self.clutter_per_sr).ln() - density;
         }
         evidence.is_finite().then_some(evidence)
@@ -276,14 +279,14 @@ fn ids(seed: &Seed) -> Vec<LineId> {
 }
 
 /// Squared Mahalanobis distance of a line from a solution, two degrees of freedom.
-fn gate_distance(solution: &MapSolution, reference: Timestamp, line: &TimedLine) -> Option<f64> {
+fn gate_distance(solution: &MapSolution, reference: Timestamp, line: &TimedLine, speed: f64) -> Option<f64> {
     let dt = line.time.seconds_since(reference);
     let state = solution.state.predicted(dt, 0.0);
-    let SightLine { origin, basis, covariance, .. } = line.line;
+    let SightLine { origin, basis, .. } = line.line;
     let range = (state.position() - origin).norm();
     let offset: Vector2<f64> = line.line.tangent_offset(state.position())?;
     let mut jacobian = Matrix2x6::zeros();
     jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(basis.transpose() / range));
-    let spread = jacobian * state.covariance * jacobian.transpose() + covariance;
+    let spread = jacobian * state.covariance * jacobian.transpose() + line.noise_at(range, speed);
     Some(offset.dot(&spread.cholesky()?.solve(&offset)))
 }

@@ -43,7 +43,7 @@ pub fn map(
         data = Matrix6::zeros();
         let mut right = Vector6::zeros();
         let mut squares = 0.0;
-        for TimedLine { line, time } in lines {
+        for timed @ TimedLine { line, time, .. } in lines {
             let dt = time.seconds_since(reference);
             let offset = |x: &Vector6<f64>| {
                 Point3::from(x.fixed_rows::<3>(0) + x.fixed_rows::<3>(3) * dt) - line.origin
@@ -55,7 +55,8 @@ pub fn map(
             let mut h = Matrix2x6::zeros();
             h.fixed_view_mut::<2, 3>(0, 0).copy_from(&tangents);
             h.fixed_view_mut::<2, 3>(0, 3).copy_from(&(tangents * dt));
-            let weight = line.covariance.try_inverse()?;
+            let noise = if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
+            let weight = noise.try_inverse()?;
             let target = tangents * line.origin.coords;
             data += h.transpose() * weight * h;
             right += h.transpose() * weight * target;
@@ -70,7 +71,7 @@ pub fn map(
         state = Some((data + prior).cholesky()?.solve(&right));
     }
     let mean = state?;
-    let in_front = lines.iter().all(|TimedLine { line, time }| {
+    let in_front = lines.iter().all(|TimedLine { line, time, .. }| {
         let dt = time.seconds_since(reference);
         let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
         (position - line.origin).dot(&line.direction) > 0.0

@@ -28,7 +28,7 @@ mod triple;
 use crossfix_filter::KinematicState;
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Matrix2, Point3, Vector3};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 pub use accuracy::{pair_range_covariance, triple_range_covariance};
@@ -46,6 +46,16 @@ pub struct TimedLine {
     pub line: SightLine,
     /// Its capture time.
     pub time: Timestamp,
+    /// Standard deviation of that time, s.
+    pub time_sd_s: f64,
+}
+
+impl TimedLine {
+    /// Covariance of the direction to a target at `range` that moves at `speed` (m/s an axis): the
+    /// line's own, and what the uncertainty of its time adds.
+    pub(crate) fn noise_at(&self, range: f64, speed: f64) -> Matrix2<f64> {
+        self.line.covariance + Matrix2::identity() * (speed * self.time_sd_s / range).powi(2)
+    }
 }
 
 /// Ranges and velocity: what the papers' systems solve for.
@@ -100,7 +110,7 @@ pub(crate) fn chi_square(p: f64, dimensions: usize) -> f64 {
 #[cfg(test)]
 pub(crate) mod tests_support {
     use crossfix_geometry::{Bearing, tangent_basis};
-    use nalgebra::{Matrix2, Unit, Vector2};
+    use nalgebra::{Unit, Vector2};
 
     use super::*;
 
@@ -135,7 +145,7 @@ pub(crate) mod tests_support {
             basis: tangent_basis(&direction),
             covariance: *bearing.covariance(),
         };
-        TimedLine { line, time: Timestamp::from_seconds(time_s) }
+        TimedLine { line, time: Timestamp::from_seconds(time_s), time_sd_s: 0.0 }
     }
 
     /// The same with noise of [`SIGMA`] on both tangents.

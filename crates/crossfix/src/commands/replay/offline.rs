@@ -9,7 +9,7 @@ use crossfix_message::{
 use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
 
 use super::{Args, Range};
-use crate::commands::rejections::RejectionLog;
+use crate::commands::rejections::{RejectionLog, report_camera};
 use crate::config::FusionFile;
 use crate::output;
 
@@ -115,6 +115,10 @@ impl OfflineFusion {
                     let time = Timestamp::from_nanos(event.time_ns);
                     tracing::debug!("{time}: track {} {}", event.track_id, event.kind().as_str_name());
                     (Channel::Events, event.time_ns, event.encode())
+                }
+                Output::Camera(camera, standing) => {
+                    report_camera(&camera, standing);
+                    continue;
                 }
                 Output::Rejected(rejection) => {
                     self.rejections.report(&rejection);

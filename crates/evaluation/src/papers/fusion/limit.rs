@@ -28,7 +28,7 @@ const DIVERGED_M: f64 = 100.0;
 fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<Matrix6<f64>> {
     let mut information = FisherInformation::default();
     let noise = BearingNoise::isotropic(BEARING_SD)?;
-    for TimedLine { line, time } in lines {
+    for TimedLine { line, time, .. } in lines {
         let geometry = LineGeometry::between(line.origin, target.at(time.seconds()))?;
         information.add(&geometry, &noise, time.seconds_since(reference));
     }
@@ -116,7 +116,7 @@ fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicS
     outputs.extend(fusion.flush());
     let last = outputs.into_iter().rev().find_map(|output| match output {
         Output::Tracks(frame) => Some(frame),
-        Output::Event(_) | Output::Rejected(_) => None,
+        _ => None,
     })?;
     (last.time_ns == flight.end().nanos()).then_some(())?;
     let truth = flight.target.at(flight.end().seconds());
@@ -238,7 +238,7 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
 fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let lines = flight.seen.iter().map(|seen| {
         let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
-        Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s) })
+        Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s), time_sd_s: 0.0 })
     });
     let lines: Vec<TimedLine> = lines.collect::<Option<_>>()?;
     Some(map(&lines, flight.end(), PRIOR_SD)?.state)
