@@ -131,12 +131,16 @@ fn camera(at: [f64; 3]) -> Option<Camera> {
     Camera::new(lens, pose).ok()
 }
 
-/// A bearing that is right, with a standard deviation of half a milliradian.
-fn bearing(towards: nalgebra::Vector3<f64>) -> BearingTrack {
+/// Variances and covariance of a standard deviation of half a milliradian.
+const ORDINARY: [f64; 3] = [2.5e-7, 0.0, 2.5e-7];
+
+/// A bearing that is right.
+fn bearing(towards: nalgebra::Vector3<f64>, [xx, xy, yy]: [f64; 3]) -> BearingTrack {
     BearingTrack {
         bearing: Some(towards.normalize().into()),
-        covariance_xx: 2.5e-7,
-        covariance_yy: 2.5e-7,
+        covariance_xx: xx,
+        covariance_xy: xy,
+        covariance_yy: yy,
         state: ImageTrackState::Tracking.into(),
         ..Default::default()
     }
@@ -144,7 +148,8 @@ fn bearing(towards: nalgebra::Vector3<f64>) -> BearingTrack {
 
 /// Where three targets are at a time: two fly straight, one turns.
 fn targets(seconds: f64) -> [Point3<f64>; 3] {
-    let t = if seconds.abs() < 1e5 { seconds } else { 0.0 };
+    // Every half minute they are back where they were.
+    let t = seconds.rem_euclid(30.0);
     [
         Point3::new(-30.0 + 8.0 * t, 5.0, 40.0 + t),
         Point3::new(20.0, 25.0 - 6.0 * t, 55.0),
@@ -158,6 +163,9 @@ struct Run<'a> {
     fusion: Fusion,
     clutter_left: usize,
     time: i64,
+    /// What cameras say of their bearings' and times' errors.
+    covariance: [f64; 3],
+    time_sd: f64,
     sent: Vec<BearingFrame>,
     bearings: usize,
     rejected: BTreeMap<&'static str, u64>,
@@ -167,7 +175,7 @@ struct Run<'a> {
 
 impl Run<'_> {
     fn operate(&mut self) {
-        match self.bytes.next() % 12 {
+        match self.bytes.next() % 13 {
             0..=2 => self.fly(),
             3 => self.glimpse(),
             4 => self.odd_frame(),
@@ -188,7 +196,24 @@ impl Run<'_> {
                 let jump = JUMPS[self.bytes.below(JUMPS.len())];
                 self.time = self.time.saturating_add(jump);
             }
-            _ => self.again(),
+            11 => self.again(),
+            _ => {
+                self.covariance = self.odd_covariance();
+                self.time_sd = self.bytes.odd();
+            }
+        }
+    }
+
+    /// What a camera may say of a bearing's error, rad^2: `[xx, xy, yy]`.
+    fn odd_covariance(&mut self) -> [f64; 3] {
+        let [x, y] = [self.bytes.odd(), self.bytes.odd()];
+        match self.bytes.next() % 6 {
+            0 | 1 => ORDINARY,
+            2 => [x.abs(), 0.0, y.abs()],
+            3 => [x.abs(), 0.0, x.abs()],
+            // As good as singular.
+            4 => [1e-6, 1e-6 * (1.0 - 1e-15), 1e-6],
+            _ => [x, self.bytes.odd(), y],
         }
     }
 
@@ -215,7 +240,7 @@ impl Run<'_> {
         let places = targets(self.time as f64 / 1e9).into_iter().enumerate();
         let tracks = places
             .filter(|(i, place)| seen >> i & 1 == 1 && camera.sees(*place))
-            .map(|(_, place)| bearing(camera.pose().camera_from_world(place)));
+            .map(|(_, place)| bearing(camera.pose().camera_from_world(place), self.covariance));
         self.send(eye, tracks.collect());
     }
 
@@ -224,6 +249,7 @@ impl Run<'_> {
             camera: NAMES[eye].into(),
             sequence: self.sent.len() as u64,
             capture_time_ns: self.time,
+            capture_time_sd_s: self.time_sd,
             tracks,
             ..Default::default()
         };
@@ -243,44 +269,22 @@ impl Run<'_> {
         let mut tracks = Vec::new();
         for _ in 0..count {
             let kind = self.bytes.next();
-            let [x, y] = [self.bytes.odd(), self.bytes.odd()];
             let vector = match kind & 7 {
                 0 => None,
-                1 => Some([x, y, 1.0]),
+                1 => Some([self.bytes.odd(), self.bytes.odd(), 1.0]),
                 2 => Some([0.0, 0.0, -1.0]),
                 3 => Some([1.0, 0.0, 0.0]),
                 4 => Some([0.0, 0.0, 1.000_000_9]),
                 _ => Some([0.0, 0.0, 1.0]),
             };
             let state = if kind & 8 == 0 { ImageTrackState::Tracking } else { ImageTrackState::Coasting };
-            let [xx, xy, yy] = match kind >> 4 {
-                0..=4 => [2.5e-7, 0.0, 2.5e-7],
-                5..=7 => [x.abs(), 0.0, y.abs()],
-                8 | 9 => [x.abs(), 0.0, x.abs()],
-                // As good as singular.
-                10 | 11 => [1e-6, 1e-6 * (1.0 - 1e-15), 1e-6],
-                _ => [x, self.bytes.odd(), y],
-            };
-            let bearing = vector.map(|[x, y, z]| Vector3 { x, y, z });
-            let odd = BearingTrack {
-                bearing,
-                covariance_xx: xx,
-                covariance_xy: xy,
-                covariance_yy: yy,
-                ..Default::default()
-            };
-            tracks.push(BearingTrack { state: state.into(), ..odd });
+            let covariance = self.odd_covariance();
+            let sound = bearing(nalgebra::Vector3::z(), covariance);
+            let vector = vector.map(|[x, y, z]| Vector3 { x, y, z });
+            tracks.push(BearingTrack { bearing: vector, state: state.into(), ..sound });
         }
-        let sd = if self.bytes.next() & 3 == 3 { self.bytes.odd() } else { 0.0 };
         self.time = self.time.saturating_add(20_000_000);
-        self.ingest(BearingFrame {
-            camera: NAMES[eye].into(),
-            sequence: self.sent.len() as u64,
-            capture_time_ns: self.time,
-            capture_time_sd_s: sd,
-            tracks,
-            ..Default::default()
-        });
+        self.send(eye, tracks);
     }
 
     /// Up to two thousand bearings of nothing, or of the same nothing.
@@ -296,7 +300,7 @@ impl Run<'_> {
         let alike = nalgebra::Vector3::new(uniform(), 0.7 * uniform(), 1.0);
         let tracks = (0..count).map(|_| {
             let other = nalgebra::Vector3::new(1.3 * uniform(), 0.7 * uniform(), 1.0);
-            bearing(if seed & 1 == 0 { alike } else { other })
+            bearing(if seed & 1 == 0 { alike } else { other }, ORDINARY)
         });
         let tracks = tracks.collect();
         self.time = self.time.saturating_add(30_000_000);
@@ -440,6 +444,8 @@ pub fn drive(data: &[u8]) {
         fusion,
         clutter_left,
         time: 0,
+        covariance: ORDINARY,
+        time_sd: 0.0,
         sent: Vec::new(),
         bearings: 0,
         rejected: BTreeMap::new(),
