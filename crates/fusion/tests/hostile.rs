@@ -1,0 +1,231 @@
+//! Whatever cameras, clocks, a network or an operator give the fusion centre, it answers with what
+//! can be, or not at all. `fuzz/` runs the same driver with a fuzzer; its corpus is replayed here.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+mod common;
+#[path = "hostile/driver.rs"]
+mod driver;
+
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+use common::{Eye, Scene, bearing, calibration, clutter, eye, found, fusion_of, site, straight};
+use crossfix_fusion::{Fusion, FusionConfig, Output, Rejection, RejectionReason};
+use crossfix_message::{BearingFrame, BearingTrack};
+use nalgebra::Vector3;
+use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 60, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_bytes_are_survived(data in prop::collection::vec(any::<u8>(), 0..160)) {
+        driver::drive(&data);
+    }
+}
+
+#[test]
+fn the_corpus_is_survived() {
+    let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus/fusion");
+    let mut files = 0;
+    for entry in std::fs::read_dir(corpus).unwrap() {
+        driver::drive(&std::fs::read(entry.unwrap().path()).unwrap());
+        files += 1;
+    }
+    assert!(files > 0, "the corpus is empty");
+}
+
+fn of_the_site() -> Fusion {
+    fusion_of(FusionConfig::default(), &site())
+}
+
+/// Takes frames in one by one and returns what came out.
+fn ingest_all(fusion: &mut Fusion, frames: &[BearingFrame]) -> Vec<Output> {
+    frames.iter().flat_map(|frame| fusion.ingest(frame)).collect()
+}
+
+/// Two targets that fly straight, for some seconds from a time on.
+fn two_targets(time_s: Range<f64>) -> Scene {
+    let paths =
+        vec![straight([-25.0, 5.0, 40.0], [2.0, 1.0, 0.2]), straight([20.0, 15.0, 50.0], [-1.0, -2.0, 0.0])];
+    Scene { time_s, ..Scene::new(paths, 0.0) }
+}
+
+/// An ordinary target comes from `from_s` on and must be found, exactly one track where it is.
+fn finds_an_ordinary_target(fusion: &mut Fusion, from_s: f64) {
+    let x = -10.0 - 5.0 * from_s;
+    let scene = Scene {
+        time_s: from_s..from_s + 4.0,
+        ..Scene::new(vec![straight([x, -20.0, 35.0], [5.0, 0.0, 0.0])], 0.0)
+    };
+    site().iter().for_each(|eye| fusion.calibrate(&calibration(eye)).unwrap());
+    ingest_all(fusion, &scene.frames(99));
+    fusion.flush();
+    let truth = scene.paths.first().unwrap();
+    let track = found(fusion, truth).expect("an ordinary target is found");
+    let error = track.state().position() - truth(track.updated.seconds()).unwrap();
+    assert!(track.updated.seconds() > from_s + 3.8, "{track:?}");
+    assert!(error.norm() < 0.2, "{error}");
+}
+
+#[test]
+fn what_comes_twice_is_counted_once_and_changes_nothing() {
+    let frames = two_targets(0.0..3.0).frames(1);
+    let (mut once, mut twice) = (of_the_site(), of_the_site());
+    let expected = ingest_all(&mut once, &frames);
+    let doubled: Vec<BearingFrame> = frames.iter().flat_map(|f| [f.clone(), f.clone()]).collect();
+    let outputs = ingest_all(&mut twice, &doubled);
+    let useful: Vec<Output> = outputs.into_iter().filter(|o| !matches!(o, Output::Rejected(_))).collect();
+    assert_eq!(useful, expected);
+    let refused = twice.counters().get("rejected_duplicate") + twice.counters().get("rejected_late");
+    assert_eq!(refused, frames.len() as u64);
+    finds_an_ordinary_target(&mut twice, 4.0);
+}
+
+#[test]
+fn frames_that_come_too_late_are_refused_and_counted() {
+    let mut fusion = of_the_site();
+    let frames = two_targets(0.0..4.0).frames(2);
+    // Every tenth frame comes a second after its time.
+    let delay = |i: usize, frame: &BearingFrame| {
+        frame.capture_time_ns + if i % 10 == 9 && i < 80 { 1_000_000_000 } else { 0 }
+    };
+    let mut order: Vec<(i64, &BearingFrame)> =
+        frames.iter().enumerate().map(|(i, frame)| (delay(i, frame), frame)).collect();
+    order.sort_by_key(|(arrival, _)| *arrival);
+    for (_, frame) in order {
+        fusion.ingest(frame);
+    }
+    assert_eq!(fusion.counters().get("rejected_late"), 8);
+    assert_eq!(fusion.counters().get("tracks_confirmed"), 2);
+    assert_eq!(fusion.counters().get("tracks_lost"), 0);
+    finds_an_ordinary_target(&mut fusion, 5.0);
+}
+
+#[test]
+fn a_camera_whose_clock_jumps_is_refused_while_it_is_wrong_and_stops_nobody() {
+    let mut fusion = of_the_site();
+    let scene = two_targets(0.0..9.0);
+    for mut frame in scene.frames(3) {
+        let second = frame.capture_time_ns / 1_000_000_000;
+        if frame.camera == "c" {
+            frame.capture_time_ns += match second {
+                2 => 3_600_000_000_000,
+                4 => -3_600_000_000_000,
+                _ => 0,
+            };
+        }
+        fusion.ingest(&frame);
+        // Two cameras are enough to go on with.
+        if second > 1 {
+            assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()), "second {second}");
+        }
+    }
+    assert_eq!(fusion.counters().get("rejected_future"), 10);
+    assert_eq!(fusion.counters().get("rejected_late"), 10);
+    assert_eq!(fusion.counters().get("tracks_confirmed"), 2);
+    assert_eq!(fusion.counters().get("tracks_lost"), 0);
+    finds_an_ordinary_target(&mut fusion, 10.0);
+}
+
+#[test]
+fn two_cameras_at_the_same_place_make_no_target_of_their_own() {
+    let mut scene = two_targets(0.0..6.0);
+    let beside = Eye { name: "d".parse().unwrap(), phase_s: 0.05, ..scene.eyes[0].clone() };
+    scene.eyes = vec![scene.eyes.remove(0), beside];
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    ingest_all(&mut fusion, &scene.frames(4));
+    fusion.flush();
+    assert_eq!(fusion.counters().get("exposures"), 120);
+    assert_eq!(fusion.tracks().filter(|track| track.is_confirmed()).count(), 0);
+    [&"a", &"d"].iter().for_each(|name| drop(fusion.camera_ended(&name.parse().unwrap())));
+    finds_an_ordinary_target(&mut fusion, 7.0);
+}
+
+#[test]
+fn bearings_that_never_meet_make_no_track() {
+    let mut fusion = of_the_site();
+    // Each camera has something of its own above the middle, all of them at other heights.
+    let mut frames = Scene::new(vec![], 6.0).frames(5);
+    for frame in &mut frames {
+        let down = match frame.camera.as_str() {
+            "a" => -0.3,
+            "b" => 0.0,
+            _ => 0.3,
+        };
+        frame.tracks = vec![bearing(Vector3::new(0.0, down, 1.0), 1)];
+    }
+    ingest_all(&mut fusion, &frames);
+    fusion.flush();
+    assert_eq!(fusion.counters().get("exposures"), 180);
+    assert_eq!(fusion.counters().get("tracks_born"), 0);
+    finds_an_ordinary_target(&mut fusion, 7.0);
+}
+
+#[test]
+fn ten_thousand_false_bearings_in_a_frame_are_survived_in_bounded_time() {
+    let mut fusion = of_the_site();
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let scene = two_targets(0.0..4.0);
+    let (mut slowest, mut flooded) = (Duration::ZERO, 0);
+    for mut frame in scene.frames(6) {
+        // Each camera has one such frame, in the same period.
+        if (2.0..2.1).contains(&(frame.capture_time_ns as f64 / 1e9)) {
+            let eye = scene.eyes.iter().find(|eye| eye.name.as_str() == frame.camera).unwrap();
+            let noise = clutter(&eye.camera, 10_000, &mut rng).into_iter().zip(100..);
+            frame.tracks.extend(noise.map(|(towards, id)| bearing(towards, id)));
+            flooded += 1;
+        }
+        let start = Instant::now();
+        fusion.ingest(&frame);
+        slowest = slowest.max(start.elapsed());
+    }
+    assert_eq!(flooded, 3);
+    println!("the slowest frame took {slowest:?}");
+    assert!(slowest < Duration::from_secs(60), "{slowest:?}");
+    assert_eq!(fusion.counters().get("tracks_born"), 2, "no combination of clutter lasts");
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    finds_an_ordinary_target(&mut fusion, 5.0);
+}
+
+#[test]
+fn a_covariance_of_zero_is_refused_and_counted() {
+    let mut fusion = of_the_site();
+    let scene = two_targets(0.0..4.0);
+    let mut frames = scene.frames(7);
+    for frame in &mut frames {
+        let certain = BearingTrack { covariance_xx: 0.0, covariance_yy: 0.0, ..frame.tracks[0] };
+        frame.tracks.push(certain);
+    }
+    let outputs = ingest_all(&mut fusion, &frames);
+    let impossible = |output: &&Output| {
+        matches!(output, Output::Rejected(Rejection { reason: RejectionReason::Bearing(_), .. }))
+    };
+    assert_eq!(outputs.iter().filter(impossible).count(), frames.len());
+    assert_eq!(fusion.counters().get("rejected_bearing"), frames.len() as u64);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()), "the others are used");
+    finds_an_ordinary_target(&mut fusion, 5.0);
+}
+
+#[test]
+fn a_camera_that_is_moved_and_calibrated_anew_loses_no_target() {
+    let mut fusion = of_the_site();
+    let before = two_targets(0.0..3.0);
+    let mut after = two_targets(3.0..6.0);
+    after.eyes[2] = Eye { rate_hz: 10.0, ..eye("c", [-20.0, 150.0, 4.0], [0.0, 0.0, 40.0], 0.067) };
+    ingest_all(&mut fusion, &before.frames(8));
+    fusion.flush();
+    let ids = |fusion: &Fusion| -> Vec<Option<u64>> {
+        before.paths.iter().map(|path| Some(found(fusion, path)?.id.0)).collect()
+    };
+    let known = ids(&fusion);
+    assert!(known.iter().all(Option::is_some), "{known:?}");
+    fusion.calibrate(&calibration(&after.eyes[2])).unwrap();
+    ingest_all(&mut fusion, &after.frames(9));
+    assert_eq!(ids(&fusion), known, "the same tracks go on");
+    assert_eq!(fusion.counters().get("tracks_born"), 2);
+    finds_an_ordinary_target(&mut fusion, 7.0);
+}
