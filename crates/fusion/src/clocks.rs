@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{DMatrix, DVector, Matrix2, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Vector3};
 
 use crate::config::Clocks;
 use crate::track::{Track, TrackId};
@@ -15,13 +15,17 @@ use crate::tracker::Tracker;
 const MAX_TARGETS: usize = 2;
 /// A target slower than this says next to nothing of clocks, m/s.
 const LEAST_SPEED: f64 = 2.0;
-/// How vaguely a target is taken over from its track, so that no bearing counts twice: m and m/s.
-const TAKEN_OVER_SD: f64 = 10.0;
+/// Position, velocity and acceleration.
+const TARGET_STATES: usize = 9;
+/// How vaguely a target is taken over from its track, so that no bearing counts twice: m, m/s, m/s^2.
+const TAKEN_OVER_SD: [f64; 3] = [10.0, 5.0, 3.0];
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
 const OFFSET_WALK: f64 = 1e-12;
 const DRIFT_WALK: f64 = 1e-16;
 /// Innovations beyond this squared distance (two degrees of freedom) are somebody else's.
 const GATE: f64 = 25.0;
+/// When so many more bearings than fit have been somebody else's, the filter has lost its way.
+const MAX_STRANGERS: u32 = 20;
 /// Offsets beyond this are no offsets any more, s.
 const MAX_OFFSET_S: f64 = 2.0;
 
@@ -33,7 +37,7 @@ pub struct ClockEstimate {
     /// Standard deviation of the offset against true time, s. What all clocks may have in common
     /// nobody can see: it stays as large as the clocks' reported deviations leave it.
     pub sd_s: f64,
-    /// Standard deviation of the offset against the best clock of the site, s.
+    /// Standard deviation of the offset against what all clocks of the site say together, s.
     pub relative_sd_s: f64,
     /// How fast the clock gains, s/s.
     pub drift: f64,
@@ -41,19 +45,35 @@ pub struct ClockEstimate {
     pub drift_sd: f64,
 }
 
-/// Offset and drift of every clock and the state of a few targets in one Kalman filter, so that
-/// what a bearing says of one is not taken for the other.
+/// A camera's clock: where the filter has it, and what was reported of it.
+#[derive(Clone, Copy, Debug)]
+struct Clock {
+    /// The place of its offset against the reference; its drift is the next. The reference, the
+    /// first camera heard, has no place.
+    place: Option<usize>,
+    /// Variance of its offset against true time before anything is seen, s^2.
+    prior: f64,
+    /// The same of its drift.
+    drift_prior: f64,
+}
+
+/// Offset and drift of every clock against the first, and the state of a few targets, in one Kalman
+/// filter, so that what a bearing says of one is not taken for the other.
+///
+/// What all clocks have in common is left out: no bearing tells it, and a linearised filter would
+/// yet learn something of it that is not true. It follows from the reported deviations alone.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockFilter {
     config: Clocks,
-    /// The place of each camera's offset; its drift is the next.
-    cameras: BTreeMap<CameraName, usize>,
+    cameras: BTreeMap<CameraName, Clock>,
     /// Targets with the place of their first component.
     targets: Vec<TrackId>,
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     time: Option<Timestamp>,
     needed: bool,
+    /// How many more bearings than fit were somebody else's of late.
+    strangers: u32,
 }
 
 impl ClockFilter {
@@ -66,6 +86,7 @@ impl ClockFilter {
             covariance: DMatrix::zeros(0, 0),
             time: None,
             needed: false,
+            strangers: 0,
         }
     }
 
@@ -79,38 +100,94 @@ impl ClockFilter {
         if !self.config.estimate || self.cameras.contains_key(camera) {
             return;
         }
-        let trusted = self.config.trusted.contains(camera);
-        let (sd, drift_sd) = if trusted { (0.0, 0.0) } else { (reported_sd_s, self.config.drift_sd) };
-        let uncertain = sd >= self.config.least_sd_s;
+        let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
         self.needed |= uncertain;
+        let (prior, drift_prior) =
+            if uncertain { (reported_sd_s.powi(2), self.config.drift_sd.powi(2)) } else { (0.0, 0.0) };
+        let reference = self.cameras.values().find(|clock| clock.place.is_none()).copied();
         // Clocks come first, so targets move up.
-        let place = 2 * self.cameras.len();
-        self.insert(place, &[sd.powi(2), if uncertain { drift_sd.powi(2) } else { 0.0 }]);
-        self.cameras.insert(camera.clone(), place);
+        let place = reference.map(|reference| {
+            let place = self.clock_states();
+            self.insert(place, &[prior + reference.prior, drift_prior + reference.drift_prior]);
+            // The reference's own error is in every offset against it.
+            for other in (0..place).step_by(2) {
+                self.covariance[(place, other)] = reference.prior;
+                self.covariance[(other, place)] = reference.prior;
+                self.covariance[(place + 1, other + 1)] = reference.drift_prior;
+                self.covariance[(other + 1, place + 1)] = reference.drift_prior;
+            }
+            place
+        });
+        self.cameras.insert(camera.clone(), Clock { place, prior, drift_prior });
+    }
+
+    /// Components of the state that are clocks'.
+    fn clock_states(&self) -> usize {
+        2 * self.cameras.values().filter(|clock| clock.place.is_some()).count()
+    }
+
+    /// Offset and drift of a clock against the reference.
+    fn relative(&self, clock: &Clock) -> (f64, f64) {
+        clock.place.map_or((0.0, 0.0), |place| (self.mean[place], self.mean[place + 1]))
+    }
+
+    /// How much each clock says of true time, by the variances reported of them, and the variance of
+    /// what all say together. A clock that is right by definition says all.
+    fn weights(&self, prior: fn(&Clock) -> f64) -> (Vec<(Clock, f64)>, f64) {
+        let clocks: Vec<Clock> = self.cameras.values().copied().collect();
+        let exact = clocks.iter().filter(|clock| prior(clock) <= 0.0).count();
+        let weight = |clock: &Clock| match exact {
+            0 => prior(clock).recip(),
+            _ => f64::from(u8::from(prior(clock) <= 0.0)),
+        };
+        let total: f64 = clocks.iter().map(weight).sum();
+        let variance = if exact == 0 { total.recip() } else { 0.0 };
+        (clocks.into_iter().map(|clock| (clock, weight(&clock) / total)).collect(), variance)
+    }
+
+    /// Offset of the reference against true time: what makes all clocks together most nearly right.
+    fn reference_offset(&self) -> f64 {
+        let (weights, _) = self.weights(|clock| clock.prior);
+        -weights.iter().map(|(clock, weight)| weight * self.relative(clock).0).sum::<f64>()
+    }
+
+    /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
+    /// variance and the variance of that common time.
+    fn absolute(&self, clock: &Clock, component: usize, prior: fn(&Clock) -> f64) -> (f64, f64, f64) {
+        let (weights, common) = self.weights(prior);
+        let mut row = DVector::<f64>::zeros(self.mean.len());
+        if let Some(place) = clock.place {
+            row[place + component] += 1.0;
+        }
+        for (other, weight) in &weights {
+            if let Some(place) = other.place {
+                row[place + component] -= weight;
+            }
+        }
+        (row.dot(&self.mean), row.dot(&(&self.covariance * &row)).max(0.0), common)
     }
 
     /// The estimate of a camera's clock.
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
-        let &place = self.cameras.get(camera)?;
-        let best =
-            self.cameras.values().copied().min_by(|&a, &b| {
-                self.covariance[(a, a)].total_cmp(&self.covariance[(b, b)]).then(a.cmp(&b))
-            })?;
-        let variance = |i: usize| self.covariance[(i, i)].max(0.0);
-        let against_best = variance(place) + variance(best) - 2.0 * self.covariance[(place, best)];
+        let clock = self.cameras.get(camera)?;
+        let (offset, own, common) = self.absolute(clock, 0, |clock| clock.prior);
+        let (drift, own_drift, common_drift) = self.absolute(clock, 1, |clock| clock.drift_prior);
         Some(ClockEstimate {
-            offset_s: self.mean[place].clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
-            sd_s: variance(place).sqrt(),
-            relative_sd_s: if place == best { 0.0 } else { against_best.max(0.0).sqrt() },
-            drift: self.mean[place + 1],
-            drift_sd: variance(place + 1).sqrt(),
+            offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
+            // No clock is worse known than what was reported of it.
+            sd_s: (own + common).min(clock.prior).sqrt(),
+            relative_sd_s: own.sqrt(),
+            drift,
+            drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
         })
     }
 
     /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
     /// behind its reported one.
     pub(crate) fn largest_offset(&self) -> f64 {
-        self.cameras.values().map(|&i| self.mean[i].min(MAX_OFFSET_S)).fold(0.0, f64::max)
+        let common = self.reference_offset();
+        let offsets = self.cameras.values().map(|clock| common + self.relative(clock).0);
+        offsets.fold(0.0, f64::max).min(MAX_OFFSET_S)
     }
 
     /// Moves on to a time; targets that are gone or that too few cameras see are let go.
@@ -122,7 +199,7 @@ impl ClockFilter {
         }
         let dt = self.time.map_or(0.0, |before| time.seconds_since(before));
         self.time = Some(time);
-        let clocks = 2 * self.cameras.len();
+        let clocks = self.clock_states();
         for k in (0..clocks).step_by(2) {
             self.carry(k, k + 1, dt);
             if self.covariance[(k, k)] > 0.0 {
@@ -130,26 +207,43 @@ impl ClockFilter {
                 self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt.abs();
             }
         }
-        for (index, id) in self.targets.clone().into_iter().enumerate() {
-            let density = tracker.track(id).map_or(1.0, |t| t.mean_density(tracker.motion()));
-            let density = density.max(self.config.least_density);
-            let first = clocks + 6 * index;
-            for axis in first..first + 3 {
-                self.carry(axis, axis + 3, dt);
-                let noise = density * dt.abs();
-                self.covariance[(axis, axis)] += noise * dt * dt / 3.0;
-                self.covariance[(axis, axis + 3)] += noise * dt / 2.0;
-                self.covariance[(axis + 3, axis)] += noise * dt / 2.0;
-                self.covariance[(axis + 3, axis + 3)] += noise;
+        for index in 0..self.targets.len() {
+            self.carry_target(clocks + TARGET_STATES * index, dt);
+        }
+    }
+
+    /// Moves a target on: constant acceleration driven by white jerk, which follows a turn closely
+    /// enough that its curve is not taken for the clocks'.
+    fn carry_target(&mut self, first: usize, dt: f64) {
+        let noise = self.config.jerk_density * dt.abs();
+        for p in first..first + 3 {
+            let (v, a) = (p + 3, p + 6);
+            self.carry(p, a, dt * dt / 2.0);
+            self.carry(p, v, dt);
+            self.carry(v, a, dt);
+            let added = [
+                (p, p, dt.powi(4) / 20.0),
+                (p, v, dt.powi(3) / 8.0),
+                (p, a, dt.powi(2) / 6.0),
+                (v, v, dt.powi(2) / 3.0),
+                (v, a, dt / 2.0),
+                (a, a, 1.0),
+            ];
+            for (i, k, share) in added {
+                self.covariance[(i, k)] += noise * share;
+                if i != k {
+                    self.covariance[(k, i)] += noise * share;
+                }
             }
         }
     }
 
     /// Takes a bearing of a track in, taken at a time that was corrected by `applied_s`.
     pub(crate) fn update(&mut self, track: &Track, camera: &CameraName, line: &SightLine, applied_s: f64) {
-        let Some(&clock) = self.cameras.get(camera) else {
+        let Some(clock) = self.cameras.get(camera).copied() else {
             return;
         };
+        let common = self.reference_offset();
         let Some(first) = self.place_of(track) else {
             return;
         };
@@ -165,16 +259,24 @@ impl ClockFilter {
         let n = self.mean.len();
         let mut jacobian = DMatrix::zeros(2, n);
         jacobian.fixed_view_mut::<2, 3>(0, first).copy_from(&across);
-        jacobian.fixed_view_mut::<2, 1>(0, clock).copy_from(&-drift);
-        let innovation = -(offset + drift * (applied_s - self.mean[clock]));
+        if let Some(place) = clock.place {
+            jacobian.fixed_view_mut::<2, 1>(0, place).copy_from(&-drift);
+        }
+        let innovation = -(offset + drift * (applied_s - common - self.relative(&clock).0));
         let tied = &self.covariance * jacobian.transpose();
         let spread: Matrix2<f64> = (&jacobian * &tied).fixed_view::<2, 2>(0, 0) + line.covariance;
+        let spread = spread + self.second_order(clock.place, first, &across);
         let Some(inverse) = spread.try_inverse() else {
             return;
         };
         if innovation.dot(&(inverse * innovation)) > GATE {
+            self.strangers += 1;
+            if self.strangers > MAX_STRANGERS {
+                self.begin_anew();
+            }
             return;
         }
+        self.strangers = self.strangers.saturating_sub(2);
         let gain = &tied * inverse;
         let (mean, covariance) =
             (&self.mean + &gain * innovation, &self.covariance - &gain * tied.transpose());
@@ -184,11 +286,44 @@ impl ClockFilter {
         }
     }
 
+    /// What the linearisation leaves out: the offset's error times the velocity's, and half the
+    /// acceleration times the offset's square; rad^2.
+    fn second_order(&self, clock: Option<usize>, first: usize, across: &Matrix2x3<f64>) -> Matrix2<f64> {
+        let variance = clock.map_or(0.0, |place| self.covariance[(place, place)].max(0.0));
+        let velocity = self.covariance.fixed_view::<3, 3>(first + 3, first + 3).into_owned();
+        let acceleration = across * self.mean.fixed_rows::<3>(first + 6);
+        across * velocity * across.transpose() * variance
+            + acceleration * acceleration.transpose() * (variance * variance / 2.0)
+    }
+
+    /// The filter has lost its way: the targets are let go, and nothing more is known of the clocks
+    /// than what was reported of them.
+    pub(crate) fn begin_anew(&mut self) {
+        self.strangers = 0;
+        for id in self.targets.clone() {
+            self.let_go(id);
+        }
+        let cameras = std::mem::take(&mut self.cameras);
+        let reference = cameras.values().find(|clock| clock.place.is_none()).copied();
+        let common = reference.map_or((0.0, 0.0), |clock| (clock.prior, clock.drift_prior));
+        self.covariance.fill(0.0);
+        self.mean.fill(0.0);
+        for (one, clock) in cameras.values().filter_map(|clock| Some((clock.place?, clock))) {
+            for other in cameras.values().filter_map(|clock| clock.place) {
+                self.covariance[(one, other)] = common.0;
+                self.covariance[(one + 1, other + 1)] = common.1;
+            }
+            self.covariance[(one, one)] += clock.prior;
+            self.covariance[(one + 1, one + 1)] += clock.drift_prior;
+        }
+        self.cameras = cameras;
+    }
+
     /// The place of a track's state; takes it over if it is worth following.
     fn place_of(&mut self, track: &Track) -> Option<usize> {
-        let clocks = 2 * self.cameras.len();
+        let clocks = self.clock_states();
         if let Some(index) = self.targets.iter().position(|&id| id == track.id) {
-            return Some(clocks + 6 * index);
+            return Some(clocks + TARGET_STATES * index);
         }
         let state = track.state();
         let worth = track.is_held() && track.residuals.len() >= 3 && state.velocity().norm() >= LEAST_SPEED;
@@ -196,8 +331,10 @@ impl ClockFilter {
             return None;
         }
         let first = self.mean.len();
-        let variances: Vec<f64> =
-            state.covariance.diagonal().iter().map(|variance| variance + TAKEN_OVER_SD.powi(2)).collect();
+        let vague = TAKEN_OVER_SD.map(|sd: f64| sd.powi(2));
+        let own = state.covariance.diagonal();
+        let variances: [f64; TARGET_STATES] =
+            std::array::from_fn(|i| vague[i / 3] + own.get(i).copied().unwrap_or(0.0));
         self.insert(first, &variances);
         self.mean.fixed_rows_mut::<6>(first).copy_from(&state.mean);
         self.targets.push(track.id);
@@ -207,10 +344,12 @@ impl ClockFilter {
     fn let_go(&mut self, id: TrackId) {
         if let Some(index) = self.targets.iter().position(|&target| target == id) {
             self.targets.remove(index);
-            let first = 2 * self.cameras.len() + 6 * index;
-            self.mean = std::mem::replace(&mut self.mean, DVector::zeros(0)).remove_rows(first, 6);
+            let first = self.clock_states() + TARGET_STATES * index;
+            self.mean =
+                std::mem::replace(&mut self.mean, DVector::zeros(0)).remove_rows(first, TARGET_STATES);
             let covariance = std::mem::replace(&mut self.covariance, DMatrix::zeros(0, 0));
-            self.covariance = covariance.remove_rows(first, 6).remove_columns(first, 6);
+            self.covariance =
+                covariance.remove_rows(first, TARGET_STATES).remove_columns(first, TARGET_STATES);
         }
     }
 

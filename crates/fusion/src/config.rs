@@ -33,14 +33,14 @@ pub struct Clocks {
     pub least_sd_s: f64,
     /// Standard deviation of a clock's drift, s/s. Default 0.0001.
     pub drift_sd: f64,
-    /// The least power spectral density of the acceleration of a target that clocks are compared by,
-    /// m^2/s^3. Default 0.01.
-    pub least_density: f64,
+    /// Power spectral density of the jerk of the targets that clocks are compared by, m^2/s^5.
+    /// Default 1.
+    pub jerk_density: f64,
 }
 
 impl Default for Clocks {
     fn default() -> Self {
-        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 1e-4, least_density: 0.01 }
+        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 3e-5, jerk_density: 1.0 }
     }
 }
 
@@ -137,6 +137,9 @@ pub struct Initiation {
     pub periods: usize,
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
+    /// How long the bearings of two cameras must agree to start a track that no third camera sees, s,
+    /// for `hypotheses`. Default 2.
+    pub pair_s: f64,
     /// Standard deviation of the velocity's prior, m/s an axis. Default 15.
     pub velocity_prior_sd_mps: f64,
     /// Fixes farther than this from a camera are ghosts, m. Default 2000.
@@ -160,6 +163,7 @@ impl Default for Initiation {
             period_s: 0.05,
             periods: 4,
             fixes: 2,
+            pair_s: 2.0,
             velocity_prior_sd_mps: 15.0,
             max_range_m: 2000.0,
             spatial_gate_probability: 0.999,
@@ -281,6 +285,7 @@ impl FusionConfig {
             ("bearings.equal_sd_rad", bearings.equal_sd_rad),
             ("initiation.period_s", initiation.period_s),
             ("initiation.velocity_prior_sd_mps", initiation.velocity_prior_sd_mps),
+            ("initiation.pair_s", initiation.pair_s),
             ("initiation.max_range_m", initiation.max_range_m),
             ("initiation.pair_gate_m2", initiation.pair_gate_m2),
             ("initiation.temporal_gate_m", initiation.temporal_gate_m.unwrap_or(1.0)),
@@ -289,7 +294,7 @@ impl FusionConfig {
             ("tracking.residual_scale", tracking.residual_scale),
             ("clocks.least_sd_s", clocks.least_sd_s),
             ("clocks.drift_sd", clocks.drift_sd),
-            ("clocks.least_density", clocks.least_density),
+            ("clocks.jerk_density", clocks.jerk_density),
             ("initiation.birth_density_per_m3", initiation.birth_density_per_m3),
             ("tracking.clutter_per_sr", tracking.clutter_per_sr),
             ("tracking.confirm_score", tracking.confirm_score),

@@ -12,7 +12,7 @@ use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::standing::CameraStanding;
 use crate::standing::Standings;
-use crate::track::{Track, TrackStatus};
+use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{Happening, Tracker};
 use crate::{ConfigError, Counters, FusionConfig};
 
@@ -69,7 +69,7 @@ impl Fusion {
         Ok(Self {
             cameras: BTreeMap::new(),
             buffer: EventBuffer::new(config.event_time.clone()),
-            tracker: Tracker::new(config.tracking.clone(), motion),
+            tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),
             clocks: ClockFilter::new(config.clocks.clone()),
             standings: Standings::default(),
@@ -205,7 +205,7 @@ impl Fusion {
 
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
-        let Some(KnownCamera { camera, .. }) = self.cameras.get(&exposure.camera) else {
+        let Some(known) = self.cameras.get(&exposure.camera) else {
             return;
         };
         self.counters.count("exposures");
@@ -213,30 +213,34 @@ impl Fusion {
         exposure.uncertainty.factor = self.standings.factor(&exposure.camera);
         let excluded = self.standings.of(&exposure.camera) == CameraStanding::Excluded;
         let mut happenings = Vec::new();
-        let evidence = if excluded {
+        let (evidence, used) = if excluded {
             self.counters.count("exposures_of_excluded_cameras");
-            self.tracker.compare(&exposure, camera)
+            self.tracker.compare(&exposure, known)
         } else {
-            let step = self.tracker.step(&exposure, camera);
+            let step = self.tracker.step(&exposure, known);
             happenings = step.happenings;
-            if self.clocks.is_needed() {
-                self.clocks.advance(exposure.time, &self.tracker);
-                for (index, id) in step.used {
-                    if let (Some(track), Some(sighting)) =
-                        (self.tracker.track(id), exposure.sightings.get(index))
-                    {
-                        self.clocks.update(track, &exposure.camera, &sighting.line, exposure.correction_s);
-                    }
-                }
-            }
             let rest = Exposure { sightings: step.free, ..exposure.clone() };
             for start in self.initiator.add(rest, &step.claims, &self.cameras, self.tracker.motion()) {
                 happenings.extend(self.tracker.adopt(start));
             }
-            step.evidence
+            (step.evidence, step.used)
         };
+        self.compare_clocks(&exposure, &used);
         self.judge(&exposure, &evidence, outputs);
         self.say(&exposure, happenings, outputs);
+    }
+
+    /// Learns from the bearings of tracks what they say of the camera's clock.
+    fn compare_clocks(&mut self, exposure: &Exposure, used: &[(usize, TrackId)]) {
+        if !self.clocks.is_needed() {
+            return;
+        }
+        self.clocks.advance(exposure.time, &self.tracker);
+        for (index, id) in used {
+            if let (Some(track), Some(sighting)) = (self.tracker.track(*id), exposure.sightings.get(*index)) {
+                self.clocks.update(track, &exposure.camera, &sighting.line, exposure.correction_s);
+            }
+        }
     }
 
     /// Learns from an exposure how far its camera can be believed.
@@ -253,6 +257,10 @@ impl Fusion {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
+            if standing == CameraStanding::Excluded && self.clocks.is_needed() {
+                // It may be the clocks that are wrong: they get another chance with all cameras.
+                self.clocks.begin_anew();
+            }
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
         }
     }
@@ -308,7 +316,7 @@ impl Fusion {
             TrackStatus::Lost => TrackState::Lost,
         };
         let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {
-            camera: camera.to_string(),
+            camera: camera.as_str().to_owned(),
             time_ns: residual.time.nanos(),
             angle_rad: residual.angle,
             nis: residual.nis,

@@ -4,7 +4,7 @@ use std::fmt;
 
 use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
-use nalgebra::{Matrix2, Matrix6};
+use nalgebra::{Matrix2, Matrix6, Point3};
 
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
@@ -41,6 +41,13 @@ pub(crate) struct KnownCamera {
     pub(crate) camera: Camera,
     /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
     pub(crate) pose_covariance: Option<Matrix6<f64>>,
+}
+
+impl KnownCamera {
+    /// Whether the camera should report a target at a place: in its image, and not too far away.
+    pub(crate) fn expects(&self, place: Point3<f64>, max_range_m: f64) -> bool {
+        (place - self.camera.pose().position()).norm() <= max_range_m && self.camera.sees(place)
+    }
 }
 
 /// Why a frame or a part of it was not used.

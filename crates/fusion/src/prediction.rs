@@ -67,6 +67,22 @@ impl BearingPrediction {
         })
     }
 
+    /// Where a camera at `origin` should see a target of a state, as of the state's time; the target
+    /// may have moved by `moved` (m, standard deviation an axis) between that time and the exposure.
+    pub(crate) fn of_state(state: &KinematicState, origin: Point3<f64>, moved: f64) -> Option<Self> {
+        let offset = state.position() - origin;
+        let range = offset.norm();
+        let direction = Unit::try_new(offset, 1e-6)?;
+        let basis = tangent_basis(&direction);
+        let across = basis / range;
+        let steady = across.transpose() * state.position_covariance() * across
+            + Matrix2::identity() * (moved / range).powi(2);
+        let mut weights = [0.0; MAX_MODELS];
+        weights[0] = 1.0;
+        let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
+        Some(Self { view, factor: 1.0, steady, added: [0.0; MAX_MODELS], weights, widest: 0.0 })
+    }
+
     /// How a bearing fits; `None` if it lies outside the gate.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
         let innovation = self.view.basis.transpose() * line.direction.into_inner();

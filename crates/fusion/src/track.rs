@@ -231,12 +231,6 @@ impl Track {
         self.imm.probabilities()
     }
 
-    /// Power spectral density of the acceleration over all models, m^2/s^3.
-    pub(crate) fn mean_density(&self, motion: &Motion) -> f64 {
-        let models = motion.models(self.held).models();
-        models.iter().zip(self.imm.probabilities()).map(|(model, weight)| model.density * weight).sum()
-    }
-
     /// Whether two other cameras than this one have lately seen the target.
     pub(crate) fn is_held_without(&self, camera: &CameraName, motion: &Motion) -> bool {
         let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;

@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 
 use crossfix_filter::{Gate, KinematicState};
-use crossfix_geometry::Camera;
 use crossfix_message::{Timestamp, TrackEventKind};
 
 use crate::assignment::{Candidate, assign};
+use crate::ingress::KnownCamera;
 use crate::initiation::Start;
 use crate::motion::Motion;
 use crate::prediction::Fit;
@@ -42,6 +42,8 @@ pub(crate) struct Tracker {
     config: Tracking,
     motion: Motion,
     gate: Gate,
+    /// Beyond this range no camera is expected to see a target, m.
+    max_range_m: f64,
     tracks: BTreeMap<TrackId, Track>,
     next_id: u64,
 }
@@ -62,9 +64,9 @@ pub(crate) struct Step {
 }
 
 impl Tracker {
-    pub(crate) fn new(config: Tracking, motion: Motion) -> Self {
+    pub(crate) fn new(config: Tracking, max_range_m: f64, motion: Motion) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
-        Self { config, motion, gate, tracks: BTreeMap::new(), next_id: 1 }
+        Self { config, motion, gate, max_range_m, tracks: BTreeMap::new(), next_id: 1 }
     }
 
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.
@@ -77,22 +79,29 @@ impl Tracker {
         self.tracks.get(&id)
     }
 
-    /// Compares an exposure with the sure tracks that other cameras hold, and uses nothing of it:
-    /// what [`Step::evidence`] is.
-    pub(crate) fn compare(&self, exposure: &Exposure, camera: &Camera) -> Vec<Option<f64>> {
+    /// Compares an exposure with the sure tracks that other cameras hold, and updates none: what
+    /// [`Step::evidence`] and [`Step::used`] would be.
+    pub(crate) fn compare(
+        &self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+    ) -> (Vec<Option<f64>>, Vec<(usize, TrackId)>) {
         let seen = self.tracks.values().filter(|track| {
             track.is_confirmed()
                 && track.is_held_without(&exposure.camera, &self.motion)
-                && camera.sees(track.position_at(exposure.time))
+                && known.expects(track.position_at(exposure.time), self.max_range_m)
         });
         let nearest = |track: &Track| {
-            let origin = camera.pose().position();
+            let origin = known.camera.pose().position();
             let prediction =
                 track.bearing_prediction(exposure.time, origin, &exposure.uncertainty, &self.motion)?;
-            let fits = exposure.sightings.iter().filter_map(|s| prediction.fit(&s.line, self.gate));
-            fits.map(|fit| fit.gate_distance).min_by(f64::total_cmp)
+            let fits = exposure.sightings.iter().enumerate();
+            let fits = fits.filter_map(|(i, s)| Some((prediction.fit(&s.line, self.gate)?.gate_distance, i)));
+            fits.min_by(|a, b| a.0.total_cmp(&b.0))
         };
-        seen.map(nearest).collect()
+        let nearest: Vec<(TrackId, Option<(f64, usize)>)> = seen.map(|t| (t.id, nearest(t))).collect();
+        let used = nearest.iter().filter_map(|(id, fit)| Some(((*fit)?.1, *id))).collect();
+        (nearest.into_iter().map(|(_, fit)| fit.map(|(distance, _)| distance)).collect(), used)
     }
 
     /// How targets move.
@@ -101,14 +110,14 @@ impl Tracker {
     }
 
     /// Takes in one exposure: what of it belongs to tracks updates them.
-    pub(crate) fn step(&mut self, exposure: &Exposure, camera: &Camera) -> Step {
+    pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
         let mut happenings = Vec::new();
         let mut evidence = Vec::new();
         // A sure track chooses before an unsure one: a ghost must not take a target's bearings.
         for sure in [true, false] {
-            happenings.extend(self.associate(exposure, camera, &mut owners, sure, &mut evidence));
+            happenings.extend(self.associate(exposure, known, &mut owners, sure, &mut evidence));
         }
         let used = owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
@@ -129,7 +138,7 @@ impl Tracker {
     fn associate(
         &mut self,
         exposure: &Exposure,
-        camera: &Camera,
+        known: &KnownCamera,
         owners: &mut [Option<TrackId>],
         sure: bool,
         evidence: &mut Vec<Option<f64>>,
@@ -142,7 +151,7 @@ impl Tracker {
             let prediction = self.tracks.get(id).and_then(|track| {
                 track.bearing_prediction(
                     exposure.time,
-                    camera.pose().position(),
+                    known.camera.pose().position(),
                     &exposure.uncertainty,
                     &self.motion,
                 )
@@ -174,7 +183,7 @@ impl Tracker {
                 track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)
             });
             let gain = update.and(column).and_then(|column| gains.get(&(row, column)));
-            let sees = camera.sees(track.position_at(exposure.time));
+            let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
             if sure && (update.is_some() || sees) && track.is_held_without(&exposure.camera, &self.motion) {
                 evidence.push(update.map(|taken| taken.reported_nis));
             }

@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_filter::Gate;
-use crossfix_geometry::Camera;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
 use super::seeds::{Seed, SeedFinder};
@@ -43,6 +42,7 @@ struct Hypothesis {
     lines: Vec<(u64, LineId)>,
     /// Periods that gave it a line.
     periods: usize,
+    born: Timestamp,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -54,6 +54,9 @@ pub(super) struct Hypotheses {
     gate: Gate,
     span: u64,
     needed: usize,
+    /// How long two cameras alone must agree, s.
+    pair_s: f64,
+    max_range_m: f64,
     shared_lines: usize,
     hypotheses: Vec<Hypothesis>,
     /// Lines that a track has used which cannot hold its place alone.
@@ -80,6 +83,8 @@ impl Hypotheses {
             tracking: config.tracking.clone(),
             span: config.initiation.periods as u64,
             needed: config.initiation.fixes,
+            pair_s: config.initiation.pair_s,
+            max_range_m: config.initiation.max_range_m,
             shared_lines: config.initiation.shared_lines,
             hypotheses: Vec::new(),
             claims: BTreeMap::new(),
@@ -105,7 +110,7 @@ impl Hypotheses {
         self.period += 1;
         for exposure in exposures {
             if let Some(known) = cameras.get(&exposure.camera) {
-                self.extend(exposure, &known.camera, motion);
+                self.extend(exposure, known, motion);
             }
         }
         let span = self.span;
@@ -125,15 +130,15 @@ impl Hypotheses {
     }
 
     /// Lets every hypothesis go on with each bearing in its gate, and without any.
-    fn extend(&mut self, exposure: &Exposure, camera: &Camera, motion: &Motion) {
+    fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &Motion) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
         let miss = (1.0 - self.tracking.detection_probability).ln();
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for mut hypothesis in self.hypotheses.drain(..) {
-            let expected = camera.sees(hypothesis.track.position_at(exposure.time));
+            let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
             let prediction = hypothesis.track.bearing_prediction(
                 exposure.time,
-                camera.pose().position(),
+                known.camera.pose().position(),
                 &exposure.uncertainty,
                 motion,
             );
@@ -193,7 +198,7 @@ impl Hypotheses {
             let mut track = Track::start(&fix, named, motion);
             track.score = seed.score;
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
-            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1 });
+            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, born: time });
         }
     }
 
@@ -221,7 +226,10 @@ impl Hypotheses {
             .chosen()
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
-                let likely = hypothesis.track.score >= self.tracking.confirm_score;
+                // Lines of two targets that two cameras see one each may cross for a while.
+                let agreed = hypothesis.track.residuals.len() >= 3
+                    || hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s;
+                let likely = agreed && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
                     let alike =

@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::PI;
 
-use crossfix_geometry::SightLine;
+use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2x6, Vector2};
 
 use super::{NamedLine, lines_of};
 use crate::ingress::KnownCamera;
+use crate::prediction::BearingPrediction;
 use crate::spatial::{MapSolution, TimedLine, chi_square, map};
 use crate::temporal::LineId;
 use crate::{Exposure, FusionConfig, Initiation};
@@ -21,6 +21,10 @@ const MAX_BRANCHES: usize = 5;
 const SETTLED_CAMERAS: usize = 4;
 /// Most sets kept of one period, the most likely ones: clutter cannot fill the memory.
 const MAX_SEEDS: usize = 2_000;
+/// Quantiles are kept for sets of up to so many cameras; larger ones pass.
+const MAX_CAMERAS: usize = 128;
+/// Most pairs of lines that pass each other closely and are looked at in one period: time is bounded.
+const MAX_CLOSE_PAIRS: usize = 20_000;
 /// Most pairs of lines tried of two cameras: time is bounded, whatever a camera reports.
 const MAX_PAIRS: usize = 250_000;
 
@@ -47,7 +51,9 @@ pub(super) struct SeedFinder {
     initiation: Initiation,
     detection_probability: f64,
     clutter_per_sr: f64,
-    line_gate: f64,
+    line_gate: Gate,
+    /// The largest sum of squares of n true lines, by 2 n - 3, with the gate's probability.
+    set_gates: Vec<f64>,
     least_cameras: usize,
 }
 
@@ -61,12 +67,15 @@ struct Growing<'a> {
 impl SeedFinder {
     pub(super) fn new(config: &FusionConfig, least_cameras: usize) -> Self {
         let initiation = config.initiation.clone();
-        let line_gate = chi_square(initiation.spatial_gate_probability, 2);
+        let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
+        let set_gates =
+            (0..2 * MAX_CAMERAS).map(|d| chi_square(initiation.spatial_gate_probability, d.max(1))).collect();
         Self {
             initiation,
             detection_probability: config.tracking.detection_probability,
             clutter_per_sr: config.tracking.clutter_per_sr,
             line_gate,
+            set_gates,
             least_cameras,
         }
     }
@@ -81,14 +90,19 @@ impl SeedFinder {
         let growing = Growing { exposures, cameras, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
+        let mut close = 0;
         for (a, b) in self.pairs_of_cameras(&growing) {
             let mut tried = 0;
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
                     tried += 1;
-                    if settled[a][i] || settled[b][j] || tried > MAX_PAIRS {
+                    if settled[a][i] || settled[b][j] || tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS {
                         continue;
                     }
+                    if !self.pass_closely(&lines[a][i].1, &lines[b][j].1) {
+                        continue;
+                    }
+                    close += 1;
                     for (places, seed) in self.sets_of(&growing, (a, i), (b, j)) {
                         if places.len() >= SETTLED_CAMERAS {
                             for (camera, line) in places {
@@ -144,9 +158,6 @@ impl SeedFinder {
         (b, j): (usize, usize),
     ) -> Vec<(Vec<(usize, usize)>, Seed)> {
         let (first, second) = (&growing.lines[a][i], &growing.lines[b][j]);
-        if !self.pass_closely(&first.1, &second.1) {
-            return Vec::new();
-        }
         let Some(pair) = self.solve(&[first.1.clone(), second.1.clone()]) else {
             return Vec::new();
         };
@@ -190,7 +201,8 @@ impl SeedFinder {
 
     /// Whether a solution of n lines is as good as a true one's is with the gate's probability.
     fn agrees(&self, solution: &MapSolution, lines: usize) -> bool {
-        solution.chi_square <= chi_square(self.initiation.spatial_gate_probability, 2 * lines - 3)
+        let gate = self.set_gates.get(2 * lines - 3).copied().unwrap_or(f64::INFINITY);
+        solution.chi_square <= gate
     }
 
     /// Whether two lines pass each other as closely as one moving target's may, in front of both.
@@ -221,13 +233,23 @@ impl SeedFinder {
         solution: &MapSolution,
         c: usize,
     ) -> Vec<usize> {
-        let times = places.iter().map(|&(k, l)| growing.lines[k][l].1.time);
-        let Some(reference) = times.max() else {
+        let known = growing.cameras.get(&growing.exposures[c].camera);
+        let newest = places.iter().map(|&(k, l)| growing.lines[k][l].1.time).max();
+        let (Some(known), Some(reference), Some((_, first))) = (known, newest, growing.lines[c].first())
+        else {
             return Vec::new();
         };
-        let distance = |(l, (_, line)): (usize, &NamedLine)| {
-            let distance = gate_distance(solution, reference, line, self.initiation.velocity_prior_sd_mps)?;
-            (distance <= self.line_gate).then_some((distance, l))
+        let state = solution.state.predicted(first.time.seconds_since(reference), 0.0);
+        // Another target's place: most cameras of a wide site do not look there.
+        if !known.expects(state.position(), self.initiation.max_range_m) {
+            return Vec::new();
+        }
+        let moved = self.initiation.velocity_prior_sd_mps * first.time_sd_s;
+        let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
+            return Vec::new();
+        };
+        let distance = |(l, (_, timed)): (usize, &NamedLine)| {
+            Some((prediction.fit(&timed.line, self.line_gate)?.gate_distance, l))
         };
         let mut near: Vec<(f64, usize)> = growing.lines[c].iter().enumerate().filter_map(distance).collect();
         near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
@@ -248,7 +270,11 @@ impl SeedFinder {
         }
         let silent = growing.exposures.iter().enumerate().filter(|(k, exposure)| {
             let missed = places.iter().all(|(camera, _)| camera != k);
-            missed && growing.cameras.get(&exposure.camera).is_some_and(|known| known.camera.sees(position))
+            missed
+                && growing
+                    .cameras
+                    .get(&exposure.camera)
+                    .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
         });
         let score = self.log_evidence(&lines, &solution)?
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
@@ -276,17 +302,4 @@ impl SeedFinder {
 
 fn ids(seed: &Seed) -> Vec<LineId> {
     seed.lines.iter().map(|(id, _)| id.clone()).collect()
-}
-
-/// Squared Mahalanobis distance of a line from a solution, two degrees of freedom.
-fn gate_distance(solution: &MapSolution, reference: Timestamp, line: &TimedLine, speed: f64) -> Option<f64> {
-    let dt = line.time.seconds_since(reference);
-    let state = solution.state.predicted(dt, 0.0);
-    let SightLine { origin, basis, .. } = line.line;
-    let range = (state.position() - origin).norm();
-    let offset: Vector2<f64> = line.line.tangent_offset(state.position())?;
-    let mut jacobian = Matrix2x6::zeros();
-    jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(basis.transpose() / range));
-    let spread = jacobian * state.covariance * jacobian.transpose() + line.noise_at(range, speed);
-    Some(offset.dot(&spread.cholesky()?.solve(&offset)))
 }

@@ -369,6 +369,7 @@ impl Run<'_> {
                     let later = event.kind() != TrackEventKind::Born && self.born.contains(&event.track_id);
                     assert!(first || later, "each track is born once, and first of all: {event:?}");
                 }
+                Output::Camera(..) => {}
                 Output::Rejected(rejection) => {
                     *self.rejected.entry(rejection.reason.counter()).or_default() += 1;
                 }

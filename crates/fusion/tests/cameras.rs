@@ -1,0 +1,210 @@
+//! What the fusion centre finds out about its cameras: their clocks from the tracks, and which of
+//! them cannot be believed.
+
+mod common;
+
+use common::{Scene, eye, found, fusion_of, site, straight};
+use crossfix_fusion::{CameraStanding, ClockEstimate, Clocks, Fusion, FusionConfig};
+use crossfix_message::{BearingFrame, CameraName, Timestamp};
+use nalgebra::{Matrix6, Point3};
+
+/// A clock that is wrong: ahead by so much at time 0, and gaining.
+#[derive(Clone, Copy)]
+struct Clock {
+    offset_s: f64,
+    drift: f64,
+}
+
+/// A target that circles at 12 m/s around the middle of the site.
+fn circling() -> common::Path {
+    let (radius, speed) = (40.0, 12.0);
+    Box::new(move |t| {
+        let (sin, cos) = (speed / radius * t).sin_cos();
+        Some(Point3::new(radius * cos, radius * sin, 45.0 + 5.0 * (0.2 * t).sin()))
+    })
+}
+
+/// The frames with the times that these clocks give them, in the order in which they are taken.
+fn with_clocks(frames: Vec<BearingFrame>, clocks: &[(&str, Clock)], sd_s: f64) -> Vec<BearingFrame> {
+    frames
+        .into_iter()
+        .map(|mut frame| {
+            if let Some((_, clock)) = clocks.iter().find(|(camera, _)| *camera == frame.camera) {
+                let time = frame.capture_time_ns as f64 / 1e9;
+                frame.capture_time_ns += ((clock.offset_s + clock.drift * time) * 1e9).round() as i64;
+                frame.capture_time_sd_s = sd_s;
+            }
+            frame
+        })
+        .collect()
+}
+
+fn clock_of(fusion: &Fusion, camera: &str) -> ClockEstimate {
+    fusion.cameras().find(|report| report.camera.as_str() == camera).unwrap().clock.unwrap()
+}
+
+#[test]
+fn offsets_of_200_ms_and_drifts_of_50_ppm_are_recovered_within_a_minute() {
+    for (seed, path) in [(1, circling()), (2, straight([-300.0, 60.0, 40.0], [10.0, -2.0, 0.2]))] {
+        let scene = Scene::new(vec![path], 60.0);
+        let wrong =
+            [("b", Clock { offset_s: 0.2, drift: 5e-5 }), ("c", Clock { offset_s: -0.2, drift: -5e-5 })];
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        for frame in with_clocks(scene.frames(seed), &wrong, 0.2) {
+            fusion.ingest(&frame);
+        }
+        fusion.flush();
+        for (camera, clock) in wrong {
+            let estimate = clock_of(&fusion, camera);
+            let error = estimate.offset_s - (clock.offset_s + clock.drift * 60.0);
+            assert!(error.abs() < 1e-3, "seed {seed}, {camera}: {error} s, {estimate:?}");
+            assert!(error.abs() < 4.0 * estimate.sd_s, "seed {seed}, {camera}: {error} s, {estimate:?}");
+        }
+        assert_eq!(clock_of(&fusion, "a").sd_s, 0.0, "a clock without deviation is right by definition");
+    }
+}
+
+#[test]
+fn what_all_clocks_have_in_common_stays_unknown_and_is_said() {
+    let scene = Scene::new(vec![circling()], 30.0);
+    let all = ["a", "b", "c"].map(|camera| (camera, Clock { offset_s: 0.05, drift: 0.0 }));
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for frame in with_clocks(scene.frames(3), &all, 0.1) {
+        fusion.ingest(&frame);
+    }
+    fusion.flush();
+    for camera in ["a", "b", "c"] {
+        let estimate = clock_of(&fusion, camera);
+        // Three clocks of 0.1 s each: their mean is known to 0.1 / sqrt(3) and no better.
+        assert!((0.05..0.065).contains(&estimate.sd_s), "{estimate:?}");
+        assert!(estimate.relative_sd_s < 1e-3, "{estimate:?}");
+    }
+}
+
+#[test]
+fn a_trusted_camera_sets_the_time_of_the_others() {
+    let scene = Scene::new(vec![circling()], 40.0);
+    let all =
+        [("a", 0.0), ("b", 0.03), ("c", -0.05)].map(|(c, offset_s)| (c, Clock { offset_s, drift: 0.0 }));
+    let trusted: CameraName = "a".parse().unwrap();
+    let clocks = Clocks { trusted: vec![trusted], ..Clocks::default() };
+    let mut fusion = fusion_of(FusionConfig { clocks, ..FusionConfig::default() }, &scene.eyes);
+    for frame in with_clocks(scene.frames(4), &all, 0.1) {
+        fusion.ingest(&frame);
+    }
+    for (camera, clock) in all {
+        let estimate = clock_of(&fusion, camera);
+        assert!((estimate.offset_s - clock.offset_s).abs() < 1e-3, "{camera}: {estimate:?}");
+    }
+}
+
+/// Five cameras, so that one of them can be outvoted.
+fn five() -> Vec<common::Eye> {
+    let middle = [0.0, 0.0, 40.0];
+    let mut eyes = site();
+    eyes.push(eye("d", [-40.0, 150.0, 4.0], middle, 0.015));
+    eyes.push(eye("e", [-30.0, -160.0, 2.0], middle, 0.08));
+    eyes
+}
+
+#[test]
+fn a_camera_that_was_knocked_is_left_out_and_comes_back_when_it_is_straightened() {
+    let scene = Scene { eyes: five(), ..Scene::new(vec![circling()], 60.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    let standing = |fusion: &Fusion| fusion.cameras().find(|r| r.camera.as_str() == "b").unwrap().standing;
+    for mut frame in scene.frames(5) {
+        let time = frame.capture_time_ns as f64 / 1e9;
+        if frame.camera == "b" && (15.0..35.0).contains(&time) {
+            for track in &mut frame.tracks {
+                let turned = nalgebra::Rotation3::from_euler_angles(0.0, 0.02, 0.0)
+                    * nalgebra::Vector3::from(track.bearing.unwrap());
+                track.bearing = Some(turned.into());
+            }
+        }
+        fusion.ingest(&frame);
+        if (14.8..15.0).contains(&time) {
+            assert_eq!(standing(&fusion), CameraStanding::Good);
+        }
+        if (34.8..35.0).contains(&time) {
+            assert_eq!(standing(&fusion), CameraStanding::Excluded);
+        }
+    }
+    fusion.flush();
+    assert_eq!(standing(&fusion), CameraStanding::Good);
+    assert_eq!(fusion.counters().get("cameras_excluded"), 1);
+    assert_eq!(fusion.counters().get("cameras_readmitted"), 1);
+    assert!(found(&fusion, &scene.paths[0]).is_some());
+    assert_eq!(fusion.tracks().filter(|track| track.is_confirmed()).count(), 1);
+}
+
+#[test]
+fn a_camera_worse_than_it_says_counts_less() {
+    let scene = Scene { eyes: five(), ..Scene::new(vec![circling()], 40.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for mut frame in scene.frames(6) {
+        if frame.camera == "c" {
+            // It claims a third of the deviation that its bearings have.
+            for track in &mut frame.tracks {
+                track.covariance_xx /= 9.0;
+                track.covariance_yy /= 9.0;
+            }
+        }
+        fusion.ingest(&frame);
+    }
+    let reports: Vec<_> = fusion.cameras().collect();
+    let worse = reports.iter().find(|report| report.camera.as_str() == "c").unwrap();
+    assert_eq!(worse.standing, CameraStanding::Doubted);
+    assert!((1.5..9.0).contains(&worse.noise_factor), "{worse:?}");
+    let others = reports.iter().filter(|report| report.camera.as_str() != "c");
+    assert!(others.clone().all(|report| report.standing == CameraStanding::Good), "{reports:?}");
+}
+
+/// Mean NEES over runs in each of which the poses are off by what their calibrations say.
+fn nees_with_wrong_poses(runs: u32, rotation_sd: f64, position_sd: f64) -> f64 {
+    let scene = Scene::new(vec![straight([-40.0, 30.0, 50.0], [8.0, -6.0, 0.5])], 8.0);
+    let mut sum = 0.0;
+    for run in 0..runs {
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        let mut rng: rand_chacha::ChaCha8Rng = rand::SeedableRng::seed_from_u64(u64::from(run));
+        let mut normal =
+            || -> f64 { rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut rng) };
+        for eye in &scene.eyes {
+            let pose = eye.camera.pose();
+            let turn = nalgebra::Rotation3::new(nalgebra::Vector3::from_fn(|_, _| rotation_sd * normal()));
+            let step = nalgebra::Vector3::from_fn(|_, _| position_sd * normal());
+            let rotation = *(pose.rotation() * turn).matrix();
+            let wrong = crossfix_geometry::Pose::new(rotation, pose.position() + step).unwrap();
+            let intrinsics = *eye.camera.model().intrinsics();
+            let camera = crossfix_geometry::Camera::new(intrinsics, wrong).unwrap();
+            let message = crossfix_message::CameraCalibration::new(&eye.name, &camera, Timestamp::EPOCH);
+            fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();
+        }
+        let mut outputs = Vec::new();
+        for frame in scene.frames(1000 + u64::from(run)) {
+            outputs.extend(fusion.ingest(&frame));
+        }
+        outputs.extend(fusion.flush());
+        let last = outputs.iter().rev().find_map(|output| match output {
+            crossfix_fusion::Output::Tracks(frame) => Some(frame),
+            _ => None,
+        });
+        let frame = last.unwrap();
+        let track = &frame.tracks[0];
+        let covariance = Matrix6::from_row_slice(&track.covariance).fixed_view::<3, 3>(0, 0).into_owned();
+        let place: Point3<f64> = track.position.unwrap().into();
+        let truth = scene.paths[0](frame.time_ns as f64 / 1e9).unwrap();
+        let error = place - truth;
+        sum += (error.transpose() * covariance.try_inverse().unwrap() * error).x;
+    }
+    sum / f64::from(runs)
+}
+
+#[test]
+fn the_uncertainty_of_poses_is_in_the_covariance_however_many_bearings_there_are() {
+    let runs = 200;
+    let nees = nees_with_wrong_poses(runs, 1e-3, 0.05);
+    // Three degrees of freedom. The filter also treats the shift as noise of each bearing, which
+    // makes it a little careful.
+    let standard_error = (6.0 / f64::from(runs)).sqrt();
+    assert!((2.0..3.0 + 3.0 * standard_error).contains(&nees), "{nees}");
+}
