@@ -1,6 +1,7 @@
 //! Scenes with flying targets and cameras that look at them: truth, rendered
 //! images, clocks with offset and drift. A scene and its seed give the same
-//! images bit for bit.
+//! images bit for bit. A [`Site`] has many cameras and targets, and gives their
+//! bearings without images.
 //!
 //! ```
 //! use crossfix_simulation::Scene;
@@ -14,11 +15,13 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod circuit;
 mod clock;
 mod path;
 mod render;
 mod scene;
 mod silhouette;
+mod site;
 mod sky;
 mod world;
 
@@ -27,4 +30,5 @@ pub use path::FlightPath;
 pub use render::RenderedFrame;
 pub use scene::{Scene, SceneCamera, SceneError, SceneTarget};
 pub use silhouette::{Silhouette, TEMPLATE_SIZES};
+pub use site::{Layout, SimulatedSite, Site, SiteCamera, SiteExposure};
 pub use world::{SimulatedCamera, TargetState, World};

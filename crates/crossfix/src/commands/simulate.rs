@@ -1,3 +1,5 @@
+mod scenario;
+
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -18,16 +20,17 @@ use crate::config;
 use crate::import::imported;
 use crate::output;
 
-/// Turn a scene into a recording of bearings with truth, or into video files.
+/// Turn a scene into a recording of bearings with truth, or into video files; or write a scenario.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos"
+    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos\n  crossfix simulate --scenario crowd --targets 50 --cameras 8 --clutter 5"
 )]
 pub struct Args {
     /// The scene (TOML).
-    scene: PathBuf,
+    #[arg(required_unless_present = "scenario", conflicts_with = "scenario")]
+    scene: Option<PathBuf>,
     /// The recording (MCAP) to write: bearings as cameras would measure them, calibrations, truth.
-    #[arg(short, long, value_name = "FILE", required_unless_present = "video")]
+    #[arg(short, long, value_name = "FILE", required_unless_present_any = ["video", "scenario"])]
     output: Option<PathBuf>,
     /// The folder to write a rendered video (Y4M) of each camera to.
     #[arg(long, value_name = "DIR")]
@@ -38,11 +41,26 @@ pub struct Args {
     /// Override a key of the scene, e.g. duration_s=10.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
+    /// The folder to write a scenario (passive-bearings/1) to, of a site that the options below
+    /// describe: a ring of cameras about 600 m by 600 m.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["output", "video", "sets"])]
+    scenario: Option<PathBuf>,
+    #[command(flatten)]
+    site: scenario::SiteArgs,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let scene: Scene = config::load(&args.scene, &args.sets)?;
-    let world = scene.build().with_context(|| format!("the scene {} has an error", args.scene.display()))?;
+    if let Some(folder) = &args.scenario {
+        let site = args.site.site().build().context("the site that the options describe is impossible")?;
+        let exposures = scenario::write(&site, folder)?;
+        output::line(format!("{exposures} exposures written to {}", folder.display()));
+    }
+    args.scene.as_ref().map_or(Ok(()), |scene| simulate(args, scene))
+}
+
+fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
+    let scene: Scene = config::load(path, &args.sets)?;
+    let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
     let noise = args.noise_px;
     ensure!((0.01..100.0).contains(&noise), "--noise-px is {noise}: it must be from 0.01 to 100 px");
     if let Some(path) = &args.output {

@@ -1,0 +1,150 @@
+//! Flights that never leave a volume: straight or gently turning, and back again at its border.
+
+use std::f64::consts::{FRAC_PI_4, PI, TAU};
+
+use nalgebra::{Point3, Vector2, Vector3};
+use rand::{Rng, RngExt};
+
+/// How long a target flies one arc before it decides anew, s.
+const LEG_S: f64 = 0.5;
+/// A target that turns gently chooses another rate of turn about so often, s.
+const MOOD_S: f64 = 10.0;
+/// Slower than this no target turns back at the border, rad/s.
+const LEAST_TURN_BACK: f64 = 0.2;
+
+/// The volume that targets keep within, and how they fly in it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Airspace {
+    /// Half of the sides of the area, east and north, m.
+    pub(crate) half: Vector2<f64>,
+    /// Lowest and highest, m.
+    pub(crate) heights: [f64; 2],
+    /// Slowest and fastest, m/s.
+    pub(crate) speeds: [f64; 2],
+    /// Greatest rate of turn on the way, rad/s; 0 is straight.
+    pub(crate) turn: f64,
+}
+
+/// Where a leg begins, and how it goes on.
+#[derive(Clone, Copy, Debug)]
+struct Leg {
+    place: Vector2<f64>,
+    /// Of the velocity, from east towards north, rad.
+    heading: f64,
+    /// Rate of turn to the left, rad/s.
+    turn: f64,
+}
+
+/// One target's flight: arcs of constant speed one after another; its height swings slowly.
+#[derive(Clone, Debug)]
+pub(crate) struct Circuit {
+    speed: f64,
+    legs: Vec<Leg>,
+    middle: f64,
+    swing: f64,
+    /// Of the swing, s.
+    period: f64,
+    phase: f64,
+}
+
+impl Circuit {
+    /// A flight of `duration_s` seconds at least.
+    pub(crate) fn random(airspace: &Airspace, duration_s: f64, rng: &mut impl Rng) -> Self {
+        let Airspace { half, heights: [low, high], speeds: [slow, fast], turn } = *airspace;
+        let speed = rng.random_range(slow..=fast);
+        let turn_back = turn.max(LEAST_TURN_BACK);
+        // From a side nobody goes farther beyond the inner border than one leg and the radius of the
+        // way back; from a corner it may be three quarters of that more.
+        let margin = speed * LEG_S + speed / turn_back;
+        let inner = half.map(|side| side - margin.min(0.75 * side));
+        let mut place = Vector2::from_fn(|axis, _| inner[axis] * rng.random_range(-1.0..=1.0));
+        let mut heading = rng.random_range(0.0..TAU);
+        let mut mood = turn * rng.random_range(-1.0..=1.0);
+        let mut legs = Vec::new();
+        for _ in 0..=(duration_s / LEG_S).ceil() as usize {
+            if rng.random_bool(LEG_S / MOOD_S) {
+                mood = turn * rng.random_range(-1.0..=1.0);
+            }
+            let back = way_back(place, heading, inner).map(|side| side * turn_back);
+            let leg = Leg { place, heading, turn: back.unwrap_or(mood) };
+            legs.push(leg);
+            (place, heading) = leg.after(LEG_S, speed);
+        }
+        let room = (high - low) / 2.0;
+        let swing = room * rng.random_range(0.0..=0.5);
+        Self {
+            speed,
+            legs,
+            middle: low + room + (room - swing) * rng.random_range(-1.0..=1.0),
+            swing,
+            // No steeper than 1 m/s.
+            period: (TAU * swing).max(60.0),
+            phase: rng.random_range(0.0..TAU),
+        }
+    }
+
+    /// Position and velocity at a time from the start; beyond the last leg it goes on as that does.
+    pub(crate) fn state(&self, t: f64) -> (Point3<f64>, Vector3<f64>) {
+        let index = ((t / LEG_S).max(0.0) as usize).min(self.legs.len() - 1);
+        let (place, heading) = self.legs[index].after(t - index as f64 * LEG_S, self.speed);
+        let rate = TAU / self.period;
+        let angle = rate * t + self.phase;
+        let position = Point3::new(place.x, place.y, self.middle + self.swing * angle.sin());
+        let climb = self.swing * rate * angle.cos();
+        (position, Vector3::new(self.speed * heading.cos(), self.speed * heading.sin(), climb))
+    }
+}
+
+impl Leg {
+    /// Place and heading `t` seconds on.
+    fn after(&self, t: f64, speed: f64) -> (Vector2<f64>, f64) {
+        let heading = self.heading + self.turn * t;
+        // The chord of an arc points along the middle heading.
+        let half = self.turn * t / 2.0;
+        let shorter = if half.abs() < 1e-6 { 1.0 } else { half.sin() / half };
+        let middle = self.heading + half;
+        (self.place + Vector2::new(middle.cos(), middle.sin()) * (speed * t * shorter), heading)
+    }
+}
+
+/// Which way to turn (1 left, -1 right) to come back within the inner border; `None` if there is no
+/// need.
+fn way_back(place: Vector2<f64>, heading: f64, inner: Vector2<f64>) -> Option<f64> {
+    let beyond = Vector2::from_fn(|axis, _| place[axis] - place[axis].clamp(-inner[axis], inner[axis]));
+    if beyond == Vector2::zeros() {
+        return None;
+    }
+    let home = (-beyond.y).atan2(-beyond.x);
+    let off = (home - heading + PI).rem_euclid(TAU) - PI;
+    (off.abs() > FRAC_PI_4).then_some(off.signum())
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        #[test]
+        fn nobody_leaves_the_volume_or_jumps(seed in 0u64..1000, turn in 0.0..0.3) {
+            let airspace =
+                Airspace { half: Vector2::new(300.0, 200.0), heights: [40.0, 120.0], speeds: [5.0, 20.0], turn };
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let flight = Circuit::random(&airspace, 120.0, &mut rng);
+            for step in 0..1200 {
+                let t = f64::from(step) * 0.1;
+                let (position, velocity) = flight.state(t);
+                // In a corner somebody may go beyond the border.
+                let beyond = [position.x.abs() - 300.0, position.y.abs() - 200.0];
+                prop_assert!(beyond.iter().all(|b| *b <= 0.75 * 110.0), "{position} at {t}");
+                prop_assert!((40.0..=120.0).contains(&position.z));
+                let (next, _) = flight.state(t + 1e-4);
+                prop_assert!(((next - position) / 1e-4 - velocity).norm() < 1e-2, "{t}");
+            }
+        }
+    }
+}

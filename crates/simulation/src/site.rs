@@ -1,0 +1,365 @@
+//! Sites of many cameras and many targets, as bearings without images: what a fusion centre is
+//! measured with.
+
+use std::f64::consts::TAU;
+
+use crossfix_geometry::{
+    Bearing, Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose, tangent_basis,
+};
+use crossfix_message::{
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState, Payload,
+    Timestamp,
+};
+use nalgebra::{Matrix2, Point3, Unit, Vector2, Vector3};
+use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Poisson, StandardNormal};
+
+use crate::circuit::{Airspace, Circuit};
+use crate::{SceneError, TargetState};
+
+/// Bearings of one exposure have numbers below this times the sequence number of the next.
+const NUMBERS_PER_EXPOSURE: u64 = 1 << 16;
+/// Height of the cameras above the ground, m.
+const MAST_M: f64 = 4.0;
+
+/// How the cameras of a site stand.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Layout {
+    /// On an ellipse about the area, all looking at the middle of the volume.
+    Ring,
+    /// In rows and columns from border to border. Each block of two by two looks inwards, so that
+    /// what the whole grid sees is much the same everywhere.
+    Grid,
+}
+
+/// A site as it is described: cameras, targets and what the cameras make of them. World frame (ENU)
+/// with its origin on the ground in the middle of the area.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Site {
+    /// Seed of everything random. The same site gives the same bytes.
+    pub seed: u64,
+    /// How long it lasts, s. Default 20.
+    pub duration_s: f64,
+    /// Sides of the area that targets keep within, east and north, m; in a corner they may go beyond
+    /// it by three quarters of the radius of their turn. Default 600 x 600.
+    pub area_m: [f64; 2],
+    /// Lowest and highest that they fly, m. Default 40 to 160.
+    pub heights_m: [f64; 2],
+    /// How many targets. Default 10.
+    pub targets: usize,
+    /// Slowest and fastest of them, m/s. Default 5 to 20.
+    pub speeds_mps: [f64; 2],
+    /// Greatest rate of turn on the way, rad/s. Default 0: straight, but for the border, where
+    /// everybody turns back at 0.2 rad/s or this, whichever is more.
+    pub turn_rps: f64,
+    /// How many cameras, 1 to 999. Default 4. They are named `cam0`, `cam1` ...
+    pub cameras: usize,
+    /// How they stand. Default: [`Layout::Ring`].
+    pub layout: Layout,
+    /// Columns and rows of their images. Default 1920 x 1080.
+    pub size_px: [u32; 2],
+    /// Focal length, pixels. Default 960: a field of view of 90 degrees across.
+    pub focal_px: f64,
+    /// Farther away than this a camera sees nothing, m. Default 2000.
+    pub range_m: f64,
+    /// Exposures a second of each camera, spread evenly among them. Default 30.
+    pub rate_hz: f64,
+    /// Probability that a target in the image is reported. Default 0.95.
+    pub detection_probability: f64,
+    /// False bearings that an exposure is expected to bring (Poisson), anywhere in the image.
+    /// Default 1.
+    pub clutter: f64,
+    /// Standard deviation of a bearing, rad an axis. Default 0.0005.
+    pub noise_rad: f64,
+}
+
+impl Default for Site {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            duration_s: 20.0,
+            area_m: [600.0, 600.0],
+            heights_m: [40.0, 160.0],
+            targets: 10,
+            speeds_mps: [5.0, 20.0],
+            turn_rps: 0.0,
+            cameras: 4,
+            layout: Layout::Ring,
+            size_px: [1920, 1080],
+            focal_px: 960.0,
+            range_m: 2000.0,
+            rate_hz: 30.0,
+            detection_probability: 0.95,
+            clutter: 1.0,
+            noise_rad: 5e-4,
+        }
+    }
+}
+
+/// A camera of a site.
+#[derive(Clone, Debug)]
+pub struct SiteCamera {
+    /// Its name.
+    pub name: CameraName,
+    /// Its model and place.
+    pub camera: Camera,
+    /// True time of its first exposure, s.
+    pub phase_s: f64,
+}
+
+/// What one camera reports at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SiteExposure {
+    /// Which camera, by its place in [`SimulatedSite::cameras`].
+    pub camera: usize,
+    /// True time, s from the start; the frame's capture time, without error.
+    pub time_s: f64,
+    /// The message.
+    pub frame: BearingFrame,
+    /// Of each of the frame's bearings the target, and `None` for clutter: for scoring only.
+    pub sources: Vec<Option<u64>>,
+}
+
+/// A site whose targets fly.
+#[derive(Clone, Debug)]
+pub struct SimulatedSite {
+    description: Site,
+    cameras: Vec<SiteCamera>,
+    flights: Vec<Circuit>,
+}
+
+impl Site {
+    /// The site ready to be looked at.
+    ///
+    /// # Errors
+    /// [`SceneError`] naming the number that makes no sense.
+    pub fn build(&self) -> Result<SimulatedSite, SceneError> {
+        self.check()?;
+        let cameras = (0..self.cameras).map(|index| self.camera(index)).collect::<Result<_, _>>()?;
+        let airspace = Airspace {
+            half: Vector2::from(self.area_m) / 2.0,
+            heights: self.heights_m,
+            speeds: self.speeds_mps,
+            turn: self.turn_rps,
+        };
+        let flight = |target| {
+            let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+            rng.set_stream(target as u64);
+            Circuit::random(&airspace, self.duration_s, &mut rng)
+        };
+        let flights = (0..self.targets).map(flight).collect();
+        Ok(SimulatedSite { description: self.clone(), cameras, flights })
+    }
+
+    fn check(&self) -> Result<(), SceneError> {
+        let in_range = |what: &str, value: f64, low: f64, high: f64, must| {
+            let good = (low..=high).contains(&value);
+            if good { Ok(()) } else { Err(SceneError::Number { what: what.to_owned(), value, must }) }
+        };
+        in_range("duration_s", self.duration_s, 1e-3, 1e5, "from 0.001 to 100000 s")?;
+        for side in self.area_m {
+            in_range("area_m", side, 1.0, 1e5, "from 1 to 100000 m")?;
+        }
+        let [low, high] = self.heights_m;
+        in_range("heights_m", low, 0.0, high, "from 0 to the greatest height")?;
+        in_range("heights_m", high, low, 1e4, "from the least height to 10000 m")?;
+        let [slow, fast] = self.speeds_mps;
+        in_range("speeds_mps", slow, 0.0, fast, "from 0 to the greatest speed")?;
+        in_range("speeds_mps", fast, slow, 1e3, "from the least speed to 1000 m/s")?;
+        in_range("turn_rps", self.turn_rps, 0.0, 3.0, "from 0 to 3 rad/s")?;
+        in_range("targets", self.targets as f64, 0.0, 1e5, "at most 100000")?;
+        in_range("cameras", self.cameras as f64, 1.0, 999.0, "from 1 to 999")?;
+        in_range("range_m", self.range_m, 1.0, 1e5, "from 1 to 100000 m")?;
+        in_range("rate_hz", self.rate_hz, 0.01, 1000.0, "from 0.01 to 1000 exposures a second")?;
+        in_range("detection_probability", self.detection_probability, 0.0, 1.0, "from 0 to 1")?;
+        in_range("clutter", self.clutter, 0.0, 1000.0, "from 0 to 1000 an exposure")?;
+        in_range("noise_rad", self.noise_rad, 1e-7, 0.1, "from 0.0000001 to 0.1 rad")
+    }
+
+    fn camera(&self, index: usize) -> Result<SiteCamera, SceneError> {
+        let text = format!("cam{index}");
+        let number = || SceneError::Number {
+            what: "cameras".to_owned(),
+            value: self.cameras as f64,
+            must: "from 1 to 999",
+        };
+        let name: CameraName = text.parse().map_err(|_| number())?;
+        let camera = self
+            .pose(index)
+            .and_then(|pose| Camera::new(self.intrinsics(), pose))
+            .map_err(|source| SceneError::Camera { camera: name.clone(), source })?;
+        let phase_s = index as f64 / (self.cameras as f64 * self.rate_hz);
+        Ok(SiteCamera { name, camera, phase_s })
+    }
+
+    fn intrinsics(&self) -> Intrinsics {
+        let [width, height] = self.size_px;
+        Intrinsics {
+            size: ImageSize { width, height },
+            fx: self.focal_px,
+            fy: self.focal_px,
+            cx: (f64::from(width) - 1.0) / 2.0,
+            cy: (f64::from(height) - 1.0) / 2.0,
+            distortion: Distortion::None,
+        }
+    }
+
+    fn pose(&self, index: usize) -> Result<Pose, GeometryError> {
+        let [low, high] = self.heights_m;
+        let middle = (low + high) / 2.0;
+        // No two at one height: what lies in one plane is not well seen.
+        let mast = MAST_M * (1 + index % 3) as f64;
+        let half = Vector2::from(self.area_m) / 2.0;
+        match self.layout {
+            Layout::Ring => {
+                let angle = TAU * index as f64 / self.cameras as f64;
+                let place = Point3::new(half.x * angle.cos(), half.y * angle.sin(), mast);
+                Pose::looking_at(place, Point3::new(0.0, 0.0, middle))
+            }
+            Layout::Grid => {
+                let columns = (self.cameras as f64).sqrt().ceil() as usize;
+                let rows = self.cameras.div_ceil(columns);
+                let (column, row) = (index % columns, index / columns);
+                let along = |i: usize, n: usize| if n < 2 { 0.5 } else { i as f64 / (n - 1) as f64 };
+                let east = half.x * (2.0 * along(column, columns) - 1.0);
+                let north = half.y * (2.0 * along(row, rows) - 1.0);
+                let inwards = |i: usize| if i.is_multiple_of(2) { 1.0 } else { -1.0 };
+                let aim = Vector2::new(inwards(column), inwards(row)) * (self.range_m / 3.0);
+                let target = Point3::new(east + aim.x, north + aim.y, middle);
+                Pose::looking_at(Point3::new(east, north, mast), target)
+            }
+        }
+    }
+}
+
+impl SimulatedSite {
+    /// What it was made from.
+    pub fn description(&self) -> &Site {
+        &self.description
+    }
+
+    /// The cameras, `cam0` first.
+    pub fn cameras(&self) -> &[SiteCamera] {
+        &self.cameras
+    }
+
+    /// What a fusion centre has to know of every camera.
+    pub fn calibrations(&self) -> Vec<CameraCalibration> {
+        let message = |c: &SiteCamera| CameraCalibration::new(&c.name, &c.camera, Timestamp::EPOCH);
+        self.cameras.iter().map(message).collect()
+    }
+
+    /// Where every target is at a true time, s from the start; their ids are 0, 1 ...
+    pub fn truth(&self, t: f64) -> impl Iterator<Item = TargetState> + '_ {
+        self.flights.iter().zip(0..).map(move |(flight, id)| {
+            let (position, velocity) = flight.state(t);
+            TargetState { id, position, velocity }
+        })
+    }
+
+    /// How many cameras have a place in their field of view and within their range.
+    pub fn cameras_that_see(&self, place: Point3<f64>) -> usize {
+        self.cameras.iter().filter(|c| self.sees(&c.camera, place)).count()
+    }
+
+    /// How many exposures all cameras take together.
+    pub fn exposures(&self) -> u64 {
+        let Site { duration_s, rate_hz, .. } = self.description;
+        let of = |c: &SiteCamera| ((duration_s - c.phase_s) * rate_hz).ceil().max(0.0) as u64;
+        self.cameras.iter().map(of).sum()
+    }
+
+    /// Everything that the cameras report, in order of time.
+    pub fn bearings(&self) -> impl Iterator<Item = SiteExposure> + '_ {
+        (0..self.exposures()).map(|index| self.exposure(index))
+    }
+
+    /// One exposure, counted over all cameras in order of time; the same whenever it is asked for.
+    pub fn exposure(&self, index: u64) -> SiteExposure {
+        let cameras = self.cameras.len() as u64;
+        let (sequence, which) = (index / cameras, (index % cameras) as usize);
+        let SiteCamera { name, camera, phase_s } = &self.cameras[which];
+        let time_s = phase_s + sequence as f64 / self.description.rate_hz;
+        let mut rng = ChaCha8Rng::seed_from_u64(self.description.seed);
+        // The targets' flights have the streams before these.
+        rng.set_stream((1 << 32) + index);
+        let mut bearings = self.detections(camera, time_s, &mut rng);
+        bearings.extend(self.clutter(camera, &mut rng).into_iter().map(|direction| (direction, None)));
+        // Nobody must tell them by their order.
+        bearings.shuffle(&mut rng);
+        let numbered = (sequence * NUMBERS_PER_EXPOSURE..).zip(&bearings);
+        let tracks = numbered.map(|(number, (bearing, _))| self.track(number, camera, bearing));
+        let frame = BearingFrame {
+            camera: name.to_string(),
+            sequence,
+            capture_time_ns: Timestamp::from_seconds(time_s).nanos(),
+            clock_source: ClockSource::Simulated.into(),
+            tracks: tracks.collect(),
+            ..Default::default()
+        };
+        let sources = bearings.into_iter().map(|(_, source)| source).collect();
+        SiteExposure { camera: which, time_s, frame: frame.stamped(), sources }
+    }
+
+    fn sees(&self, camera: &Camera, place: Point3<f64>) -> bool {
+        (place - camera.pose().position()).norm() <= self.description.range_m && camera.sees(place)
+    }
+
+    /// Directions in the camera's frame in which targets are reported.
+    fn detections(
+        &self,
+        camera: &Camera,
+        time_s: f64,
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<(Unit<Vector3<f64>>, Option<u64>)> {
+        let Site { detection_probability, noise_rad, .. } = self.description;
+        let mut found = Vec::new();
+        for target in self.truth(time_s) {
+            if !self.sees(camera, target.position) || !rng.random_bool(detection_probability) {
+                continue;
+            }
+            let exact = Unit::new_normalize(camera.pose().camera_from_world(target.position));
+            let noise = Vector2::from_fn(|_, _| {
+                let deviation: f64 = StandardNormal.sample(rng);
+                noise_rad * deviation
+            });
+            let measured = Unit::new_normalize(exact.into_inner() + tangent_basis(&exact) * noise);
+            found.push((measured, Some(target.id)));
+        }
+        found
+    }
+
+    /// Directions in the camera's frame in which nothing is.
+    fn clutter(&self, camera: &Camera, rng: &mut ChaCha8Rng) -> Vec<Unit<Vector3<f64>>> {
+        // A mean of zero has no distribution, and no clutter.
+        let count = Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
+        let [width, height] = self.description.size_px.map(|side| f64::from(side) - 1.0);
+        let direction = |_| {
+            let pixel = Pixel::new(rng.random_range(0.0..=width), rng.random_range(0.0..=height));
+            camera.model().direction(pixel).ok()
+        };
+        (0..count as u64).filter_map(direction).collect()
+    }
+
+    fn track(&self, number: u64, camera: &Camera, direction: &Unit<Vector3<f64>>) -> BearingTrack {
+        let variance = self.description.noise_rad.powi(2);
+        let bearing = Bearing::new(direction.into_inner(), Matrix2::identity() * variance);
+        let pixel = bearing.ok().and_then(|bearing| camera.model().project(&bearing.direction()));
+        BearingTrack {
+            track_id: number,
+            bearing: Some(direction.into_inner().into()),
+            covariance_xx: variance,
+            covariance_yy: variance,
+            pixel_x: pixel.map_or(0.0, |pixel| pixel.x()),
+            pixel_y: pixel.map_or(0.0, |pixel| pixel.y()),
+            score: 1.0,
+            state: ImageTrackState::Tracking.into(),
+            ..Default::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
