@@ -65,7 +65,7 @@ fn finds_an_ordinary_target(fusion: &mut Fusion, from_s: f64) {
     ingest_all(fusion, &scene.frames(99));
     fusion.flush();
     let truth = scene.paths.first().unwrap();
-    let track = found(fusion, truth).expect("an ordinary target is found");
+    let track = found(fusion, truth).unwrap();
     let error = track.state().position() - truth(track.updated.seconds()).unwrap();
     assert!(track.updated.seconds() > from_s + 3.8, "{track:?}");
     assert!(error.norm() < 0.2, "{error}");
@@ -172,7 +172,7 @@ fn ten_thousand_false_bearings_in_a_frame_are_survived_in_bounded_time() {
     let scene = two_targets(0.0..4.0);
     let (mut slowest, mut flooded) = (Duration::ZERO, 0);
     for mut frame in scene.frames(6) {
-        // Each camera has one such frame, in the same period.
+        // Each camera has one such frame, one after the other.
         if (2.0..2.1).contains(&(frame.capture_time_ns as f64 / 1e9)) {
             let eye = scene.eyes.iter().find(|eye| eye.name.as_str() == frame.camera).unwrap();
             let noise = clutter(&eye.camera, 10_000, &mut rng).into_iter().zip(100..);

@@ -79,8 +79,11 @@ pub fn map(
     let scale =
         lines.iter().map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm()).fold(0.0, f64::max);
     in_front.then_some(())?;
+    // A nearly singular system is inverted to something that rounding leaves not quite symmetric.
+    let inverse = (data + prior).cholesky()?.inverse();
+    let covariance = (inverse + inverse.transpose()) / 2.0;
     Some(MapSolution {
-        state: KinematicState { mean, covariance: (data + prior).try_inverse()? },
+        state: KinematicState { mean, covariance },
         chi_square,
         observability: Observability::of_information(&data, scale, velocity_sd),
     })
