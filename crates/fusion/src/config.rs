@@ -138,7 +138,7 @@ pub struct Initiation {
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
     /// How long the bearings of two cameras must agree to start a track that no third camera sees, s,
-    /// for `hypotheses`. Default 2.
+    /// for `hypotheses`. Default 1.
     pub pair_s: f64,
     /// Standard deviation of the velocity's prior, m/s an axis. Default 15.
     pub velocity_prior_sd_mps: f64,
@@ -163,7 +163,7 @@ impl Default for Initiation {
             period_s: 0.05,
             periods: 4,
             fixes: 2,
-            pair_s: 2.0,
+            pair_s: 1.0,
             velocity_prior_sd_mps: 15.0,
             max_range_m: 2000.0,
             spatial_gate_probability: 0.999,
@@ -221,7 +221,8 @@ pub struct Tracking {
     pub innovation_window: usize,
     /// Probability of its false alarm. Default 0.0001.
     pub innovation_false_alarm: f64,
-    /// Probability with which a true bearing passes a track's gate. Default 0.9999.
+    /// Probability with which a true bearing passes a track's gate. Default 0.999999: a target that begins to
+    /// turn must still be in it when the likelihoods have noticed.
     pub gate_probability: f64,
     /// Probability that a camera reports a target in its field of view. Default 0.9.
     pub detection_probability: f64,
@@ -249,7 +250,7 @@ impl Default for Tracking {
             residual_scale: 0.81,
             innovation_window: 2,
             innovation_false_alarm: 1e-4,
-            gate_probability: 0.9999,
+            gate_probability: 0.999_999,
             detection_probability: 0.9,
             clutter_per_sr: 5.0,
             confirm_score: 25.0,

@@ -19,7 +19,7 @@ use crate::{ConfigError, Counters, FusionConfig};
 /// What comes out of the fusion centre.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Output {
-    /// All tracks after one exposure.
+    /// The tracks that an exposure has changed.
     Tracks(TrackFrame),
     /// Something happened to a track.
     Event(TrackEvent),
@@ -277,8 +277,12 @@ impl Fusion {
             });
             outputs.push(Output::Event(event(happening, exposure)));
         }
-        let tracks: Vec<crossfix_message::Track> =
-            self.tracker.tracks().map(|track| self.track_message(track, exposure.time)).collect();
+        let due = self.tracker.due(exposure.time);
+        let tracks: Vec<crossfix_message::Track> = due
+            .iter()
+            .filter_map(|id| self.tracker.track(*id))
+            .map(|t| self.track_message(t, exposure.time))
+            .collect();
         if !tracks.is_empty() {
             let frame = TrackFrame {
                 sequence: self.sequence,

@@ -93,6 +93,8 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// When its state went out, and as what.
+    pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
     detector: Option<Detector>,
 }
@@ -205,6 +207,7 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             detector: motion.detector(),
         }
@@ -213,6 +216,11 @@ impl Track {
     /// Position and velocity at [`Self::updated`].
     pub fn state(&self) -> &KinematicState {
         self.imm.combined()
+    }
+
+    /// Root of the sum of the position's variances, m: not less than the deviation along any axis.
+    pub(crate) fn position_sd(&self) -> f64 {
+        self.state().covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
     }
 
     /// Position and velocity expected at another time.

@@ -19,6 +19,10 @@ const DROP_SCORE: f64 = -4.6;
 /// Two positions that differ by less than this (squared Mahalanobis, three degrees of freedom,
 /// P = 0.99) are one target if one of the tracks is coasting.
 const MERGE_GATE: f64 = 11.34;
+/// A bearing is not compared with tracks beyond this many times the range of the cameras.
+const REACH: f64 = 1.5;
+/// Every track's state goes out at least this often, s.
+const PUBLISHED_EVERY_S: f64 = 0.5;
 /// A score beyond this counts no more: a track that has long been good can still be doubted.
 const MAX_SCORE: f64 = 100.0;
 
@@ -72,6 +76,22 @@ impl Tracker {
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.
     pub(crate) fn tracks(&self) -> impl Iterator<Item = &Track> {
         self.tracks.values()
+    }
+
+    /// The tracks whose state should go out now, ordered by id: those just updated, those whose status
+    /// has changed, and each at least every half second.
+    pub(crate) fn due(&mut self, now: Timestamp) -> Vec<TrackId> {
+        let mut due = Vec::new();
+        for track in self.tracks.values_mut() {
+            let silent = track.published.is_none_or(|(time, status)| {
+                status != track.status || now.seconds_since(time) >= PUBLISHED_EVERY_S
+            });
+            if silent || track.updated == now {
+                track.published = Some((now, track.status));
+                due.push(track.id);
+            }
+        }
+        due
     }
 
     /// A track by its number.
@@ -149,6 +169,10 @@ impl Tracker {
         let mut candidates = Vec::new();
         for (row, id) in ids.iter().enumerate() {
             let prediction = self.tracks.get(id).and_then(|track| {
+                let away = (track.position_at(exposure.time) - known.camera.pose().position()).norm();
+                if away > REACH * self.max_range_m {
+                    return None;
+                }
                 track.bearing_prediction(
                     exposure.time,
                     known.camera.pose().position(),

@@ -1,4 +1,4 @@
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
@@ -37,8 +37,7 @@ pub struct Picture {
     stream: RecordingStream,
     cameras: BTreeMap<String, CameraView>,
     trails: BTreeMap<u64, VecDeque<[f32; 3]>>,
-    drawn: BTreeSet<u64>,
-    places: Vec<Point3<f64>>,
+    drawn: BTreeMap<u64, (Timestamp, Point3<f64>)>,
     limiter: Limiter,
     arrivals: BTreeMap<(String, u64), Timestamp>,
 }
@@ -55,8 +54,7 @@ impl Picture {
             stream,
             cameras: BTreeMap::new(),
             trails: BTreeMap::new(),
-            drawn: BTreeSet::new(),
-            places: Vec::new(),
+            drawn: BTreeMap::new(),
             limiter: Limiter::default(),
             arrivals: BTreeMap::new(),
         })
@@ -155,7 +153,7 @@ impl Picture {
         }
         // As far as the farthest track, so that the crossings are seen.
         let origin = view.camera.pose().position();
-        let farthest = self.places.iter().map(|place| (place - origin).norm()).fold(0.0, f64::max);
+        let farthest = self.drawn.values().map(|(_, place)| (place - origin).norm()).fold(0.0, f64::max);
         let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
         draw::bearings(&self.stream, frame, view.index, &view.camera, reach, view.scale)
     }
@@ -171,25 +169,24 @@ impl Picture {
             .collect();
         for id in ended {
             self.trails.remove(&id);
-            if self.drawn.remove(&id) {
+            if self.drawn.remove(&id).is_some() {
                 self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
             }
         }
-        if !self.limiter.allows("tracks", time, TRACK_RATE_HZ) {
-            return Ok(());
-        }
-        self.places.clear();
         for track in frame.tracks.iter().filter(|track| track.state() != TrackState::Lost) {
             let Some(position) = track.position else {
                 continue;
             };
+            let since = self.drawn.get(&track.id).map(|(then, _)| time.seconds_since(*then));
+            if since.is_some_and(|since| (0.0..TRACK_RATE_HZ.recip()).contains(&since)) {
+                continue;
+            }
             let trail = self.trails.entry(track.id).or_default();
             trail.push_back([position.x as f32, position.y as f32, position.z as f32]);
             while trail.len() > TRAIL_POINTS {
                 trail.pop_front();
             }
-            self.drawn.insert(track.id);
-            self.places.push(position.into());
+            self.drawn.insert(track.id, (time, position.into()));
             draw::track(&self.stream, track, trail.make_contiguous())?;
         }
         Ok(())

@@ -193,6 +193,7 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
 
     let bar = progress_bar(args.duration);
     let mut interrupted = false;
+    let mut tracks = BTreeMap::new();
     while !agents.is_empty() {
         let mut running = Vec::new();
         for mut agent in agents {
@@ -207,7 +208,7 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         }
         let elapsed = (wall_seconds() - start_at).clamp(0.0, args.duration);
         bar.set_position((elapsed * 10.0) as u64);
-        if let Some(message) = newest(&subscription) {
+        if let Some(message) = newest(&subscription, &mut tracks) {
             bar.set_message(message);
         }
         std::thread::sleep(Duration::from_millis(100));
@@ -239,23 +240,35 @@ fn progress_bar(duration: f64) -> ProgressBar {
     bar
 }
 
-/// The newest track frame as a line of the progress bar.
-fn newest(subscription: &crossfix_transport::Subscription) -> Option<String> {
-    let mut last = None;
+/// The newest state of every confirmed track as a line of the progress bar; a frame holds only the
+/// tracks that it changes.
+fn newest(
+    subscription: &crossfix_transport::Subscription,
+    tracks: &mut BTreeMap<u64, crossfix_message::Track>,
+) -> Option<String> {
+    let mut heard = false;
     while let Some(received) = subscription.next(Duration::ZERO) {
-        last = Some(received);
+        let Ok(frame) = decode::<TrackFrame>(&received.data) else {
+            continue;
+        };
+        heard = true;
+        for track in frame.tracks {
+            if track.state() == TrackState::Lost {
+                tracks.remove(&track.id);
+            } else {
+                tracks.insert(track.id, track);
+            }
+        }
     }
-    let frame: TrackFrame = decode(&last?.data).ok()?;
-    let confirmed: Vec<String> = frame
-        .tracks
-        .iter()
+    let confirmed: Vec<String> = tracks
+        .values()
         .filter(|track| track.state() == TrackState::Confirmed)
         .filter_map(|track| {
             let p = track.position?;
             Some(format!("#{} ({:.0}, {:.0}, {:.0}) m", track.id, p.x, p.y, p.z))
         })
         .collect();
-    Some(format!("{} tracks  {}", confirmed.len(), confirmed.join("  ")))
+    heard.then(|| format!("{} tracks  {}", confirmed.len(), confirmed.join("  ")))
 }
 
 /// A network on this machine's own ports that nobody uses now.

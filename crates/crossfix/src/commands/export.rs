@@ -63,7 +63,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         None => {
             for (time, estimates) in history.frames() {
-                write(time.seconds(), estimates)?;
+                write(time.seconds(), &estimates)?;
             }
         }
     }

@@ -29,6 +29,9 @@ const LEAST_SCORE: f64 = -12.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
+/// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
+/// nearly parallel lines of two targets cross too.
+const MAX_PAIR_SD_M: f64 = 3.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
 const MAX_HYPOTHESES: usize = 3_000;
 
@@ -227,8 +230,9 @@ impl Hypotheses {
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
                 // Lines of two targets that two cameras see one each may cross for a while.
-                let agreed = hypothesis.track.residuals.len() >= 3
-                    || hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s;
+                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
+                    && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
+                let agreed = hypothesis.track.residuals.len() >= 3 || pair_holds;
                 let likely = agreed && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
