@@ -10,6 +10,7 @@ use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
+use crate::spatial::Quantity;
 use crate::standing::CameraStanding;
 use crate::standing::Standings;
 use crate::track::{Track, TrackId, TrackStatus};
@@ -325,6 +326,10 @@ impl Fusion {
             angle_rad: residual.angle,
             nis: residual.nis,
         });
+        let weak = |quantity: Quantity| {
+            let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
+            Some(axis.direction.into_inner().into())
+        };
         crossfix_message::Track {
             id: track.id.0,
             state: state.into(),
@@ -337,6 +342,8 @@ impl Fusion {
             rank: track.observability.rank as u32,
             condition_number: track.observability.condition_number,
             updated_ns: track.updated.nanos(),
+            weak_position_axis: weak(Quantity::Position),
+            weak_velocity_axis: weak(Quantity::Velocity),
         }
     }
 }

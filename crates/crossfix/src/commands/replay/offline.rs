@@ -1,6 +1,7 @@
 //! Into the fusion, as fast as it goes.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use crossfix_fusion::{Fusion, Output};
 use crossfix_message::{
@@ -20,6 +21,9 @@ struct OfflineFusion {
     rejections: RejectionLog,
     frames: u64,
     tracks: u64,
+    /// Time spent in the fusion itself, and the longest for one frame.
+    busy: Duration,
+    longest: Duration,
 }
 
 /// Fuses a recording's bearings and writes calibrations, bearings, truth and tracks.
@@ -31,6 +35,8 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
         rejections: RejectionLog::default(),
         frames: 0,
         tracks: 0,
+        busy: Duration::ZERO,
+        longest: Duration::ZERO,
     };
     let mut site: Option<SiteName> = None;
     // Calibrations first: a range may begin after they were said.
@@ -51,7 +57,7 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
         let last = run.fusion.flush();
         run.write(site, last)?;
     }
-    let OfflineFusion { writer, frames, tracks, fusion, .. } = run;
+    let OfflineFusion { writer, frames, tracks, fusion, busy, longest, .. } = run;
     writer.finish()?;
     if let Some(damage) = report.damage {
         tracing::warn!("{} is torn: {damage}; everything before was used", args.recording.display());
@@ -63,6 +69,14 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
         "{frames} bearing frames fused, {tracks} track frames written to {}",
         output.display()
     ));
+    if frames > 0 {
+        output::line(format!(
+            "the fusion itself took {:.1} ms: {:.1} us a frame, {:.2} ms at most",
+            busy.as_secs_f64() * 1e3,
+            busy.as_secs_f64() * 1e6 / frames as f64,
+            longest.as_secs_f64() * 1e3
+        ));
+    }
     Ok(())
 }
 
@@ -89,7 +103,13 @@ impl OfflineFusion {
             Channel::Bearings(_) => {
                 self.frames += 1;
                 self.writer.write(entry)?;
-                self.fusion.ingest(&decode::<BearingFrame>(&entry.data)?)
+                let frame: BearingFrame = decode(&entry.data)?;
+                let start = Instant::now();
+                let outputs = self.fusion.ingest(&frame);
+                let took = start.elapsed();
+                self.busy += took;
+                self.longest = self.longest.max(took);
+                outputs
             }
             Channel::CameraHealth(camera) => {
                 let health: Health = decode(&entry.data)?;
