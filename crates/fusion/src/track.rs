@@ -395,10 +395,10 @@ mod tests {
             let first = map(&lines[..3], lines[2].time, 15.6).unwrap();
             let fix = Fix {
                 time: lines[2].time,
-                state: first.state,
+                state: first.state.clone(),
                 velocity: VelocityKnowledge::Solved,
                 solver: Solver::Map,
-                observability: first.observability,
+                observability: first.observability(),
             };
             let mut track = Track::start(&fix, [], &motion);
             for timed in &lines[3..] {

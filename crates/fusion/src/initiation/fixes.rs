@@ -44,7 +44,7 @@ impl FixFinder {
             SpatialSolver::Map => {
                 let sets = self.seeds.find(exposures, cameras).into_iter();
                 sets.filter_map(|seed| {
-                    let MapSolution { state, observability, .. } = seed.solution.clone();
+                    let (observability, state) = (seed.solution.observability(), seed.solution.state.clone());
                     let (time, velocity) = (seed.time()?, VelocityKnowledge::Solved);
                     let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
                     Some(PeriodFix { fix, lines: seed.lines })
@@ -135,7 +135,8 @@ impl FixFinder {
         solver: Solver,
         velocity: VelocityKnowledge,
     ) -> Option<Fix> {
-        let MapSolution { state, observability, .. } = self.solve(lines, time)?;
+        let solution = self.solve(lines, time)?;
+        let (observability, state) = (solution.observability(), solution.state);
         Some(Fix { time, state, velocity, solver, observability })
     }
 

@@ -10,7 +10,7 @@ use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
-use crate::spatial::{Fix, MapSolution, VelocityKnowledge};
+use crate::spatial::{Fix, VelocityKnowledge};
 use crate::temporal::LineId;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, same_target};
@@ -194,7 +194,7 @@ impl Hypotheses {
                 continue;
             };
             self.families += 1;
-            let MapSolution { state, observability, .. } = seed.solution;
+            let (observability, state) = (seed.solution.observability(), seed.solution.state);
             let velocity = VelocityKnowledge::Solved;
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
             let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));

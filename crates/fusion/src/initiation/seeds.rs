@@ -122,6 +122,11 @@ impl SeedFinder {
         seeds.sort_by(|a, b| b.score.total_cmp(&a.score).then_with(|| ids(a).cmp(&ids(b))));
         let mut seen = BTreeSet::new();
         seeds.retain(|seed| seen.insert(ids(seed)));
+        // Where three cameras agree on both lines of a pair, with others or with each other, the pair
+        // can wait for the next period: there are many more of these than targets.
+        let agreed: BTreeSet<LineId> =
+            seeds.iter().filter(|seed| seed.lines.len() > 2).flat_map(ids).collect();
+        seeds.retain(|seed| seed.lines.len() > 2 || !ids(seed).iter().all(|id| agreed.contains(id)));
         seeds.truncate(MAX_SEEDS);
         seeds
     }

@@ -14,8 +14,17 @@ pub struct MapSolution {
     /// Sum of squared normalised residuals, the prior's included: chi-square with
     /// `2 n - 3` degrees of freedom for n true lines.
     pub chi_square: f64,
-    /// What the lines alone say, against the prior scales.
-    pub observability: Observability,
+    /// Fisher information of the lines alone, and the scales that it is held against, m and m/s.
+    information: Matrix6<f64>,
+    scales: (f64, f64),
+}
+
+impl MapSolution {
+    /// What the lines alone say, against the prior scales: the farthest line's length and the velocity
+    /// prior. Not computed with the solution, as eigenvalues cost more than that.
+    pub fn observability(&self) -> Observability {
+        Observability::of_information(&self.information, self.scales.0, self.scales.1)
+    }
 }
 
 /// The weighted solution for any number of lines of any times: position and velocity at
@@ -85,7 +94,8 @@ pub fn map(
     Some(MapSolution {
         state: KinematicState { mean, covariance },
         chi_square,
-        observability: Observability::of_information(&data, scale, velocity_sd),
+        information: data,
+        scales: (scale, velocity_sd),
     })
 }
 
@@ -148,8 +158,8 @@ mod tests {
             .map(|(camera, t)| line_at(*camera, Point3::new(1.0, 2.0, 0.0), t))
             .collect();
         let found = map(&lines, Timestamp::EPOCH, 15.0).unwrap();
-        assert!(!found.observability.is_full());
-        let weak = found.observability.weak_axis.unwrap();
+        assert!(!found.observability().is_full());
+        let weak = found.observability().weak_axis.unwrap();
         // The second and the third camera look along y, from both sides; the first sees y once.
         assert_eq!(weak.quantity, Quantity::Velocity);
         assert!(weak.direction.y > 0.99, "{weak:?}");

@@ -105,7 +105,7 @@ fn answers(lines: &[TimedLine; 3]) -> [Option<Answer>; 3] {
         position: solution.state.position(),
         velocity: solution.state.velocity(),
         time: first.time,
-        observability: Some(solution.observability),
+        observability: Some(solution.observability()),
     });
     [papers_inverse(lines), ours, posterior]
 }
