@@ -206,6 +206,10 @@ impl Imm {
             *weight = (kept + (1.0 - stay) * share) * probability;
             total += *weight;
         }
+        if total <= 0.0 {
+            // Ruled out, and no time in which it could have come up again: its state counts for nothing.
+            return self.combined.clone();
+        }
         combined(&self.states, &weights.map(|weight| weight / total))
     }
 }
@@ -281,6 +285,16 @@ mod tests {
         assert_eq!(imm, before);
         assert!(imm.update(1.0, &models(), |s| Some((s.clone(), f64::NAN))).is_none());
         assert_eq!(imm, before);
+    }
+
+    #[test]
+    fn a_model_that_is_ruled_out_spoils_no_measurement_of_the_same_time() {
+        let mut imm = running();
+        let far = Point3::new(500.0, 0.0, 0.0);
+        imm.update(0.7, &models(), |s| s.position_updated(far, &Matrix3::identity())).unwrap();
+        assert_eq!(imm.probabilities()[0], 0.0, "so unlikely that it underflows");
+        imm.update(0.0, &models(), |s| s.position_updated(far, &Matrix3::identity())).unwrap();
+        assert!(imm.combined().is_finite(), "{:?}", imm.combined());
     }
 
     #[test]
