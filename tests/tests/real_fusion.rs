@@ -4,6 +4,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use crossfix_evaluation::TrackHistory;
 use crossfix_fusion::{Fusion, FusionConfig, Output};
@@ -32,8 +33,28 @@ impl Labels {
         let share = (t - t0) / (t1 - t0);
         let [u, v] = [before, next].map(|track| Vector3::from(track.bearing.unwrap()));
         let between = (u * (1.0 - share) + v * share).normalize();
-        Some(BearingTrack { track_id: 2, bearing: Some(between.into()), ..before.clone() })
+        Some(BearingTrack { track_id: 2, bearing: Some(between.into()), ..*before })
     }
+}
+
+fn time_of(frame: &BearingFrame) -> f64 {
+    Timestamp::from_nanos(frame.capture_time_ns).seconds()
+}
+
+fn labels_of(frames: &[BearingFrame]) -> BTreeMap<String, Labels> {
+    let mut labels: BTreeMap<String, Labels> = BTreeMap::new();
+    for frame in frames {
+        let own = labels.entry(frame.camera.clone()).or_insert(Labels(Vec::new()));
+        own.0.extend(frame.tracks.first().map(|track| (time_of(frame), *track)));
+    }
+    labels
+}
+
+/// Where the drone was, and when (s).
+fn truth_of(recording: &Path) -> Vec<(f64, Point3<f64>)> {
+    let place = |data: &[u8]| decode::<TruthFrame>(data).unwrap().targets[0].position.unwrap().into();
+    let entries = messages(recording, |channel| *channel == Channel::Truth);
+    entries.into_iter().map(|entry| (entry.data_time.seconds(), place(&entry.data))).collect()
 }
 
 #[test]
@@ -56,19 +77,8 @@ fn two_real_targets_are_both_followed_and_never_taken_for_each_other() {
         .into_iter()
         .map(|entry| decode(&entry.data).unwrap())
         .collect();
-    let time_of = |frame: &BearingFrame| Timestamp::from_nanos(frame.capture_time_ns).seconds();
-    let mut labels: BTreeMap<String, Labels> = BTreeMap::new();
-    for frame in &frames {
-        let own = labels.entry(frame.camera.clone()).or_insert(Labels(Vec::new()));
-        own.0.extend(frame.tracks.first().map(|track| (time_of(frame), track.clone())));
-    }
-    let truth: Vec<(f64, Point3<f64>)> = messages(&half, |channel| *channel == Channel::Truth)
-        .into_iter()
-        .map(|entry| {
-            let frame: TruthFrame = decode(&entry.data).unwrap();
-            (entry.data_time.seconds(), frame.targets[0].position.unwrap().into())
-        })
-        .collect();
+    let labels = labels_of(&frames);
+    let truth = truth_of(&half);
     let all_see = |t: f64| intervals.iter().all(|(name, interval)| labels[*name].at(t, *interval).is_some());
 
     let mut history = TrackHistory::default();
