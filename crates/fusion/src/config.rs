@@ -208,7 +208,7 @@ pub struct Tracking {
     pub manoeuvres: Manoeuvres,
     /// The ways of flying of `models`. Default: straight (1e-6), drifting (0.3), manoeuvring (5).
     pub models: Vec<FlightModel>,
-    /// How often a target changes its way of flying, 1/s. Default 0.002.
+    /// How often a target changes its way of flying, 1/s. Default 0.01.
     pub switching_rate_per_s: f64,
     /// Power spectral density of the white acceleration where there is one model, m^2/s^3. Default 3,
     /// for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for what flies straight.
@@ -244,7 +244,7 @@ impl Default for Tracking {
         Self {
             manoeuvres: Manoeuvres::default(),
             models: vec![model(1e-6, 0.998), model(0.3, 0.001), model(5.0, 0.001)],
-            switching_rate_per_s: 0.002,
+            switching_rate_per_s: 0.01,
             acceleration_density: 3.0,
             residual_window: 8,
             residual_scale: 0.81,

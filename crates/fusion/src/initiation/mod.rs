@@ -26,6 +26,9 @@ use grouped::Grouped;
 use hypotheses::Hypotheses;
 use period::Periods;
 
+/// Lines of one exposure that the initiation looks at: time is bounded, whatever a camera reports.
+const MAX_LINES: usize = 500;
+
 /// A sight line with its name.
 type NamedLine = (LineId, TimedLine);
 
@@ -88,7 +91,7 @@ impl Initiator {
 
 /// An exposure's sight lines with their names.
 fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
-    exposure.sightings.iter().enumerate().map(|(index, Sighting { line, .. })| {
+    exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
         let line = SightLine { covariance: line.covariance * exposure.uncertainty.factor, ..*line };
         (id, TimedLine { line, time: exposure.time, time_sd_s: exposure.uncertainty.time_sd_s })

@@ -1,9 +1,13 @@
 //! Which readings of the bearings go together: the set of greatest total score without common lines.
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::temporal::LineId;
 
+/// Comparisons of readings in one period, about a tenth of a second's worth; half of them are kept for the question
+/// how sure each choice is.
+const MAX_COMPARISONS: usize = 20_000_000;
 /// Passes of the local search; each makes the total greater, and few are ever needed.
 const MAX_PASSES: usize = 20;
 
@@ -23,6 +27,8 @@ pub(super) struct Selection {
     users: Vec<Vec<usize>>,
     shared_lines: usize,
     chosen: BTreeSet<usize>,
+    /// Comparisons that may still be made: time is bounded where everything clashes with everything.
+    budget: Cell<usize>,
 }
 
 impl Selection {
@@ -52,7 +58,13 @@ impl Selection {
                 users[line].push(i);
             }
         }
-        let mut selection = Self { readings, users, shared_lines, chosen: BTreeSet::new() };
+        let mut selection = Self {
+            readings,
+            users,
+            shared_lines,
+            chosen: BTreeSet::new(),
+            budget: Cell::new(MAX_COMPARISONS),
+        };
         selection.fill(&(0..selection.readings.len()).collect::<Vec<_>>());
         selection.exchange();
         selection
@@ -70,7 +82,8 @@ impl Selection {
         let mut without = self.chosen.clone();
         without.remove(&chosen);
         let gained: f64 = self.additions(&without, &others).iter().map(|&i| self.readings[i].score).sum();
-        self.readings[chosen].score - gained
+        // Where there was no time to look for others, nothing is sure.
+        if self.budget.get() == 0 { 0.0 } else { self.readings[chosen].score - gained }
     }
 
     /// Readings that have a line in common with one.
@@ -87,6 +100,12 @@ impl Selection {
 
     fn fits(&self, reading: usize, choice: &BTreeSet<usize>) -> bool {
         let lines = &self.readings[reading].lines;
+        let cost = lines.iter().map(|&line| self.users[line].len()).sum();
+        let left = self.budget.get().checked_sub(cost);
+        self.budget.set(left.unwrap_or(0));
+        if left.is_none() {
+            return false;
+        }
         let near = lines.iter().flat_map(|&line| &self.users[line]);
         near.filter(|i| choice.contains(i)).all(|&i| i != reading && !self.clash(reading, i))
     }
@@ -122,6 +141,9 @@ impl Selection {
                 without.remove(&out);
                 let added = self.additions(&without, &others);
                 let gained: f64 = added.iter().map(|&i| self.readings[i].score).sum();
+                if self.budget.get() < MAX_COMPARISONS / 2 {
+                    return;
+                }
                 if gained > self.readings[out].score + 1e-9 {
                     self.chosen = without;
                     self.chosen.extend(added);
