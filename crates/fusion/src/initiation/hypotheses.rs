@@ -14,6 +14,7 @@ use crate::spatial::{Fix, VelocityKnowledge};
 use crate::temporal::LineId;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, same_target};
+use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// Bearings of one exposure that continue one hypothesis, the best first.
@@ -135,6 +136,8 @@ impl Hypotheses {
     /// Lets every hypothesis go on with each bearing in its gate, and without any.
     fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &Motion) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
+        // The lines have the camera's factor in their covariances already.
+        let uncertainty = CameraUncertainty { factor: 1.0, ..exposure.uncertainty };
         let miss = (1.0 - self.tracking.detection_probability).ln();
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for mut hypothesis in self.hypotheses.drain(..) {
@@ -142,7 +145,7 @@ impl Hypotheses {
             let prediction = hypothesis.track.bearing_prediction(
                 exposure.time,
                 known.camera.pose().position(),
-                &exposure.uncertainty,
+                &uncertainty,
                 motion,
             );
             let ratio = |(i, (_, line)): (usize, &NamedLine)| {
@@ -154,7 +157,7 @@ impl Hypotheses {
             for &(ratio, i) in near.iter().take(MAX_BRANCHES).filter(|(ratio, _)| *ratio > miss) {
                 let mut child = hypothesis.clone();
                 let (id, line) = &lines[i];
-                let time = (exposure.time, &exposure.uncertainty);
+                let time = (exposure.time, &uncertainty);
                 if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
                     child.track.score += ratio;
                     child.lines.push((self.period, id.clone()));
