@@ -41,6 +41,7 @@ pub mod temporal;
 mod track;
 mod tracker;
 mod uncertainty;
+mod watch;
 
 pub use clocks::ClockEstimate;
 pub use config::{

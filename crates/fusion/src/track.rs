@@ -11,6 +11,9 @@ use crate::prediction::BearingPrediction;
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 use crate::uncertainty::{CameraUncertainty, View};
 
+/// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
+/// nearly parallel lines of two targets cross too.
+pub(crate) const MAX_PAIR_SD_M: f64 = 3.0;
 /// Rounds of the iterated update; the linearisation settles in two or three.
 const MAX_ITERATIONS: usize = 5;
 /// The linearisation has settled when a round moves the position by less than this, m.
@@ -243,6 +246,13 @@ impl Track {
     pub(crate) fn is_held_without(&self, camera: &CameraName, motion: &Motion) -> bool {
         let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
         self.residuals.iter().filter(|(name, r)| *name != camera && lately(r)).count() >= 2
+    }
+
+    /// Whether the track is too uncertain for a camera that has not been following it: any line that
+    /// crosses another camera's sight line would pass for its target.
+    pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &Motion) -> bool {
+        let follows = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        !self.held && !self.residuals.get(camera).is_some_and(follows) && self.position_sd() > MAX_PAIR_SD_M
     }
 
     /// What a camera at `origin` should see at a time.

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use crossfix_filter::{Gate, KinematicState};
-use crossfix_message::{Timestamp, TrackEventKind};
+use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
 use crate::assignment::{Candidate, assign};
 use crate::ingress::KnownCamera;
@@ -12,6 +12,7 @@ use crate::initiation::Start;
 use crate::motion::Motion;
 use crate::prediction::Fit;
 use crate::track::{Track, TrackId, TrackStatus};
+use crate::watch::Watch;
 use crate::{Exposure, Sighting, Tracking};
 
 /// A tentative track whose score falls below this is dropped: a chance of 1 in 100 against clutter.
@@ -24,7 +25,18 @@ const REACH: f64 = 1.5;
 /// Every track's state goes out at least this often, s.
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// A score beyond this counts no more: a track that has long been good can still be doubted.
-const MAX_SCORE: f64 = 100.0;
+const MAX_SCORE: f64 = 40.0;
+/// What hides a sure target from a camera hides it for about so long, s: exposures that follow each
+/// other more closely tell together no more than one does.
+const HIDDEN_S: f64 = 0.5;
+
+/// A camera brings a track back that it has lost sight of if the line is so many times (logarithm)
+/// more likely the target's than one of the strangers that the camera reports anyway.
+const FOUND_AGAIN_MARGIN: f64 = 8.0;
+
+/// A track that one camera alone was following is found again within this distance (squared
+/// Mahalanobis, P = 0.999 999).
+const FOUND_AGAIN_GATE: f64 = 30.7;
 
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,6 +62,7 @@ pub(crate) struct Tracker {
     max_range_m: f64,
     tracks: BTreeMap<TrackId, Track>,
     next_id: u64,
+    watches: BTreeMap<CameraName, Watch>,
 }
 
 /// What an exposure has done.
@@ -70,7 +83,7 @@ pub(crate) struct Step {
 impl Tracker {
     pub(crate) fn new(config: Tracking, max_range_m: f64, motion: Motion) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
-        Self { config, motion, gate, max_range_m, tracks: BTreeMap::new(), next_id: 1 }
+        Self { config, motion, gate, max_range_m, tracks: BTreeMap::new(), next_id: 1, watches: BTreeMap::new() }
     }
 
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.
@@ -150,6 +163,13 @@ impl Tracker {
                 free.push(sighting.clone());
             }
         }
+        let (time, strangers) = (exposure.time, free.len());
+        let watch = self.watches.get_mut(&exposure.camera);
+        if let Some(watch) = watch {
+            watch.see(time, strangers);
+        } else {
+            self.watches.insert(exposure.camera.clone(), Watch::first(time, strangers));
+        }
         happenings.extend(self.review(exposure.time));
         happenings.extend(self.merge(exposure.time));
         Step { free, claims, used, evidence, happenings }
@@ -166,6 +186,10 @@ impl Tracker {
         let ids: Vec<TrackId> =
             self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
         let miss = (1.0 - self.config.detection_probability).ln();
+        let watch = self.watches.get(&exposure.camera);
+        let interval_s = watch.map_or(f64::INFINITY, |watch| watch.seconds_to(exposure.time));
+        // What a line must be worth to bring a track back that the camera has lost sight of.
+        let stranger = watch.map_or(0.0, |watch| watch.strangers_per_sr(known).ln()) + FOUND_AGAIN_MARGIN;
         let mut candidates = Vec::new();
         for (row, id) in ids.iter().enumerate() {
             let prediction = self.tracks.get(id).and_then(|track| {
@@ -183,9 +207,12 @@ impl Tracker {
             let Some(prediction) = prediction else {
                 continue;
             };
+            let lost_sight =
+                self.tracks.get(id).is_some_and(|t| t.is_lost_sight_of_by(&exposure.camera, &self.motion));
             let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
             for (column, sighting) in open {
-                if let Some(fit) = prediction.fit(&sighting.line, self.gate) {
+                let fit = prediction.fit(&sighting.line, self.gate);
+                if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
                     let gain = log_likelihood_ratio(&fit, &self.config) - miss;
                     candidates.push(Candidate { row, column, gain });
                 }
@@ -211,10 +238,16 @@ impl Tracker {
             if sure && (update.is_some() || sees) && track.is_held_without(&exposure.camera, &self.motion) {
                 evidence.push(update.map(|taken| taken.reported_nis));
             }
-            // Outside its field of view a camera has missed nothing.
-            let expected = gain.is_some() || sees;
-            let change = gain.unwrap_or(&0.0) + if expected { miss } else { 0.0 };
-            track.score = (track.score + change).min(MAX_SCORE);
+            let change = match gain {
+                // What one camera alone follows may be anything along its sight line.
+                Some(_) if sure && !track.is_held_without(&exposure.camera, &self.motion) => 0.0,
+                Some(gain) => gain + miss,
+                // Outside its field of view a camera has missed nothing.
+                None if !sees => 0.0,
+                None => miss,
+            };
+            let weight = if sure { (interval_s / HIDDEN_S).min(1.0) } else { 1.0 };
+            track.score = (track.score + change * weight).min(MAX_SCORE);
             if update.is_some_and(|taken| taken.manoeuvre) {
                 happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
             }
@@ -238,7 +271,7 @@ impl Tracker {
                     track.status = TrackStatus::Confirmed;
                     happenings.push(Happening::new(TrackEventKind::Confirmed, track.id));
                 }
-                TrackStatus::Confirmed | TrackStatus::Coasting if hopeless => {
+                TrackStatus::Confirmed | TrackStatus::Coasting if hopeless || track.score < DROP_SCORE => {
                     track.status = TrackStatus::Lost;
                     happenings.push(Happening::new(TrackEventKind::Lost, track.id));
                 }
@@ -279,14 +312,23 @@ impl Tracker {
     }
 
     /// Takes a track over that the initiation has found, and numbers it. Where it has used the
-    /// bearings of a track that one camera alone was following, that is the same target found again:
-    /// it goes on under the old number.
-    pub(crate) fn adopt(&mut self, Start { mut track, found_again }: Start) -> Vec<Happening> {
-        let old = found_again.and_then(|id| self.tracks.get(&id));
-        if let Some(old) = old.filter(|old| old.is_confirmed() && !old.is_held()) {
+    /// bearings of a track that one camera alone was following and lies where that may have gone, it
+    /// is the same target found again: it goes on under the old number. Where it lies elsewhere, two
+    /// cameras are not enough to say so: their lines cross anywhere.
+    pub(crate) fn adopt(&mut self, Start { mut track, cameras, claimed_by }: Start) -> Vec<Happening> {
+        let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
+        let unheld: Vec<&Track> = owners.filter(|old| old.is_confirmed() && !old.is_held()).collect();
+        let same = unheld.iter().find(|old| {
+            let expected = old.predicted(track.updated, &self.motion);
+            mahalanobis_squared(&expected, track.state()).is_some_and(|distance| distance < FOUND_AGAIN_GATE)
+        });
+        if let Some(old) = same {
             track.id = old.id;
             track.score = track.score.max(old.score);
             self.tracks.insert(track.id, track);
+            return Vec::new();
+        }
+        if !unheld.is_empty() && cameras < 3 {
             return Vec::new();
         }
         let id = TrackId(self.next_id);
@@ -312,9 +354,14 @@ fn position_sd(track: &Track, now: Timestamp, motion: &Motion) -> f64 {
     state.covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
 }
 
-/// Whether two states of one time may be one target's.
-pub(crate) fn same_target(one: &KinematicState, other: &KinematicState) -> bool {
+/// Squared Mahalanobis distance of two states' positions, three degrees of freedom.
+fn mahalanobis_squared(one: &KinematicState, other: &KinematicState) -> Option<f64> {
     let difference = one.position() - other.position();
     let spread = one.position_covariance() + other.position_covariance();
-    spread.cholesky().is_some_and(|c| difference.dot(&c.solve(&difference)) < MERGE_GATE)
+    spread.cholesky().map(|c| difference.dot(&c.solve(&difference)))
+}
+
+/// Whether two states of one time may be one target's.
+pub(crate) fn same_target(one: &KinematicState, other: &KinematicState) -> bool {
+    mahalanobis_squared(one, other).is_some_and(|distance| distance < MERGE_GATE)
 }

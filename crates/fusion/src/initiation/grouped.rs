@@ -1,6 +1,6 @@
 //! 002's temporal processing on the fixes of each period.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::CameraName;
 
@@ -50,7 +50,7 @@ impl Grouped {
     ) -> Vec<Start> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
         let tracks = groups.iter().filter_map(|group| start(group, motion));
-        tracks.map(|track| Start { track, found_again: None }).collect()
+        tracks.map(|track| Start { cameras: track.residuals.len(), track, claimed_by: BTreeSet::new() }).collect()
     }
 }
 

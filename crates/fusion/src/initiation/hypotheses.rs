@@ -12,7 +12,7 @@ use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::{Fix, VelocityKnowledge};
 use crate::temporal::LineId;
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{MAX_PAIR_SD_M, Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
@@ -30,9 +30,6 @@ const LEAST_SCORE: f64 = -12.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
-/// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
-/// nearly parallel lines of two targets cross too.
-const MAX_PAIR_SD_M: f64 = 3.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
 const MAX_HYPOTHESES: usize = 3_000;
 
@@ -46,7 +43,8 @@ struct Hypothesis {
     lines: Vec<(u64, LineId)>,
     /// Periods that gave it a line.
     periods: usize,
-    born: Timestamp,
+    /// Since when two cameras at least have been giving it lines.
+    agreed: Timestamp,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -72,6 +70,11 @@ pub(super) struct Hypotheses {
 impl Hypothesis {
     fn shares(&self, lines: &BTreeSet<&LineId>) -> usize {
         self.lines.iter().filter(|(_, id)| lines.contains(id)).count()
+    }
+
+    /// The cameras that have lately given it a line.
+    fn cameras(&self) -> BTreeSet<&CameraName> {
+        self.lines.iter().map(|(_, (camera, ..))| camera).collect()
     }
 
     fn newest(&self, period: u64) -> Vec<&LineId> {
@@ -123,6 +126,9 @@ impl Hypotheses {
             hypothesis.lines.retain(|(p, _)| p + span > period);
             if hypothesis.lines.last().is_some_and(|(p, _)| *p == period) {
                 hypothesis.periods += 1;
+            }
+            if hypothesis.cameras().len() < 2 {
+                hypothesis.agreed = hypothesis.track.updated;
             }
         }
         self.hypotheses.retain(|h| !h.lines.is_empty());
@@ -204,7 +210,7 @@ impl Hypotheses {
             let mut track = Track::start(&fix, named, motion);
             track.score = seed.score;
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
-            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, born: time });
+            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, agreed: time });
         }
     }
 
@@ -233,9 +239,9 @@ impl Hypotheses {
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
                 // Lines of two targets that two cameras see one each may cross for a while.
-                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
+                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.agreed) >= self.pair_s
                     && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
-                let agreed = hypothesis.track.residuals.len() >= 3 || pair_holds;
+                let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
                 let likely = agreed && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
@@ -260,7 +266,7 @@ impl Hypotheses {
         let mut track = hypothesis.track.clone();
         track.status = TrackStatus::Confirmed;
         track.observe();
-        let found_again = hypothesis.lines.iter().rev().find_map(|(_, id)| self.claims.get(id)).copied();
-        Start { track, found_again }
+        let claimed_by = hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
+        Start { track, cameras: hypothesis.cameras().len(), claimed_by }
     }
 }

@@ -10,7 +10,7 @@ mod period;
 mod seeds;
 mod selection;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::CameraName;
@@ -36,8 +36,10 @@ type NamedLine = (LineId, TimedLine);
 #[derive(Clone, Debug)]
 pub(crate) struct Start {
     pub(crate) track: Track,
-    /// The track whose bearings it has used, where that could not hold its place alone.
-    pub(crate) found_again: Option<TrackId>,
+    /// How many cameras have lately seen it.
+    pub(crate) cameras: usize,
+    /// The tracks whose bearings it has used, where these could not hold their place alone.
+    pub(crate) claimed_by: BTreeSet<TrackId>,
 }
 
 /// Finds new targets among the bearings that no track claims.
