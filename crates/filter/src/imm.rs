@@ -158,18 +158,19 @@ impl Imm {
         mut update: impl FnMut(&KinematicState) -> Option<(KinematicState, f64)>,
     ) -> Option<f64> {
         let weights = self.predicted_probabilities(interval, models);
-        let mut states = Vec::with_capacity(self.states.len());
+        let mut states: [Option<KinematicState>; MAX_MODELS] = Default::default();
         let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
-        for (j, model) in models.models().iter().enumerate() {
+        for (j, (next, model)) in states.iter_mut().zip(models.models()).enumerate() {
             let mut predicted = self.mixed(j, interval, models);
             predicted.time_update(interval, model.density);
             let updated = update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
-            if let Some((state, logarithm)) = updated {
-                logarithms[j] = logarithm + weights[j].ln();
-                states.push(state);
-            } else {
-                states.push(predicted);
-            }
+            *next = Some(match updated {
+                Some((state, logarithm)) => {
+                    logarithms[j] = logarithm + weights[j].ln();
+                    state
+                }
+                None => predicted,
+            });
         }
         let largest = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         if !largest.is_finite() {
@@ -177,7 +178,9 @@ impl Imm {
         }
         let sum: f64 = logarithms.iter().map(|l| (l - largest).exp()).sum();
         self.probabilities = logarithms.map(|l| (l - largest).exp() / sum);
-        self.states = states;
+        for (state, next) in self.states.iter_mut().zip(states.into_iter().flatten()) {
+            *state = next;
+        }
         self.combined = combined(&self.states, &self.probabilities);
         Some(largest + sum.ln())
     }

@@ -31,20 +31,19 @@ const LEAST_SCORE: f64 = -12.0;
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
-const MAX_HYPOTHESES: usize = 3_000;
 
 /// One reading of the bearings: these are one target's.
 #[derive(Clone, Debug)]
 struct Hypothesis {
     /// What began alike belongs to one family.
     family: u64,
-    track: Track,
+    /// Apart, as hypotheses are sorted often.
+    track: Box<Track>,
     /// Its lines of the last periods with the number of the period, in order of time.
     lines: Vec<(u64, LineId)>,
     /// Periods that gave it a line.
     periods: usize,
-    /// Since when two cameras at least have been giving it lines.
-    agreed: Timestamp,
+    born: Timestamp,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -127,11 +126,9 @@ impl Hypotheses {
             if hypothesis.lines.last().is_some_and(|(p, _)| *p == period) {
                 hypothesis.periods += 1;
             }
-            if hypothesis.cameras().len() < 2 {
-                hypothesis.agreed = hypothesis.track.updated;
-            }
         }
-        self.hypotheses.retain(|h| !h.lines.is_empty());
+        // What one camera alone sees may be anywhere: it begins anew when another sees it too.
+        self.hypotheses.retain(|h| h.cameras().len() >= 2);
         let seeds = self.finder.find(exposures, cameras);
         self.begin(seeds, motion);
         self.prune();
@@ -188,7 +185,6 @@ impl Hypotheses {
             *count += 1;
             *count <= MAX_FAMILY && h.track.score > *best - FAMILY_MARGIN && h.track.score > LEAST_SCORE
         });
-        self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     fn sort(&mut self) {
@@ -207,10 +203,10 @@ impl Hypotheses {
             let velocity = VelocityKnowledge::Solved;
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
             let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
-            let mut track = Track::start(&fix, named, motion);
+            let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
-            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, agreed: time });
+            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, born: time });
         }
     }
 
@@ -227,7 +223,6 @@ impl Hypotheses {
                 *count <= MAX_ALIKE
             }
         });
-        self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     /// The best hypotheses without common lines that are likely enough and have no rival.
@@ -239,7 +234,7 @@ impl Hypotheses {
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
                 // Lines of two targets that two cameras see one each may cross for a while.
-                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.agreed) >= self.pair_s
+                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
                     && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
                 let likely = agreed && hypothesis.track.score >= self.tracking.confirm_score;
@@ -263,7 +258,7 @@ impl Hypotheses {
     }
 
     fn start(&self, hypothesis: &Hypothesis) -> Start {
-        let mut track = hypothesis.track.clone();
+        let mut track = Track::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
         let claimed_by = hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
