@@ -26,7 +26,7 @@ fn lines(cameras: usize) -> Vec<TimedLine> {
             let direction = Unit::new_normalize(target - origin);
             let basis = tangent_basis(&direction);
             let line = SightLine { origin, direction, basis, covariance: Matrix2::identity() * 1e-6 };
-            TimedLine { line, time: Timestamp::from_seconds(time), time_sd_s: 0.0 }
+            TimedLine::exact(line, Timestamp::from_seconds(time))
         })
         .collect()
 }

@@ -68,6 +68,11 @@ impl Motion {
         if held { &self.models } else { &self.unheld }
     }
 
+    /// Density of acceleration over all models of a track that is held, m^2/s^3.
+    pub(crate) fn density(&self, probabilities: &[f64]) -> f64 {
+        self.models.models().iter().zip(probabilities).map(|(model, p)| model.density * p).sum()
+    }
+
     pub(crate) fn detector(&self) -> Option<Detector> {
         self.detector.clone()
     }

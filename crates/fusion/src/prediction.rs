@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Point3, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, View};
 
@@ -17,6 +17,8 @@ pub(crate) struct BearingPrediction {
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
     steady: Matrix2<f64>,
+    /// What of this pose and clock of the camera add, rad^2.
+    common: Matrix2<f64>,
     /// What each model's process noise adds along both tangents, rad^2, and its probability.
     added: ModelWeights,
     weights: ModelWeights,
@@ -51,7 +53,8 @@ impl BearingPrediction {
         let basis = tangent_basis(&direction);
         let across = basis / range;
         let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
-        let steady = across.transpose() * state.position_covariance() * across + uncertainty.common(&view);
+        let common = uncertainty.common(&view);
+        let steady = across.transpose() * state.position_covariance() * across + common;
         let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
         let mut added = [0.0; MAX_MODELS];
         for (variance, model) in added.iter_mut().zip(models.models()) {
@@ -61,6 +64,7 @@ impl BearingPrediction {
             view,
             factor: uncertainty.factor,
             steady,
+            common,
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * spread,
@@ -80,7 +84,31 @@ impl BearingPrediction {
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
         let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
-        Some(Self { view, factor: 1.0, steady, added: [0.0; MAX_MODELS], weights, widest: 0.0 })
+        let (common, added) = (Matrix2::zeros(), [0.0; MAX_MODELS]);
+        Some(Self { view, factor: 1.0, steady, common, added, weights, widest: 0.0 })
+    }
+
+    /// Range of the target, m.
+    pub(crate) fn range(&self) -> f64 {
+        self.view.range
+    }
+
+    /// The tangents at the predicted direction, in which its covariances are expressed, world.
+    pub(crate) fn basis(&self) -> &Matrix3x2<f64> {
+        &self.view.basis
+    }
+
+    /// Covariance of the predicted direction without what pose and clock of the camera add, and that,
+    /// rad^2.
+    pub(crate) fn spreads(&self) -> (Matrix2<f64>, Matrix2<f64>) {
+        let added: f64 = self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
+        (self.steady - self.common + Matrix2::identity() * added, self.common)
+    }
+
+    /// Covariance of a bearing, rad^2.
+    pub(crate) fn noise_of(&self, line: &SightLine) -> Matrix2<f64> {
+        let turn = self.view.basis.transpose() * line.basis;
+        turn * line.covariance * turn.transpose() * self.factor
     }
 
     /// How a bearing fits; `None` if it lies outside the gate.
@@ -92,8 +120,7 @@ impl BearingPrediction {
         if behind || innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
-        let turn = self.view.basis.transpose() * line.basis;
-        let spread = self.steady + turn * line.covariance * turn.transpose() * self.factor;
+        let spread = self.steady + self.noise_of(line);
         let gate_distance = distance(&spread, self.widest, innovation)?.0;
         if !gate.holds(gate_distance) {
             return None;
@@ -107,6 +134,12 @@ impl BearingPrediction {
         }
         Some(Fit { gate_distance, log_density: density.ln() })
     }
+}
+
+/// Logarithm of a normal density of mean 0.
+pub(crate) fn log_density(covariance: &Matrix2<f64>, vector: Vector2<f64>) -> Option<f64> {
+    let (squared, determinant) = distance(covariance, 0.0, vector)?;
+    Some(-squared / 2.0 - (2.0 * PI).ln() - determinant.ln() / 2.0)
 }
 
 /// Squared Mahalanobis distance of a vector, and the determinant, for `covariance + I added`.

@@ -193,7 +193,7 @@ impl Track {
         lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine)>,
         motion: &Motion,
     ) -> Self {
-        let residual = |(camera, TimedLine { line, time, time_sd_s }): (&CameraName, &TimedLine)| {
+        let residual = |(camera, TimedLine { line, time, time_sd_s, .. }): (&CameraName, &TimedLine)| {
             let here = fix.state.predicted(time.seconds_since(fix.time), 0.0);
             let uncertainty = CameraUncertainty::of_time(*time_sd_s);
             let seen = Linearised::at(&here, line, &uncertainty)?;

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
+use super::coincidence::Coincidence;
 use super::seeds::{Seed, SeedFinder};
 use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
@@ -30,7 +31,11 @@ const LEAST_SCORE: f64 = -12.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
+/// What several cameras see is one target if that is so many times (logarithm) likelier than that
+/// each sees another.
+const COINCIDENCE_MARGIN: f64 = 5.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
+const MAX_HYPOTHESES: usize = 3_000;
 
 /// One reading of the bearings: these are one target's.
 #[derive(Clone, Debug)]
@@ -44,6 +49,8 @@ struct Hypothesis {
     /// Periods that gave it a line.
     periods: usize,
     born: Timestamp,
+    /// Whether its lines are rather of several targets that one camera each sees.
+    coincidence: Coincidence,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -58,12 +65,16 @@ pub(super) struct Hypotheses {
     /// How long two cameras alone must agree, s.
     pair_s: f64,
     max_range_m: f64,
+    /// How fast targets are, m/s, standard deviation an axis.
+    speed: f64,
     shared_lines: usize,
     hypotheses: Vec<Hypothesis>,
     /// Lines that a track has used which cannot hold its place alone.
     claims: BTreeMap<LineId, TrackId>,
     period: u64,
     families: u64,
+    /// When each camera was exposed last.
+    exposed: BTreeMap<CameraName, Timestamp>,
 }
 
 impl Hypothesis {
@@ -91,11 +102,13 @@ impl Hypotheses {
             needed: config.initiation.fixes,
             pair_s: config.initiation.pair_s,
             max_range_m: config.initiation.max_range_m,
+            speed: config.initiation.velocity_prior_sd_mps,
             shared_lines: config.initiation.shared_lines,
             hypotheses: Vec::new(),
             claims: BTreeMap::new(),
             period: 0,
             families: 0,
+            exposed: BTreeMap::new(),
         }
     }
 
@@ -128,7 +141,7 @@ impl Hypotheses {
             }
         }
         // What one camera alone sees may be anywhere: it begins anew when another sees it too.
-        self.hypotheses.retain(|h| h.cameras().len() >= 2);
+        self.hypotheses.retain(|h| h.cameras().len() >= 2 && h.coincidence.log_ratio() > LEAST_SCORE);
         let seeds = self.finder.find(exposures, cameras);
         self.begin(seeds, motion);
         self.prune();
@@ -142,6 +155,8 @@ impl Hypotheses {
         // The lines have the camera's factor in their covariances already.
         let uncertainty = CameraUncertainty { factor: 1.0, ..exposure.uncertainty };
         let miss = (1.0 - self.tracking.detection_probability).ln();
+        let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
+        let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for mut hypothesis in self.hypotheses.drain(..) {
             let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
@@ -157,18 +172,29 @@ impl Hypotheses {
             };
             let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
             near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+            let density = motion.density(hypothesis.track.model_probabilities());
             for &(ratio, i) in near.iter().take(MAX_BRANCHES).filter(|(ratio, _)| *ratio > miss) {
                 let mut child = hypothesis.clone();
                 let (id, line) = &lines[i];
                 let time = (exposure.time, &uncertainty);
                 if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
                     child.track.score += ratio;
+                    if let Some(prediction) = &prediction {
+                        child.coincidence.see(
+                            &exposure.camera,
+                            (&line.line, exposure.time),
+                            prediction,
+                            (density, self.speed),
+                            ratio,
+                        );
+                    }
                     child.lines.push((self.period, id.clone()));
                     next.push(child);
                 }
             }
             if expected {
                 hypothesis.track.score += miss;
+                hypothesis.coincidence.miss(&exposure.camera, miss, interval_s);
             }
             next.push(hypothesis);
         }
@@ -185,6 +211,7 @@ impl Hypotheses {
             *count += 1;
             *count <= MAX_FAMILY && h.track.score > *best - FAMILY_MARGIN && h.track.score > LEAST_SCORE
         });
+        self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     fn sort(&mut self) {
@@ -205,8 +232,17 @@ impl Hypotheses {
             let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
+            let lines = seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
+            let coincidence = Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
-            self.hypotheses.push(Hypothesis { family: self.families, track, lines, periods: 1, born: time });
+            self.hypotheses.push(Hypothesis {
+                family: self.families,
+                track,
+                lines,
+                periods: 1,
+                born: time,
+                coincidence,
+            });
         }
     }
 
@@ -223,6 +259,7 @@ impl Hypotheses {
                 *count <= MAX_ALIKE
             }
         });
+        self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     /// The best hypotheses without common lines that are likely enough and have no rival.
@@ -237,7 +274,8 @@ impl Hypotheses {
                 let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
                     && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let likely = agreed && hypothesis.track.score >= self.tracking.confirm_score;
+                let one = hypothesis.coincidence.log_ratio() >= COINCIDENCE_MARGIN;
+                let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
                     let alike =

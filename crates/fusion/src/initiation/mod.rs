@@ -3,6 +3,7 @@
 //! together is found either by following hypotheses ([`Hypotheses`]) or, as in
 //! 002, by solving each period for fixes and grouping these ([`Grouped`]).
 
+mod coincidence;
 mod fixes;
 mod grouped;
 mod hypotheses;
@@ -14,12 +15,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::CameraName;
+use nalgebra::Vector2;
 
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::TimedLine;
 use crate::temporal::LineId;
 use crate::track::{Track, TrackId};
+use crate::uncertainty::View;
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 
 use grouped::Grouped;
@@ -96,6 +99,22 @@ fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
         let line = SightLine { covariance: line.covariance * exposure.uncertainty.factor, ..*line };
-        (id, TimedLine { line, time: exposure.time, time_sd_s: exposure.uncertainty.time_sd_s })
+        let time_sd_s = exposure.uncertainty.time_sd_s;
+        (id, TimedLine { line, time: exposure.time, time_sd_s, origin_sd_m: 0.0 })
+    })
+}
+
+/// The same with what is uncertain of the camera's pose: where one bearing of each camera must meet,
+/// that is noise like any other.
+fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
+    let pose = exposure.uncertainty.pose;
+    let origin_sd_m =
+        pose.map_or(0.0, |pose| (pose.fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());
+    lines_of(exposure).map(move |(id, mut timed)| {
+        let line = &mut timed.line;
+        let at_infinity =
+            View { direction: line.direction, basis: line.basis, range: f64::INFINITY, rate: Vector2::zeros() };
+        line.covariance += exposure.uncertainty.common(&at_infinity);
+        (id, TimedLine { origin_sd_m, ..timed })
     })
 }

@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Timestamp};
 
-use super::{NamedLine, lines_of};
+use super::{NamedLine, lines_with_pose};
 use crate::ingress::KnownCamera;
 use crate::prediction::BearingPrediction;
 use crate::spatial::{MapSolution, TimedLine, chi_square, map};
@@ -86,7 +86,7 @@ impl SeedFinder {
         exposures: &[&Exposure],
         cameras: &BTreeMap<CameraName, KnownCamera>,
     ) -> Vec<Seed> {
-        let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_of(e).collect()).collect();
+        let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
         let growing = Growing { exposures, cameras, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();

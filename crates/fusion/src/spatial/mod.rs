@@ -48,13 +48,21 @@ pub struct TimedLine {
     pub time: Timestamp,
     /// Standard deviation of that time, s.
     pub time_sd_s: f64,
+    /// Standard deviation of the line's origin, m an axis.
+    pub origin_sd_m: f64,
 }
 
 impl TimedLine {
+    /// A line of which time and origin are known exactly.
+    pub fn exact(line: SightLine, time: Timestamp) -> Self {
+        Self { line, time, time_sd_s: 0.0, origin_sd_m: 0.0 }
+    }
+
     /// Covariance of the direction to a target at `range` that moves at `speed` (m/s an axis): the
-    /// line's own, and what the uncertainty of its time adds.
+    /// line's own, and what the uncertainty of its time and origin adds.
     pub(crate) fn noise_at(&self, range: f64, speed: f64) -> Matrix2<f64> {
-        self.line.covariance + Matrix2::identity() * (speed * self.time_sd_s / range).powi(2)
+        let variance = (speed * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
+        self.line.covariance + Matrix2::identity() * (variance / range.powi(2))
     }
 }
 
@@ -145,7 +153,7 @@ pub(crate) mod tests_support {
             basis: tangent_basis(&direction),
             covariance: *bearing.covariance(),
         };
-        TimedLine { line, time: Timestamp::from_seconds(time_s), time_sd_s: 0.0 }
+        TimedLine::exact(line, Timestamp::from_seconds(time_s))
     }
 
     /// The same with noise of [`SIGMA`] on both tangents.

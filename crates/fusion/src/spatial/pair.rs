@@ -32,7 +32,7 @@ pub struct PairSolution {
 /// #         cx: 319.5, cy: 239.5, distortion: Distortion::None };
 /// #     let camera = Camera::new(intrinsics, pose).unwrap();
 /// #     let bearing = Bearing::new(Vector3::z(), Matrix2::identity() * 1e-6).unwrap();
-/// #     TimedLine { line: camera.sight_line(&bearing), time: Timestamp::EPOCH, time_sd_s: 0.0 }
+/// #     TimedLine::exact(camera.sight_line(&bearing), Timestamp::EPOCH)
 /// # };
 /// let target = Point3::new(10.0, 20.0, 50.0);
 /// let first = line(Point3::new(100.0, 0.0, 0.0), target);

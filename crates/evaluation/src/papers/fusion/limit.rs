@@ -238,7 +238,7 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
 fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let lines = flight.seen.iter().map(|seen| {
         let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
-        Some(TimedLine { line, time: Timestamp::from_seconds(seen.time_s), time_sd_s: 0.0 })
+        Some(TimedLine::exact(line, Timestamp::from_seconds(seen.time_s)))
     });
     let lines: Vec<TimedLine> = lines.collect::<Option<_>>()?;
     Some(map(&lines, flight.end(), PRIOR_SD)?.state)

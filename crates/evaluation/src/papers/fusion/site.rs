@@ -122,5 +122,5 @@ pub(super) fn line(
     time_s: f64,
 ) -> Option<TimedLine> {
     let line = camera.sight_line(&bearing(camera, place, offset)?);
-    Some(TimedLine { line, time: Timestamp::from_seconds(time_s), time_sd_s: 0.0 })
+    Some(TimedLine::exact(line, Timestamp::from_seconds(time_s)))
 }

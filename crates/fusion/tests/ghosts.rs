@@ -1,0 +1,98 @@
+//! Targets that are not there: lines of several real ones that cross, and tracks that live on what
+//! one camera alone sees.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+mod common;
+
+use common::{Path, Scene, found, fusion_of, site, straight};
+use crossfix_fusion::{Fusion, FusionConfig};
+use crossfix_message::BearingFrame;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Thirty pictures a second of each camera.
+fn quick_site() -> Vec<common::Eye> {
+    let mut eyes = site();
+    for eye in &mut eyes {
+        eye.rate_hz = 30.0;
+        eye.phase_s /= 3.0;
+    }
+    eyes
+}
+
+/// Straight flights through where all cameras look, at up to 15 m/s an axis.
+fn crowd(count: usize, rng: &mut ChaCha8Rng) -> Vec<Path> {
+    (0..count)
+        .map(|_| {
+            let mut within = |half: f64| rng.random_range(-half..half);
+            let middle = [within(40.0), within(40.0), 45.0 + within(15.0)];
+            let velocity = [within(15.0), within(15.0), within(3.0)];
+            straight([0, 1, 2].map(|i: usize| middle[i] - 4.0 * velocity[i]), velocity)
+        })
+        .collect()
+}
+
+/// Epochs of half a second with the number of confirmed tracks at each.
+fn confirmed_over_time(fusion: &mut Fusion, frames: &[BearingFrame]) -> Vec<usize> {
+    let mut counts = Vec::new();
+    for frame in frames {
+        fusion.ingest(frame);
+        let epoch = (frame.capture_time_ns / 500_000_000) as usize;
+        if epoch > counts.len() {
+            counts.push(fusion.tracks().filter(|track| track.is_confirmed()).count());
+        }
+    }
+    counts
+}
+
+#[test]
+fn targets_that_one_camera_each_sees_make_next_to_no_tracks() {
+    let eyes = quick_site();
+    let (mut epochs, mut ghosts) = (0, 0);
+    for seed in 0..4 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        // Fifteen targets before each camera that the two others do not see: 675 pairs of lines.
+        let mut frames: Vec<BearingFrame> = Vec::new();
+        for eye in &eyes {
+            let scene = Scene { eyes: vec![eye.clone()], clutter: 1.0, ..Scene::new(crowd(15, &mut rng), 8.0) };
+            frames.extend(scene.frames(seed));
+        }
+        frames.sort_by_key(|frame| frame.capture_time_ns);
+        let mut fusion = fusion_of(FusionConfig::default(), &eyes);
+        let counts = confirmed_over_time(&mut fusion, &frames);
+        epochs += counts.len();
+        ghosts += counts.iter().sum::<usize>();
+    }
+    // Before lines were held against each camera's own: 308 in 60.
+    assert!(ghosts * 2 <= epochs, "{ghosts} ghosts in {epochs} epochs");
+}
+
+#[test]
+fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_given_up() {
+    for seed in 0..5 {
+        let path = || straight([-20.0, 10.0, 40.0], [2.0, -1.0, 0.1]);
+        let scene = Scene { detection: 0.9, clutter: 1.0, ..Scene::new(vec![path()], 16.0) };
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        let mut followed = 0;
+        for mut frame in scene.frames(seed) {
+            let time = frame.capture_time_ns as f64 / 1e9;
+            if time > 5.0 && frame.camera != "a" {
+                frame.tracks.clear();
+            }
+            fusion.ingest(&frame);
+            if (4.9..5.0).contains(&time) {
+                assert!(found(&fusion, &path()).is_some(), "seed {seed}");
+            }
+            // As long as it is there, the truth lies within what it claims to know.
+            for track in fusion.tracks().filter(|track| track.is_confirmed()) {
+                let error = track.state().position() - path()(track.updated.seconds()).unwrap();
+                let spread = track.state().position_covariance().cholesky().unwrap();
+                assert!(error.dot(&spread.solve(&error)) < 30.0, "seed {seed}, {time} s: {error}");
+                followed += usize::from(time > 5.0);
+            }
+        }
+        assert!(followed > 0, "seed {seed}");
+        assert_eq!(fusion.tracks().count(), 0, "seed {seed}");
+    }
+}
