@@ -14,10 +14,11 @@ use crate::uncertainty::{CameraUncertainty, View};
 /// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
 /// nearly parallel lines of two targets cross too.
 pub(crate) const MAX_PAIR_SD_M: f64 = 3.0;
-/// Rounds of the iterated update; the linearisation settles in two or three.
+/// Rounds of the iterated update; the linearisation mostly holds from the first.
 const MAX_ITERATIONS: usize = 5;
-/// The linearisation has settled when a round moves the position by less than this, m.
-const SETTLED_M: f64 = 1e-5;
+/// The linearisation has settled when what a round leaves out, the square of its step over the range,
+/// is less than this, m.
+const SETTLED_M: f64 = 1e-4;
 /// What a track can be told apart by is looked at this often, s: eigenvalues cost more than an update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
@@ -159,7 +160,7 @@ pub(crate) fn updated(
     let mut covariance = prior.covariance;
     for _ in 0..MAX_ITERATIONS {
         let here = KinematicState { mean, covariance: prior.covariance };
-        let Linearised { offset, jacobian, noise, .. } = Linearised::at(&here, line, camera)?;
+        let Linearised { offset, jacobian, noise, view } = Linearised::at(&here, line, camera)?;
         let across = ties * jacobian.transpose();
         let spread = jacobian * across.fixed_rows::<3>(0) + noise;
         let determinant = spread.determinant();
@@ -177,7 +178,7 @@ pub(crate) fn updated(
         let moved = (next - mean).fixed_rows::<3>(0).norm();
         mean = next;
         covariance = prior.covariance - gain * across.transpose();
-        if moved < SETTLED_M {
+        if moved * moved < SETTLED_M * view.range {
             break;
         }
     }
@@ -309,9 +310,6 @@ impl Track {
             self.residuals.insert(camera.clone(), residual);
         }
         self.held = self.cameras_lately(motion.holding_s) >= 2;
-        if time.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
-            self.observe();
-        }
         Some(Taken { manoeuvre, reported_nis })
     }
 
@@ -350,6 +348,13 @@ impl Track {
     /// the track may run along its sight lines.
     pub fn is_held(&self) -> bool {
         self.held
+    }
+
+    /// Looks at what the covariance tells apart if that was a second ago.
+    pub(crate) fn observe_again(&mut self) {
+        if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
+            self.observe();
+        }
     }
 
     /// Looks at what the covariance tells apart.

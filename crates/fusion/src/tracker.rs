@@ -101,6 +101,7 @@ impl Tracker {
             });
             if silent || track.updated == now {
                 track.published = Some((now, track.status));
+                track.observe_again();
                 due.push(track.id);
             }
         }

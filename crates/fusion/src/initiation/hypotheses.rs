@@ -27,7 +27,7 @@ const MAX_ALIKE: usize = 20;
 /// A way this much less likely than its family's best (log-likelihood) is given up.
 const FAMILY_MARGIN: f64 = 15.0;
 /// A hypothesis less likely than this is clutter.
-const LEAST_SCORE: f64 = -12.0;
+const LEAST_SCORE: f64 = -8.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;

@@ -22,7 +22,7 @@ const SETTLED_CAMERAS: usize = 4;
 /// Most sets kept of one period, the most likely ones: clutter cannot fill the memory.
 const MAX_SEEDS: usize = 2_000;
 /// Quantiles are kept for sets of up to so many cameras; larger ones pass.
-const MAX_CAMERAS: usize = 128;
+const MAX_CAMERAS: usize = 64;
 /// Most pairs of lines that pass each other closely and are looked at in one period: time is bounded.
 const MAX_CLOSE_PAIRS: usize = 20_000;
 /// Most pairs of lines tried of two cameras: time is bounded, whatever a camera reports.
@@ -52,7 +52,7 @@ pub(super) struct SeedFinder {
     detection_probability: f64,
     clutter_per_sr: f64,
     line_gate: Gate,
-    /// The largest sum of squares of n true lines, by 2 n - 3, with the gate's probability.
+    /// The largest sum of squares of n true lines, by n, with the gate's probability.
     set_gates: Vec<f64>,
     least_cameras: usize,
 }
@@ -68,8 +68,10 @@ impl SeedFinder {
     pub(super) fn new(config: &FusionConfig, least_cameras: usize) -> Self {
         let initiation = config.initiation.clone();
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
-        let set_gates =
-            (0..2 * MAX_CAMERAS).map(|d| chi_square(initiation.spatial_gate_probability, d.max(1))).collect();
+        // n lines have 2 n - 3 degrees of freedom, as the velocity has a prior.
+        let set_gates = (0..MAX_CAMERAS)
+            .map(|n: usize| chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1)))
+            .collect();
         Self {
             initiation,
             detection_probability: config.tracking.detection_probability,
@@ -206,7 +208,7 @@ impl SeedFinder {
 
     /// Whether a solution of n lines is as good as a true one's is with the gate's probability.
     fn agrees(&self, solution: &MapSolution, lines: usize) -> bool {
-        let gate = self.set_gates.get(2 * lines - 3).copied().unwrap_or(f64::INFINITY);
+        let gate = self.set_gates.get(lines).copied().unwrap_or(f64::INFINITY);
         solution.chi_square <= gate
     }
 
