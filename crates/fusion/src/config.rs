@@ -48,7 +48,8 @@ impl Default for Clocks {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EventTime {
-    /// How long to wait for a camera that is behind the others, s of capture time. Above 0.
+    /// How long to wait for a camera that is behind the others, or for a frame that a newer one of its
+    /// camera has overtaken where that has happened within the last 20 times this, s of capture time. Above 0.
     /// Default 0.5: longer than any network hiccup that a track would not survive anyway.
     pub lateness_s: f64,
     /// A frame this far ahead of the second newest camera is from the future and refused, s.
