@@ -104,8 +104,7 @@ fn config(bytes: &mut Bytes<'_>) -> FusionConfig {
             1 => config.event_time.max_ahead_s = value,
             2 => config.bearings.equal_sd_rad = value,
             3 => config.bearings.systematic_sd_rad = value,
-            // More than one in a litre, and every combination of clutter is worth a long thought.
-            4 => initiation.birth_density_per_m3 = value.min(1e3),
+            4 => initiation.birth_density_per_m3 = value,
             5 => initiation.period_s = value,
             6 => initiation.velocity_prior_sd_mps = value,
             7 => initiation.max_range_m = value,
