@@ -7,6 +7,7 @@ mod import;
 mod logging;
 mod output;
 mod pace;
+mod scenario;
 mod shutdown;
 
 use std::process::ExitCode;

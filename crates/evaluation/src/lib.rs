@@ -22,8 +22,10 @@ mod history;
 mod latency;
 mod metrics;
 mod papers;
+mod sightings;
 
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Report, TargetReport, TrueTarget};
 pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker};
+pub use sightings::Sightings;

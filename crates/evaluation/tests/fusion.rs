@@ -54,6 +54,30 @@ fn all_bearings_at_once_reach_the_bound_in_every_geometry() {
 }
 
 #[test]
+fn nothing_diverges_where_one_period_does_not_determine_position_and_velocity() {
+    let tables = tables("degenerate geometries, whole", 60);
+    for name in ["fusion-degenerate", "fusion-degenerate-diverged", "fusion-degenerate-confirmed"] {
+        assert_eq!(failures(&tables, name), NONE);
+    }
+    // Equal delays, one delay of nothing, all at once; the cameras' plane, and 5 and 1 degrees above it.
+    let nees = &tables.iter().find(|table| table.name == "fusion-degenerate-nees").unwrap().rows;
+    let asked = [
+        "equal delays 0.2/0.2",
+        "dt2 = 0, dt3 = 0.2",
+        "synchronous",
+        "90 degree arc, 5 degrees up",
+        "90 degree arc, 1 degree up",
+        "coplanar",
+    ];
+    for layout in asked {
+        let row = nees.iter().find(|row| row.series == layout);
+        let row = row.unwrap_or_else(|| panic!("there is no layout {layout}"));
+        // Four standard deviations of the mean of 60 chi-squares of six degrees of freedom.
+        assert!((row.ours - 6.0).abs() < 4.0 * (12.0_f64 / 60.0).sqrt(), "{row:?}");
+    }
+}
+
+#[test]
 fn the_whole_fusion_confirms_a_lone_target() {
     let tables = tables("bound of all periods, whole", 20);
     assert_eq!(failures(&tables, "fusion-confirmed"), NONE);

@@ -7,11 +7,15 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::{EventTime, Exposure, RejectionReason};
 
-/// More exposures than this are not held back, whatever the clocks say: memory is bounded.
+/// More exposures than this are not held back, whatever the clocks say, nor are more remembered of
+/// those that came out: memory is bounded.
 const MAX_HELD: usize = 20_000;
 
 /// A camera that has been silent for so many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
+
+/// For so many times the lateness a camera is waited for as one whose frames overtake each other.
+const DISORDER_LASTS: f64 = 20.0;
 
 type Order = (Timestamp, CameraName);
 
@@ -31,16 +35,63 @@ pub(crate) enum Arrival {
     OutOfOrder,
 }
 
+/// How one camera's frames come.
+#[derive(Clone, Copy, Debug)]
+struct Stream {
+    newest: Timestamp,
+    /// How far behind the newest others came, at most, s, and the newest when one did last; from a
+    /// frame on that came too late for it.
+    disorder: Option<(f64, Timestamp)>,
+}
+
+impl Stream {
+    fn beginning(newest: Timestamp) -> Self {
+        Self { newest, disorder: None }
+    }
+
+    /// Takes note of a frame that came `late_s` too late.
+    fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
+        let behind_s = self.newest.seconds_since(time);
+        let known_s = self.disorder_s(lateness_s);
+        if behind_s <= 0.0 {
+            self.newest = time;
+        } else if behind_s <= lateness_s {
+            if late_s.is_some() || known_s > 0.0 {
+                self.disorder = Some((behind_s.max(known_s), self.newest));
+            }
+        } else if late_s.is_none_or(|late_s| late_s <= lateness_s) {
+            // No network reorders so far: the clock was ahead, and now it is not.
+            *self = Self::beginning(time);
+        }
+    }
+
+    /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the order.
+    fn disorder_s(&self, lateness_s: f64) -> f64 {
+        let lasts_s = DISORDER_LASTS * lateness_s;
+        let lately = |(_, then): &(f64, Timestamp)| self.newest.seconds_since(*then) <= lasts_s;
+        self.disorder.filter(lately).map_or(0.0, |(behind_s, _)| behind_s)
+    }
+}
+
 /// The buffer that puts exposures into order.
 ///
 /// The time up to which exposures are released follows the *second* newest camera, so that one
 /// camera with a wrong clock cannot drag the others into the past: up to the slowest camera that
 /// is still heard, or `lateness_s` behind that second newest, whichever is later.
+///
+/// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
+/// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be as
+/// far behind its newest frame as that one was.
+///
+/// What is late is not measured by that word but by what has been worked on: an exposure that can
+/// still be taken in order is taken.
 #[derive(Debug)]
 pub(crate) struct EventBuffer {
     config: EventTime,
     held: BTreeMap<Order, Held>,
-    newest: BTreeMap<CameraName, Timestamp>,
+    /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
+    taken: BTreeSet<Order>,
+    streams: BTreeMap<CameraName, Stream>,
     /// The newest time of each camera that agreed with another camera's.
     trusted: BTreeMap<CameraName, Timestamp>,
     ended: BTreeSet<CameraName>,
@@ -48,7 +99,10 @@ pub(crate) struct EventBuffer {
     expected: BTreeSet<CameraName>,
     /// The oldest time heard.
     first: Option<Timestamp>,
+    /// The newest time that came out.
     released: Timestamp,
+    /// The newest time, less the clock's offset, that has been worked on.
+    passed: Timestamp,
 }
 
 impl EventBuffer {
@@ -56,12 +110,14 @@ impl EventBuffer {
         Self {
             config,
             held: BTreeMap::new(),
-            newest: BTreeMap::new(),
+            taken: BTreeSet::new(),
+            streams: BTreeMap::new(),
             trusted: BTreeMap::new(),
             ended: BTreeSet::new(),
             expected: BTreeSet::new(),
             first: None,
             released: Timestamp::MIN,
+            passed: Timestamp::MIN,
         }
     }
 
@@ -74,8 +130,15 @@ impl EventBuffer {
     pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<Arrival, RejectionReason> {
         let time = exposure.time;
         self.ended.remove(&exposure.camera);
-        let previous = self.newest.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
-        self.newest.insert(exposure.camera.clone(), previous.max(time));
+        let order = (time, exposure.camera.clone());
+        if self.held.contains_key(&order) || self.taken.contains(&order) {
+            return Err(RejectionReason::Duplicate);
+        }
+        let late_s = self.late_s(&exposure);
+        let new = Stream::beginning(time);
+        let stream = self.streams.entry(exposure.camera.clone()).or_insert(new);
+        let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
+        stream.hear(time, late_s, self.config.lateness_s);
         self.first = Some(self.first.map_or(time, |first| first.min(time)));
         let reference = self.second_newest();
         if let Some(reference) = reference {
@@ -87,15 +150,24 @@ impl EventBuffer {
             }
             self.trusted.insert(exposure.camera.clone(), trusted.max(time));
         }
-        if time <= self.released {
-            return Err(RejectionReason::Late { by_s: self.released.seconds_since(time) });
-        }
-        let order = (time, exposure.camera.clone());
-        if self.held.contains_key(&order) {
-            return Err(RejectionReason::Duplicate);
+        if let Some(by_s) = late_s {
+            return Err(RejectionReason::Late { by_s });
         }
         self.held.insert(order, Held { exposure, compared: reference.is_some() });
-        Ok(if time < previous { Arrival::OutOfOrder } else { Arrival::InOrder })
+        Ok(arrival)
+    }
+
+    /// By how much an exposure comes too late, s: what follows it has been worked on. What came out may
+    /// still wait for other clocks to be sure (its time is less the clock's offset then).
+    fn late_s(&self, exposure: &Exposure) -> Option<f64> {
+        let corrected = exposure.time.plus_seconds(-exposure.correction_s);
+        let is_late = exposure.time < self.released && corrected < self.passed;
+        is_late.then(|| self.released.seconds_since(exposure.time))
+    }
+
+    /// Says that an exposure of this time, less the clock's offset, is being worked on.
+    pub(crate) fn pass(&mut self, corrected: Timestamp) {
+        self.passed = self.passed.max(corrected);
     }
 
     /// Marks a camera as come to its end: nobody waits for it any more.
@@ -114,7 +186,7 @@ impl EventBuffer {
 
     /// The next exposure, whatever may still come.
     pub(crate) fn pop(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
-        let (_, Held { exposure, compared }) = self.held.pop_first()?;
+        let (order, Held { exposure, compared }) = self.held.pop_first()?;
         // A frame taken in before a second camera was heard may turn out to be from the future.
         if !compared && let Some(reference) = self.second_newest() {
             let ahead = exposure.time.seconds_since(reference);
@@ -123,31 +195,42 @@ impl EventBuffer {
             }
         }
         self.released = self.released.max(exposure.time);
+        self.remember(order);
         Some(Ok(exposure))
     }
 
+    fn remember(&mut self, order: Order) {
+        self.taken.insert(order);
+        let oldest = self.released.plus_seconds(-self.config.lateness_s);
+        while self.taken.len() > MAX_HELD || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
+            self.taken.pop_first();
+        }
+    }
+
     fn everyone_ended(&self) -> bool {
-        self.newest.len() > 1 && self.newest.keys().all(|camera| self.ended.contains(camera))
+        self.streams.len() > 1 && self.streams.keys().all(|camera| self.ended.contains(camera))
     }
 
     fn second_newest(&self) -> Option<Timestamp> {
-        let mut times: Vec<Timestamp> = self.newest.values().copied().collect();
+        let mut times: Vec<Timestamp> = self.streams.values().map(|stream| stream.newest).collect();
         times.sort_unstable_by(|a, b| b.cmp(a));
         times.get(1).copied()
     }
 
     fn watermark(&self) -> Option<Timestamp> {
+        let lateness_s = self.config.lateness_s;
         let reference = self.second_newest()?;
-        let patience = reference.plus_seconds(-self.config.lateness_s);
-        let forgotten = reference.plus_seconds(-PATIENCES * self.config.lateness_s);
-        let never_heard = |camera: &CameraName| !self.newest.contains_key(camera);
+        let patience = reference.plus_seconds(-lateness_s);
+        let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
+        let never_heard = |camera: &CameraName| !self.streams.contains_key(camera);
         let waits_for_new = self.first.is_some_and(|first| first > forgotten)
             && self.expected.iter().any(|camera| never_heard(camera) && !self.ended.contains(camera));
         if waits_for_new {
             return Some(patience);
         }
-        let heard = self.newest.iter().filter(|(camera, _)| !self.ended.contains(camera));
-        let slowest = heard.map(|(_, &time)| time).filter(|&time| time > forgotten).min();
+        let heard = self.streams.iter().filter(|(camera, _)| !self.ended.contains(camera));
+        let heard = heard.map(|(_, stream)| stream).filter(|stream| stream.newest > forgotten);
+        let slowest = heard.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before `slowest`.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }
@@ -171,7 +254,13 @@ mod tests {
     }
 
     fn drain(buffer: &mut EventBuffer) -> Vec<f64> {
-        std::iter::from_fn(|| buffer.release()).filter_map(Result::ok).map(|e| e.time.seconds()).collect()
+        let mut times = Vec::new();
+        while let Some(next) = buffer.release() {
+            let Ok(exposure) = next else { continue };
+            buffer.pass(exposure.time);
+            times.push(exposure.time.seconds());
+        }
+        times
     }
 
     #[test]
@@ -194,6 +283,90 @@ mod tests {
         buffer.insert(exposure("b", 2.0)).unwrap();
         buffer.insert(exposure("a", 2.0)).unwrap();
         assert_eq!(drain(&mut buffer), [1.0, 1.1, 2.0, 2.0]);
+    }
+
+    #[test]
+    fn what_is_overtaken_is_taken_until_something_later_is_worked_on() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        for (camera, time_s) in [("a", 1.0), ("a", 1.2), ("b", 1.25)] {
+            buffer.insert(exposure(camera, time_s)).unwrap();
+        }
+        // Two come out, and the second waits for the clocks.
+        buffer.release().unwrap().unwrap();
+        buffer.pass(Timestamp::from_seconds(1.0));
+        assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.2));
+        assert_eq!(buffer.insert(exposure("a", 1.1)), Ok(Arrival::OutOfOrder));
+        assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.1));
+        buffer.pass(Timestamp::from_seconds(1.2));
+        let late = buffer.insert(exposure("a", 1.15)).unwrap_err();
+        assert!(matches!(late, RejectionReason::Late { by_s } if (by_s - 0.05).abs() < 1e-9), "{late:?}");
+    }
+
+    #[test]
+    fn what_comes_at_the_time_of_the_last_is_taken_and_what_comes_twice_is_told_from_what_is_late() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        for (camera, time_s) in [("a", 1.0), ("c", 1.0), ("a", 1.1), ("c", 1.1), ("c", 1.2)] {
+            buffer.insert(exposure(camera, time_s)).unwrap();
+        }
+        assert_eq!(drain(&mut buffer), [1.0, 1.0, 1.1, 1.1]);
+        assert_eq!(buffer.insert(exposure("b", 1.1)), Ok(Arrival::InOrder));
+        assert_eq!(drain(&mut buffer), [1.1]);
+        for (camera, time_s) in [("a", 1.0), ("b", 1.1), ("c", 1.1), ("c", 1.2)] {
+            assert_eq!(buffer.insert(exposure(camera, time_s)), Err(RejectionReason::Duplicate));
+        }
+        assert!(matches!(buffer.insert(exposure("b", 1.0)), Err(RejectionReason::Late { .. })));
+    }
+
+    /// Frames of `b`, and of `a` in pairs whose second comes first; returns how many are refused.
+    fn swapped(buffer: &mut EventBuffer, tenths: std::ops::Range<u32>) -> usize {
+        let mut refused = 0;
+        for k in tenths {
+            let t = 0.1 * f64::from(k);
+            let of_a = if k % 2 == 0 { t + 0.1 } else { t - 0.1 };
+            refused += usize::from(buffer.insert(exposure("a", of_a)).is_err());
+            buffer.insert(exposure("b", t + 0.15)).unwrap();
+            drain(buffer);
+        }
+        refused
+    }
+
+    #[test]
+    fn a_camera_whose_frames_overtake_each_other_is_waited_for_from_then_on() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        assert_eq!(swapped(&mut buffer, 0..100), 1);
+        // For a while nobody relies on its order, then everybody does again.
+        let mut waits = Vec::new();
+        for k in 100..400 {
+            let t = 0.1 * f64::from(k);
+            buffer.insert(exposure("a", t + 0.1)).unwrap();
+            buffer.insert(exposure("b", t + 0.15)).unwrap();
+            let newest = drain(&mut buffer).last().copied();
+            waits.push(newest.is_none_or(|newest| newest < t + 0.09));
+        }
+        let (first, last) = waits.split_at(90);
+        assert!(first.iter().all(|wait| *wait) && last[20..].iter().all(|wait| !wait), "{waits:?}");
+    }
+
+    #[test]
+    fn a_clock_that_was_ahead_is_waited_for_when_it_is_right_again() {
+        for (ahead_s, refused) in [(5.0, vec![21, 22]), (3600.0, vec![20, 21, 22])] {
+            let mut buffer = EventBuffer::new(EventTime::default());
+            buffer.expect(&"c".parse().unwrap());
+            let mut errors = Vec::new();
+            for k in 0..60 {
+                let t = 0.1 * f64::from(k);
+                buffer.insert(exposure("a", t)).unwrap();
+                buffer.insert(exposure("b", t)).unwrap();
+                // `c` comes 0.3 s after the others.
+                let wrong = if k == 20 { ahead_s } else { 0.0 };
+                if k >= 3 && buffer.insert(exposure("c", t - 0.3 + wrong)).is_err() {
+                    errors.push(k);
+                }
+                drain(&mut buffer);
+            }
+            // When it was ahead nobody waited for it: the others were worked on up to 2.0 s.
+            assert_eq!(errors, refused);
+        }
     }
 
     #[test]

@@ -53,8 +53,9 @@ pub struct Fusion {
     initiator: Initiator,
     clocks: ClockFilter,
     standings: Standings,
-    /// Exposures in the order of their corrected times, until nothing can come before them.
-    corrected: BTreeMap<(Timestamp, CameraName), Exposure>,
+    /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
+    /// camera may be corrected to the same time: their reported times tell them apart.
+    corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
     counters: Counters,
     sequence: u64,
 }
@@ -98,10 +99,12 @@ impl Fusion {
         self.counters.count("frames");
         let mut outputs = Vec::new();
         match self.read(frame) {
-            Ok((exposure, left_out)) => {
+            Ok((mut exposure, left_out)) => {
                 for reason in left_out {
                     outputs.push(self.reject(frame, reason));
                 }
+                // As far as is known by now: it is settled when the exposure's turn comes.
+                exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
                 match self.buffer.insert(exposure) {
                     Ok(Arrival::InOrder) => {}
                     Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
@@ -189,14 +192,14 @@ impl Fusion {
     /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to come.
     fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
         self.clocks.see(&exposure.camera, exposure.uncertainty.time_sd_s);
-        let Some(clock) = self.clocks.estimate(&exposure.camera).filter(|_| self.clocks.is_needed()) else {
+        let Some(clock) = self.clock(&exposure.camera) else {
             return self.process(&exposure, outputs);
         };
         let reported = exposure.time;
         exposure.correction_s = clock.offset_s;
         exposure.time = reported.plus_seconds(-clock.offset_s);
         exposure.uncertainty.time_sd_s = clock.relative_sd_s;
-        self.corrected.insert((exposure.time, exposure.camera.clone()), exposure);
+        self.corrected.insert((exposure.time, exposure.camera.clone(), reported), exposure);
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
         while let Some(entry) = self.corrected.first_entry().filter(|entry| entry.key().0 <= settled) {
             let next = entry.remove();
@@ -204,8 +207,14 @@ impl Fusion {
         }
     }
 
+    /// What is known of a camera's clock, if clocks are in doubt.
+    fn clock(&self, camera: &CameraName) -> Option<ClockEstimate> {
+        self.clocks.estimate(camera).filter(|_| self.clocks.is_needed())
+    }
+
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
+        self.buffer.pass(exposure.time);
         let Some(known) = self.cameras.get(&exposure.camera) else {
             return;
         };

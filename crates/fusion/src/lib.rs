@@ -35,6 +35,7 @@ mod ingress;
 mod initiation;
 mod motion;
 mod prediction;
+mod ranges;
 pub mod spatial;
 mod standing;
 pub mod temporal;

@@ -55,7 +55,7 @@ impl Motion {
         let models = models.ok_or(ConfigError {
             key: "tracking.models",
             value: config.models.len() as f64,
-            must: "one to four models with densities of 0 and more and positive shares",
+            must: "one to four models with densities of 0 and more and positive shares".to_owned(),
         })?;
         let wide: Vec<MotionModel> =
             models.models().iter().map(|m| MotionModel { density: models.widest(), ..*m }).collect();

@@ -19,6 +19,8 @@ use crate::spatial::{Fix, TimedLine, VelocityKnowledge};
 
 /// Groups kept from one period to the next: the best ones, so that clutter cannot fill the memory.
 const MAX_GROUPS: usize = 5_000;
+/// Fixes of one period that are grouped, the first ones: with [`MAX_GROUPS`] it bounds the time.
+const MAX_FIXES: usize = 500;
 
 /// A sight line's name: camera, sequence number of the frame, place in the frame.
 pub type LineId = (CameraName, u64, usize);
@@ -124,6 +126,23 @@ impl Group {
     }
 }
 
+/// What a group would be, before it is made: where all is alike there are millions.
+#[derive(Clone, Copy, Debug)]
+struct Candidate {
+    fixes: usize,
+    indicator: f64,
+    /// An old group, one with one fix more, or a new one; the group's place, and the fix's.
+    from: (u8, usize, usize),
+}
+
+/// Keeps the best candidates, those with the most fixes first, then those with the least indicators.
+fn keep_best(candidates: &mut Vec<Candidate>) {
+    candidates.sort_by(|a, b| {
+        b.fixes.cmp(&a.fixes).then(a.indicator.total_cmp(&b.indicator)).then(a.from.cmp(&b.from))
+    });
+    candidates.truncate(MAX_GROUPS);
+}
+
 impl Grouping {
     /// No group yet.
     pub fn new(rules: GroupingRules) -> Self {
@@ -142,28 +161,50 @@ impl Grouping {
         let oldest = self.period.saturating_sub(self.rules.periods as u64 - 1);
         self.groups.retain(|group| group.first_period >= oldest);
 
-        let mut grown = Vec::new();
-        for group in &self.groups {
-            for fix in fixes {
+        let fixes = &fixes[..fixes.len().min(MAX_FIXES)];
+        self.grow(fixes);
+        self.select()
+    }
+
+    /// Every group goes on with each fix that passes the gate, and without any; every fix begins one.
+    fn grow(&mut self, fixes: &[PeriodFix]) {
+        let mut candidates = Vec::new();
+        for (index, group) in self.groups.iter().enumerate() {
+            // A group without a fix in this period stays open for the next.
+            candidates.push(Candidate {
+                fixes: group.fixes.len(),
+                indicator: group.indicator,
+                from: (0, index, 0),
+            });
+            for (place, fix) in fixes.iter().enumerate() {
                 if let Some(residual) = self.residual(group, fix) {
-                    let mut longer = group.clone();
-                    longer.fixes.push(fix.clone());
-                    longer.indicator += residual;
-                    grown.push(longer);
+                    candidates.push(Candidate {
+                        fixes: group.fixes.len() + 1,
+                        indicator: group.indicator + residual,
+                        from: (1, index, place),
+                    });
                 }
             }
+            if candidates.len() > 4 * MAX_GROUPS {
+                keep_best(&mut candidates);
+            }
         }
-        grown.extend(fixes.iter().map(|fix| Group {
-            fixes: vec![fix.clone()],
-            indicator: 0.0,
-            first_period: self.period,
-        }));
-        // A group without a fix in this period stays open for the next.
-        self.groups.append(&mut grown);
-        self.groups
-            .sort_by(|a, b| b.fixes.len().cmp(&a.fixes.len()).then(a.indicator.total_cmp(&b.indicator)));
-        self.groups.truncate(MAX_GROUPS);
-        self.select()
+        let begin = |place| Candidate { fixes: 1, indicator: 0.0, from: (2, 0, place) };
+        candidates.extend((0..fixes.len()).map(begin));
+        keep_best(&mut candidates);
+        let grown = candidates.into_iter().map(|candidate| match candidate.from {
+            (0, index, _) => self.groups[index].clone(),
+            (1, index, place) => {
+                let mut longer = self.groups[index].clone();
+                longer.fixes.push(fixes[place].clone());
+                longer.indicator = candidate.indicator;
+                longer
+            }
+            (_, _, place) => {
+                Group { fixes: vec![fixes[place].clone()], indicator: 0.0, first_period: self.period }
+            }
+        });
+        self.groups = grown.collect();
     }
 
     /// The residual of a fix from a group's extrapolation, if it passes the gate.
@@ -196,14 +237,14 @@ impl Grouping {
     /// The groups with the least indicators that share no lines, or few (002, step 5 of the
     /// alternative algorithm and step 4 of the proposed one).
     fn select(&mut self) -> Vec<Group> {
-        let mut good: Vec<&Group> =
-            self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes).collect();
-        good.sort_by(|a, b| a.indicator.total_cmp(&b.indicator).then_with(|| a.lines().cmp(&b.lines())));
+        let good = self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes);
+        let mut good: Vec<(BTreeSet<&LineId>, &Group)> = good.map(|group| (group.lines(), group)).collect();
+        good.sort_by(|a, b| a.1.indicator.total_cmp(&b.1.indicator).then_with(|| a.0.cmp(&b.0)));
         let mut taken: BTreeSet<LineId> = BTreeSet::new();
         let mut selected = Vec::new();
-        for group in good {
-            if group.shares(&taken) <= self.rules.shared_lines {
-                taken.extend(group.lines().into_iter().cloned());
+        for (lines, group) in good {
+            if lines.iter().filter(|id| taken.contains(**id)).count() <= self.rules.shared_lines {
+                taken.extend(lines.into_iter().cloned());
                 selected.push(group.clone());
             }
         }

@@ -11,9 +11,11 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use common::{Eye, Scene, bearing, calibration, clutter, eye, found, fusion_of, site, straight};
-use crossfix_fusion::{Fusion, FusionConfig, Output, Rejection, RejectionReason};
+use crossfix_fusion::{
+    Fusion, FusionConfig, InitiationMethod, Output, Rejection, RejectionReason, SpatialSolver,
+};
 use crossfix_message::{BearingFrame, BearingTrack};
-use nalgebra::Vector3;
+use nalgebra::{Point3, Vector3};
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -80,9 +82,23 @@ fn what_comes_twice_is_counted_once_and_changes_nothing() {
     let outputs = ingest_all(&mut twice, &doubled);
     let useful: Vec<Output> = outputs.into_iter().filter(|o| !matches!(o, Output::Rejected(_))).collect();
     assert_eq!(useful, expected);
-    let refused = twice.counters().get("rejected_duplicate") + twice.counters().get("rejected_late");
-    assert_eq!(refused, frames.len() as u64);
+    assert_eq!(twice.counters().get("rejected_duplicate"), frames.len() as u64);
     finds_an_ordinary_target(&mut twice, 4.0);
+}
+
+#[test]
+fn a_network_that_swaps_one_cameras_frames_costs_one_of_them() {
+    let scene = two_targets(0.0..6.0);
+    let mut frames = scene.frames(11);
+    let of_b: Vec<usize> = (0..frames.len()).filter(|&i| frames[i].camera == "b").collect();
+    of_b.chunks_exact(2).skip(10).for_each(|pair| frames.swap(pair[0], pair[1]));
+    let mut fusion = of_the_site();
+    ingest_all(&mut fusion, &frames);
+    assert_eq!(fusion.counters().get("rejected_late"), 1, "the first, for nobody knew");
+    assert_eq!(fusion.counters().get("frames_out_of_order"), 19);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    assert_eq!(fusion.counters().get("tracks_lost"), 0);
+    finds_an_ordinary_target(&mut fusion, 7.0);
 }
 
 #[test]
@@ -165,30 +181,56 @@ fn bearings_that_never_meet_make_no_track() {
     finds_an_ordinary_target(&mut fusion, 7.0);
 }
 
-#[test]
-fn ten_thousand_false_bearings_in_a_frame_are_survived_in_bounded_time() {
-    let mut fusion = of_the_site();
-    let mut rng = ChaCha8Rng::seed_from_u64(6);
+/// Takes in a scene of two targets in which every camera also reports `more` from 2 s to 2.5 s;
+/// returns how long the slowest frame took. Both targets must be held.
+fn flooded(fusion: &mut Fusion, mut more: impl FnMut(&Eye) -> Vec<Vector3<f64>>) -> Duration {
     let scene = two_targets(0.0..4.0);
-    let (mut slowest, mut flooded) = (Duration::ZERO, 0);
+    let (mut slowest, mut floods) = (Duration::ZERO, 0);
     for mut frame in scene.frames(6) {
-        // Each camera has one such frame, one after the other.
-        if (2.0..2.1).contains(&(frame.capture_time_ns as f64 / 1e9)) {
+        if (2.0..2.5).contains(&(frame.capture_time_ns as f64 / 1e9)) {
             let eye = scene.eyes.iter().find(|eye| eye.name.as_str() == frame.camera).unwrap();
-            let noise = clutter(&eye.camera, 10_000, &mut rng).into_iter().zip(100..);
-            frame.tracks.extend(noise.map(|(towards, id)| bearing(towards, id)));
-            flooded += 1;
+            frame.tracks.extend(more(eye).into_iter().zip(100..).map(|(towards, id)| bearing(towards, id)));
+            floods += 1;
         }
         let start = Instant::now();
         fusion.ingest(&frame);
         slowest = slowest.max(start.elapsed());
     }
-    assert_eq!(flooded, 3);
+    assert_eq!(floods, 15);
+    assert!(scene.paths.iter().all(|path| found(fusion, path).is_some()));
+    slowest
+}
+
+/// In the dev profile it is half a second on two busy cores.
+const BOUNDED: Duration = Duration::from_secs(20);
+
+#[test]
+fn ten_thousand_false_bearings_of_every_camera_are_survived_in_bounded_time() {
+    let mut fusion = of_the_site();
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let slowest = flooded(&mut fusion, |eye| clutter(&eye.camera, 10_000, &mut rng));
     println!("the slowest frame took {slowest:?}");
-    assert!(slowest < Duration::from_secs(60), "{slowest:?}");
+    assert!(slowest < BOUNDED, "{slowest:?}");
     assert_eq!(fusion.counters().get("tracks_born"), 2, "no combination of clutter lasts");
-    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
     finds_an_ordinary_target(&mut fusion, 5.0);
+}
+
+#[test]
+fn two_hundred_bearings_that_are_all_alike_are_survived_in_bounded_time_by_every_method() {
+    let solvers = [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
+    let mut configs = vec![FusionConfig::default(); 5];
+    for (config, solver) in configs.iter_mut().zip(solvers) {
+        (config.initiation.method, config.initiation.solver) = (InitiationMethod::Grouping, solver);
+    }
+    for config in configs {
+        let method = (config.initiation.method, config.initiation.solver);
+        let mut fusion = fusion_of(config, &site());
+        // All cameras' lines meet, so that every combination is as good as any other.
+        let place = Point3::new(5.0, -10.0, 60.0);
+        let slowest = flooded(&mut fusion, |eye| vec![eye.camera.pose().camera_from_world(place); 200]);
+        println!("{method:?}: the slowest frame took {slowest:?}");
+        assert!(slowest < BOUNDED, "{method:?}: {slowest:?}");
+    }
 }
 
 #[test]

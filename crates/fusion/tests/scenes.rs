@@ -88,31 +88,34 @@ fn hidden(path: Path, from_s: f64, to_s: f64) -> Path {
     Box::new(move |t| path(t).filter(|_| !(from_s..to_s).contains(&t)))
 }
 
+/// False bearings of a frame, on average, where a target is away: nothing that could be taken for it,
+/// and 60 a second that could.
+const NOTHING_AND_CLUTTER: [f64; 2] = [0.0, 2.0];
+
 #[test]
 fn a_target_out_of_sight_for_three_seconds_keeps_its_number() {
-    for seed in SEEDS {
+    for (clutter, seed) in NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed))) {
         let path = || straight([-30.0, 10.0, 40.0], [5.0, -1.0, 0.0]);
-        // Without clutter: nothing that could be taken for it while it is away.
-        let scene = Scene { clutter: 0.0, ..good_day(vec![hidden(path(), 5.0, 8.0)], 12.0) };
+        let scene = Scene { clutter, ..good_day(vec![hidden(path(), 5.0, 8.0)], 12.0) };
         let mut flight = Flight::new(scene, seed);
         let before = assert_one_each(flight.until(5.0), 1, seed);
         let coasting = found(&flight.until(7.8).fusion, &path()).map(|t| (Some(t.id.0), t.status));
         assert_eq!(coasting, Some((before[0], TrackStatus::Coasting)), "seed {seed}");
         assert_eq!(assert_one_each(flight.until(11.5), 1, seed), before, "seed {seed}");
         assert!(flight.error(0) < CLOSE_M, "seed {seed}");
+        assert_eq!(flight.fusion.counters().get("tracks_born"), 1, "seed {seed}");
     }
 }
 
 #[test]
 fn a_target_that_leaves_the_field_of_view_for_long_is_lost_and_found_as_another() {
-    for seed in SEEDS {
+    for (clutter, seed) in NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed))) {
         // Up out of all cameras' sight, which ends at some 105 m, and down again, within half a minute.
         let path: Path = Box::new(|t| {
             let turn = (t - 4.0).clamp(0.0, 30.0) / 30.0 * std::f64::consts::TAU;
             Some(Point3::new(-20.0 + t, 5.0, 140.0 - 100.0 * turn.cos()))
         });
-        // Without clutter: nothing that could be taken for it while it is away.
-        let mut flight = Flight::new(Scene { clutter: 0.0, ..good_day(vec![path], 38.0) }, seed);
+        let mut flight = Flight::new(Scene { clutter, ..good_day(vec![path], 38.0) }, seed);
         let before = assert_one_each(flight.until(8.0), 1, seed);
         assert_eq!(flight.until(20.0).fusion.tracks().count(), 0, "seed {seed}");
         assert_eq!(flight.fusion.counters().get("tracks_lost"), 1, "seed {seed}");

@@ -12,7 +12,7 @@ use crossfix_transport::{Link, NetworkConfig, Role};
 use crossfix_vision::{DetectorConfig, TrackerConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::commands::evaluate::{evaluate, render};
+use crate::commands::evaluate::{Question, evaluate, render};
 use crate::commands::view::save_recording;
 use crate::config::{self, CameraFile, ClockConfig, FusionFile, PoseConfig, SourceConfig};
 use crate::output;
@@ -143,7 +143,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         output::line(format!("stopped early; the recording is readable: {}", files.recording.display()));
         return Ok(());
     }
-    let evaluation = evaluate(&files.recording, None, 5.0, 1.0 + SETTLING_S)?;
+    let question = Question { skip_s: 1.0 + SETTLING_S, ..Question::default() };
+    let evaluation = evaluate(&files.recording, &question)?;
     if args.json {
         return output::json(&evaluation);
     }

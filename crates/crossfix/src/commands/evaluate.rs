@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
-use crossfix_evaluation::{Evaluator, Latency, LatencyRecorder, Report, TrackHistory, TrueTarget};
+use crossfix_evaluation::{Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory, TrueTarget};
 use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame, decode};
 use crossfix_recording::RecordingReader;
 use serde::Serialize;
@@ -10,22 +10,40 @@ use crate::output;
 
 /// Hold the tracks of a recording against the truth in it.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix evaluate tracks.mcap --json")]
+#[command(after_help = "Examples:\n  crossfix evaluate tracks.mcap --json\n  \
+                  crossfix evaluate tracks.mcap --min-cameras 3")]
 pub struct Args {
     /// The recording (MCAP) with tracks and truth.
     recording: PathBuf,
-    /// A second recording (MCAP) with the truth, if the first has none.
-    #[arg(long, value_name = "FILE")]
-    truth: Option<PathBuf>,
-    /// Farther than this from a target a track is not that target's, metres.
-    #[arg(long, default_value_t = 5.0, value_name = "METRES")]
-    cutoff_m: f64,
-    /// Leave out what lies less than this after the first truth, seconds.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
-    skip_s: f64,
+    #[command(flatten)]
+    question: Question,
     /// Print JSON.
     #[arg(long)]
     json: bool,
+}
+
+/// What is held against what.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Question {
+    /// A second recording (MCAP) with the truth, if the first has none.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+    /// Farther than this from a target a track is not that target's, metres.
+    #[arg(long, default_value_t = 5.0, value_name = "METRES")]
+    pub cutoff_m: f64,
+    /// Leave out what lies less than this after the first truth, seconds.
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    pub skip_s: f64,
+    /// Only the instants at which so many cameras saw something: in the frame just before and in that
+    /// just after.
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub min_cameras: usize,
+}
+
+impl Default for Question {
+    fn default() -> Self {
+        Self { truth: None, cutoff_m: 5.0, skip_s: 0.0, min_cameras: 0 }
+    }
 }
 
 /// The figures of a run.
@@ -43,6 +61,7 @@ pub struct Evaluation {
 struct Run {
     truth: Vec<TruthFrame>,
     tracks: TrackHistory,
+    sightings: Sightings,
     latency: LatencyRecorder,
 }
 
@@ -59,6 +78,7 @@ impl Run {
                 Channel::Bearings(_) => {
                     let frame: BearingFrame = decode(&entry.data)?;
                     self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
+                    self.sightings.add(&frame);
                 }
                 _ => {}
             }
@@ -75,16 +95,11 @@ fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
     frame.targets.iter().filter_map(target).collect()
 }
 
-/// Evaluates a recording; `truth` may hold the truth if the recording has none.
-pub fn evaluate(
-    recording: &Path,
-    truth: Option<&Path>,
-    cutoff_m: f64,
-    skip_s: f64,
-) -> anyhow::Result<Evaluation> {
+/// Evaluates a recording.
+pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluation> {
     let mut run = Run::default();
     run.read(recording)?;
-    if let Some(path) = truth {
+    if let Some(path) = &question.truth {
         let mut other = Run::default();
         other.read(path)?;
         run.truth = other.truth;
@@ -95,11 +110,11 @@ pub fn evaluate(
         recording.display()
     );
     run.truth.sort_by_key(|frame| frame.time_ns);
-    let start = Timestamp::from_nanos(run.truth[0].time_ns).plus_seconds(skip_s);
-    let mut evaluator = Evaluator::new(cutoff_m);
-    for frame in &run.truth {
-        let time = Timestamp::from_nanos(frame.time_ns);
-        if time >= start {
+    let times: Vec<Timestamp> = run.truth.iter().map(|f| Timestamp::from_nanos(f.time_ns)).collect();
+    let start = times[0].plus_seconds(question.skip_s);
+    let mut evaluator = Evaluator::new(question.cutoff_m);
+    for ((frame, &time), cameras) in run.truth.iter().zip(&times).zip(run.sightings.cameras_at(&times)) {
+        if time >= start && cameras >= question.min_cameras {
             evaluator.add(&targets(frame), &run.tracks.at(time));
         }
     }
@@ -109,7 +124,7 @@ pub fn evaluate(
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let evaluation = evaluate(&args.recording, args.truth.as_deref(), args.cutoff_m, args.skip_s)?;
+    let evaluation = evaluate(&args.recording, &args.question)?;
     if args.json {
         return output::json(&evaluation);
     }

@@ -12,7 +12,7 @@ use crossfix_message::{
     Payload, SiteName, Timestamp, TrueState, TruthFrame,
 };
 use crossfix_recording::Entry;
-use nalgebra::{Matrix2, Matrix3, Point3};
+use nalgebra::{Matrix2, Matrix3, Point3, Vector3};
 use serde::Deserialize;
 
 use crate::import::{imported, read_text};
@@ -216,33 +216,59 @@ fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> anyhow::Result<Be
     })
 }
 
-/// The RTK samples of the test part, without the masked ones; velocities by central differences.
+/// The RTK samples of the test part, without the masked ones.
 fn truth(folder: &Path, site: &SiteName, split: &Split, masked: &[f64]) -> anyhow::Result<Vec<Entry>> {
-    let path = folder.join("trajectory").join("rtk.txt");
-    let rows: Vec<Vec<f64>> = read_text(&path)?
-        .lines()
-        .map(|line| line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>())
-        .filter(|row| row.len() >= 3)
-        .collect();
+    let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"), masked)?;
     let key = Key::new(site.clone(), Channel::Truth);
-    let position = |row: &[f64]| {
-        // Four columns: an index first.
-        let offset = usize::from(row.len() > 3);
-        Point3::new(row[offset], row[offset + 1], row[offset + 2])
-    };
     let mut entries = Vec::new();
-    for (index, window) in rows.windows(3).enumerate() {
-        let k = index + 1;
-        let seconds = k as f64 / RTK_RATE;
-        if masked.contains(&(k as f64)) || !in_test_part(split, seconds) {
+    for window in rtk.windows(3) {
+        let (seconds, place) = window[1];
+        if !in_test_part(split, seconds) {
             continue;
         }
-        let velocity = (position(&window[2]) - position(&window[0])) * (RTK_RATE / 2.0);
+        let velocity = Some(velocity_between(&window[0], &window[1], &window[2]).into());
         let time = Timestamp::from_seconds(seconds);
-        let state =
-            TrueState { id: 1, position: Some(position(&window[1]).into()), velocity: Some(velocity.into()) };
+        let state = TrueState { id: 1, position: Some(place.into()), velocity };
         let frame = TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
         entries.push(imported(key.clone(), time, frame.encode()));
     }
     Ok(entries)
+}
+
+/// A place and when (s) the drone was there.
+type Sample = (f64, Point3<f64>);
+
+/// The RTK samples that are not masked, in order of time.
+fn rtk_samples(path: &Path, masked: &[f64]) -> anyhow::Result<Vec<Sample>> {
+    let text = read_text(path)?;
+    let rows = text
+        .lines()
+        .map(|line| line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>())
+        .filter(|row| row.len() >= 3);
+    let sample = |(k, row): (usize, Vec<f64>)| {
+        // Four columns: an index first.
+        let offset = usize::from(row.len() > 3);
+        (k as f64 / RTK_RATE, Point3::new(row[offset], row[offset + 1], row[offset + 2]))
+    };
+    Ok(rows.enumerate().filter(|(k, _)| !masked.contains(&(*k as f64))).map(sample).collect())
+}
+
+/// The velocity at the second of three samples: that of the parabola through them, which where they
+/// are as far apart is the difference of the outer two.
+fn velocity_between(before: &Sample, at: &Sample, after: &Sample) -> Vector3<f64> {
+    let (back, on) = (at.0 - before.0, after.0 - at.0);
+    let (came, goes) = ((at.1 - before.1) / back, (after.1 - at.1) / on);
+    (came * on + goes * back) / (back + on)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_velocity_beside_a_masked_sample_is_that_of_the_curve() {
+        let at = |t: f64| (t, Point3::new(1.0 + 2.0 * t + 3.0 * t * t, -t, 0.0));
+        let velocity = velocity_between(&at(0.8), &at(1.0), &at(1.6));
+        assert!((velocity - Vector3::new(8.0, -1.0, 0.0)).norm() < 1e-12, "{velocity}");
+    }
 }

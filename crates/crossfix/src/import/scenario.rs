@@ -15,6 +15,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use serde::Deserialize;
 
 use crate::import::{imported, read_text};
+use crate::scenario::{DetectionRow, ExposureRow, FORMAT, TruthRow, turned};
 
 #[derive(Debug, Deserialize)]
 struct Scenario {
@@ -31,45 +32,10 @@ struct ScenarioCamera {
     R_world_from_cam: [[f64; 3]; 3],
 }
 
-#[derive(Debug, Deserialize)]
-struct ExposureRow {
-    t: f64,
-    cam: u32,
-    scan: u64,
-}
-
-#[derive(Debug, Deserialize)]
-struct DetectionRow {
-    cam: u32,
-    scan: u64,
-    det: u64,
-    ux: f64,
-    uy: f64,
-    uz: f64,
-    sigma_rad: f64,
-}
-
-#[derive(Debug, Deserialize)]
-struct TruthRow {
-    t: f64,
-    id: u64,
-    x: f64,
-    y: f64,
-    z: f64,
-    vx: f64,
-    vy: f64,
-    vz: f64,
-}
-
 fn read_csv<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<Vec<T>> {
     csv::Reader::from_path(path)
         .and_then(|mut reader| reader.deserialize().collect())
         .with_context(|| format!("cannot read {}", path.display()))
-}
-
-/// The format's camera axes are x left, y up, z forward; ours are x right, y down, z forward.
-fn turned(v: Vector3<f64>) -> Vector3<f64> {
-    Vector3::new(-v.x, -v.y, v.z)
 }
 
 fn name_of(id: u32) -> anyhow::Result<CameraName> {
@@ -82,8 +48,8 @@ pub fn read(dir: &Path) -> anyhow::Result<Vec<Entry>> {
     let scenario: Scenario = serde_json::from_str(&read_text(&description)?)
         .with_context(|| format!("{} is no scenario", description.display()))?;
     ensure!(
-        scenario.format == "passive-bearings/1",
-        "{}: format `{}` is not `passive-bearings/1`",
+        scenario.format == FORMAT,
+        "{}: format `{}` is not `{FORMAT}`",
         description.display(),
         scenario.format
     );

@@ -16,6 +16,11 @@ use crate::{Exposure, FusionConfig, Initiation, SpatialSolver};
 /// A target is not faster than this many standard deviations of the velocity prior.
 pub(super) const SPEED_SIGMAS: f64 = 4.0;
 
+/// Bearings of each camera that are tried in every combination of three: time is bounded.
+const MAX_IN_TRIPLES: usize = 40;
+/// Most fixes of one period, the first ones: memory is bounded.
+const MAX_FIXES: usize = 2_000;
+
 /// Solves periods for fixes by the solver that the configuration names.
 #[derive(Debug)]
 pub(super) struct FixFinder {
@@ -70,6 +75,9 @@ impl FixFinder {
                     continue;
                 }
                 let lines = vec![one.clone(), two];
+                if fixes.len() >= MAX_FIXES {
+                    return fixes;
+                }
                 if let Some(mut fix) =
                     self.fix_at(&lines, one.1.time, Solver::Pair, VelocityKnowledge::Unknown)
                 {
@@ -88,9 +96,12 @@ impl FixFinder {
             return Vec::new();
         };
         let mut fixes = Vec::new();
-        for one in lines_of(first) {
-            for two in lines_of(second) {
-                for three in lines_of(third) {
+        for one in lines_of(first).take(MAX_IN_TRIPLES) {
+            for two in lines_of(second).take(MAX_IN_TRIPLES) {
+                for three in lines_of(third).take(MAX_IN_TRIPLES) {
+                    if fixes.len() >= MAX_FIXES {
+                        return fixes;
+                    }
                     let lines = vec![one.clone(), two.clone(), three];
                     let timed = [&lines[0].1, &lines[1].1, &lines[2].1];
                     if let Some(solution) = triple(timed, self.config.velocity_prior_sd_mps) {

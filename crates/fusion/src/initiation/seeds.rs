@@ -25,6 +25,9 @@ const MAX_SEEDS: usize = 2_000;
 const MAX_CAMERAS: usize = 64;
 /// Most pairs of lines that pass each other closely and are looked at in one period: time is bounded.
 const MAX_CLOSE_PAIRS: usize = 20_000;
+/// No more pairs are looked at where so many sets have been found: of bearings that are alike every
+/// combination is as good as any other.
+const MAX_FOUND: usize = 20_000;
 /// Most pairs of lines tried of two cameras: time is bounded, whatever a camera reports.
 const MAX_PAIRS: usize = 250_000;
 
@@ -98,7 +101,8 @@ impl SeedFinder {
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
                     tried += 1;
-                    if settled[a][i] || settled[b][j] || tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS {
+                    let enough = tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
+                    if settled[a][i] || settled[b][j] || enough {
                         continue;
                     }
                     if !self.pass_closely(&lines[a][i].1, &lines[b][j].1) {
@@ -120,17 +124,23 @@ impl SeedFinder {
     }
 
     /// The most likely, each set once.
-    fn best(&self, mut seeds: Vec<Seed>) -> Vec<Seed> {
-        seeds.sort_by(|a, b| b.score.total_cmp(&a.score).then_with(|| ids(a).cmp(&ids(b))));
+    fn best(&self, seeds: Vec<Seed>) -> Vec<Seed> {
+        // Where cameras report the same bearings many times, many are alike: names are made once.
+        let names: Vec<Vec<LineId>> = seeds.iter().map(ids).collect();
+        let mut order: Vec<usize> = (0..seeds.len()).collect();
+        order.sort_by(|&a, &b| {
+            seeds[b].score.total_cmp(&seeds[a].score).then_with(|| names[a].cmp(&names[b]))
+        });
         let mut seen = BTreeSet::new();
-        seeds.retain(|seed| seen.insert(ids(seed)));
+        order.retain(|&i| seen.insert(&names[i]));
         // Where three cameras agree on both lines of a pair, with others or with each other, the pair
         // can wait for the next period: there are many more of these than targets.
-        let agreed: BTreeSet<LineId> =
-            seeds.iter().filter(|seed| seed.lines.len() > 2).flat_map(ids).collect();
-        seeds.retain(|seed| seed.lines.len() > 2 || !ids(seed).iter().all(|id| agreed.contains(id)));
-        seeds.truncate(MAX_SEEDS);
-        seeds
+        let agreed: BTreeSet<&LineId> =
+            order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
+        order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
+        order.truncate(MAX_SEEDS);
+        let mut seeds: Vec<Option<Seed>> = seeds.into_iter().map(Some).collect();
+        order.into_iter().filter_map(|i| seeds[i].take()).collect()
     }
 
     /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first

@@ -49,12 +49,10 @@ const JUMPS: [i64; 12] = [
     i64::MAX,
     i64::MIN,
 ];
-/// Clutter bearings that a run may have in all, and those that are all alike: a fuzzer must get on.
-/// The solvers of 002 try every combination of the cameras' bearings, and of bearings that are alike
-/// every combination is as good as any other.
-const MOST_CLUTTER: usize = 800;
-const MOST_CLUTTER_GROUPED: usize = 24;
-const MOST_ALIKE: usize = 16;
+/// Clutter bearings that a run may have in all, and those of a frame that are all alike: a fuzzer must
+/// get on. Whatever there are, a period takes a few tenths of a second.
+const MOST_CLUTTER: usize = 6_000;
+const MOST_ALIKE: usize = 200;
 /// Operations of a run.
 const MOST_OPERATIONS: usize = 60;
 
@@ -104,8 +102,7 @@ fn config(bytes: &mut Bytes<'_>) -> FusionConfig {
             1 => config.event_time.max_ahead_s = value,
             2 => config.bearings.equal_sd_rad = value,
             3 => config.bearings.systematic_sd_rad = value,
-            // More than one in a litre, and every combination of clutter is worth a long thought.
-            4 => initiation.birth_density_per_m3 = value.min(1e3),
+            4 => initiation.birth_density_per_m3 = value,
             5 => initiation.period_s = value,
             6 => initiation.velocity_prior_sd_mps = value,
             7 => initiation.max_range_m = value,
@@ -439,8 +436,6 @@ fn assert_sound(track: &Track) {
 pub fn drive(data: &[u8]) {
     let mut bytes = Bytes(data);
     let config = config(&mut bytes);
-    let grouped = config.initiation.method == InitiationMethod::Grouping;
-    let clutter_left = if grouped { MOST_CLUTTER_GROUPED } else { MOST_CLUTTER };
     let lines_are_owned = config.initiation.shared_lines == 0;
     let Ok(mut fusion) = Fusion::new(config) else { return };
     for (name, place) in NAMES.iter().zip(PLACES).take(4) {
@@ -452,7 +447,7 @@ pub fn drive(data: &[u8]) {
     let mut run = Run {
         bytes,
         fusion,
-        clutter_left,
+        clutter_left: MOST_CLUTTER,
         lines_are_owned,
         time: 0,
         covariance: ORDINARY,

@@ -5,8 +5,9 @@ use std::path::Path;
 use anyhow::Context;
 use crossfix_simulation::{SimulatedSite, Site, SiteCamera};
 use nalgebra::{Matrix3, Vector3};
-use serde::Serialize;
 use serde_json::json;
+
+use crate::scenario::{DetectionRow, ExposureRow, FORMAT, TruthRow, turned};
 
 /// What a generated site is made of.
 #[derive(Debug, clap::Args)]
@@ -54,45 +55,6 @@ impl SiteArgs {
     }
 }
 
-#[derive(Serialize)]
-struct DetectionRow {
-    t: f64,
-    cam: usize,
-    scan: u64,
-    det: usize,
-    ux: f64,
-    uy: f64,
-    uz: f64,
-    sigma_rad: f64,
-    /// -1 is clutter.
-    truth_id: i64,
-}
-
-#[derive(Serialize)]
-struct ExposureRow {
-    t: f64,
-    cam: usize,
-    scan: u64,
-    n: usize,
-}
-
-#[derive(Serialize)]
-struct TruthRow {
-    t: f64,
-    id: u64,
-    x: f64,
-    y: f64,
-    z: f64,
-    vx: f64,
-    vy: f64,
-    vz: f64,
-}
-
-/// Our camera axes are x right, y down, z forward; the format's are x left, y up, z forward.
-fn turned(v: Vector3<f64>) -> Vector3<f64> {
-    Vector3::new(-v.x, -v.y, v.z)
-}
-
 fn table(dir: &Path, name: &str) -> anyhow::Result<csv::Writer<std::fs::File>> {
     let path = dir.join(name);
     csv::Writer::from_path(&path).with_context(|| format!("cannot write {}", path.display()))
@@ -106,7 +68,7 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
     let mut truth = table(dir, "truth.csv")?;
     let mut epochs = Vec::new();
     for exposure in site.bearings() {
-        let (cam, scan) = (exposure.camera, exposure.frame.sequence);
+        let (cam, scan) = (exposure.camera as u32, exposure.frame.sequence);
         // The time as the frame has it, to the nanosecond.
         let t = exposure.frame.capture_time_ns as f64 / 1e9;
         for (det, (track, source)) in exposure.frame.tracks.iter().zip(&exposure.sources).enumerate() {
@@ -117,7 +79,7 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
                 t,
                 cam,
                 scan,
-                det,
+                det: det as u64,
                 ux: u.x,
                 uy: u.y,
                 uz: u.z,
@@ -139,7 +101,7 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
                 vz: v.z,
             })?;
         }
-        if cam + 1 == site.cameras().len() {
+        if exposure.camera + 1 == site.cameras().len() {
             epochs.push(t);
         }
     }
@@ -158,7 +120,7 @@ fn description(site: &SimulatedSite, epochs: &[f64]) -> serde_json::Value {
     let [low, high] = about.heights_m;
     let cameras: Vec<_> = site.cameras().iter().enumerate().map(|(id, c)| camera(id, c, about)).collect();
     json!({
-        "format": "passive-bearings/1",
+        "format": FORMAT,
         "seed": about.seed,
         "tau_s": 1.0 / about.rate_hz,
         "scans": epochs.len(),

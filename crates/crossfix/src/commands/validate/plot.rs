@@ -1,63 +1,223 @@
-//! Tables as figures: ours as lines with points, the paper's as crosses, a reference
-//! implementation's as circles.
+//! Tables as figures. Where series go over several places they are curves; where each has one, as
+//! those of camera layouts, they are rows with a point each. Ours are points with a bar of a standard
+//! error, the paper's figures crosses, a reference implementation's circles.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::path::Path;
 
 use anyhow::anyhow;
-use crossfix_evaluation::Table;
+use crossfix_evaluation::{Row, Table};
+use plotters::coord::Shift;
 use plotters::prelude::*;
 
-const SIZE: (u32, u32) = (960, 600);
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Failure = Box<dyn std::error::Error>;
+
+/// Width of a figure, px, and height of one of curves at least.
+const SIZE: (u32, u32) = (1200, 600);
+/// Height of a row or of a line of the legend, px.
+const ROW: u32 = 18;
+/// Room for title, axis and margins, px.
+const FRAME: u32 = 110;
+/// About the width of a letter of the small font, px.
+const LETTER: usize = 7;
+/// Positive figures that differ by more than this factor are drawn on a logarithmic axis.
+const WIDE: f64 = 50.0;
+
+const OURS: RGBColor = RGBColor(31, 90, 160);
+const PAPER: RGBColor = RGBColor(200, 70, 20);
+const REFERENCE: RGBColor = RGBColor(30, 130, 60);
 
 /// Draws a table into an SVG file.
 pub fn draw(table: &Table, path: &Path) -> anyhow::Result<()> {
-    draw_on(table, path).map_err(|error| anyhow!("{error}"))
+    let names: BTreeSet<&str> = table.rows.iter().map(|row| row.series.as_str()).collect();
+    let drawn = if names.len() == table.rows.len() { rows(table, path) } else { curves(table, path) };
+    drawn.map_err(|error| anyhow!("{error}"))
 }
 
-fn draw_on(table: &Table, path: &Path) -> Result<(), Box<dyn std::error::Error>> {
-    let area = SVGBackend::new(path, SIZE).into_drawing_area();
-    area.fill(&WHITE)?;
-    let range = |values: &mut dyn Iterator<Item = f64>| {
+/// An axis from the least to the greatest of some figures, linear or logarithmic.
+struct Axis {
+    is_logarithmic: bool,
+    range: Range<f64>,
+}
+
+impl Axis {
+    fn of(values: impl Iterator<Item = f64>, may_be_logarithmic: bool) -> Self {
         let (low, high) = values
             .filter(|v| v.is_finite())
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
-        let margin = 0.05 * (high - low).max(1e-3);
-        (low - margin)..(high + margin)
-    };
-    let x = range(&mut table.rows.iter().map(|row| row.x));
-    let y =
-        range(&mut table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.reference]).flatten());
+        if low > high {
+            return Self { is_logarithmic: false, range: 0.0..1.0 };
+        }
+        let is_logarithmic = may_be_logarithmic && low > 0.0 && high > WIDE * low;
+        let (low, high) = if is_logarithmic { (low.log10(), high.log10()) } else { (low, high) };
+        let margin = 0.05 * (high - low).max(1e-3 * high.abs()).max(1e-3);
+        Self { is_logarithmic, range: (low - margin)..(high + margin) }
+    }
+
+    /// Where a figure lies on the axis, its ends at the most.
+    fn place(&self, value: f64) -> f64 {
+        let place = if self.is_logarithmic { value.max(f64::MIN_POSITIVE).log10() } else { value };
+        place.clamp(self.range.start, self.range.end)
+    }
+
+    fn label(&self, place: f64) -> String {
+        let value = if self.is_logarithmic { 10f64.powf(place) } else { place };
+        let digits = if self.is_logarithmic { 2 } else { 4 };
+        let rounded: f64 = format!("{value:.digits$e}").parse().unwrap_or(value);
+        if rounded == 0.0 || (1e-3..1e6).contains(&rounded.abs()) {
+            rounded.to_string()
+        } else {
+            format!("{rounded:e}")
+        }
+    }
+}
+
+/// All figures of a table.
+fn figures(table: &Table) -> impl Iterator<Item = f64> {
+    table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.reference]).flatten()
+}
+
+/// A sheet with the table's title, and below it what the marks mean.
+fn sheet<'a>(
+    table: &Table,
+    path: &'a Path,
+    height: u32,
+    colour: fn(Mark) -> RGBColor,
+) -> Result<Area<'a>, Failure> {
+    let area = SVGBackend::new(path, (SIZE.0, height)).into_drawing_area();
+    area.fill(&WHITE)?;
+    let area = area.titled(&table.title, ("sans-serif", 20))?;
+    let mut x = 16;
+    let has = |figure: fn(&Row) -> Option<f64>| table.rows.iter().any(|row| figure(row).is_some());
+    let marks = [
+        ("ours", Mark::Ours, true),
+        ("paper", Mark::Paper, has(|row| row.paper)),
+        ("reference", Mark::Reference, has(|row| row.reference)),
+    ];
+    for (name, mark, _) in marks.into_iter().filter(|(.., is_there)| *is_there) {
+        mark.draw_at(&area, (x, 8), colour(mark))?;
+        area.draw(&Text::new(name, (x + 9, 2), ("sans-serif", 12)))?;
+        x += 30 + (LETTER * name.len()) as i32;
+    }
+    Ok(area.margin(18, 8, 8, 12))
+}
+
+/// Whose figure it is.
+#[derive(Clone, Copy)]
+enum Mark {
+    Ours,
+    Paper,
+    Reference,
+}
+
+impl Mark {
+    fn colour(self) -> RGBColor {
+        match self {
+            Self::Ours => OURS,
+            Self::Paper => PAPER,
+            Self::Reference => REFERENCE,
+        }
+    }
+
+    fn draw_at(self, area: &Area<'_>, at: (i32, i32), colour: RGBColor) -> Result<(), Failure> {
+        match self {
+            Self::Ours => area.draw(&Circle::new(at, 4, colour.filled()))?,
+            Self::Paper => area.draw(&Cross::new(at, 4, colour.stroke_width(2)))?,
+            Self::Reference => area.draw(&Circle::new(at, 5, colour.stroke_width(2)))?,
+        }
+        Ok(())
+    }
+}
+
+/// A row for each series, with its name before it.
+fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
+    let count = table.rows.len();
+    let area = sheet(table, path, FRAME + ROW * count as u32, Mark::colour)?;
+    let bars = table.rows.iter().flat_map(|row| {
+        let low = row.ours - row.standard_error;
+        // A bar that reaches 0 is no reason to give up the logarithm.
+        [if row.ours > 0.0 { low.max(row.ours / 4.0) } else { low }, row.ours + row.standard_error]
+    });
+    let axis = Axis::of(figures(table).chain(bars), true);
+    let longest = table.rows.iter().map(|row| row.series.chars().count()).max().unwrap_or(0);
     let mut chart = ChartBuilder::on(&area)
-        .caption(&table.title, ("sans-serif", 20))
-        .margin(12)
+        .x_label_area_size(36)
+        .y_label_area_size((LETTER * longest + 12) as u32)
+        .build_cartesian_2d(axis.range.clone(), (count as f64 - 0.5)..-0.5)?;
+    let name = |place: &f64| {
+        table.rows.get(place.round() as usize).map_or_else(String::new, |row| row.series.clone())
+    };
+    chart
+        .configure_mesh()
+        .max_light_lines(0)
+        .bold_line_style(BLACK.mix(0.15))
+        .y_labels(2 * count)
+        .y_label_formatter(&name)
+        .x_label_formatter(&|place| axis.label(*place))
+        .x_desc(table.y)
+        .draw()?;
+    for (index, row) in table.rows.iter().enumerate().filter(|(_, row)| row.ours.is_finite()) {
+        let at = |value: f64| chart.backend_coord(&(axis.place(value), index as f64));
+        let bar = [row.ours - row.standard_error, row.ours + row.standard_error].map(at);
+        let whole = area.strip_coord_spec();
+        let origin = area.get_base_pixel();
+        let local = |(x, y): (i32, i32)| (x - origin.0, y - origin.1);
+        whole.draw(&PathElement::new(bar.map(local), OURS.stroke_width(2)))?;
+        let marks =
+            [(Some(row.ours), Mark::Ours), (row.paper, Mark::Paper), (row.reference, Mark::Reference)];
+        for (value, mark) in marks.into_iter().filter_map(|(value, mark)| Some((value?, mark))) {
+            mark.draw_at(&whole, local(at(value)), mark.colour())?;
+        }
+    }
+    area.present()?;
+    Ok(())
+}
+
+/// A curve for each series, with a legend beside.
+fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
+    let mut series: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    for row in &table.rows {
+        series.entry(&row.series).or_default().push(row);
+    }
+    let height = SIZE.1.max(FRAME + ROW * series.len() as u32);
+    // The colours are the series'.
+    let area = sheet(table, path, height, |_| BLACK)?;
+    let longest = series.keys().map(|name| name.chars().count()).max().unwrap_or(0);
+    let legend_width = (LETTER * longest + 50) as u32;
+    let (left, legend) = area.split_horizontally(SIZE.0.saturating_sub(20 + legend_width));
+    let axis = Axis::of(figures(table), true);
+    let across = Axis::of(table.rows.iter().map(|row| row.x), false);
+    let mut chart = ChartBuilder::on(&left)
         .x_label_area_size(40)
         .y_label_area_size(60)
-        .build_cartesian_2d(x, y)?;
-    chart.configure_mesh().x_desc(table.x).y_desc(table.y).draw()?;
-
-    let mut series: BTreeMap<&str, Vec<(f64, f64)>> = BTreeMap::new();
-    for row in &table.rows {
-        series.entry(&row.series).or_default().push((row.x, row.ours));
-    }
-    for (index, (name, points)) in series.into_iter().enumerate() {
-        let colour = Palette99::pick(index).to_rgba();
-        chart
-            .draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)).point_size(3))?
-            .label(name)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], colour.stroke_width(2)));
-        let rows = || table.rows.iter().filter(|row| row.series == name);
-        let papers = rows().filter_map(|row| row.paper.map(|paper| (row.x, paper)));
-        chart.draw_series(papers.map(|place| Cross::new(place, 5, colour.stroke_width(2))))?;
-        let references = rows().filter_map(|row| row.reference.map(|reference| (row.x, reference)));
-        chart.draw_series(references.map(|place| Circle::new(place, 5, colour.stroke_width(2))))?;
-    }
+        .build_cartesian_2d(across.range.clone(), axis.range.clone())?;
     chart
-        .configure_series_labels()
-        .background_style(WHITE.mix(0.8))
-        .border_style(BLACK.mix(0.3))
-        .label_font(("sans-serif", 12))
+        .configure_mesh()
+        .max_light_lines(0)
+        .bold_line_style(BLACK.mix(0.15))
+        .x_label_formatter(&|place| across.label(*place))
+        .y_label_formatter(&|place| axis.label(*place))
+        .x_desc(table.x)
+        .y_desc(table.y)
         .draw()?;
+    let count = series.len();
+    for (index, (name, rows)) in series.into_iter().enumerate() {
+        // Hues all round, every other one darker.
+        let light = if index % 2 == 0 { 0.45 } else { 0.3 };
+        let colour = HSLColor(index as f64 / count as f64, 0.75, light);
+        let place = |value: f64, row: &Row| (row.x, axis.place(value));
+        let ours = rows.iter().filter(|row| row.ours.is_finite()).map(|row| place(row.ours, row));
+        chart.draw_series(LineSeries::new(ours, colour.stroke_width(2)).point_size(3))?;
+        let papers = rows.iter().filter_map(|row| Some(place(row.paper?, row)));
+        chart.draw_series(papers.map(|at| Cross::new(at, 5, colour.stroke_width(2))))?;
+        let references = rows.iter().filter_map(|row| Some(place(row.reference?, row)));
+        chart.draw_series(references.map(|at| Circle::new(at, 5, colour.stroke_width(2))))?;
+        let y = (index as u32 * ROW) as i32 + 10;
+        legend.draw(&PathElement::new([(10, y), (30, y)], colour.stroke_width(3)))?;
+        legend.draw(&Text::new(name, (36, y - 6), ("sans-serif", 12)))?;
+    }
     area.present()?;
     Ok(())
 }

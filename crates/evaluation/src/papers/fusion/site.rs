@@ -63,12 +63,13 @@ impl Layout {
 }
 
 /// The layouts in which the paper's system breaks, and two in which it does not.
-pub(super) const LAYOUTS: [Layout; 7] = [
+pub(super) const LAYOUTS: [Layout; 8] = [
     Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
     Layout::orthogonal("orthogonal, 0.1/0.11", [0.0, 0.1, 0.11]),
     Layout::orthogonal("equal delays 0.2/0.2", [0.0, 0.2, 0.2]),
     Layout::orthogonal("dt2 = 0, dt3 = 0.2", [0.0, 0.0, 0.2]),
     Layout::orthogonal("synchronous", [0.0, 0.0, 0.0]),
+    Layout::arc("90 degree arc, 5 degrees up", 5.0),
     Layout::arc("90 degree arc, 1 degree up", 1.0),
     Layout::arc("coplanar", 0.0),
 ];
