@@ -329,10 +329,15 @@ impl Track {
         let information: Matrix3<f64> =
             weights.iter().zip(&parts).map(|(weight, part)| weight * part.jacobian).sum();
         if let Some(spread) = information.try_inverse().filter(|_| weights.len() == parts.len()) {
-            let mut position = state.covariance.fixed_view_mut::<3, 3>(0, 0);
+            let mut shifted = Matrix3::zeros();
             for (weight, part) in weights.iter().zip(&parts) {
                 let moves = spread * weight;
-                position += moves * part.common * moves.transpose();
+                shifted += moves * part.common * moves.transpose();
+            }
+            // Covariances that no camera has make weights that are no numbers.
+            if shifted.iter().all(|v| v.is_finite()) {
+                let mut position = state.covariance.fixed_view_mut::<3, 3>(0, 0);
+                position += shifted;
             }
         }
         state

@@ -11,7 +11,7 @@ use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
-use crate::spatial::{Fix, VelocityKnowledge};
+use crate::spatial::{Fix, Observability, VelocityKnowledge};
 use crate::temporal::LineId;
 use crate::track::{MAX_PAIR_SD_M, Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, same_target};
@@ -226,8 +226,9 @@ impl Hypotheses {
                 continue;
             };
             self.families += 1;
-            let (observability, state) = (seed.solution.observability(), seed.solution.state);
-            let velocity = VelocityKnowledge::Solved;
+            let (state, velocity) = (seed.solution.state, VelocityKnowledge::Solved);
+            // Eigenvalues cost more than all the rest: they are for those that are confirmed.
+            let observability = Observability::unexamined(6);
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
             let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
             let mut track = Box::new(Track::start(&fix, named, motion));

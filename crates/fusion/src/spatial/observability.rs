@@ -67,6 +67,11 @@ impl Observability {
         Self { rank: unknowns, unknowns, condition_number, weak_axis: None }
     }
 
+    /// Of a system that nobody has looked at yet.
+    pub(crate) fn unexamined(unknowns: usize) -> Self {
+        Self { rank: 0, unknowns, condition_number: f64::INFINITY, weak_axis: None }
+    }
+
     /// Whether everything asked for can be seen.
     pub fn is_full(&self) -> bool {
         self.rank == self.unknowns
