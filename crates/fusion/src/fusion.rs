@@ -5,7 +5,7 @@ use crossfix_message::{
     TrackEvent, TrackFrame, TrackState,
 };
 
-use crate::clocks::{ClockEstimate, ClockFilter};
+use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
 use crate::initiation::Initiator;
@@ -51,7 +51,7 @@ pub struct Fusion {
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
-    clocks: ClockFilter,
+    clocks: ClockEstimator,
     standings: Standings,
     /// Exposures in the order of their corrected times, until nothing can come before them.
     corrected: BTreeMap<(Timestamp, CameraName), Exposure>,
@@ -72,7 +72,7 @@ impl Fusion {
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),
-            clocks: ClockFilter::new(config.clocks.clone()),
+            clocks: ClockEstimator::new(config.clocks.clone()),
             standings: Standings::default(),
             corrected: BTreeMap::new(),
             counters: Counters::default(),
@@ -239,7 +239,7 @@ impl Fusion {
         self.clocks.advance(exposure.time, &self.tracker);
         for (index, id) in used {
             if let (Some(track), Some(sighting)) = (self.tracker.track(*id), exposure.sightings.get(*index)) {
-                self.clocks.update(track, &exposure.camera, &sighting.line, exposure.correction_s);
+                self.clocks.update(track, exposure, &sighting.line);
             }
         }
     }
@@ -259,8 +259,8 @@ impl Fusion {
                 _ => "cameras_readmitted",
             });
             if standing == CameraStanding::Excluded && self.clocks.is_needed() {
-                // It may be the clocks that are wrong: they get another chance with all cameras.
-                self.clocks.begin_anew();
+                // It may be its clock that is wrong: that is learnt anew, from bearings compared and not used.
+                self.clocks.doubt(&exposure.camera);
             }
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
         }

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Point3, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix3, Point3, Unit, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, View};
 
@@ -65,6 +65,13 @@ impl BearingPrediction {
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * spread,
         })
+    }
+
+    /// The same where the target's position is uncertain by more than the track itself knows, m^2.
+    pub(crate) fn widened(mut self, more: &Matrix3<f64>) -> Self {
+        let across = self.view.basis / self.view.range;
+        self.steady += across.transpose() * more * across;
+        self
     }
 
     /// Where a camera at `origin` should see a target of a state, as of the state's time; the target

@@ -15,6 +15,8 @@ use crate::uncertainty::{CameraUncertainty, View};
 const MAX_ITERATIONS: usize = 5;
 /// The linearisation has settled when a round moves the position by less than this, m.
 const SETTLED_M: f64 = 1e-5;
+/// Clocks less sure than this shift tracks by more than their bearings' noise, s.
+const UNSURE_CLOCK_S: f64 = 2e-3;
 /// What a track can be told apart by is looked at this often, s: eigenvalues cost more than an update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
@@ -63,6 +65,8 @@ struct Contribution {
     own: Matrix2<f64>,
     /// Pose and clock of its camera, rad^2.
     common: Matrix2<f64>,
+    /// Standard deviation of its camera's clock, s.
+    time_sd_s: f64,
 }
 
 /// A bearing that a track has taken in.
@@ -93,6 +97,8 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// What unsure clocks may shift the position by, m^2; `None` where all are sure.
+    shift: Option<Matrix3<f64>>,
     /// When its state went out, and as what.
     pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
@@ -137,6 +143,7 @@ impl Linearised {
             jacobian: self.jacobian,
             own: line.covariance * camera.factor,
             common: camera.common(&self.view),
+            time_sd_s: camera.time_sd_s,
         };
         MeasurementResidual { time, angle: self.offset.norm(), nis, contribution }
     }
@@ -197,7 +204,7 @@ impl Track {
             let nis = seen.offset.dot(&seen.noise.cholesky()?.solve(&seen.offset));
             Some((camera.clone(), seen.residual(*time, nis, line, &uncertainty)))
         };
-        Self {
+        let mut track = Self {
             id: TrackId(0),
             status: TrackStatus::Tentative,
             updated: fix.time,
@@ -207,10 +214,13 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            shift: None,
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             detector: motion.detector(),
-        }
+        };
+        track.shift = track.clock_shift(motion);
+        track
     }
 
     /// Position and velocity at [`Self::updated`].
@@ -253,13 +263,14 @@ impl Track {
         camera: &CameraUncertainty,
         motion: &Motion,
     ) -> Option<BearingPrediction> {
-        BearingPrediction::new(
+        let prediction = BearingPrediction::new(
             &self.imm,
             time.seconds_since(self.updated),
             motion.models(self.held),
             origin,
             camera,
-        )
+        )?;
+        Some(self.shift.iter().fold(prediction, |prediction, shift| prediction.widened(shift)))
     }
 
     /// Takes a bearing in. Leaves the track as it was and returns `None` if the numbers fail;
@@ -275,7 +286,8 @@ impl Track {
         let before = self.imm.predicted(interval, motion.models(self.held));
         let seen = Linearised::at(&before, line, uncertainty)?;
         let offset = seen.offset;
-        let known = seen.jacobian * before.position_covariance() * seen.jacobian.transpose();
+        let known = before.position_covariance() + self.shift.unwrap_or_else(Matrix3::zeros);
+        let known = seen.jacobian * known * seen.jacobian.transpose();
         let distance = |noise: Matrix2<f64>| Some(offset.dot(&(known + noise).cholesky()?.solve(&offset)));
         let nis = distance(seen.noise)?;
         let reported_nis = distance(line.covariance + uncertainty.common(&seen.view))?;
@@ -299,6 +311,9 @@ impl Track {
             self.residuals.insert(camera.clone(), residual);
         }
         self.held = self.cameras_lately(motion.holding_s) >= 2;
+        if self.shift.is_some() || uncertainty.time_sd_s >= UNSURE_CLOCK_S {
+            self.shift = self.clock_shift(motion);
+        }
         if time.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
             self.observe();
         }
@@ -328,6 +343,26 @@ impl Track {
             }
         }
         state
+    }
+
+    /// What the clocks that are not sure may shift the position by, m^2. The filter takes such a shift
+    /// for noise of each bearing and averages it away; a camera that joins would find the target
+    /// outside its gate.
+    fn clock_shift(&self, motion: &Motion) -> Option<Matrix3<f64>> {
+        let recent = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        let parts = || self.residuals.values().filter(recent).map(|r| &r.contribution);
+        if parts().all(|part| part.time_sd_s < UNSURE_CLOCK_S) {
+            return None;
+        }
+        let mut information = Matrix3::zeros();
+        let mut shifted = Matrix3::zeros();
+        for Contribution { jacobian, own, common, .. } in parts() {
+            let weight = jacobian.transpose() * (own + common).try_inverse()?;
+            information += weight * jacobian;
+            shifted += weight * common * weight.transpose();
+        }
+        let spread = information.try_inverse()?;
+        Some(spread * shifted * spread).filter(|shift| shift.iter().all(|value| value.is_finite()))
     }
 
     /// Cameras that have given a bearing within the last seconds before [`Self::updated`].

@@ -1,0 +1,351 @@
+//! The adjustment of a window: the target's way and the clocks that fit its bearings best together.
+
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+use super::curve::{Basis, Curve};
+use super::window::Sight;
+
+/// Squared distances (two degrees of freedom) beyond which a bearing pulls no harder: in the
+/// beginning, when all may be far off, ...
+const HUBER: f64 = 9.0;
+/// ... and in the end, beyond which it is somebody else's and does not pull at all (1 in 50 000).
+const STRANGER: f64 = 22.0;
+/// Rounds of one descent; most take three to six.
+const MAX_ROUNDS: usize = 25;
+/// Damping of a round against the diagonal: first, and when a descent is given up.
+const FIRST_DAMPING: f64 = 1e-4;
+const MAX_DAMPING: f64 = 1e4;
+/// A descent has settled when a round gains less than this of the squared distances.
+const SETTLED: f64 = 1e-3;
+/// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
+/// turns of a racing drone.
+const DENSITIES: std::ops::RangeInclusive<i32> = -5..=4;
+
+/// What pulls how hard.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Loss {
+    Huber,
+    Trimmed,
+}
+
+impl Loss {
+    /// What a squared distance costs, and the weight of the bearing.
+    fn of(self, squared: f64) -> (f64, f64) {
+        match self {
+            Self::Huber if squared > HUBER => {
+                (2.0 * (HUBER * squared).sqrt() - HUBER, (HUBER / squared).sqrt())
+            }
+            Self::Trimmed if squared > STRANGER => (STRANGER, 0.0),
+            _ => (squared, 1.0),
+        }
+    }
+}
+
+/// The clocks as they are known before: the first two components belong to the first clock that a
+/// camera of the window has a place for, offset before drift.
+#[derive(Clone, Debug)]
+pub(super) struct Prior {
+    pub(super) mean: DVector<f64>,
+    pub(super) precision: DMatrix<f64>,
+    /// The time their offsets are of, s after the window's beginning.
+    pub(super) epoch_s: f64,
+    /// Where each camera's offset is among the components; `None` for the reference.
+    pub(super) places: Vec<Option<usize>>,
+}
+
+/// A target's way and the clocks.
+#[derive(Clone, Debug)]
+struct State {
+    coefficients: DVector<f64>,
+    clocks: DVector<f64>,
+}
+
+/// Minus twice the logarithm of the posterior density at a state, but for a constant, with half its
+/// gradient and half its second derivative (Gauss-Newton's).
+#[derive(Clone, Debug)]
+struct Quadratic {
+    cost: f64,
+    gradient: DVector<f64>,
+    information: DMatrix<f64>,
+}
+
+/// What an adjustment has found.
+#[derive(Clone, Debug)]
+pub(super) struct Adjusted {
+    pub(super) clocks: DVector<f64>,
+    pub(super) covariance: DMatrix<f64>,
+    /// Mean square of the residuals of the bearings that fit, over what was to be expected: 1 is honest.
+    pub(super) misfit: f64,
+    /// Share of each camera's bearings that do not fit.
+    pub(super) strangers: Vec<f64>,
+    /// Squared distance of the clocks from what was known of them before.
+    pub(super) pulled: f64,
+    /// Power of ten of the density of jerk that explains the bearings best.
+    pub(super) density: i32,
+}
+
+/// One window's bearings, with what is known beforehand.
+#[derive(Clone, Debug)]
+pub(super) struct Adjustment<'a> {
+    sights: &'a [Sight],
+    curve: Curve,
+    prior: &'a Prior,
+    /// The bearings' covariances count this many times.
+    scale: f64,
+}
+
+impl<'a> Adjustment<'a> {
+    pub(super) fn new(sights: &'a [Sight], curve: Curve, prior: &'a Prior) -> Self {
+        Self { sights, curve, prior, scale: 1.0 }
+    }
+
+    /// Fits way and clocks. `None` if the numbers fail.
+    pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
+        let mut state = self.begin()?;
+        state = self.descend(state, density, Loss::Huber)?.0;
+        let (mut state, mut density, _) = self.best_density(state, density)?;
+        let (mut misfit, strangers) = self.misfit(&state, density)?;
+        // Bearings worse than they say: what they tell is worth as much less.
+        let expected = 1.0 + 3.0 * (self.sights.len() as f64).sqrt().recip();
+        if misfit > expected {
+            self.scale = misfit;
+            (state, density, _) = self.best_density(state, density)?;
+            misfit = misfit.max(self.misfit(&state, density)?.0 * self.scale);
+        }
+        let (covariance, pulled) = self.posterior(&state, density)?;
+        Some(Adjusted { clocks: state.clocks, covariance, misfit, strangers, pulled, density })
+    }
+
+    /// The clocks as known before, and a way through the places that the track had.
+    fn begin(&self) -> Option<State> {
+        let clocks = self.prior.mean.clone();
+        let places = self.sights.iter().map(|sight| (self.time(sight, &clocks).0, sight.place));
+        Some(State { coefficients: self.curve.fit(places, 1.0)?, clocks })
+    }
+
+    /// When a bearing was taken by the reference's clock, s, where its camera's offset is among the
+    /// clocks' components, and how long after their epoch it was taken.
+    fn time(&self, sight: &Sight, clocks: &DVector<f64>) -> (f64, Option<usize>, f64) {
+        let since = sight.time_s - self.prior.epoch_s;
+        let place = self.prior.places.get(sight.camera).copied().flatten();
+        let offset = place.map_or(0.0, |place| clocks[place] + clocks[place + 1] * since);
+        (sight.time_s - offset, place, since)
+    }
+
+    /// The density of jerk of the greatest evidence, with the state that belongs to it.
+    fn best_density(&self, state: State, first: i32) -> Option<(State, i32, f64)> {
+        let (state, evidence) = self.with_evidence(state, first)?;
+        let mut best = (state, first, evidence);
+        for step in [-1, 1] {
+            let mut moved = false;
+            while DENSITIES.contains(&(best.1 + step)) {
+                let Some((state, evidence)) = self.with_evidence(best.0.clone(), best.1 + step) else {
+                    break;
+                };
+                if evidence <= best.2 {
+                    break;
+                }
+                best = (state, best.1 + step, evidence);
+                moved = true;
+            }
+            if moved {
+                break;
+            }
+        }
+        Some(best)
+    }
+
+    /// Descends, and twice the logarithm of the evidence (Laplace's), but for a constant.
+    fn with_evidence(&self, state: State, density: i32) -> Option<(State, f64)> {
+        let (state, Quadratic { cost, information, .. }) = self.descend(state, density, Loss::Trimmed)?;
+        let factor = information.cholesky()?;
+        let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
+        let evidence = -cost - log_determinant - self.curve.log_width(jerk(density));
+        evidence.is_finite().then_some((state, evidence))
+    }
+
+    /// Levenberg and Marquardt's descent to the most likely state.
+    fn descend(&self, mut state: State, density: i32, loss: Loss) -> Option<(State, Quadratic)> {
+        let mut here = self.quadratic(&state, density, loss);
+        let mut damping = FIRST_DAMPING;
+        for _ in 0..MAX_ROUNDS {
+            let mut damped = here.information.clone();
+            for i in 0..damped.nrows() {
+                damped[(i, i)] *= 1.0 + damping;
+            }
+            let next = damped.cholesky().map(|factor| self.moved(&state, &factor.solve(&here.gradient)));
+            let there = next.as_ref().map(|next| self.quadratic(next, density, loss));
+            match (next, there) {
+                (Some(next), Some(there)) if there.cost < here.cost => {
+                    let gained = here.cost - there.cost;
+                    (state, here) = (next, there);
+                    damping /= 10.0;
+                    if gained < SETTLED {
+                        break;
+                    }
+                }
+                _ if damping > MAX_DAMPING => break,
+                (Some(_), Some(there)) if there.cost - here.cost < SETTLED => break,
+                _ => damping *= 10.0,
+            }
+        }
+        here.cost.is_finite().then_some((state, here))
+    }
+
+    fn moved(&self, state: &State, step: &DVector<f64>) -> State {
+        let points = state.coefficients.len();
+        State {
+            coefficients: &state.coefficients - step.rows(0, points),
+            clocks: &state.clocks - step.rows(points, state.clocks.len()),
+        }
+    }
+
+    fn quadratic(&self, state: &State, density: i32, loss: Loss) -> Quadratic {
+        let mut quadratic = self.prior_quadratic(state, density);
+        for sight in self.sights {
+            let (time_s, place, since) = self.time(sight, &state.clocks);
+            let basis = self.curve.basis(time_s);
+            let (target, velocity) = basis.at(&state.coefficients);
+            let Some(seen) = Seen::at(sight, target, self.scale) else {
+                // Behind the camera: as far off as can be.
+                quadratic.cost += loss.of(1e6).0;
+                continue;
+            };
+            let (cost, weight) = loss.of(seen.squared);
+            quadratic.cost += cost;
+            if weight > 0.0 {
+                let place = place.map(|place| (state.coefficients.len() + place, since));
+                quadratic.add(&basis, place, velocity, &seen, weight);
+            }
+        }
+        quadratic
+    }
+
+    /// What is known beforehand.
+    fn prior_quadratic(&self, state: &State, density: i32) -> Quadratic {
+        let (points, clocks) = (state.coefficients.len(), state.clocks.len());
+        let mut information = DMatrix::zeros(points + clocks, points + clocks);
+        self.curve.add_prior(&mut information, jerk(density));
+        information.view_mut((points, points), (clocks, clocks)).copy_from(&self.prior.precision);
+        let mut away = DVector::zeros(points + clocks);
+        away.rows_mut(0, points).copy_from(&state.coefficients);
+        away.rows_mut(points, clocks).copy_from(&(&state.clocks - &self.prior.mean));
+        let gradient = &information * &away;
+        Quadratic { cost: away.dot(&gradient), gradient, information }
+    }
+
+    /// How well the bearings fit: mean square over what was to be expected, and the share of each
+    /// camera's that do not.
+    fn misfit(&self, state: &State, density: i32) -> Option<(f64, Vec<f64>)> {
+        let cameras = self.prior.places.len();
+        let (mut all, mut strange) = (vec![0.0_f64; cameras], vec![0.0_f64; cameras]);
+        let (mut sum, mut fitting) = (0.0, 0.0);
+        for sight in self.sights {
+            let target = self.curve.basis(self.time(sight, &state.clocks).0).at(&state.coefficients).0;
+            let squared = Seen::at(sight, target, self.scale).map_or(f64::INFINITY, |seen| seen.squared);
+            all[sight.camera] += 1.0;
+            if squared > STRANGER {
+                strange[sight.camera] += 1.0;
+            } else {
+                sum += squared;
+                fitting += 2.0;
+            }
+        }
+        let quadratic = self.quadratic(state, density, Loss::Trimmed);
+        let before = self.prior_quadratic(state, density).information;
+        let free = before.nrows() as f64 - quadratic.information.cholesky()?.solve(&before).trace();
+        let shares = all.iter().zip(strange).map(|(all, strange)| strange / all.max(1.0)).collect();
+        let expected: f64 = fitting - free;
+        (expected > 0.0).then(|| (sum / expected, shares))
+    }
+
+    /// Covariance of the clocks, and their squared distance from what was known before.
+    fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
+        let (points, clocks) = (state.coefficients.len(), state.clocks.len());
+        let information = self.quadratic(state, density, Loss::Trimmed).information;
+        let mut unit = DMatrix::zeros(points + clocks, clocks);
+        unit.view_mut((points, 0), (clocks, clocks)).fill_with_identity();
+        let covariance = information.cholesky()?.solve(&unit).rows(points, clocks).into_owned();
+        let away = &state.clocks - &self.prior.mean;
+        let pulled = away.dot(&(&self.prior.precision * &away));
+        let possible = covariance.iter().all(|value| value.is_finite()) && pulled.is_finite();
+        possible.then_some((covariance, pulled))
+    }
+}
+
+/// Density of the jerk, m^2/s^5.
+fn jerk(power: i32) -> f64 {
+    10.0_f64.powi(power)
+}
+
+/// A bearing against a place of the target.
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    /// Squared distance of the residual by its covariance.
+    squared: f64,
+    /// What the residual pulls the place by, and what it tells of the place.
+    pull: Vector3<f64>,
+    information: Matrix3<f64>,
+}
+
+impl Seen {
+    /// `None` if the place lies behind the camera.
+    fn at(sight: &Sight, target: Vector3<f64>, scale: f64) -> Option<Self> {
+        let residual: Vector2<f64> = sight.line.tangent_offset(target.into())?;
+        let away = target - sight.line.origin.coords;
+        let range = away.norm();
+        let direction = away / range;
+        let across: Matrix2x3<f64> =
+            sight.line.basis.transpose() * (Matrix3::identity() - direction * direction.transpose()) / range;
+        let inverse: Matrix2<f64> = (sight.line.covariance * scale).try_inverse()?;
+        let weighed = across.transpose() * inverse;
+        let squared = residual.dot(&(inverse * residual));
+        let seen = Self { squared, pull: weighed * residual, information: weighed * across };
+        seen.squared.is_finite().then_some(seen)
+    }
+}
+
+impl Quadratic {
+    /// Adds a bearing. A clock ahead by o shows the target where it was o ago: its offset moves the
+    /// place by minus the velocity, its drift by that times the time since the epoch.
+    fn add(
+        &mut self,
+        basis: &Basis,
+        clock: Option<(usize, f64)>,
+        velocity: Vector3<f64>,
+        seen: &Seen,
+        weight: f64,
+    ) {
+        let (pull, information) = (seen.pull * weight, seen.information * weight);
+        let shift = clock.map(|(place, since)| {
+            let moved = -(information * velocity);
+            [(place, moved), (place + 1, moved * since)]
+        });
+        for (i, a) in basis.place.iter().enumerate() {
+            let row = 3 * (basis.first + i);
+            let mut part = self.gradient.fixed_rows_mut::<3>(row);
+            part += pull * *a;
+            for (k, b) in basis.place.iter().enumerate() {
+                let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (basis.first + k));
+                block += information * (a * b);
+            }
+            for (place, moved) in shift.iter().flatten() {
+                let mut below = self.information.fixed_view_mut::<1, 3>(*place, row);
+                below += moved.transpose() * *a;
+                let mut beside = self.information.fixed_view_mut::<3, 1>(row, *place);
+                beside += moved * *a;
+            }
+        }
+        let (Some((place, since)), Some([(_, moved), _])) = (clock, shift) else {
+            return;
+        };
+        let told = -moved.dot(&velocity);
+        let pulled = -velocity.dot(&pull);
+        for (i, a) in [(0, 1.0), (1, since)] {
+            self.gradient[place + i] += pulled * a;
+            for (k, b) in [(0, 1.0), (1, since)] {
+                self.information[(place + i, place + k)] += told * a * b;
+            }
+        }
+    }
+}

@@ -1,0 +1,257 @@
+//! What is believed of the clocks: offset and drift of each against one of them, the reference.
+
+use std::collections::BTreeMap;
+
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::{DMatrix, DVector};
+
+use super::ClockEstimate;
+
+/// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
+const OFFSET_WALK: f64 = 1e-12;
+const DRIFT_WALK: f64 = 1e-16;
+/// No two clocks are the same to better than this, s and s/s: their covariance stays regular.
+const OFFSET_FLOOR_S: f64 = 1e-6;
+const DRIFT_FLOOR: f64 = 1e-9;
+/// Offsets beyond this are no offsets any more, s.
+const MAX_OFFSET_S: f64 = 2.0;
+
+/// A camera's clock: where its offset stands, and what was reported of it.
+#[derive(Clone, Copy, Debug)]
+struct Clock {
+    /// The place of its offset against the reference; its drift is the next. The reference, the
+    /// first camera heard, has no place.
+    place: Option<usize>,
+    /// Variance of its offset against true time before anything is seen, s^2.
+    prior: f64,
+    /// The same of its drift.
+    drift_prior: f64,
+}
+
+/// Offsets and drifts of all clocks against the first as one normal distribution, as of an epoch.
+///
+/// What all clocks have in common is left out: no bearing tells it, and a linearised estimate would
+/// yet learn something of it that is not true. It follows from the reported deviations alone.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Belief {
+    cameras: BTreeMap<CameraName, Clock>,
+    mean: DVector<f64>,
+    covariance: DMatrix<f64>,
+    epoch: Option<Timestamp>,
+}
+
+impl Belief {
+    pub(super) fn knows(&self, camera: &CameraName) -> bool {
+        self.cameras.contains_key(camera)
+    }
+
+    /// Makes a clock known by the standard deviations of its offset (s) and drift (s/s).
+    pub(super) fn add(&mut self, camera: &CameraName, offset_sd: f64, drift_sd: f64) {
+        let (prior, drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
+        let reference = self.reference();
+        let place = reference.map(|_| self.mean.len());
+        self.cameras.insert(camera.clone(), Clock { place, prior, drift_prior });
+        let (Some(reference), Some(place)) = (reference, place) else {
+            return;
+        };
+        let grown = place + 2;
+        self.mean.resize_vertically_mut(grown, 0.0);
+        self.covariance.resize_mut(grown, grown, 0.0);
+        // The reference's own error is in every offset against it.
+        for k in (0..grown).step_by(2) {
+            for (i, common) in [(0, reference.prior), (1, reference.drift_prior)] {
+                self.covariance[(place + i, k + i)] = common;
+                self.covariance[(k + i, place + i)] = common;
+            }
+        }
+        self.covariance[(place, place)] += prior + OFFSET_FLOOR_S.powi(2);
+        self.covariance[(place + 1, place + 1)] += drift_prior + DRIFT_FLOOR.powi(2);
+    }
+
+    fn reference(&self) -> Option<Clock> {
+        self.cameras.values().find(|clock| clock.place.is_none()).copied()
+    }
+
+    /// The place of a clock's offset in the state; its drift is the next. `None` for the reference.
+    pub(super) fn place(&self, camera: &CameraName) -> Option<usize> {
+        self.cameras.get(camera)?.place
+    }
+
+    /// Whether anything was left open by what a camera has reported of its clock.
+    pub(super) fn is_uncertain(&self, camera: &CameraName) -> bool {
+        self.cameras.get(camera).is_some_and(|clock| clock.prior > 0.0)
+    }
+
+    /// The time that the state is of.
+    pub(super) fn epoch(&self) -> Option<Timestamp> {
+        self.epoch
+    }
+
+    /// Moves on to a time; never back.
+    pub(super) fn advance(&mut self, time: Timestamp) {
+        let dt = self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch));
+        if self.epoch.is_some() && dt <= 0.0 {
+            return;
+        }
+        self.epoch = Some(time);
+        let n = self.mean.len();
+        let mut transition = DMatrix::<f64>::identity(n, n);
+        for k in (0..n).step_by(2) {
+            transition[(k, k + 1)] = dt;
+        }
+        self.mean = &transition * &self.mean;
+        self.covariance = &transition * &self.covariance * transition.transpose();
+        for k in (0..n).step_by(2) {
+            self.covariance[(k, k)] += OFFSET_WALK * dt;
+            self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
+        }
+    }
+
+    /// Mean and covariance of some components of the state.
+    pub(super) fn marginal(&self, components: &[usize]) -> (DVector<f64>, DMatrix<f64>) {
+        let n = components.len();
+        (
+            DVector::from_fn(n, |i, _| self.mean[components[i]]),
+            DMatrix::from_fn(n, n, |i, k| self.covariance[(components[i], components[k])]),
+        )
+    }
+
+    /// Replaces what is believed of some components; what hangs together with them moves along.
+    pub(super) fn learn(&mut self, components: &[usize], mean: &DVector<f64>, covariance: &DMatrix<f64>) {
+        let (before_mean, before) = self.marginal(components);
+        let Some(factor) = before.clone().cholesky() else {
+            return;
+        };
+        let n = self.mean.len();
+        let ties = DMatrix::from_fn(n, components.len(), |i, k| self.covariance[(i, components[k])]);
+        let gain = factor.solve(&ties.transpose()).transpose();
+        let next_mean = &self.mean + &gain * (mean - before_mean);
+        let next = &self.covariance + &gain * (covariance - before) * gain.transpose();
+        let possible = (0..n).all(|i| next[(i, i)] >= 0.0);
+        if possible && next_mean.iter().chain(next.iter()).all(|value| value.is_finite()) {
+            self.mean = next_mean;
+            self.covariance = (&next + next.transpose()) / 2.0;
+        }
+    }
+
+    /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.
+    pub(super) fn doubt(&mut self, camera: &CameraName) {
+        let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference()) else {
+            return;
+        };
+        let n = self.mean.len();
+        let Some(place) = clock.place else {
+            // Another reference: all the others are as far from it as it may be from true time.
+            for (i, variance) in [(0, clock.prior), (1, clock.drift_prior)] {
+                for (k, l) in (i..n).step_by(2).flat_map(|k| (i..n).step_by(2).map(move |l| (k, l))) {
+                    self.covariance[(k, l)] += variance;
+                }
+            }
+            return;
+        };
+        // Against true time it is as reported; against the reference, as that is against true time.
+        let common = self.reference_offset_and_drift();
+        let variances = [
+            clock.prior + reference.prior + OFFSET_FLOOR_S.powi(2),
+            clock.drift_prior + reference.drift_prior + DRIFT_FLOOR.powi(2),
+        ];
+        for (i, variance) in variances.into_iter().enumerate() {
+            self.mean[place + i] = -common[i];
+            self.covariance.row_mut(place + i).fill(0.0);
+            self.covariance.column_mut(place + i).fill(0.0);
+            self.covariance[(place + i, place + i)] = variance;
+        }
+    }
+
+    /// Forgets all that was learnt of any clock.
+    pub(super) fn begin_anew(&mut self) {
+        let mut anew = Self { epoch: self.epoch, ..Self::default() };
+        let mut cameras: Vec<(&CameraName, &Clock)> = self.cameras.iter().collect();
+        // In the order in which they were heard: the reference first.
+        cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
+        for (camera, clock) in cameras {
+            anew.add(camera, clock.prior.sqrt(), clock.drift_prior.sqrt());
+        }
+        *self = anew;
+    }
+
+    /// How much each clock says of true time, by the variances reported of them, and the variance of
+    /// what all say together. A clock that is right by definition says all.
+    fn weights(&self, prior: fn(&Clock) -> f64) -> (Vec<(Clock, f64)>, f64) {
+        let clocks: Vec<Clock> = self.cameras.values().copied().collect();
+        let exact = clocks.iter().filter(|clock| prior(clock) <= 0.0).count();
+        let weight = |clock: &Clock| match exact {
+            0 => prior(clock).recip(),
+            _ => f64::from(u8::from(prior(clock) <= 0.0)),
+        };
+        let total: f64 = clocks.iter().map(weight).sum();
+        let variance = if exact == 0 { total.recip() } else { 0.0 };
+        (clocks.into_iter().map(|clock| (clock, weight(&clock) / total)).collect(), variance)
+    }
+
+    /// A clock's components in the state, with the offset as of `ahead` seconds after the epoch.
+    fn relative(&self, clock: &Clock, component: usize, ahead: f64) -> f64 {
+        clock.place.map_or(0.0, |place| match component {
+            0 => self.mean[place] + ahead * self.mean[place + 1],
+            _ => self.mean[place + 1],
+        })
+    }
+
+    fn ahead(&self, time: Timestamp) -> f64 {
+        self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch))
+    }
+
+    /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
+    /// variance and the variance of that common time.
+    fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
+        let prior = [|clock: &Clock| clock.prior, |clock: &Clock| clock.drift_prior][component];
+        let (weights, common) = self.weights(prior);
+        let mut row = DVector::<f64>::zeros(self.mean.len());
+        let mut put = |clock: &Clock, weight: f64| {
+            if let Some(place) = clock.place {
+                row[place + component] += weight;
+                if component == 0 {
+                    row[place + 1] += weight * ahead;
+                }
+            }
+        };
+        put(clock, 1.0);
+        weights.iter().for_each(|(other, weight)| put(other, -weight));
+        (row.dot(&self.mean), row.dot(&(&self.covariance * &row)).max(0.0), common)
+    }
+
+    /// The estimate of a camera's clock as of a time.
+    pub(super) fn estimate(&self, camera: &CameraName, time: Timestamp) -> Option<ClockEstimate> {
+        let clock = self.cameras.get(camera)?;
+        let ahead = self.ahead(time);
+        let (offset, own, common) = self.absolute(clock, 0, ahead);
+        let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
+        Some(ClockEstimate {
+            offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
+            // No clock is worse known than what was reported of it.
+            sd_s: (own + common).min(clock.prior).sqrt(),
+            relative_sd_s: own.sqrt(),
+            drift,
+            drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
+        })
+    }
+
+    /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
+    /// behind its reported one.
+    pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
+        let ahead = self.ahead(time);
+        let (weights, _) = self.weights(|clock| clock.prior);
+        let offset = |clock: &Clock| self.relative(clock, 0, ahead);
+        let common: f64 = weights.iter().map(|(clock, weight)| weight * offset(clock)).sum();
+        self.cameras.values().map(|clock| offset(clock) - common).fold(0.0, f64::max).min(MAX_OFFSET_S)
+    }
+
+    /// Offset and drift of the reference against true time as of the epoch.
+    fn reference_offset_and_drift(&self) -> [f64; 2] {
+        let priors: [fn(&Clock) -> f64; 2] = [|clock| clock.prior, |clock| clock.drift_prior];
+        std::array::from_fn(|i| {
+            let (weights, _) = self.weights(priors[i]);
+            -weights.iter().map(|(clock, weight)| weight * self.relative(clock, i, 0.0)).sum::<f64>()
+        })
+    }
+}

@@ -1,0 +1,116 @@
+//! The bearings of one track over a few seconds, by the cameras' own clocks.
+
+use crossfix_geometry::SightLine;
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Vector3;
+
+use crate::track::TrackId;
+
+/// A window holds no more bearings than this: when it is full, every other one of each camera is let go,
+/// and from then on as many are not taken.
+const MAX_SIGHTS: usize = 1500;
+/// Bearings this far from the window's beginning are not of it, s.
+const MAX_SPAN_S: f64 = 30.0;
+
+/// A bearing of a target.
+#[derive(Clone, Debug)]
+pub(super) struct Sight {
+    /// When it was taken by the camera's own clock, s after the window's beginning.
+    pub(super) time_s: f64,
+    /// Which camera of the window took it.
+    pub(super) camera: usize,
+    /// With the covariance that is believed.
+    pub(super) line: SightLine,
+    /// Where the track had the target then.
+    pub(super) place: Vector3<f64>,
+}
+
+/// The bearings of a track.
+#[derive(Clone, Debug)]
+pub(super) struct Window {
+    pub(super) track: TrackId,
+    pub(super) start: Timestamp,
+    pub(super) cameras: Vec<CameraName>,
+    pub(super) sights: Vec<Sight>,
+    /// One in so many bearings of each camera is taken.
+    thinned: usize,
+    /// Bearings of each camera that were offered.
+    offered: Vec<usize>,
+}
+
+impl Window {
+    pub(super) fn new(track: TrackId, start: Timestamp) -> Self {
+        Self { track, start, cameras: Vec::new(), sights: Vec::new(), thinned: 1, offered: Vec::new() }
+    }
+
+    /// Takes in a bearing of a camera by its own clock, with where the track has the target.
+    pub(super) fn add(&mut self, camera: &CameraName, time: Timestamp, line: SightLine, place: Vector3<f64>) {
+        let time_s = time.seconds_since(self.start);
+        if time_s.abs() > MAX_SPAN_S {
+            return;
+        }
+        let index = self.cameras.iter().position(|known| known == camera).unwrap_or_else(|| {
+            self.cameras.push(camera.clone());
+            self.offered.push(0);
+            self.cameras.len() - 1
+        });
+        let number = self.offered[index];
+        self.offered[index] += 1;
+        if number % self.thinned == 0 {
+            self.sights.push(Sight { time_s, camera: index, line, place });
+        }
+        if self.sights.len() >= MAX_SIGHTS {
+            self.thin();
+        }
+    }
+
+    /// Lets every other bearing of each camera go.
+    fn thin(&mut self) {
+        self.thinned *= 2;
+        let mut seen = vec![0_usize; self.cameras.len()];
+        self.sights.retain(|sight| {
+            seen[sight.camera] += 1;
+            seen[sight.camera] % 2 == 1
+        });
+    }
+
+    /// Earliest and latest time of its bearings, s.
+    pub(super) fn span(&self) -> Option<(f64, f64)> {
+        let times = || self.sights.iter().map(|sight| sight.time_s);
+        (!self.sights.is_empty())
+            .then(|| (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max)))
+    }
+
+    /// The same without a camera's bearings.
+    pub(super) fn without(&self, camera: &CameraName) -> Self {
+        let mut rest = self.clone();
+        if let Some(index) = self.cameras.iter().position(|known| known == camera) {
+            rest.sights.retain(|sight| sight.camera != index);
+        }
+        rest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+    use crate::spatial::tests_support::line_at;
+
+    #[test]
+    fn a_window_stays_bounded_and_spans_all_its_time() {
+        let mut window = Window::new(TrackId(1), Timestamp::EPOCH);
+        let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
+        for k in 0..9000_u32 {
+            let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
+            let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
+            window.add(&camera, time, line.clone(), Vector3::zeros());
+        }
+        assert!((MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()), "{}", window.sights.len());
+        let (first, last) = window.span().unwrap();
+        assert!(first < 0.01 && last > 8.9, "{first} {last}");
+        let of_b = window.sights.iter().filter(|sight| sight.camera == 1).count();
+        assert!(of_b.abs_diff(window.sights.len() / 3) <= 2, "{of_b}");
+    }
+}
