@@ -31,16 +31,13 @@ pub struct Clocks {
     pub trusted: Vec<CameraName>,
     /// Clocks reported to be better than this are taken at their word, s. Default 0.001.
     pub least_sd_s: f64,
-    /// Standard deviation of a clock's drift, s/s. Default 0.0001.
+    /// Standard deviation of a clock's drift, s/s. Default 0.00003: quartzes are within 50 ppm.
     pub drift_sd: f64,
-    /// Power spectral density of the jerk of the targets that clocks are compared by, m^2/s^5.
-    /// Default 1.
-    pub jerk_density: f64,
 }
 
 impl Default for Clocks {
     fn default() -> Self {
-        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 3e-5, jerk_density: 1.0 }
+        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 3e-5 }
     }
 }
 
@@ -295,7 +292,6 @@ impl FusionConfig {
             ("tracking.residual_scale", tracking.residual_scale),
             ("clocks.least_sd_s", clocks.least_sd_s),
             ("clocks.drift_sd", clocks.drift_sd),
-            ("clocks.jerk_density", clocks.jerk_density),
             ("initiation.birth_density_per_m3", initiation.birth_density_per_m3),
             ("tracking.clutter_per_sr", tracking.clutter_per_sr),
             ("tracking.confirm_score", tracking.confirm_score),

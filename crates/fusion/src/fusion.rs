@@ -258,9 +258,9 @@ impl Fusion {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
-            if standing == CameraStanding::Excluded && self.clocks.is_needed() {
-                // It may be its clock that is wrong: that is learnt anew, from bearings compared and not used.
-                self.clocks.doubt(&exposure.camera);
+            if standing == CameraStanding::Excluded {
+                // It may be its clock that is wrong: bearings compared and not used can tell.
+                self.clocks.suspect(&exposure.camera);
             }
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
         }

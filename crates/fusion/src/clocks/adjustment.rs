@@ -10,6 +10,10 @@ use super::window::Sight;
 const HUBER: f64 = 9.0;
 /// ... and in the end, beyond which it is somebody else's and does not pull at all (1 in 50 000).
 const STRANGER: f64 = 22.0;
+/// The median of a squared distance.
+const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
+/// A camera's covariances count no more often than this.
+const MAX_SCALE: f64 = 1e4;
 /// Rounds of one descent; most take three to six.
 const MAX_ROUNDS: usize = 25;
 /// Damping of a round against the diagonal: first, and when a descent is given up.
@@ -74,14 +78,15 @@ struct Quadratic {
 pub(super) struct Adjusted {
     pub(super) clocks: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
-    /// Mean square of the residuals of the bearings that fit, over what was to be expected: 1 is honest.
-    pub(super) misfit: f64,
+    /// How often each camera's reported covariances count: 1 where it is honest.
+    pub(super) scales: Vec<f64>,
     /// Share of each camera's bearings that do not fit.
     pub(super) strangers: Vec<f64>,
     /// Squared distance of the clocks from what was known of them before.
     pub(super) pulled: f64,
-    /// Power of ten of the density of jerk that explains the bearings best.
-    pub(super) density: i32,
+    /// Twice the logarithm of the probability of these bearings by what was known before, but for
+    /// what is the same for any knowledge.
+    pub(super) evidence: f64,
 }
 
 /// One window's bearings, with what is known beforehand.
@@ -90,30 +95,63 @@ pub(super) struct Adjustment<'a> {
     sights: &'a [Sight],
     curve: Curve,
     prior: &'a Prior,
-    /// The bearings' covariances count this many times.
-    scale: f64,
+    /// Each camera's covariances count this many times.
+    scales: Vec<f64>,
 }
 
 impl<'a> Adjustment<'a> {
     pub(super) fn new(sights: &'a [Sight], curve: Curve, prior: &'a Prior) -> Self {
-        Self { sights, curve, prior, scale: 1.0 }
+        Self { sights, curve, prior, scales: vec![1.0; prior.places.len()] }
     }
 
     /// Fits way and clocks. `None` if the numbers fail.
     pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
-        let mut state = self.begin()?;
-        state = self.descend(state, density, Loss::Huber)?.0;
-        let (mut state, mut density, _) = self.best_density(state, density)?;
-        let (mut misfit, strangers) = self.misfit(&state, density)?;
-        // Bearings worse than they say: what they tell is worth as much less.
-        let expected = 1.0 + 3.0 * (self.sights.len() as f64).sqrt().recip();
-        if misfit > expected {
-            self.scale = misfit;
-            (state, density, _) = self.best_density(state, density)?;
-            misfit = misfit.max(self.misfit(&state, density)?.0 * self.scale);
+        let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
+        self.rescale(&state, Loss::Huber);
+        let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
+        if self.rescale(&state, Loss::Trimmed) {
+            (state, density, evidence) = self.best_density(state, density)?;
         }
+        let strangers = self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
-        Some(Adjusted { clocks: state.clocks, covariance, misfit, strangers, pulled, density })
+        Some(Adjusted { clocks: state.clocks, covariance, scales: self.scales, strangers, pulled, evidence })
+    }
+
+    /// Sets how often each camera's covariances count, by its residuals: after the first descent,
+    /// when not all may fit, by their median; in the end by the mean of what fits. Says whether that
+    /// has changed much.
+    fn rescale(&mut self, state: &State, loss: Loss) -> bool {
+        let squares = self.squares(state);
+        let mut changed = false;
+        for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
+            if loss == Loss::Trimmed {
+                squares.retain(|squared| *squared <= STRANGER);
+            }
+            squares.sort_unstable_by(f64::total_cmp);
+            let count = squares.len() as f64;
+            let typical = match (loss, squares.get(squares.len() / 2)) {
+                (_, None) => continue,
+                (Loss::Huber, Some(median)) => median / MEDIAN,
+                (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
+            };
+            // Up to three standard errors of an honest camera's are chance.
+            let found = typical * *scale;
+            let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
+            changed |= (next / *scale - 1.0).abs() > 0.1;
+            *scale = next.min(MAX_SCALE);
+        }
+        changed
+    }
+
+    /// The squared distances of each camera's bearings.
+    fn squares(&self, state: &State) -> Vec<Vec<f64>> {
+        let mut squares = vec![Vec::new(); self.scales.len()];
+        for sight in self.sights {
+            let target = self.curve.basis(self.time(sight, &state.clocks).0).at(&state.coefficients).0;
+            let seen = Seen::at(sight, target, self.scales[sight.camera]);
+            squares[sight.camera].push(seen.map_or(f64::INFINITY, |seen| seen.squared));
+        }
+        squares
     }
 
     /// The clocks as known before, and a way through the places that the track had.
@@ -160,7 +198,11 @@ impl<'a> Adjustment<'a> {
         let (state, Quadratic { cost, information, .. }) = self.descend(state, density, Loss::Trimmed)?;
         let factor = information.cholesky()?;
         let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
-        let evidence = -cost - log_determinant - self.curve.log_width(jerk(density));
+        let before = self.prior.precision.clone().cholesky()?;
+        let log_before: f64 = 2.0 * before.l_dirty().diagonal().map(f64::ln).sum();
+        let scales = self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
+        let width = self.curve.log_width(jerk(density));
+        let evidence = log_before - cost - log_determinant - width - scales;
         evidence.is_finite().then_some((state, evidence))
     }
 
@@ -206,7 +248,7 @@ impl<'a> Adjustment<'a> {
             let (time_s, place, since) = self.time(sight, &state.clocks);
             let basis = self.curve.basis(time_s);
             let (target, velocity) = basis.at(&state.coefficients);
-            let Some(seen) = Seen::at(sight, target, self.scale) else {
+            let Some(seen) = Seen::at(sight, target, self.scales[sight.camera]) else {
                 // Behind the camera: as far off as can be.
                 quadratic.cost += loss.of(1e6).0;
                 continue;
@@ -234,31 +276,6 @@ impl<'a> Adjustment<'a> {
         Quadratic { cost: away.dot(&gradient), gradient, information }
     }
 
-    /// How well the bearings fit: mean square over what was to be expected, and the share of each
-    /// camera's that do not.
-    fn misfit(&self, state: &State, density: i32) -> Option<(f64, Vec<f64>)> {
-        let cameras = self.prior.places.len();
-        let (mut all, mut strange) = (vec![0.0_f64; cameras], vec![0.0_f64; cameras]);
-        let (mut sum, mut fitting) = (0.0, 0.0);
-        for sight in self.sights {
-            let target = self.curve.basis(self.time(sight, &state.clocks).0).at(&state.coefficients).0;
-            let squared = Seen::at(sight, target, self.scale).map_or(f64::INFINITY, |seen| seen.squared);
-            all[sight.camera] += 1.0;
-            if squared > STRANGER {
-                strange[sight.camera] += 1.0;
-            } else {
-                sum += squared;
-                fitting += 2.0;
-            }
-        }
-        let quadratic = self.quadratic(state, density, Loss::Trimmed);
-        let before = self.prior_quadratic(state, density).information;
-        let free = before.nrows() as f64 - quadratic.information.cholesky()?.solve(&before).trace();
-        let shares = all.iter().zip(strange).map(|(all, strange)| strange / all.max(1.0)).collect();
-        let expected: f64 = fitting - free;
-        (expected > 0.0).then(|| (sum / expected, shares))
-    }
-
     /// Covariance of the clocks, and their squared distance from what was known before.
     fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
         let (points, clocks) = (state.coefficients.len(), state.clocks.len());
@@ -271,6 +288,10 @@ impl<'a> Adjustment<'a> {
         let possible = covariance.iter().all(|value| value.is_finite()) && pulled.is_finite();
         possible.then_some((covariance, pulled))
     }
+}
+
+fn share_of_strangers(squares: &[f64]) -> f64 {
+    squares.iter().filter(|squared| **squared > STRANGER).count() as f64 / squares.len().max(1) as f64
 }
 
 /// Density of the jerk, m^2/s^5.

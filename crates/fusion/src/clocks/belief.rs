@@ -77,9 +77,14 @@ impl Belief {
         self.cameras.get(camera)?.place
     }
 
+    /// The standard deviation that a camera has reported of its clock, s.
+    pub(super) fn reported_sd(&self, camera: &CameraName) -> Option<f64> {
+        Some(self.cameras.get(camera)?.prior.sqrt())
+    }
+
     /// Whether anything was left open by what a camera has reported of its clock.
     pub(super) fn is_uncertain(&self, camera: &CameraName) -> bool {
-        self.cameras.get(camera).is_some_and(|clock| clock.prior > 0.0)
+        self.reported_sd(camera).is_some_and(|sd| sd > 0.0)
     }
 
     /// The time that the state is of.

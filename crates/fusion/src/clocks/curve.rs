@@ -50,7 +50,8 @@ impl Curve {
         let (v, u2) = (1.0 - u, u * u);
         let u3 = u2 * u;
         let place = [v * v * v, 3.0 * u3 - 6.0 * u2 + 4.0, 3.0 * (u + u2 - u3) + 1.0, u3].map(|b| b / 6.0);
-        let velocity = [-v * v, 3.0 * u2 - 4.0 * u, 1.0 + 2.0 * u - 3.0 * u2, u2].map(|b| b / (2.0 * PIECE_S));
+        let velocity =
+            [-v * v, 3.0 * u2 - 4.0 * u, 1.0 + 2.0 * u - 3.0 * u2, u2].map(|b| b / (2.0 * PIECE_S));
         Basis { first, place, velocity }
     }
 
@@ -71,7 +72,11 @@ impl Curve {
     }
 
     /// The coefficients that pass nearest to places at times, all with this standard deviation, m.
-    pub(super) fn fit(&self, places: impl Iterator<Item = (f64, Vector3<f64>)>, sd_m: f64) -> Option<DVector<f64>> {
+    pub(super) fn fit(
+        &self,
+        places: impl Iterator<Item = (f64, Vector3<f64>)>,
+        sd_m: f64,
+    ) -> Option<DVector<f64>> {
         let n = 3 * self.points();
         let mut information = DMatrix::zeros(n, n);
         let mut pull = DVector::zeros(n);

@@ -10,15 +10,16 @@
 mod adjustment;
 mod belief;
 mod curve;
+mod lesson;
 mod window;
+
+use std::collections::BTreeSet;
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::DMatrix;
 
-use self::adjustment::{Adjusted, Adjustment, Prior};
 use self::belief::Belief;
-use self::curve::Curve;
+use self::lesson::{Lesson, lesson};
 use self::window::Window;
 use crate::config::Clocks;
 use crate::ingress::Exposure;
@@ -31,25 +32,14 @@ const MAX_WINDOWS: usize = 3;
 const LEAST_SPEED: f64 = 2.0;
 /// How long the bearings of a target are gathered before what they say is kept, s.
 const WINDOW_S: f64 = 8.0;
-/// Bearings of less than this say nothing that can be checked, s.
-const LEAST_WINDOW_S: f64 = 1.0;
 /// As long as a clock is worse known than this, s, ...
 const SURE_S: f64 = 0.002;
-/// ... what has been gathered so far is looked at so often, s.
+/// ... what has been gathered so far is looked at so often, s; ...
 const LOOK_EVERY_S: f64 = 1.0;
-/// Residuals larger than this (squared, over what was reported) are not the noise's but a mistake's.
-const MAX_MISFIT: f64 = 4.0;
-/// When more than this share of a camera's bearings do not fit, the camera does not.
-const MAX_STRANGERS: f64 = 0.3;
-/// Clocks farther than this from what was believed of them (squared, in standard deviations, for
-/// each degree of freedom) have jumped.
-const MAX_PULL: f64 = 12.0;
-/// So many windows one after the other that fit nothing say that what is believed of the clocks is wrong.
-const MAX_REFUSED: u32 = 3;
-/// A curve reaches beyond its bearings as far as the clocks may move, and no farther than this, s.
-const MAX_MARGIN_S: f64 = 1.0;
-/// Density of jerk that is tried first, m^2/s^5, as a power of ten.
-const FIRST_DENSITY: i32 = 0;
+/// ... and so often where all are known, for one may jump.
+const CHECK_EVERY_S: f64 = 4.0;
+/// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
+const MAX_REFUSED: u32 = 2;
 
 /// What is known of a camera's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,10 +66,14 @@ pub(crate) struct ClockEstimator {
     /// The same with what the open windows tell so far.
     provisional: Option<Belief>,
     windows: Vec<Window>,
+    /// Cameras whose clocks may have jumped, ...
+    suspects: BTreeSet<CameraName>,
+    /// ... and those of which the open windows tell all the same.
+    cleared: BTreeSet<CameraName>,
     now: Timestamp,
-    looked: Timestamp,
+    next_look: Timestamp,
     needed: bool,
-    /// Windows one after the other that fitted nothing.
+    /// Windows one after the other that fitted nothing that was learnt before.
     refused: u32,
 }
 
@@ -90,8 +84,10 @@ impl ClockEstimator {
             belief: Belief::default(),
             provisional: None,
             windows: Vec::new(),
+            suspects: BTreeSet::new(),
+            cleared: BTreeSet::new(),
             now: Timestamp::MIN,
-            looked: Timestamp::MIN,
+            next_look: Timestamp::MIN,
             needed: false,
             refused: 0,
         }
@@ -120,7 +116,12 @@ impl ClockEstimator {
 
     /// The estimate of a camera's clock.
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
-        self.newest().estimate(camera, self.now)
+        let estimate = self.newest().estimate(camera, self.now)?;
+        let suspected = self.suspects.contains(camera) && !self.cleared.contains(camera);
+        let reported = self.belief.reported_sd(camera).filter(|_| suspected);
+        let widened = |sd: f64| reported.map_or(sd, |reported| reported.max(sd));
+        let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
+        Some(ClockEstimate { sd_s, relative_sd_s, ..estimate })
     }
 
     /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
@@ -142,9 +143,10 @@ impl ClockEstimator {
             self.close(&window);
             closed += 1;
         }
-        if closed > 0 || self.now.seconds_since(self.looked) >= LOOK_EVERY_S {
-            self.looked = self.now;
+        if closed > 0 || self.now >= self.next_look {
             self.look();
+            let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
+            self.next_look = self.now.plus_seconds(pause);
         }
     }
 
@@ -161,129 +163,63 @@ impl ClockEstimator {
             })
         });
         if let Some(window) = index.and_then(|index| self.windows.get_mut(index)) {
-            let line = SightLine { covariance: line.covariance * exposure.uncertainty.factor, ..*line };
-            window.add(camera, time, line, track.position_at(exposure.time).coords);
+            window.add(camera, time, *line, track.position_at(exposure.time).coords);
         }
     }
 
-    /// A camera's bearings do not fit the others': its clock may have jumped. What was learnt of it
-    /// is forgotten, and with it the windows that it may have spoilt.
-    pub(crate) fn doubt(&mut self, camera: &CameraName) {
+    /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
+    /// as it was in the beginning, until a window tells.
+    pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
-            self.belief.doubt(camera);
-            self.provisional = None;
-            self.windows.clear();
+            self.suspects.insert(camera.clone());
+            self.cleared.remove(camera);
+            self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
+            // Up to now its bearings may be by the clock as it was.
+            self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
         }
     }
 
     /// Keeps what a window has told.
     fn close(&mut self, window: &Window) {
-        match learnt(&self.belief, window) {
-            Outcome::Learnt(belief) => {
+        match lesson(&self.belief, window) {
+            Lesson::Learnt(belief) => {
                 self.belief = *belief;
                 self.refused = 0;
+                for camera in window.checked_cameras() {
+                    self.suspects.remove(&camera);
+                }
             }
-            Outcome::Nothing => {}
-            Outcome::Refused => {
+            Lesson::Nothing => {}
+            Lesson::Anew(belief) => {
                 self.refused += 1;
                 if self.refused >= MAX_REFUSED {
                     self.refused = 0;
-                    self.belief.begin_anew();
+                    self.belief = *belief;
                 }
             }
         }
     }
 
-    /// Looks at what the open windows tell so far, as long as a clock in them is not well known.
-    fn look(&mut self) {
+    /// Whether the clock of a camera that sees one of the targets is not well known.
+    fn is_unsure(&self) -> bool {
         let unsure = |camera: &CameraName| {
-            self.belief.estimate(camera, self.now).is_some_and(|clock| clock.relative_sd_s > SURE_S)
+            let clock = self.belief.estimate(camera, self.now);
+            self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
         };
-        let worth: Vec<&Window> =
-            self.windows.iter().filter(|window| window.cameras.iter().any(unsure)).collect();
+        self.windows.iter().flat_map(|window| &window.cameras).any(unsure)
+    }
+
+    /// Looks at what the open windows tell so far.
+    fn look(&mut self) {
         let mut belief = None;
-        for window in worth {
-            if let Outcome::Learnt(next) = learnt(belief.as_ref().unwrap_or(&self.belief), window) {
+        let mut cleared = BTreeSet::new();
+        for window in &self.windows {
+            if let Lesson::Learnt(next) = lesson(belief.as_ref().unwrap_or(&self.belief), window) {
                 belief = Some(*next);
+                cleared.extend(window.checked_cameras());
             }
         }
         self.provisional = belief;
+        self.cleared = cleared;
     }
-}
-
-/// What a window says to a belief.
-enum Outcome {
-    Learnt(Box<Belief>),
-    /// It is too short, or sees no clock that could be learnt.
-    Nothing,
-    /// Its bearings fit no target of any clocks.
-    Refused,
-}
-
-/// A belief after a window. If the window does not fit it, the clock of a camera may have jumped, or
-/// a camera does not fit at all.
-fn learnt(belief: &Belief, window: &Window) -> Outcome {
-    let long = window.span().is_some_and(|(first, last)| last - first >= LEAST_WINDOW_S);
-    if !long || window.cameras.len() < 2 {
-        return Outcome::Nothing;
-    }
-    let mut before = belief.clone();
-    before.advance(window.start.plus_seconds(window.span().map_or(0.0, |(_, last)| last)));
-    let Some(components) = components(&before, window) else {
-        return Outcome::Nothing;
-    };
-    if let Some(adjusted) = adjust(&before, window, &components).filter(fits) {
-        before.learn(&components, &adjusted.clocks, &adjusted.covariance);
-        return Outcome::Learnt(Box::new(before));
-    }
-    for camera in window.cameras.iter().filter(|camera| before.is_uncertain(camera)) {
-        let mut doubting = before.clone();
-        doubting.doubt(camera);
-        if let Some(adjusted) = adjust(&doubting, window, &components).filter(fits) {
-            doubting.learn(&components, &adjusted.clocks, &adjusted.covariance);
-            return Outcome::Learnt(Box::new(doubting));
-        }
-    }
-    Outcome::Refused
-}
-
-fn fits(adjusted: &Adjusted) -> bool {
-    adjusted.misfit < MAX_MISFIT
-        && adjusted.strangers.iter().all(|share| *share < MAX_STRANGERS)
-        && adjusted.pulled < MAX_PULL * adjusted.clocks.len() as f64
-}
-
-/// The components of the belief that a window's cameras tell of; `None` if there are none.
-fn components(belief: &Belief, window: &Window) -> Option<Vec<usize>> {
-    let places = window.cameras.iter().filter_map(|camera| belief.place(camera));
-    let components: Vec<usize> = places.flat_map(|place| [place, place + 1]).collect();
-    (!components.is_empty()).then_some(components)
-}
-
-/// Fits a window with what is believed of the clocks.
-fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adjusted> {
-    let (mean, covariance) = belief.marginal(components);
-    let sd = |i: usize| covariance[(i, i)].max(0.0).sqrt();
-    let widest = (0..components.len()).step_by(2).map(sd).fold(0.0, f64::max);
-    let margin = (2.0 * widest).min(MAX_MARGIN_S);
-    let mut next = 0;
-    let places: Vec<Option<usize>> = window
-        .cameras
-        .iter()
-        .map(|camera| {
-            let place = belief.place(camera).map(|_| next);
-            next += 2 * usize::from(place.is_some());
-            place
-        })
-        .collect();
-    let offsets: Vec<f64> = places.iter().map(|place| place.map_or(0.0, |place| mean[place])).collect();
-    let times = || window.sights.iter().map(|sight| sight.time_s - offsets[sight.camera]);
-    let first = times().fold(f64::INFINITY, f64::min) - margin;
-    let last = times().fold(f64::NEG_INFINITY, f64::max) + margin;
-    let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
-    let epoch_s = belief.epoch()?.seconds_since(window.start);
-    let prior = Prior { mean, precision, epoch_s, places };
-    let reach = WINDOW_S + 4.0 * MAX_MARGIN_S;
-    let curve = Curve::over(first, last.min(first + reach));
-    Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)
 }

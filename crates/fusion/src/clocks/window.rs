@@ -9,6 +9,8 @@ use crate::track::TrackId;
 /// A window holds no more bearings than this: when it is full, every other one of each camera is let go,
 /// and from then on as many are not taken.
 const MAX_SIGHTS: usize = 1500;
+/// A camera says nothing of its clock that can be checked with fewer bearings than this.
+const LEAST_SIGHTS: usize = 5;
 /// Bearings this far from the window's beginning are not of it, s.
 const MAX_SPAN_S: f64 = 30.0;
 
@@ -19,7 +21,7 @@ pub(super) struct Sight {
     pub(super) time_s: f64,
     /// Which camera of the window took it.
     pub(super) camera: usize,
-    /// With the covariance that is believed.
+    /// With the covariance that was reported.
     pub(super) line: SightLine,
     /// Where the track had the target then.
     pub(super) place: Vector3<f64>,
@@ -56,7 +58,7 @@ impl Window {
         });
         let number = self.offered[index];
         self.offered[index] += 1;
-        if number % self.thinned == 0 {
+        if number.is_multiple_of(self.thinned) {
             self.sights.push(Sight { time_s, camera: index, line, place });
         }
         if self.sights.len() >= MAX_SIGHTS {
@@ -81,13 +83,38 @@ impl Window {
             .then(|| (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max)))
     }
 
-    /// The same without a camera's bearings.
-    pub(super) fn without(&self, camera: &CameraName) -> Self {
-        let mut rest = self.clone();
-        if let Some(index) = self.cameras.iter().position(|known| known == camera) {
-            rest.sights.retain(|sight| sight.camera != index);
+    /// Which cameras have given enough bearings for what they say to be checked.
+    fn checked_indices(&self) -> Vec<usize> {
+        let count = |index: usize| self.sights.iter().filter(|sight| sight.camera == index).count();
+        (0..self.cameras.len()).filter(|index| count(*index) >= LEAST_SIGHTS).collect()
+    }
+
+    /// Cameras that have given enough bearings for what they say to be checked.
+    pub(super) fn checked_cameras(&self) -> Vec<CameraName> {
+        self.checked_indices().into_iter().map(|index| self.cameras[index].clone()).collect()
+    }
+
+    /// The window without the bearings that a camera took before a time, s.
+    pub(super) fn without_early(&self, time_s: f64, camera: &CameraName) -> Self {
+        let mut later = self.clone();
+        let index = self.cameras.iter().position(|known| known == camera);
+        later.sights.retain(|sight| Some(sight.camera) != index || sight.time_s >= time_s);
+        later
+    }
+
+    /// The window without the cameras that have given it too few bearings.
+    pub(super) fn checked(&self) -> Self {
+        let kept = self.checked_indices();
+        let moved = |sight: &Sight| {
+            let camera = kept.iter().position(|index| *index == sight.camera)?;
+            Some(Sight { camera, ..sight.clone() })
+        };
+        Self {
+            cameras: self.checked_cameras(),
+            sights: self.sights.iter().filter_map(moved).collect(),
+            offered: kept.iter().map(|index| self.offered[*index]).collect(),
+            ..*self
         }
-        rest
     }
 }
 
@@ -105,7 +132,7 @@ mod tests {
         for k in 0..9000_u32 {
             let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
-            window.add(&camera, time, line.clone(), Vector3::zeros());
+            window.add(&camera, time, line, Vector3::zeros());
         }
         assert!((MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()), "{}", window.sights.len());
         let (first, last) = window.span().unwrap();
