@@ -188,7 +188,7 @@ impl Fusion {
     /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
     /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to come.
     fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
-        self.clocks.see(&exposure.camera, exposure.uncertainty.time_sd_s);
+        self.clocks.see(&exposure.camera, &exposure.uncertainty);
         let Some(clock) = self.clocks.estimate(&exposure.camera).filter(|_| self.clocks.is_needed()) else {
             return self.process(&exposure, outputs);
         };

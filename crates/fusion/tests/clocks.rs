@@ -186,7 +186,8 @@ fn table() {
     println!("{}", Tally::HEADS);
     for (name, scene, clocks) in [5.0, 10.0, 30.0].into_iter().flat_map(cases) {
         if name.starts_with(&only) {
-            let mut tally = Tally::default();
+            let turned = std::env::var("TURNED").ok().and_then(|sd| sd.parse().ok()).unwrap_or(0.0);
+            let mut tally = Tally::of_wrong_poses(turned, 50.0 * turned);
             (0..runs).for_each(|seed| tally.fly(&scene, &clocks(seed), seed));
             println!("{}", tally.line(&name));
         }

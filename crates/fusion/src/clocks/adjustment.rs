@@ -1,4 +1,5 @@
-//! The adjustment of a window: the target's way and the clocks that fit its bearings best together.
+//! The adjustment of a window: the target's way, the clocks and the poses that fit its bearings best
+//! together.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
@@ -45,23 +46,41 @@ impl Loss {
     }
 }
 
-/// The clocks as they are known before: the first two components belong to the first clock that a
-/// camera of the window has a place for, offset before drift.
+/// Where what is unknown of a camera is among the components of the prior.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Unknowns {
+    /// Its clock's offset, with the drift the next; `None` for the reference.
+    pub(super) clock: Option<usize>,
+    /// What its pose is off by: three of rotation, three of position; `None` where it is exact.
+    pub(super) pose: Option<usize>,
+}
+
+/// The cameras' clocks and poses as they are known before.
 #[derive(Clone, Debug)]
 pub(super) struct Prior {
     pub(super) mean: DVector<f64>,
     pub(super) precision: DMatrix<f64>,
     /// The time their offsets are of, s after the window's beginning.
     pub(super) epoch_s: f64,
-    /// Where each camera's offset is among the components; `None` for the reference.
-    pub(super) places: Vec<Option<usize>>,
+    pub(super) cameras: Vec<Unknowns>,
 }
 
-/// A target's way and the clocks.
+/// A target's way, and clocks and poses of the cameras.
 #[derive(Clone, Debug)]
 struct State {
     coefficients: DVector<f64>,
-    clocks: DVector<f64>,
+    cameras: DVector<f64>,
+}
+
+/// A bearing's target at a state, as if the pose were right: where it lies, and by what vector each
+/// component of the cameras moves it.
+#[derive(Clone, Debug)]
+struct Target {
+    basis: Basis,
+    place: Vector3<f64>,
+    shifts: [(usize, Vector3<f64>); 8],
+    /// How many of them there are.
+    count: usize,
 }
 
 /// Minus twice the logarithm of the posterior density at a state, but for a constant, with half its
@@ -76,13 +95,13 @@ struct Quadratic {
 /// What an adjustment has found.
 #[derive(Clone, Debug)]
 pub(super) struct Adjusted {
-    pub(super) clocks: DVector<f64>,
+    pub(super) cameras: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
     /// How often each camera's reported covariances count: 1 where it is honest.
     pub(super) scales: Vec<f64>,
     /// Share of each camera's bearings that do not fit.
     pub(super) strangers: Vec<f64>,
-    /// Squared distance of the clocks from what was known of them before.
+    /// Squared distance of clocks and poses from what was known of them before.
     pub(super) pulled: f64,
     /// Twice the logarithm of the probability of these bearings by what was known before, but for
     /// what is the same for any knowledge.
@@ -101,10 +120,10 @@ pub(super) struct Adjustment<'a> {
 
 impl<'a> Adjustment<'a> {
     pub(super) fn new(sights: &'a [Sight], curve: Curve, prior: &'a Prior) -> Self {
-        Self { sights, curve, prior, scales: vec![1.0; prior.places.len()] }
+        Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
     }
 
-    /// Fits way and clocks. `None` if the numbers fail.
+    /// Fits way, clocks and poses. `None` if the numbers fail.
     pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
@@ -114,7 +133,14 @@ impl<'a> Adjustment<'a> {
         }
         let strangers = self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
-        Some(Adjusted { clocks: state.clocks, covariance, scales: self.scales, strangers, pulled, evidence })
+        Some(Adjusted {
+            cameras: state.cameras,
+            covariance,
+            scales: self.scales,
+            strangers,
+            pulled,
+            evidence,
+        })
     }
 
     /// Sets how often each camera's covariances count, by its residuals: after the first descent,
@@ -147,27 +173,56 @@ impl<'a> Adjustment<'a> {
     fn squares(&self, state: &State) -> Vec<Vec<f64>> {
         let mut squares = vec![Vec::new(); self.scales.len()];
         for sight in self.sights {
-            let target = self.curve.basis(self.time(sight, &state.clocks).0).at(&state.coefficients).0;
-            let seen = Seen::at(sight, target, self.scales[sight.camera]);
+            let seen = Seen::at(sight, self.target(sight, state).place, self.scales[sight.camera]);
             squares[sight.camera].push(seen.map_or(f64::INFINITY, |seen| seen.squared));
         }
         squares
     }
 
-    /// The clocks as known before, and a way through the places that the track had.
+    /// Clocks and poses as known before, and a way through the places that the track had.
     fn begin(&self) -> Option<State> {
-        let clocks = self.prior.mean.clone();
-        let places = self.sights.iter().map(|sight| (self.time(sight, &clocks).0, sight.place));
-        Some(State { coefficients: self.curve.fit(places, 1.0)?, clocks })
+        let cameras = self.prior.mean.clone();
+        let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
+        Some(State { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 
-    /// When a bearing was taken by the reference's clock, s, where its camera's offset is among the
-    /// clocks' components, and how long after their epoch it was taken.
-    fn time(&self, sight: &Sight, clocks: &DVector<f64>) -> (f64, Option<usize>, f64) {
+    /// When a bearing was taken by the reference's clock, s, and how long after the epoch.
+    fn time(&self, sight: &Sight, cameras: &DVector<f64>) -> (f64, f64) {
         let since = sight.time_s - self.prior.epoch_s;
-        let place = self.prior.places.get(sight.camera).copied().flatten();
-        let offset = place.map_or(0.0, |place| clocks[place] + clocks[place + 1] * since);
-        (sight.time_s - offset, place, since)
+        let clock = self.prior.cameras[sight.camera].clock;
+        let offset = clock.map_or(0.0, |place| cameras[place] + cameras[place + 1] * since);
+        (sight.time_s - offset, since)
+    }
+
+    /// The target of a bearing. A clock ahead by o shows it where it was o ago: its offset moves the
+    /// place by minus the velocity, its drift by that times the time since the epoch. A camera turned
+    /// by d and moved by c sees it at p + d x (p - origin) + c.
+    fn target(&self, sight: &Sight, state: &State) -> Target {
+        let (time_s, since) = self.time(sight, &state.cameras);
+        let basis = self.curve.basis(time_s);
+        let (mut place, velocity) = basis.at(&state.coefficients);
+        let Unknowns { clock, pose } = self.prior.cameras[sight.camera];
+        let mut shifts = [(0, Vector3::zeros()); 8];
+        let mut count = 0;
+        let mut add = |component: usize, shift: Vector3<f64>| {
+            shifts[count] = (component, shift);
+            count += 1;
+        };
+        if let Some(first) = clock {
+            add(first, -velocity);
+            add(first + 1, -velocity * since);
+        }
+        if let Some(first) = pose {
+            let away = place - sight.line.origin.coords;
+            for axis in 0..3 {
+                let unit = Vector3::ith(axis, 1.0);
+                let turned = unit.cross(&away);
+                add(first + axis, turned);
+                add(first + 3 + axis, unit);
+                place += turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
+            }
+        }
+        Target { basis, place, shifts, count }
     }
 
     /// The density of jerk of the greatest evidence, with the state that belongs to it.
@@ -238,17 +293,15 @@ impl<'a> Adjustment<'a> {
         let points = state.coefficients.len();
         State {
             coefficients: &state.coefficients - step.rows(0, points),
-            clocks: &state.clocks - step.rows(points, state.clocks.len()),
+            cameras: &state.cameras - step.rows(points, state.cameras.len()),
         }
     }
 
     fn quadratic(&self, state: &State, density: i32, loss: Loss) -> Quadratic {
         let mut quadratic = self.prior_quadratic(state, density);
         for sight in self.sights {
-            let (time_s, place, since) = self.time(sight, &state.clocks);
-            let basis = self.curve.basis(time_s);
-            let (target, velocity) = basis.at(&state.coefficients);
-            let Some(seen) = Seen::at(sight, target, self.scales[sight.camera]) else {
+            let target = self.target(sight, state);
+            let Some(seen) = Seen::at(sight, target.place, self.scales[sight.camera]) else {
                 // Behind the camera: as far off as can be.
                 quadratic.cost += loss.of(1e6).0;
                 continue;
@@ -256,8 +309,7 @@ impl<'a> Adjustment<'a> {
             let (cost, weight) = loss.of(seen.squared);
             quadratic.cost += cost;
             if weight > 0.0 {
-                let place = place.map(|place| (state.coefficients.len() + place, since));
-                quadratic.add(&basis, place, velocity, &seen, weight);
+                quadratic.add(&target, state.coefficients.len(), &seen, weight);
             }
         }
         quadratic
@@ -265,25 +317,25 @@ impl<'a> Adjustment<'a> {
 
     /// What is known beforehand.
     fn prior_quadratic(&self, state: &State, density: i32) -> Quadratic {
-        let (points, clocks) = (state.coefficients.len(), state.clocks.len());
-        let mut information = DMatrix::zeros(points + clocks, points + clocks);
+        let (points, cameras) = (state.coefficients.len(), state.cameras.len());
+        let mut information = DMatrix::zeros(points + cameras, points + cameras);
         self.curve.add_prior(&mut information, jerk(density));
-        information.view_mut((points, points), (clocks, clocks)).copy_from(&self.prior.precision);
-        let mut away = DVector::zeros(points + clocks);
+        information.view_mut((points, points), (cameras, cameras)).copy_from(&self.prior.precision);
+        let mut away = DVector::zeros(points + cameras);
         away.rows_mut(0, points).copy_from(&state.coefficients);
-        away.rows_mut(points, clocks).copy_from(&(&state.clocks - &self.prior.mean));
+        away.rows_mut(points, cameras).copy_from(&(&state.cameras - &self.prior.mean));
         let gradient = &information * &away;
         Quadratic { cost: away.dot(&gradient), gradient, information }
     }
 
-    /// Covariance of the clocks, and their squared distance from what was known before.
+    /// Covariance of clocks and poses, and their squared distance from what was known before.
     fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
-        let (points, clocks) = (state.coefficients.len(), state.clocks.len());
+        let (points, cameras) = (state.coefficients.len(), state.cameras.len());
         let information = self.quadratic(state, density, Loss::Trimmed).information;
-        let mut unit = DMatrix::zeros(points + clocks, clocks);
-        unit.view_mut((points, 0), (clocks, clocks)).fill_with_identity();
-        let covariance = information.cholesky()?.solve(&unit).rows(points, clocks).into_owned();
-        let away = &state.clocks - &self.prior.mean;
+        let mut unit = DMatrix::zeros(points + cameras, cameras);
+        unit.view_mut((points, 0), (cameras, cameras)).fill_with_identity();
+        let covariance = information.cholesky()?.solve(&unit).rows(points, cameras).into_owned();
+        let away = &state.cameras - &self.prior.mean;
         let pulled = away.dot(&(&self.prior.precision * &away));
         let possible = covariance.iter().all(|value| value.is_finite()) && pulled.is_finite();
         possible.then_some((covariance, pulled))
@@ -327,45 +379,32 @@ impl Seen {
 }
 
 impl Quadratic {
-    /// Adds a bearing. A clock ahead by o shows the target where it was o ago: its offset moves the
-    /// place by minus the velocity, its drift by that times the time since the epoch.
-    fn add(
-        &mut self,
-        basis: &Basis,
-        clock: Option<(usize, f64)>,
-        velocity: Vector3<f64>,
-        seen: &Seen,
-        weight: f64,
-    ) {
+    /// Adds a bearing; the cameras' components come after so many of the way's.
+    fn add(&mut self, target: &Target, points: usize, seen: &Seen, weight: f64) {
         let (pull, information) = (seen.pull * weight, seen.information * weight);
-        let shift = clock.map(|(place, since)| {
-            let moved = -(information * velocity);
-            [(place, moved), (place + 1, moved * since)]
-        });
-        for (i, a) in basis.place.iter().enumerate() {
-            let row = 3 * (basis.first + i);
+        let shifts = &target.shifts[..target.count];
+        let Basis { first, place, .. } = target.basis;
+        for (i, a) in place.iter().enumerate() {
+            let row = 3 * (first + i);
             let mut part = self.gradient.fixed_rows_mut::<3>(row);
             part += pull * *a;
-            for (k, b) in basis.place.iter().enumerate() {
-                let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (basis.first + k));
+            for (k, b) in place.iter().enumerate() {
+                let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (first + k));
                 block += information * (a * b);
             }
-            for (place, moved) in shift.iter().flatten() {
-                let mut below = self.information.fixed_view_mut::<1, 3>(*place, row);
-                below += moved.transpose() * *a;
-                let mut beside = self.information.fixed_view_mut::<3, 1>(row, *place);
-                beside += moved * *a;
+            for (component, shift) in shifts {
+                let tied = information * shift * *a;
+                let mut beside = self.information.fixed_view_mut::<3, 1>(row, points + component);
+                beside += tied;
+                let mut below = self.information.fixed_view_mut::<1, 3>(points + component, row);
+                below += tied.transpose();
             }
         }
-        let (Some((place, since)), Some([(_, moved), _])) = (clock, shift) else {
-            return;
-        };
-        let told = -moved.dot(&velocity);
-        let pulled = -velocity.dot(&pull);
-        for (i, a) in [(0, 1.0), (1, since)] {
-            self.gradient[place + i] += pulled * a;
-            for (k, b) in [(0, 1.0), (1, since)] {
-                self.information[(place + i, place + k)] += told * a * b;
+        for (one, shift) in shifts {
+            self.gradient[points + one] += shift.dot(&pull);
+            let told = information * shift;
+            for (other, shift) in shifts {
+                self.information[(points + one, points + other)] += told.dot(shift);
             }
         }
     }

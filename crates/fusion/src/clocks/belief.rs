@@ -1,9 +1,10 @@
-//! What is believed of the clocks: offset and drift of each against one of them, the reference.
+//! What is believed of the clocks, offset and drift of each against one of them, the reference; and,
+//! as a camera that is turned sees a moving target early or late, of the cameras' poses.
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
 
@@ -13,6 +14,8 @@ const DRIFT_WALK: f64 = 1e-16;
 /// No two clocks are the same to better than this, s and s/s: their covariance stays regular.
 const OFFSET_FLOOR_S: f64 = 1e-6;
 const DRIFT_FLOOR: f64 = 1e-9;
+/// Nor any pose, rad and m.
+const POSE_FLOOR: f64 = 1e-6;
 /// Offsets beyond this are no offsets any more, s.
 const MAX_OFFSET_S: f64 = 2.0;
 
@@ -22,13 +25,16 @@ struct Clock {
     /// The place of its offset against the reference; its drift is the next. The reference, the
     /// first camera heard, has no place.
     place: Option<usize>,
+    /// The place of its camera's pose in the state, where that is uncertain.
+    pose: Option<usize>,
     /// Variance of its offset against true time before anything is seen, s^2.
     prior: f64,
     /// The same of its drift.
     drift_prior: f64,
 }
 
-/// Offsets and drifts of all clocks against the first as one normal distribution, as of an epoch.
+/// Offsets and drifts of all clocks against the first, and what the poses are off by (world's axes:
+/// rotation, rad, then position, m), as one normal distribution, as of an epoch.
 ///
 /// What all clocks have in common is left out: no bearing tells it, and a linearised estimate would
 /// yet learn something of it that is not true. It follows from the reported deviations alone.
@@ -38,6 +44,8 @@ pub(super) struct Belief {
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     epoch: Option<Timestamp>,
+    /// The poses' covariances as they were reported.
+    poses: BTreeMap<CameraName, Matrix6<f64>>,
 }
 
 impl Belief {
@@ -45,27 +53,50 @@ impl Belief {
         self.cameras.contains_key(camera)
     }
 
-    /// Makes a clock known by the standard deviations of its offset (s) and drift (s/s).
-    pub(super) fn add(&mut self, camera: &CameraName, offset_sd: f64, drift_sd: f64) {
+    /// Makes a camera known: standard deviations of its clock's offset (s) and drift (s/s), and the
+    /// covariance of its pose.
+    pub(super) fn add(
+        &mut self,
+        camera: &CameraName,
+        [offset_sd, drift_sd]: [f64; 2],
+        pose: Option<Matrix6<f64>>,
+    ) {
         let (prior, drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let reference = self.reference();
-        let place = reference.map(|_| self.mean.len());
-        self.cameras.insert(camera.clone(), Clock { place, prior, drift_prior });
-        let (Some(reference), Some(place)) = (reference, place) else {
-            return;
-        };
-        let grown = place + 2;
-        self.mean.resize_vertically_mut(grown, 0.0);
-        self.covariance.resize_mut(grown, grown, 0.0);
-        // The reference's own error is in every offset against it.
-        for k in (0..grown).step_by(2) {
-            for (i, common) in [(0, reference.prior), (1, reference.drift_prior)] {
-                self.covariance[(place + i, k + i)] = common;
-                self.covariance[(k + i, place + i)] = common;
+        let others: Vec<usize> = self.clock_places().collect();
+        let place = reference.map(|_| self.grow(2));
+        if let (Some(reference), Some(place)) = (reference, place) {
+            let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
+            for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
+                // The reference's own error is in every offset against it.
+                for &other in &others {
+                    self.covariance[(place + i, other + i)] = common;
+                    self.covariance[(other + i, place + i)] = common;
+                }
+                self.covariance[(place + i, place + i)] = common + own[i];
             }
         }
-        self.covariance[(place, place)] += prior + OFFSET_FLOOR_S.powi(2);
-        self.covariance[(place + 1, place + 1)] += drift_prior + DRIFT_FLOOR.powi(2);
+        let pose_place = pose.map(|covariance| {
+            let first = self.grow(6);
+            let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
+            self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
+            self.poses.insert(camera.clone(), covariance);
+            first
+        });
+        self.cameras.insert(camera.clone(), Clock { place, pose: pose_place, prior, drift_prior });
+    }
+
+    /// Makes room for so many components; returns the first.
+    fn grow(&mut self, by: usize) -> usize {
+        let before = self.mean.len();
+        self.mean.resize_vertically_mut(before + by, 0.0);
+        self.covariance.resize_mut(before + by, before + by, 0.0);
+        before
+    }
+
+    /// The places of all offsets.
+    fn clock_places(&self) -> impl Iterator<Item = usize> + '_ {
+        self.cameras.values().filter_map(|clock| clock.place)
     }
 
     fn reference(&self) -> Option<Clock> {
@@ -75,6 +106,11 @@ impl Belief {
     /// The place of a clock's offset in the state; its drift is the next. `None` for the reference.
     pub(super) fn place(&self, camera: &CameraName) -> Option<usize> {
         self.cameras.get(camera)?.place
+    }
+
+    /// The place of a camera's pose in the state, of six components; `None` where it is exact.
+    pub(super) fn pose(&self, camera: &CameraName) -> Option<usize> {
+        self.cameras.get(camera)?.pose
     }
 
     /// The standard deviation that a camera has reported of its clock, s.
@@ -101,12 +137,13 @@ impl Belief {
         self.epoch = Some(time);
         let n = self.mean.len();
         let mut transition = DMatrix::<f64>::identity(n, n);
-        for k in (0..n).step_by(2) {
+        let clocks: Vec<usize> = self.clock_places().collect();
+        for &k in &clocks {
             transition[(k, k + 1)] = dt;
         }
         self.mean = &transition * &self.mean;
         self.covariance = &transition * &self.covariance * transition.transpose();
-        for k in (0..n).step_by(2) {
+        for k in clocks {
             self.covariance[(k, k)] += OFFSET_WALK * dt;
             self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
         }
@@ -144,12 +181,12 @@ impl Belief {
         let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference()) else {
             return;
         };
-        let n = self.mean.len();
         let Some(place) = clock.place else {
             // Another reference: all the others are as far from it as it may be from true time.
-            for (i, variance) in [(0, clock.prior), (1, clock.drift_prior)] {
-                for (k, l) in (i..n).step_by(2).flat_map(|k| (i..n).step_by(2).map(move |l| (k, l))) {
-                    self.covariance[(k, l)] += variance;
+            let others: Vec<usize> = self.clock_places().collect();
+            for (i, variance) in [clock.prior, clock.drift_prior].into_iter().enumerate() {
+                for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
+                    self.covariance[(k + i, l + i)] += variance;
                 }
             }
             return;
@@ -175,7 +212,8 @@ impl Belief {
         // In the order in which they were heard: the reference first.
         cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
         for (camera, clock) in cameras {
-            anew.add(camera, clock.prior.sqrt(), clock.drift_prior.sqrt());
+            let pose = self.poses.get(camera).copied();
+            anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], pose);
         }
         *self = anew;
     }
@@ -211,18 +249,23 @@ impl Belief {
     fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
         let prior = [|clock: &Clock| clock.prior, |clock: &Clock| clock.drift_prior][component];
         let (weights, common) = self.weights(prior);
-        let mut row = DVector::<f64>::zeros(self.mean.len());
+        let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let mut put = |clock: &Clock, weight: f64| {
-            if let Some(place) = clock.place {
-                row[place + component] += weight;
+            if let Some(place) = clock.place.filter(|_| weight != 0.0) {
+                *row.entry(place + component).or_default() += weight;
                 if component == 0 {
-                    row[place + 1] += weight * ahead;
+                    *row.entry(place + 1).or_default() += weight * ahead;
                 }
             }
         };
         put(clock, 1.0);
         weights.iter().for_each(|(other, weight)| put(other, -weight));
-        (row.dot(&self.mean), row.dot(&(&self.covariance * &row)).max(0.0), common)
+        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum();
+        let along = |(&i, a): (&usize, &f64)| -> f64 {
+            a * row.iter().map(|(&k, b)| b * self.covariance[(i, k)]).sum::<f64>()
+        };
+        let variance: f64 = row.iter().map(along).sum();
+        (mean, variance.max(0.0), common)
     }
 
     /// The estimate of a camera's clock as of a time.

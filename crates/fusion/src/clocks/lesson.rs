@@ -3,7 +3,7 @@
 use crossfix_message::CameraName;
 use nalgebra::DMatrix;
 
-use super::adjustment::{Adjusted, Adjustment, Prior};
+use super::adjustment::{Adjusted, Adjustment, Prior, Unknowns};
 use super::belief::Belief;
 use super::curve::Curve;
 use super::window::Window;
@@ -59,11 +59,11 @@ pub(super) fn lesson(belief: &Belief, window: &Window) -> Lesson {
     };
     let mut belief = belief.clone();
     belief.advance(window.start.plus_seconds(last));
-    let places = window.cameras.iter().filter_map(|camera| belief.place(camera));
-    let components: Vec<usize> = places.flat_map(|place| [place, place + 1]).collect();
-    if components.is_empty() || window.cameras.len() < 2 {
+    let clocks = window.cameras.iter().filter(|camera| belief.place(camera).is_some()).count();
+    if clocks == 0 || window.cameras.len() < 2 {
         return Lesson::Nothing;
     }
+    let components = window.cameras.iter().flat_map(|camera| of_camera(&belief, camera)).collect();
     Pupil { belief, components, window: &window }.learn()
 }
 
@@ -101,7 +101,7 @@ impl Pupil<'_> {
     }
 
     fn learnt(&self, mut belief: Belief, adjusted: &Adjusted) -> Belief {
-        belief.learn(&self.components, &adjusted.clocks, &adjusted.covariance);
+        belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
         belief
     }
 
@@ -140,6 +140,13 @@ impl Pupil<'_> {
     }
 }
 
+/// The components of the state that are a camera's: its clock's, then its pose's.
+fn of_camera(belief: &Belief, camera: &CameraName) -> impl Iterator<Item = usize> + use<> {
+    let clock = belief.place(camera).map(|place| place..place + 2);
+    let pose = belief.pose(camera).map(|place| place..place + 6);
+    clock.into_iter().chain(pose).flatten()
+}
+
 fn fits(adjusted: &Adjusted) -> bool {
     adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
         && adjusted.strangers.iter().all(|share| *share < MAX_STRANGERS)
@@ -147,32 +154,34 @@ fn fits(adjusted: &Adjusted) -> bool {
 
 fn is_suspicious(adjusted: &Adjusted) -> bool {
     adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
-        || adjusted.pulled > SUSPICIOUS_PULL * adjusted.clocks.len() as f64
+        || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
-/// Fits a window with what is believed of the clocks.
+/// Fits a window with what is believed of clocks and poses.
 fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adjusted> {
     let (mean, covariance) = belief.marginal(components);
-    let sd = |i: usize| covariance[(i, i)].max(0.0).sqrt();
-    let widest = (0..components.len()).step_by(2).map(sd).fold(0.0, f64::max);
-    let margin = (2.0 * widest).min(MAX_MARGIN_S);
     let mut next = 0;
-    let places: Vec<Option<usize>> = window
-        .cameras
-        .iter()
-        .map(|camera| {
-            let place = belief.place(camera).map(|_| next);
-            next += 2 * usize::from(place.is_some());
-            place
-        })
-        .collect();
-    let offsets: Vec<f64> = places.iter().map(|place| place.map_or(0.0, |place| mean[place])).collect();
+    let mut room = |place: Option<usize>, size: usize| {
+        let first = place.map(|_| next);
+        next += first.map_or(0, |_| size);
+        first
+    };
+    let unknowns = |camera: &CameraName| Unknowns {
+        clock: room(belief.place(camera), 2),
+        pose: room(belief.pose(camera), 6),
+    };
+    let cameras: Vec<Unknowns> = window.cameras.iter().map(unknowns).collect();
+    let sd = |place: usize| covariance[(place, place)].max(0.0).sqrt();
+    let widest = cameras.iter().filter_map(|unknowns| unknowns.clock).map(sd).fold(0.0, f64::max);
+    let margin = (2.0 * widest).min(MAX_MARGIN_S);
+    let offset = |unknowns: &Unknowns| unknowns.clock.map_or(0.0, |place| mean[place]);
+    let offsets: Vec<f64> = cameras.iter().map(offset).collect();
     let times = || window.sights.iter().map(|sight| sight.time_s - offsets[sight.camera]);
     let first = times().fold(f64::INFINITY, f64::min) - margin;
     let last = times().fold(f64::NEG_INFINITY, f64::max) + margin;
     let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
     let epoch_s = belief.epoch()?.seconds_since(window.start);
-    let prior = Prior { mean, precision, epoch_s, places };
+    let prior = Prior { mean, precision, epoch_s, cameras };
     let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
     let curve = Curve::over(first, last.min(first + reach));
     Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)

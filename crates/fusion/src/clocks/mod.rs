@@ -25,6 +25,7 @@ use crate::config::Clocks;
 use crate::ingress::Exposure;
 use crate::track::{Track, TrackId};
 use crate::tracker::Tracker;
+use crate::uncertainty::CameraUncertainty;
 
 /// Targets looked at at a time.
 const MAX_WINDOWS: usize = 3;
@@ -98,15 +99,16 @@ impl ClockEstimator {
         self.needed
     }
 
-    /// Makes a camera's clock known by the deviation it reports; later reports change nothing.
-    pub(crate) fn see(&mut self, camera: &CameraName, reported_sd_s: f64) {
+    /// Makes a camera's clock and pose known by the deviations it reports; later reports change nothing.
+    pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
+        let reported_sd_s = reported.time_sd_s;
         if !self.config.estimate || self.belief.knows(camera) {
             return;
         }
         let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
         self.needed |= uncertain;
-        let (sd, drift_sd) = if uncertain { (reported_sd_s, self.config.drift_sd) } else { (0.0, 0.0) };
-        self.belief.add(camera, sd, drift_sd);
+        let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
+        self.belief.add(camera, deviations, reported.pose);
         self.provisional = None;
     }
 

@@ -3,9 +3,12 @@
 use std::time::Instant;
 
 use crossfix_fusion::{ClockEstimate, Fusion, FusionConfig};
-use crossfix_message::BearingFrame;
+use crossfix_geometry::{Camera, Pose};
+use crossfix_message::{BearingFrame, CameraCalibration, Timestamp};
+use nalgebra::{Rotation3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 use crate::common::{Scene, found, fusion_of};
 
@@ -81,6 +84,9 @@ pub struct Tally {
     pub excluded: u64,
     /// Latest time at which a clock was not settled, s, of each flight.
     pub settled: Vec<f64>,
+    /// Standard deviations of the cameras' poses, rad and m an axis: calibrations are off by these,
+    /// and say so.
+    pub pose_sd: (f64, f64),
     frames: u32,
     seconds: f64,
     slowest: f64,
@@ -92,6 +98,11 @@ fn root_mean(squares: impl Iterator<Item = f64>) -> f64 {
 }
 
 impl Tally {
+    /// A series of flights before cameras whose poses are off.
+    pub fn of_wrong_poses(rotation_sd: f64, position_sd: f64) -> Self {
+        Self { pose_sd: (rotation_sd, position_sd), ..Self::default() }
+    }
+
     /// Root mean square of the errors, s.
     pub fn rms(&self) -> f64 {
         root_mean(self.errors.iter().map(|(error, _)| error.powi(2)))
@@ -115,6 +126,7 @@ impl Tally {
     /// One flight before a fusion centre of the defaults.
     pub fn fly(&mut self, scene: &Scene, clocks: &[Clock], seed: u64) {
         let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        self.knock(&mut fusion, scene, seed);
         let frames = scene.frames(seed);
         let truths: Vec<f64> = frames.iter().map(|frame| frame.capture_time_ns as f64 / 1e9).collect();
         let mut settled: f64 = 0.0;
@@ -148,6 +160,25 @@ impl Tally {
         let errors: Vec<(f64, f64)> = clocks.iter().map(error).collect();
         self.lost += usize::from(errors.iter().any(|(error, _)| error.abs() > LOST_S));
         self.errors.extend(errors);
+    }
+
+    /// Calibrates the cameras anew, with poses that are wrong.
+    fn knock(&self, fusion: &mut Fusion, scene: &Scene, seed: u64) {
+        let (rotation_sd, position_sd) = self.pose_sd;
+        if rotation_sd <= 0.0 {
+            return;
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(20_000 + seed);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        for eye in &scene.eyes {
+            let pose = eye.camera.pose();
+            let turn = Rotation3::new(Vector3::from_fn(|_, _| rotation_sd * normal()));
+            let step = Vector3::from_fn(|_, _| position_sd * normal());
+            let wrong = Pose::new(*(pose.rotation() * turn).matrix(), pose.position() + step).unwrap();
+            let camera = Camera::new(*eye.camera.model().intrinsics(), wrong).unwrap();
+            let message = CameraCalibration::new(&eye.name, &camera, Timestamp::EPOCH);
+            fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();
+        }
     }
 
     fn look(&mut self, fusion: &Fusion, scene: &Scene, time: f64) {
