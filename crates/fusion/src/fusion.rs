@@ -89,6 +89,9 @@ impl Fusion {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
         let known = KnownCamera { camera: calibration.camera, pose_covariance: calibration.pose_covariance };
+        if self.cameras.get(&calibration.name).is_some_and(|before| before.is_elsewhere(&known)) {
+            self.clocks.calibrate(&calibration.name, known.pose_covariance);
+        }
         self.cameras.insert(calibration.name, known);
         Ok(())
     }

@@ -76,14 +76,28 @@ impl Belief {
                 self.covariance[(place + i, place + i)] = common + own[i];
             }
         }
-        let pose_place = pose.map(|covariance| {
-            let first = self.grow(6);
+        self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior });
+        self.calibrate(camera, pose);
+    }
+
+    /// A camera has another pose, of this covariance: what was learnt of the one before is forgotten.
+    pub(super) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
+        let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
+            return;
+        };
+        let place = pose.map(|covariance| {
+            let first = before.unwrap_or_else(|| self.grow(6));
+            self.mean.fixed_rows_mut::<6>(first).fill(0.0);
+            self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
+            self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
             let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
             self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
             self.poses.insert(camera.clone(), covariance);
             first
         });
-        self.cameras.insert(camera.clone(), Clock { place, pose: pose_place, prior, drift_prior });
+        if let Some(known) = self.cameras.get_mut(camera) {
+            known.pose = place;
+        }
     }
 
     /// Makes room for so many components; returns the first.
@@ -212,7 +226,7 @@ impl Belief {
         // In the order in which they were heard: the reference first.
         cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
         for (camera, clock) in cameras {
-            let pose = self.poses.get(camera).copied();
+            let pose = self.poses.get(camera).filter(|_| clock.pose.is_some()).copied();
             anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], pose);
         }
         *self = anew;

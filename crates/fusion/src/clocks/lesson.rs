@@ -63,7 +63,7 @@ pub(super) fn lesson(belief: &Belief, window: &Window) -> Lesson {
     if clocks == 0 || window.cameras.len() < 2 {
         return Lesson::Nothing;
     }
-    let components = window.cameras.iter().flat_map(|camera| of_camera(&belief, camera)).collect();
+    let components = components(&belief, &window);
     Pupil { belief, components, window: &window }.learn()
 }
 
@@ -94,6 +94,7 @@ impl Pupil<'_> {
             return Lesson::Learnt(Box::new(self.learnt(belief, &adjusted)));
         }
         self.belief.begin_anew();
+        self.components = components(&self.belief, self.window);
         let anew = adjust(&self.belief, self.window, &self.components).filter(fits);
         anew.map_or(Lesson::Nothing, |adjusted| {
             Lesson::Anew(Box::new(self.learnt(self.belief.clone(), &adjusted)))
@@ -140,11 +141,14 @@ impl Pupil<'_> {
     }
 }
 
-/// The components of the state that are a camera's: its clock's, then its pose's.
-fn of_camera(belief: &Belief, camera: &CameraName) -> impl Iterator<Item = usize> + use<> {
-    let clock = belief.place(camera).map(|place| place..place + 2);
-    let pose = belief.pose(camera).map(|place| place..place + 6);
-    clock.into_iter().chain(pose).flatten()
+/// The components of the state that are a window's cameras': of each its clock's, then its pose's.
+fn components(belief: &Belief, window: &Window) -> Vec<usize> {
+    let of_camera = |camera: &CameraName| {
+        let clock = belief.place(camera).map(|place| place..place + 2);
+        let pose = belief.pose(camera).map(|place| place..place + 6);
+        clock.into_iter().chain(pose).flatten()
+    };
+    window.cameras.iter().flat_map(of_camera).collect()
 }
 
 fn fits(adjusted: &Adjusted) -> bool {

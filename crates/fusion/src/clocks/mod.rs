@@ -17,6 +17,7 @@ use std::collections::BTreeSet;
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Matrix6;
 
 use self::belief::Belief;
 use self::lesson::{Lesson, lesson};
@@ -110,6 +111,15 @@ impl ClockEstimator {
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
         self.belief.add(camera, deviations, reported.pose);
         self.provisional = None;
+    }
+
+    /// A camera has been calibrated anew: its bearings so far say nothing of the pose that follows.
+    pub(crate) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
+        if self.belief.knows(camera) {
+            self.belief.calibrate(camera, pose);
+            self.provisional = None;
+            self.windows.clear();
+        }
     }
 
     fn newest(&self) -> &Belief {

@@ -6,9 +6,12 @@ use nalgebra::Vector3;
 
 use crate::track::TrackId;
 
-/// A window holds no more bearings than this: when it is full, every other one of each camera is let go,
-/// and from then on as many are not taken.
+/// A window holds no more bearings than this: when it is full, every other one of each camera is let
+/// go, and from then on as many are not taken.
 const MAX_SIGHTS: usize = 1500;
+/// A window is of so many cameras, the first that see its target: eight unknowns each, in time that
+/// is bounded. The others have their turn with another window.
+const MAX_CAMERAS: usize = 12;
 /// A camera says nothing of its clock that can be checked with fewer bearings than this.
 const LEAST_SIGHTS: usize = 5;
 /// Bearings this far from the window's beginning are not of it, s.
@@ -51,7 +54,11 @@ impl Window {
         if time_s.abs() > MAX_SPAN_S {
             return;
         }
-        let index = self.cameras.iter().position(|known| known == camera).unwrap_or_else(|| {
+        let known = self.cameras.iter().position(|known| known == camera);
+        if known.is_none() && self.cameras.len() >= MAX_CAMERAS {
+            return;
+        }
+        let index = known.unwrap_or_else(|| {
             self.cameras.push(camera.clone());
             self.offered.push(0);
             self.cameras.len() - 1
