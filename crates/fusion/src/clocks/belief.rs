@@ -317,3 +317,71 @@ impl Belief {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> CameraName {
+        text.parse().unwrap()
+    }
+
+    /// Three clocks of 0.1 s, of which the second and the third are learnt against the first, the reference.
+    fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
+        let mut belief = Belief::default();
+        for (camera, pose) in ["a", "b", "c"].into_iter().zip(poses) {
+            belief.add(&name(camera), [0.1, 3e-5], pose);
+        }
+        belief.advance(Timestamp::EPOCH);
+        let components: Vec<usize> =
+            ["b", "c"].into_iter().filter_map(|c| belief.place(&name(c))).flat_map(|k| [k, k + 1]).collect();
+        let mean = DVector::from_vec(vec![0.06, 1e-5, -0.03, 0.0]);
+        belief.learn(&components, &mean, &DMatrix::from_diagonal_element(4, 4, 1e-12));
+        (belief, components)
+    }
+
+    fn of(belief: &Belief, camera: &str) -> ClockEstimate {
+        belief.estimate(&name(camera), Timestamp::EPOCH).unwrap()
+    }
+
+    #[test]
+    fn offsets_are_against_what_all_clocks_say_and_their_mean_stays_unknown() {
+        let (belief, _) = learnt([None; 3]);
+        for (camera, offset) in [("a", -0.01), ("b", 0.05), ("c", -0.04)] {
+            let estimate = of(&belief, camera);
+            assert!((estimate.offset_s - offset).abs() < 1e-9, "{estimate:?}");
+            assert!((estimate.sd_s - 0.1 / 3.0_f64.sqrt()).abs() < 1e-4, "{estimate:?}");
+            assert!(estimate.relative_sd_s < 1e-5, "{estimate:?}");
+        }
+        let later = belief.estimate(&name("b"), Timestamp::from_seconds(100.0)).unwrap();
+        assert!((later.offset_s - of(&belief, "b").offset_s - 100.0 * later.drift).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_doubted_clock_is_as_badly_known_as_it_was_reported_and_the_others_stay() {
+        for doubted in ["a", "b"] {
+            let (mut belief, _) = learnt([Some(Matrix6::identity() * 1e-6), None, None]);
+            belief.doubt(&name(doubted));
+            assert!(of(&belief, doubted).relative_sd_s > 0.06, "{:?}", of(&belief, doubted));
+            let (b, c) = (of(&belief, "b"), of(&belief, "c"));
+            if doubted == "a" {
+                assert!((b.offset_s - c.offset_s - 0.09).abs() < 1e-9);
+            }
+            assert!(belief.covariance.clone().cholesky().is_some());
+        }
+    }
+
+    #[test]
+    fn beginning_anew_and_calibrating_leave_a_regular_covariance() {
+        let pose = Some(Matrix6::identity() * 1e-6);
+        let (mut belief, _) = learnt([pose, None, pose]);
+        belief.calibrate(&name("b"), pose);
+        belief.calibrate(&name("c"), None);
+        assert_eq!(belief.pose(&name("c")), None);
+        assert!(belief.covariance.clone().cholesky().is_some());
+        belief.begin_anew();
+        assert!(belief.covariance.clone().cholesky().is_some());
+        assert_eq!(of(&belief, "b").offset_s, 0.0);
+        assert!(belief.pose(&name("b")).is_some());
+    }
+}
