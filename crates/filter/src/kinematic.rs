@@ -103,7 +103,8 @@ impl KinematicState {
 
     /// Whether all numbers are finite.
     pub fn is_finite(&self) -> bool {
-        self.mean.iter().chain(self.covariance.iter()).all(|value| value.is_finite())
+        let numbers = self.mean.as_slice().iter().chain(self.covariance.as_slice());
+        numbers.fold(true, |all, value| all & value.is_finite())
     }
 
     /// The state `interval` seconds on, leaving this one as it is.

@@ -29,16 +29,13 @@ pub struct Clocks {
     pub trusted: Vec<CameraName>,
     /// Clocks reported to be better than this are taken at their word, s. 1e-9 to 10. Default 0.001.
     pub least_sd_s: f64,
-    /// Standard deviation of a clock's drift, s/s. 1e-12 to 0.1. Default 0.00003.
+    /// Standard deviation of a clock's drift, s/s. 1e-12 to 0.1. Default 0.00003: quartzes are within 50 ppm.
     pub drift_sd: f64,
-    /// Power spectral density of the jerk of the targets that clocks are compared by, m^2/s^5. 1e-9 to
-    /// 1000000. Default 1.
-    pub jerk_density: f64,
 }
 
 impl Default for Clocks {
     fn default() -> Self {
-        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 3e-5, jerk_density: 1.0 }
+        Self { estimate: true, trusted: Vec::new(), least_sd_s: 1e-3, drift_sd: 3e-5 }
     }
 }
 

@@ -5,7 +5,7 @@ use crossfix_message::{
     TrackEvent, TrackFrame, TrackState,
 };
 
-use crate::clocks::{ClockEstimate, ClockFilter};
+use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
 use crate::initiation::Initiator;
@@ -51,7 +51,7 @@ pub struct Fusion {
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
-    clocks: ClockFilter,
+    clocks: ClockEstimator,
     standings: Standings,
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
@@ -73,7 +73,7 @@ impl Fusion {
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),
-            clocks: ClockFilter::new(config.clocks.clone()),
+            clocks: ClockEstimator::new(config.clocks.clone()),
             standings: Standings::default(),
             corrected: BTreeMap::new(),
             counters: Counters::default(),
@@ -90,6 +90,9 @@ impl Fusion {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
         let known = KnownCamera { camera: calibration.camera, pose_covariance: calibration.pose_covariance };
+        if self.cameras.get(&calibration.name).is_some_and(|before| before.is_elsewhere(&known)) {
+            self.clocks.calibrate(&calibration.name, known.pose_covariance);
+        }
         self.cameras.insert(calibration.name, known);
         Ok(())
     }
@@ -191,7 +194,7 @@ impl Fusion {
     /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
     /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to come.
     fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
-        self.clocks.see(&exposure.camera, exposure.uncertainty.time_sd_s);
+        self.clocks.see(&exposure.camera, &exposure.uncertainty);
         let Some(clock) = self.clock(&exposure.camera) else {
             return self.process(&exposure, outputs);
         };
@@ -209,7 +212,7 @@ impl Fusion {
 
     /// What is known of a camera's clock, if clocks are in doubt.
     fn clock(&self, camera: &CameraName) -> Option<ClockEstimate> {
-        self.clocks.estimate(camera).filter(|_| self.clocks.is_needed())
+        if self.clocks.is_needed() { self.clocks.estimate(camera) } else { None }
     }
 
     /// One exposure, in the order of capture times.
@@ -248,7 +251,7 @@ impl Fusion {
         self.clocks.advance(exposure.time, &self.tracker);
         for (index, id) in used {
             if let (Some(track), Some(sighting)) = (self.tracker.track(*id), exposure.sightings.get(*index)) {
-                self.clocks.update(track, &exposure.camera, &sighting.line, exposure.correction_s);
+                self.clocks.update(track, exposure, &sighting.line);
             }
         }
     }
@@ -267,9 +270,9 @@ impl Fusion {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
-            if standing == CameraStanding::Excluded && self.clocks.is_needed() {
-                // It may be the clocks that are wrong: they get another chance with all cameras.
-                self.clocks.begin_anew();
+            if standing == CameraStanding::Excluded {
+                // It may be its clock that is wrong: bearings compared and not used can tell.
+                self.clocks.suspect(&exposure.camera);
             }
             outputs.push(Output::Camera(exposure.camera.clone(), standing));
         }

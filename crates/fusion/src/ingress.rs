@@ -44,6 +44,14 @@ pub(crate) struct KnownCamera {
 }
 
 impl KnownCamera {
+    /// Whether its pose, or what is known of it, is another.
+    pub(crate) fn is_elsewhere(&self, other: &Self) -> bool {
+        let (one, two) = (self.camera.pose(), other.camera.pose());
+        one.position() != two.position()
+            || one.rotation() != two.rotation()
+            || self.pose_covariance != other.pose_covariance
+    }
+
     /// Whether the camera should report a target at a place: in its image, and not too far away.
     pub(crate) fn expects(&self, place: Point3<f64>, max_range_m: f64) -> bool {
         (place - self.camera.pose().position()).norm() <= max_range_m && self.camera.sees(place)

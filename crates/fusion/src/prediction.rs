@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix3, Matrix3x2, Point3, Unit, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, View};
 
@@ -17,7 +17,7 @@ pub(crate) struct BearingPrediction {
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
     steady: Matrix2<f64>,
-    /// What of this pose and clock of the camera add, rad^2.
+    /// What of this poses and clocks add, which is the same in many bearings, rad^2.
     common: Matrix2<f64>,
     /// What each model's process noise adds along both tangents, rad^2, and its probability.
     added: ModelWeights,
@@ -69,6 +69,16 @@ impl BearingPrediction {
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * spread,
         })
+    }
+
+    /// The same where the target's position is uncertain by more than the track itself knows, m^2: for
+    /// what the cameras' clocks shift all their bearings by.
+    pub(crate) fn widened(mut self, more: &Matrix3<f64>) -> Self {
+        let across = self.view.basis / self.view.range;
+        let seen = across.transpose() * more * across;
+        self.steady += seen;
+        self.common += seen;
+        self
     }
 
     /// Where a camera at `origin` should see a target of a state, as of the state's time; the target

@@ -53,7 +53,6 @@ impl FusionConfig {
             range("bearings.systematic_sd_rad", bearings.systematic_sd_rad, 0.0, 0.1),
             range("clocks.least_sd_s", clocks.least_sd_s, 1e-9, 10.0),
             range("clocks.drift_sd", clocks.drift_sd, 1e-12, 0.1),
-            range("clocks.jerk_density", clocks.jerk_density, 1e-9, 1e6),
         ]
     }
 

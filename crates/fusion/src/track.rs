@@ -16,9 +16,11 @@ use crate::uncertainty::{CameraUncertainty, View};
 pub(crate) const MAX_PAIR_SD_M: f64 = 3.0;
 /// Rounds of the iterated update; the linearisation mostly holds from the first.
 const MAX_ITERATIONS: usize = 5;
-/// The linearisation has settled when what a round leaves out, the square of its step over the range,
-/// is less than this, m.
-const SETTLED_M: f64 = 1e-4;
+/// The linearisation has settled when what a round leaves out, the square of the angle of its step, is
+/// less than this share of the bearing's noise.
+const SETTLED: f64 = 0.01;
+/// Clocks less sure than this shift tracks by more than their bearings' noise, s.
+const UNSURE_CLOCK_S: f64 = 2e-3;
 /// What a track can be told apart by is looked at this often, s: eigenvalues cost more than an update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
@@ -67,6 +69,8 @@ struct Contribution {
     own: Matrix2<f64>,
     /// Pose and clock of its camera, rad^2.
     common: Matrix2<f64>,
+    /// Standard deviation of its camera's clock, s.
+    time_sd_s: f64,
 }
 
 /// A bearing that a track has taken in.
@@ -97,6 +101,8 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// What unsure clocks may shift the position by, m^2; `None` where all are sure.
+    shift: Option<Matrix3<f64>>,
     /// When its state went out, and as what.
     pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
@@ -141,6 +147,7 @@ impl Linearised {
             jacobian: self.jacobian,
             own: line.covariance * camera.factor,
             common: camera.common(&self.view),
+            time_sd_s: camera.time_sd_s,
         };
         MeasurementResidual { time, angle: self.offset.norm(), nis, contribution }
     }
@@ -178,7 +185,7 @@ pub(crate) fn updated(
         let moved = (next - mean).fixed_rows::<3>(0).norm();
         mean = next;
         covariance = prior.covariance - gain * across.transpose();
-        if moved * moved < SETTLED_M * view.range {
+        if (moved / view.range).powi(2) < SETTLED * (noise.trace() / 2.0).sqrt() {
             break;
         }
     }
@@ -201,7 +208,7 @@ impl Track {
             let nis = seen.offset.dot(&seen.noise.cholesky()?.solve(&seen.offset));
             Some((camera.clone(), seen.residual(*time, nis, line, &uncertainty)))
         };
-        Self {
+        let mut track = Self {
             id: TrackId(0),
             status: TrackStatus::Tentative,
             updated: fix.time,
@@ -211,10 +218,13 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            shift: None,
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             detector: motion.detector(),
-        }
+        };
+        track.shift = track.clock_shift(motion);
+        track
     }
 
     /// Position and velocity at [`Self::updated`].
@@ -264,13 +274,14 @@ impl Track {
         camera: &CameraUncertainty,
         motion: &Motion,
     ) -> Option<BearingPrediction> {
-        BearingPrediction::new(
+        let prediction = BearingPrediction::new(
             &self.imm,
             time.seconds_since(self.updated),
             motion.models(self.held),
             origin,
             camera,
-        )
+        )?;
+        Some(self.shift.iter().fold(prediction, |prediction, shift| prediction.widened(shift)))
     }
 
     /// Takes a bearing in. Leaves the track as it was and returns `None` if the numbers fail;
@@ -286,7 +297,8 @@ impl Track {
         let before = self.imm.predicted(interval, motion.models(self.held));
         let seen = Linearised::at(&before, line, uncertainty)?;
         let offset = seen.offset;
-        let known = seen.jacobian * before.position_covariance() * seen.jacobian.transpose();
+        let known = before.position_covariance() + self.shift.unwrap_or_else(Matrix3::zeros);
+        let known = seen.jacobian * known * seen.jacobian.transpose();
         let distance = |noise: Matrix2<f64>| Some(offset.dot(&(known + noise).cholesky()?.solve(&offset)));
         let nis = distance(seen.noise)?;
         let reported_nis = distance(line.covariance + uncertainty.common(&seen.view))?;
@@ -310,6 +322,9 @@ impl Track {
             self.residuals.insert(camera.clone(), residual);
         }
         self.held = self.cameras_lately(motion.holding_s) >= 2;
+        if self.shift.is_some() || uncertainty.time_sd_s >= UNSURE_CLOCK_S {
+            self.shift = self.clock_shift(motion);
+        }
         Some(Taken { manoeuvre, reported_nis })
     }
 
@@ -341,6 +356,26 @@ impl Track {
             }
         }
         state
+    }
+
+    /// What the clocks that are not sure may shift the position by, m^2. The filter takes such a shift
+    /// for noise of each bearing and averages it away; a camera that joins would find the target
+    /// outside its gate.
+    fn clock_shift(&self, motion: &Motion) -> Option<Matrix3<f64>> {
+        let recent = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        let parts = || self.residuals.values().filter(recent).map(|r| &r.contribution);
+        if parts().all(|part| part.time_sd_s < UNSURE_CLOCK_S) {
+            return None;
+        }
+        let mut information = Matrix3::zeros();
+        let mut shifted = Matrix3::zeros();
+        for Contribution { jacobian, own, common, .. } in parts() {
+            let weight = jacobian.transpose() * (own + common).try_inverse()?;
+            information += weight * jacobian;
+            shifted += weight * common * weight.transpose();
+        }
+        let spread = information.try_inverse()?;
+        Some(spread * shifted * spread).filter(|shift| shift.iter().all(|value| value.is_finite()))
     }
 
     /// Cameras that have given a bearing within the last seconds before [`Self::updated`].

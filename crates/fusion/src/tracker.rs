@@ -83,7 +83,15 @@ pub(crate) struct Step {
 impl Tracker {
     pub(crate) fn new(config: Tracking, max_range_m: f64, motion: Motion) -> Self {
         let gate = Gate::with_probability(config.gate_probability);
-        Self { config, motion, gate, max_range_m, tracks: BTreeMap::new(), next_id: 1, watches: BTreeMap::new() }
+        Self {
+            config,
+            motion,
+            gate,
+            max_range_m,
+            tracks: BTreeMap::new(),
+            next_id: 1,
+            watches: BTreeMap::new(),
+        }
     }
 
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.

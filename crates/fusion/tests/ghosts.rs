@@ -55,7 +55,8 @@ fn targets_that_one_camera_each_sees_make_next_to_no_tracks() {
         // Fifteen targets before each camera that the two others do not see: 675 pairs of lines.
         let mut frames: Vec<BearingFrame> = Vec::new();
         for eye in &eyes {
-            let scene = Scene { eyes: vec![eye.clone()], clutter: 1.0, ..Scene::new(crowd(15, &mut rng), 8.0) };
+            let scene =
+                Scene { eyes: vec![eye.clone()], clutter: 1.0, ..Scene::new(crowd(15, &mut rng), 8.0) };
             frames.extend(scene.frames(seed));
         }
         frames.sort_by_key(|frame| frame.capture_time_ns);

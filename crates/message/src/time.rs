@@ -47,7 +47,10 @@ impl Timestamp {
 
     /// Seconds from `earlier` to this instant; negative if it is the later one.
     pub fn seconds_since(self, earlier: Self) -> f64 {
-        (i128::from(self.0) - i128::from(earlier.0)) as f64 / 1e9
+        match self.0.checked_sub(earlier.0) {
+            Some(nanos) => nanos as f64 / 1e9,
+            None => (i128::from(self.0) - i128::from(earlier.0)) as f64 / 1e9,
+        }
     }
 
     /// This instant moved by `seconds`, which may be negative; saturates.

@@ -11,6 +11,8 @@ use crate::prediction::{BearingPrediction, log_density};
 pub(super) const HIDDEN_S: f64 = 0.5;
 /// Logarithm of the probability that a camera is blind for a target that it should see.
 const BLIND: f64 = -4.6;
+/// A camera's bearings that are shifted by so many times their own variance agree with nothing.
+const VAGUE: f64 = 10.0;
 
 /// A line as one camera alone goes on with it: a direction that turns evenly.
 #[derive(Clone, Debug)]
@@ -99,6 +101,8 @@ pub(super) struct Coincidence {
     /// Cameras that should see the target and never have, with the logarithm of that probability.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
+    /// Whether poses or clocks are so uncertain that it says nothing.
+    vague: bool,
 }
 
 impl Coincidence {
@@ -113,7 +117,7 @@ impl Coincidence {
             let range = (place - line.origin).norm();
             (camera.clone(), Sight::first(line, time, speed / range))
         };
-        Self { sights: lines.map(sight).collect(), silent: Vec::new(), log_ratio }
+        Self { sights: lines.map(sight).collect(), silent: Vec::new(), log_ratio, vague: false }
     }
 
     /// A line that goes on with the target as predicted. `first_ratio` is its log-likelihood ratio
@@ -134,6 +138,7 @@ impl Coincidence {
         };
         sight.predict(time, density / range.powi(2));
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
+        self.vague |= sight.shift_variance.is_some_and(|v| v > VAGUE * line.covariance.trace() / 2.0);
         sight.update(line);
     }
 
@@ -149,10 +154,13 @@ impl Coincidence {
         }
     }
 
-    /// The log-likelihood ratio.
-    pub(super) fn log_ratio(&self) -> f64 {
+    /// The log-likelihood ratio; `None` if poses or clocks are too uncertain for it.
+    pub(super) fn log_ratio(&self) -> Option<f64> {
+        if self.vague {
+            return None;
+        }
         let never = |camera: &CameraName| self.sights.iter().all(|(name, _)| name != camera);
-        self.log_ratio
-            + self.silent.iter().filter(|(camera, _)| never(camera)).map(|(_, log)| log).sum::<f64>()
+        let silent = self.silent.iter().filter(|(camera, _)| never(camera));
+        Some(self.log_ratio + silent.map(|(_, log)| log).sum::<f64>())
     }
 }

@@ -50,7 +50,9 @@ impl Grouped {
     ) -> Vec<Start> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
         let tracks = groups.iter().filter_map(|group| start(group, motion));
-        tracks.map(|track| Start { cameras: track.residuals.len(), track, claimed_by: BTreeSet::new() }).collect()
+        tracks
+            .map(|track| Start { cameras: track.residuals.len(), track, claimed_by: BTreeSet::new() })
+            .collect()
     }
 }
 

@@ -141,7 +141,8 @@ impl Hypotheses {
             }
         }
         // What one camera alone sees may be anywhere: it begins anew when another sees it too.
-        self.hypotheses.retain(|h| h.cameras().len() >= 2 && h.coincidence.log_ratio() > LEAST_SCORE);
+        self.hypotheses
+            .retain(|h| h.cameras().len() >= 2 && h.coincidence.log_ratio().is_none_or(|r| r > LEAST_SCORE));
         let seeds = self.finder.find(exposures, cameras);
         self.begin(seeds, motion);
         self.prune();
@@ -275,7 +276,7 @@ impl Hypotheses {
                 let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
                     && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let one = hypothesis.coincidence.log_ratio() >= COINCIDENCE_MARGIN;
+                let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= COINCIDENCE_MARGIN);
                 let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);

@@ -1,0 +1,411 @@
+//! The adjustment of a window: the target's way, the clocks and the poses that fit its bearings best
+//! together.
+
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+use super::curve::{Basis, Curve};
+use super::window::Sight;
+
+/// Squared distances (two degrees of freedom) beyond which a bearing pulls no harder: in the
+/// beginning, when all may be far off, ...
+const HUBER: f64 = 9.0;
+/// ... and in the end, beyond which it is somebody else's and does not pull at all (1 in 50 000).
+const STRANGER: f64 = 22.0;
+/// The median of a squared distance.
+const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
+/// A camera's covariances count no more often than this.
+const MAX_SCALE: f64 = 1e4;
+/// Rounds of one descent; most take three to six.
+const MAX_ROUNDS: usize = 25;
+/// Damping of a round against the diagonal: first, and when a descent is given up.
+const FIRST_DAMPING: f64 = 1e-4;
+const MAX_DAMPING: f64 = 1e4;
+/// A descent has settled when a round gains less than this of the squared distances.
+const SETTLED: f64 = 1e-3;
+/// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
+/// turns of a racing drone.
+const DENSITIES: std::ops::RangeInclusive<i32> = -5..=4;
+
+/// What pulls how hard.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Loss {
+    Huber,
+    Trimmed,
+}
+
+impl Loss {
+    /// What a squared distance costs, and the weight of the bearing.
+    fn of(self, squared: f64) -> (f64, f64) {
+        match self {
+            Self::Huber if squared > HUBER => {
+                (2.0 * (HUBER * squared).sqrt() - HUBER, (HUBER / squared).sqrt())
+            }
+            Self::Trimmed if squared > STRANGER => (STRANGER, 0.0),
+            _ => (squared, 1.0),
+        }
+    }
+}
+
+/// Where what is unknown of a camera is among the components of the prior.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Unknowns {
+    /// Its clock's offset, with the drift the next; `None` for the reference.
+    pub(super) clock: Option<usize>,
+    /// What its pose is off by: three of rotation, three of position; `None` where it is exact.
+    pub(super) pose: Option<usize>,
+}
+
+/// The cameras' clocks and poses as they are known before.
+#[derive(Clone, Debug)]
+pub(super) struct Prior {
+    pub(super) mean: DVector<f64>,
+    pub(super) precision: DMatrix<f64>,
+    /// The time their offsets are of, s after the window's beginning.
+    pub(super) epoch_s: f64,
+    pub(super) cameras: Vec<Unknowns>,
+}
+
+/// A target's way, and clocks and poses of the cameras.
+#[derive(Clone, Debug)]
+struct State {
+    coefficients: DVector<f64>,
+    cameras: DVector<f64>,
+}
+
+/// A bearing's target at a state, as if the pose were right: where it lies, and by what vector each
+/// component of the cameras moves it.
+#[derive(Clone, Debug)]
+struct Target {
+    basis: Basis,
+    place: Vector3<f64>,
+    shifts: [(usize, Vector3<f64>); 8],
+    /// How many of them there are.
+    count: usize,
+}
+
+/// Minus twice the logarithm of the posterior density at a state, but for a constant, with half its
+/// gradient and half its second derivative (Gauss-Newton's).
+#[derive(Clone, Debug)]
+struct Quadratic {
+    cost: f64,
+    gradient: DVector<f64>,
+    information: DMatrix<f64>,
+}
+
+/// What an adjustment has found.
+#[derive(Clone, Debug)]
+pub(super) struct Adjusted {
+    pub(super) cameras: DVector<f64>,
+    pub(super) covariance: DMatrix<f64>,
+    /// How often each camera's reported covariances count: 1 where it is honest.
+    pub(super) scales: Vec<f64>,
+    /// Share of each camera's bearings that do not fit.
+    pub(super) strangers: Vec<f64>,
+    /// Squared distance of clocks and poses from what was known of them before.
+    pub(super) pulled: f64,
+    /// Twice the logarithm of the probability of these bearings by what was known before, but for
+    /// what is the same for any knowledge.
+    pub(super) evidence: f64,
+}
+
+/// One window's bearings, with what is known beforehand.
+#[derive(Clone, Debug)]
+pub(super) struct Adjustment<'a> {
+    sights: &'a [Sight],
+    curve: Curve,
+    prior: &'a Prior,
+    /// Each camera's covariances count this many times.
+    scales: Vec<f64>,
+}
+
+impl<'a> Adjustment<'a> {
+    pub(super) fn new(sights: &'a [Sight], curve: Curve, prior: &'a Prior) -> Self {
+        Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
+    }
+
+    /// Fits way, clocks and poses. `None` if the numbers fail.
+    pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
+        let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
+        self.rescale(&state, Loss::Huber);
+        let (mut state, mut density, mut evidence) = self.best_density(state, density)?;
+        if self.rescale(&state, Loss::Trimmed) {
+            (state, density, evidence) = self.best_density(state, density)?;
+        }
+        let strangers = self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
+        let (covariance, pulled) = self.posterior(&state, density)?;
+        Some(Adjusted {
+            cameras: state.cameras,
+            covariance,
+            scales: self.scales,
+            strangers,
+            pulled,
+            evidence,
+        })
+    }
+
+    /// Sets how often each camera's covariances count, by its residuals: after the first descent,
+    /// when not all may fit, by their median; in the end by the mean of what fits. Says whether that
+    /// has changed much.
+    fn rescale(&mut self, state: &State, loss: Loss) -> bool {
+        let squares = self.squares(state);
+        let mut changed = false;
+        for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
+            if loss == Loss::Trimmed {
+                squares.retain(|squared| *squared <= STRANGER);
+            }
+            squares.sort_unstable_by(f64::total_cmp);
+            let count = squares.len() as f64;
+            let typical = match (loss, squares.get(squares.len() / 2)) {
+                (_, None) => continue,
+                (Loss::Huber, Some(median)) => median / MEDIAN,
+                (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
+            };
+            // Up to three standard errors of an honest camera's are chance.
+            let found = typical * *scale;
+            let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
+            changed |= (next / *scale - 1.0).abs() > 0.1;
+            *scale = next.min(MAX_SCALE);
+        }
+        changed
+    }
+
+    /// The squared distances of each camera's bearings.
+    fn squares(&self, state: &State) -> Vec<Vec<f64>> {
+        let mut squares = vec![Vec::new(); self.scales.len()];
+        for sight in self.sights {
+            let seen = Seen::at(sight, self.target(sight, state).place, self.scales[sight.camera]);
+            squares[sight.camera].push(seen.map_or(f64::INFINITY, |seen| seen.squared));
+        }
+        squares
+    }
+
+    /// Clocks and poses as known before, and a way through the places that the track had.
+    fn begin(&self) -> Option<State> {
+        let cameras = self.prior.mean.clone();
+        let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
+        Some(State { coefficients: self.curve.fit(places, 1.0)?, cameras })
+    }
+
+    /// When a bearing was taken by the reference's clock, s, and how long after the epoch.
+    fn time(&self, sight: &Sight, cameras: &DVector<f64>) -> (f64, f64) {
+        let since = sight.time_s - self.prior.epoch_s;
+        let clock = self.prior.cameras[sight.camera].clock;
+        let offset = clock.map_or(0.0, |place| cameras[place] + cameras[place + 1] * since);
+        (sight.time_s - offset, since)
+    }
+
+    /// The target of a bearing. A clock ahead by o shows it where it was o ago: its offset moves the
+    /// place by minus the velocity, its drift by that times the time since the epoch. A camera turned
+    /// by d and moved by c sees it at p + d x (p - origin) + c.
+    fn target(&self, sight: &Sight, state: &State) -> Target {
+        let (time_s, since) = self.time(sight, &state.cameras);
+        let basis = self.curve.basis(time_s);
+        let (mut place, velocity) = basis.at(&state.coefficients);
+        let Unknowns { clock, pose } = self.prior.cameras[sight.camera];
+        let mut shifts = [(0, Vector3::zeros()); 8];
+        let mut count = 0;
+        let mut add = |component: usize, shift: Vector3<f64>| {
+            shifts[count] = (component, shift);
+            count += 1;
+        };
+        if let Some(first) = clock {
+            add(first, -velocity);
+            add(first + 1, -velocity * since);
+        }
+        if let Some(first) = pose {
+            let away = place - sight.line.origin.coords;
+            for axis in 0..3 {
+                let unit = Vector3::ith(axis, 1.0);
+                let turned = unit.cross(&away);
+                add(first + axis, turned);
+                add(first + 3 + axis, unit);
+                place += turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
+            }
+        }
+        Target { basis, place, shifts, count }
+    }
+
+    /// The density of jerk of the greatest evidence, with the state that belongs to it.
+    fn best_density(&self, state: State, first: i32) -> Option<(State, i32, f64)> {
+        let (state, evidence) = self.with_evidence(state, first)?;
+        let mut best = (state, first, evidence);
+        for step in [-1, 1] {
+            let mut moved = false;
+            while DENSITIES.contains(&(best.1 + step)) {
+                let Some((state, evidence)) = self.with_evidence(best.0.clone(), best.1 + step) else {
+                    break;
+                };
+                if evidence <= best.2 {
+                    break;
+                }
+                best = (state, best.1 + step, evidence);
+                moved = true;
+            }
+            if moved {
+                break;
+            }
+        }
+        Some(best)
+    }
+
+    /// Descends, and twice the logarithm of the evidence (Laplace's), but for a constant.
+    fn with_evidence(&self, state: State, density: i32) -> Option<(State, f64)> {
+        let (state, Quadratic { cost, information, .. }) = self.descend(state, density, Loss::Trimmed)?;
+        let factor = information.cholesky()?;
+        let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
+        let before = self.prior.precision.clone().cholesky()?;
+        let log_before: f64 = 2.0 * before.l_dirty().diagonal().map(f64::ln).sum();
+        let scales = self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
+        let width = self.curve.log_width(jerk(density));
+        let evidence = log_before - cost - log_determinant - width - scales;
+        evidence.is_finite().then_some((state, evidence))
+    }
+
+    /// Levenberg and Marquardt's descent to the most likely state.
+    fn descend(&self, mut state: State, density: i32, loss: Loss) -> Option<(State, Quadratic)> {
+        let mut here = self.quadratic(&state, density, loss);
+        let mut damping = FIRST_DAMPING;
+        for _ in 0..MAX_ROUNDS {
+            let mut damped = here.information.clone();
+            for i in 0..damped.nrows() {
+                damped[(i, i)] *= 1.0 + damping;
+            }
+            let next = damped.cholesky().map(|factor| self.moved(&state, &factor.solve(&here.gradient)));
+            let there = next.as_ref().map(|next| self.quadratic(next, density, loss));
+            match (next, there) {
+                (Some(next), Some(there)) if there.cost < here.cost => {
+                    let gained = here.cost - there.cost;
+                    (state, here) = (next, there);
+                    damping /= 10.0;
+                    if gained < SETTLED {
+                        break;
+                    }
+                }
+                _ if damping > MAX_DAMPING => break,
+                (Some(_), Some(there)) if there.cost - here.cost < SETTLED => break,
+                _ => damping *= 10.0,
+            }
+        }
+        here.cost.is_finite().then_some((state, here))
+    }
+
+    fn moved(&self, state: &State, step: &DVector<f64>) -> State {
+        let points = state.coefficients.len();
+        State {
+            coefficients: &state.coefficients - step.rows(0, points),
+            cameras: &state.cameras - step.rows(points, state.cameras.len()),
+        }
+    }
+
+    fn quadratic(&self, state: &State, density: i32, loss: Loss) -> Quadratic {
+        let mut quadratic = self.prior_quadratic(state, density);
+        for sight in self.sights {
+            let target = self.target(sight, state);
+            let Some(seen) = Seen::at(sight, target.place, self.scales[sight.camera]) else {
+                // Behind the camera: as far off as can be.
+                quadratic.cost += loss.of(1e6).0;
+                continue;
+            };
+            let (cost, weight) = loss.of(seen.squared);
+            quadratic.cost += cost;
+            if weight > 0.0 {
+                quadratic.add(&target, state.coefficients.len(), &seen, weight);
+            }
+        }
+        quadratic
+    }
+
+    /// What is known beforehand.
+    fn prior_quadratic(&self, state: &State, density: i32) -> Quadratic {
+        let (points, cameras) = (state.coefficients.len(), state.cameras.len());
+        let mut information = DMatrix::zeros(points + cameras, points + cameras);
+        self.curve.add_prior(&mut information, jerk(density));
+        information.view_mut((points, points), (cameras, cameras)).copy_from(&self.prior.precision);
+        let mut away = DVector::zeros(points + cameras);
+        away.rows_mut(0, points).copy_from(&state.coefficients);
+        away.rows_mut(points, cameras).copy_from(&(&state.cameras - &self.prior.mean));
+        let gradient = &information * &away;
+        Quadratic { cost: away.dot(&gradient), gradient, information }
+    }
+
+    /// Covariance of clocks and poses, and their squared distance from what was known before.
+    fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
+        let (points, cameras) = (state.coefficients.len(), state.cameras.len());
+        let information = self.quadratic(state, density, Loss::Trimmed).information;
+        let mut unit = DMatrix::zeros(points + cameras, cameras);
+        unit.view_mut((points, 0), (cameras, cameras)).fill_with_identity();
+        let covariance = information.cholesky()?.solve(&unit).rows(points, cameras).into_owned();
+        let away = &state.cameras - &self.prior.mean;
+        let pulled = away.dot(&(&self.prior.precision * &away));
+        let possible = covariance.iter().all(|value| value.is_finite()) && pulled.is_finite();
+        possible.then_some((covariance, pulled))
+    }
+}
+
+fn share_of_strangers(squares: &[f64]) -> f64 {
+    squares.iter().filter(|squared| **squared > STRANGER).count() as f64 / squares.len().max(1) as f64
+}
+
+/// Density of the jerk, m^2/s^5.
+fn jerk(power: i32) -> f64 {
+    10.0_f64.powi(power)
+}
+
+/// A bearing against a place of the target.
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    /// Squared distance of the residual by its covariance.
+    squared: f64,
+    /// What the residual pulls the place by, and what it tells of the place.
+    pull: Vector3<f64>,
+    information: Matrix3<f64>,
+}
+
+impl Seen {
+    /// `None` if the place lies behind the camera.
+    fn at(sight: &Sight, target: Vector3<f64>, scale: f64) -> Option<Self> {
+        let residual: Vector2<f64> = sight.line.tangent_offset(target.into())?;
+        let away = target - sight.line.origin.coords;
+        let range = away.norm();
+        let direction = away / range;
+        let across: Matrix2x3<f64> =
+            sight.line.basis.transpose() * (Matrix3::identity() - direction * direction.transpose()) / range;
+        let inverse: Matrix2<f64> = (sight.line.covariance * scale).try_inverse()?;
+        let weighed = across.transpose() * inverse;
+        let squared = residual.dot(&(inverse * residual));
+        let seen = Self { squared, pull: weighed * residual, information: weighed * across };
+        seen.squared.is_finite().then_some(seen)
+    }
+}
+
+impl Quadratic {
+    /// Adds a bearing; the cameras' components come after so many of the way's.
+    fn add(&mut self, target: &Target, points: usize, seen: &Seen, weight: f64) {
+        let (pull, information) = (seen.pull * weight, seen.information * weight);
+        let shifts = &target.shifts[..target.count];
+        let Basis { first, place, .. } = target.basis;
+        for (i, a) in place.iter().enumerate() {
+            let row = 3 * (first + i);
+            let mut part = self.gradient.fixed_rows_mut::<3>(row);
+            part += pull * *a;
+            for (k, b) in place.iter().enumerate() {
+                let mut block = self.information.fixed_view_mut::<3, 3>(row, 3 * (first + k));
+                block += information * (a * b);
+            }
+            for (component, shift) in shifts {
+                let tied = information * shift * *a;
+                let mut beside = self.information.fixed_view_mut::<3, 1>(row, points + component);
+                beside += tied;
+                let mut below = self.information.fixed_view_mut::<1, 3>(points + component, row);
+                below += tied.transpose();
+            }
+        }
+        for (one, shift) in shifts {
+            self.gradient[points + one] += shift.dot(&pull);
+            let told = information * shift;
+            for (other, shift) in shifts {
+                self.information[(points + one, points + other)] += told.dot(shift);
+            }
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! What is believed of the clocks, offset and drift of each against one of them, the reference; and,
+//! as a camera that is turned sees a moving target early or late, of the cameras' poses.
+
+use std::collections::BTreeMap;
+
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::{DMatrix, DVector, Matrix6};
+
+use super::ClockEstimate;
+
+/// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
+const OFFSET_WALK: f64 = 1e-12;
+const DRIFT_WALK: f64 = 1e-16;
+/// No two clocks are the same to better than this, s and s/s: their covariance stays regular.
+const OFFSET_FLOOR_S: f64 = 1e-6;
+const DRIFT_FLOOR: f64 = 1e-9;
+/// Nor any pose, rad and m.
+const POSE_FLOOR: f64 = 1e-6;
+/// Offsets beyond this are no offsets any more, s.
+const MAX_OFFSET_S: f64 = 2.0;
+
+/// A camera's clock: where its offset stands, and what was reported of it.
+#[derive(Clone, Copy, Debug)]
+struct Clock {
+    /// The place of its offset against the reference; its drift is the next. The reference, the
+    /// first camera heard, has no place.
+    place: Option<usize>,
+    /// The place of its camera's pose in the state, where that is uncertain.
+    pose: Option<usize>,
+    /// Variance of its offset against true time before anything is seen, s^2.
+    prior: f64,
+    /// The same of its drift.
+    drift_prior: f64,
+}
+
+/// Offsets and drifts of all clocks against the first, and what the poses are off by (world's axes:
+/// rotation, rad, then position, m), as one normal distribution, as of an epoch.
+///
+/// What all clocks have in common is left out: no bearing tells it, and a linearised estimate would
+/// yet learn something of it that is not true. It follows from the reported deviations alone.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Belief {
+    cameras: BTreeMap<CameraName, Clock>,
+    mean: DVector<f64>,
+    covariance: DMatrix<f64>,
+    epoch: Option<Timestamp>,
+    /// The poses' covariances as they were reported.
+    poses: BTreeMap<CameraName, Matrix6<f64>>,
+}
+
+impl Belief {
+    pub(super) fn knows(&self, camera: &CameraName) -> bool {
+        self.cameras.contains_key(camera)
+    }
+
+    /// Makes a camera known: standard deviations of its clock's offset (s) and drift (s/s), and the
+    /// covariance of its pose.
+    pub(super) fn add(
+        &mut self,
+        camera: &CameraName,
+        [offset_sd, drift_sd]: [f64; 2],
+        pose: Option<Matrix6<f64>>,
+    ) {
+        let (prior, drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
+        let reference = self.reference();
+        let others: Vec<usize> = self.clock_places().collect();
+        let place = reference.map(|_| self.grow(2));
+        if let (Some(reference), Some(place)) = (reference, place) {
+            let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
+            for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
+                // The reference's own error is in every offset against it.
+                for &other in &others {
+                    self.covariance[(place + i, other + i)] = common;
+                    self.covariance[(other + i, place + i)] = common;
+                }
+                self.covariance[(place + i, place + i)] = common + own[i];
+            }
+        }
+        self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior });
+        self.calibrate(camera, pose);
+    }
+
+    /// A camera has another pose, of this covariance: what was learnt of the one before is forgotten.
+    pub(super) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
+        let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
+            return;
+        };
+        let place = pose.map(|covariance| {
+            let first = before.unwrap_or_else(|| self.grow(6));
+            self.mean.fixed_rows_mut::<6>(first).fill(0.0);
+            self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
+            self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
+            let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
+            self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
+            self.poses.insert(camera.clone(), covariance);
+            first
+        });
+        if let Some(known) = self.cameras.get_mut(camera) {
+            known.pose = place;
+        }
+    }
+
+    /// Makes room for so many components; returns the first.
+    fn grow(&mut self, by: usize) -> usize {
+        let before = self.mean.len();
+        self.mean.resize_vertically_mut(before + by, 0.0);
+        self.covariance.resize_mut(before + by, before + by, 0.0);
+        before
+    }
+
+    /// The places of all offsets.
+    fn clock_places(&self) -> impl Iterator<Item = usize> + '_ {
+        self.cameras.values().filter_map(|clock| clock.place)
+    }
+
+    fn reference(&self) -> Option<Clock> {
+        self.cameras.values().find(|clock| clock.place.is_none()).copied()
+    }
+
+    /// The place of a clock's offset in the state; its drift is the next. `None` for the reference.
+    pub(super) fn place(&self, camera: &CameraName) -> Option<usize> {
+        self.cameras.get(camera)?.place
+    }
+
+    /// The place of a camera's pose in the state, of six components; `None` where it is exact.
+    pub(super) fn pose(&self, camera: &CameraName) -> Option<usize> {
+        self.cameras.get(camera)?.pose
+    }
+
+    /// The standard deviation that a camera has reported of its clock, s.
+    pub(super) fn reported_sd(&self, camera: &CameraName) -> Option<f64> {
+        Some(self.cameras.get(camera)?.prior.sqrt())
+    }
+
+    /// Whether anything was left open by what a camera has reported of its clock.
+    pub(super) fn is_uncertain(&self, camera: &CameraName) -> bool {
+        self.reported_sd(camera).is_some_and(|sd| sd > 0.0)
+    }
+
+    /// The time that the state is of.
+    pub(super) fn epoch(&self) -> Option<Timestamp> {
+        self.epoch
+    }
+
+    /// Moves on to a time; never back.
+    pub(super) fn advance(&mut self, time: Timestamp) {
+        let dt = self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch));
+        if self.epoch.is_some() && dt <= 0.0 {
+            return;
+        }
+        self.epoch = Some(time);
+        let n = self.mean.len();
+        let mut transition = DMatrix::<f64>::identity(n, n);
+        let clocks: Vec<usize> = self.clock_places().collect();
+        for &k in &clocks {
+            transition[(k, k + 1)] = dt;
+        }
+        self.mean = &transition * &self.mean;
+        self.covariance = &transition * &self.covariance * transition.transpose();
+        for k in clocks {
+            self.covariance[(k, k)] += OFFSET_WALK * dt;
+            self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
+        }
+    }
+
+    /// Mean and covariance of some components of the state.
+    pub(super) fn marginal(&self, components: &[usize]) -> (DVector<f64>, DMatrix<f64>) {
+        let n = components.len();
+        (
+            DVector::from_fn(n, |i, _| self.mean[components[i]]),
+            DMatrix::from_fn(n, n, |i, k| self.covariance[(components[i], components[k])]),
+        )
+    }
+
+    /// Replaces what is believed of some components; what hangs together with them moves along.
+    pub(super) fn learn(&mut self, components: &[usize], mean: &DVector<f64>, covariance: &DMatrix<f64>) {
+        let (before_mean, before) = self.marginal(components);
+        let Some(factor) = before.clone().cholesky() else {
+            return;
+        };
+        let n = self.mean.len();
+        let ties = DMatrix::from_fn(n, components.len(), |i, k| self.covariance[(i, components[k])]);
+        let gain = factor.solve(&ties.transpose()).transpose();
+        let next_mean = &self.mean + &gain * (mean - before_mean);
+        let next = &self.covariance + &gain * (covariance - before) * gain.transpose();
+        let possible = (0..n).all(|i| next[(i, i)] >= 0.0);
+        if possible && next_mean.iter().chain(next.iter()).all(|value| value.is_finite()) {
+            self.mean = next_mean;
+            self.covariance = (&next + next.transpose()) / 2.0;
+        }
+    }
+
+    /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.
+    pub(super) fn doubt(&mut self, camera: &CameraName) {
+        let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference()) else {
+            return;
+        };
+        let Some(place) = clock.place else {
+            // Another reference: all the others are as far from it as it may be from true time.
+            let others: Vec<usize> = self.clock_places().collect();
+            for (i, variance) in [clock.prior, clock.drift_prior].into_iter().enumerate() {
+                for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
+                    self.covariance[(k + i, l + i)] += variance;
+                }
+            }
+            return;
+        };
+        // Against true time it is as reported; against the reference, as that is against true time.
+        let common = self.reference_offset_and_drift();
+        let variances = [
+            clock.prior + reference.prior + OFFSET_FLOOR_S.powi(2),
+            clock.drift_prior + reference.drift_prior + DRIFT_FLOOR.powi(2),
+        ];
+        for (i, variance) in variances.into_iter().enumerate() {
+            self.mean[place + i] = -common[i];
+            self.covariance.row_mut(place + i).fill(0.0);
+            self.covariance.column_mut(place + i).fill(0.0);
+            self.covariance[(place + i, place + i)] = variance;
+        }
+    }
+
+    /// Forgets all that was learnt of any clock.
+    pub(super) fn begin_anew(&mut self) {
+        let mut anew = Self { epoch: self.epoch, ..Self::default() };
+        let mut cameras: Vec<(&CameraName, &Clock)> = self.cameras.iter().collect();
+        // In the order in which they were heard: the reference first.
+        cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
+        for (camera, clock) in cameras {
+            let pose = self.poses.get(camera).filter(|_| clock.pose.is_some()).copied();
+            anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], pose);
+        }
+        *self = anew;
+    }
+
+    /// How much each clock says of true time, by the variances reported of them, and the variance of
+    /// what all say together. A clock that is right by definition says all.
+    fn weights(&self, prior: fn(&Clock) -> f64) -> (Vec<(Clock, f64)>, f64) {
+        let clocks: Vec<Clock> = self.cameras.values().copied().collect();
+        let exact = clocks.iter().filter(|clock| prior(clock) <= 0.0).count();
+        let weight = |clock: &Clock| match exact {
+            0 => prior(clock).recip(),
+            _ => f64::from(u8::from(prior(clock) <= 0.0)),
+        };
+        let total: f64 = clocks.iter().map(weight).sum();
+        let variance = if exact == 0 { total.recip() } else { 0.0 };
+        (clocks.into_iter().map(|clock| (clock, weight(&clock) / total)).collect(), variance)
+    }
+
+    /// A clock's components in the state, with the offset as of `ahead` seconds after the epoch.
+    fn relative(&self, clock: &Clock, component: usize, ahead: f64) -> f64 {
+        clock.place.map_or(0.0, |place| match component {
+            0 => self.mean[place] + ahead * self.mean[place + 1],
+            _ => self.mean[place + 1],
+        })
+    }
+
+    fn ahead(&self, time: Timestamp) -> f64 {
+        self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch))
+    }
+
+    /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
+    /// variance and the variance of that common time.
+    fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
+        let prior = [|clock: &Clock| clock.prior, |clock: &Clock| clock.drift_prior][component];
+        let (weights, common) = self.weights(prior);
+        let mut row: BTreeMap<usize, f64> = BTreeMap::new();
+        let mut put = |clock: &Clock, weight: f64| {
+            if let Some(place) = clock.place.filter(|_| weight != 0.0) {
+                *row.entry(place + component).or_default() += weight;
+                if component == 0 {
+                    *row.entry(place + 1).or_default() += weight * ahead;
+                }
+            }
+        };
+        put(clock, 1.0);
+        weights.iter().for_each(|(other, weight)| put(other, -weight));
+        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum();
+        let along = |(&i, a): (&usize, &f64)| -> f64 {
+            a * row.iter().map(|(&k, b)| b * self.covariance[(i, k)]).sum::<f64>()
+        };
+        let variance: f64 = row.iter().map(along).sum();
+        (mean, variance.max(0.0), common)
+    }
+
+    /// The estimate of a camera's clock as of a time.
+    pub(super) fn estimate(&self, camera: &CameraName, time: Timestamp) -> Option<ClockEstimate> {
+        let clock = self.cameras.get(camera)?;
+        let ahead = self.ahead(time);
+        let (offset, own, common) = self.absolute(clock, 0, ahead);
+        let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
+        Some(ClockEstimate {
+            offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
+            // No clock is worse known than what was reported of it.
+            sd_s: (own + common).min(clock.prior).sqrt(),
+            relative_sd_s: own.sqrt(),
+            drift,
+            drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
+        })
+    }
+
+    /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
+    /// behind its reported one.
+    pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
+        let ahead = self.ahead(time);
+        let (weights, _) = self.weights(|clock| clock.prior);
+        let offset = |clock: &Clock| self.relative(clock, 0, ahead);
+        let common: f64 = weights.iter().map(|(clock, weight)| weight * offset(clock)).sum();
+        self.cameras.values().map(|clock| offset(clock) - common).fold(0.0, f64::max).min(MAX_OFFSET_S)
+    }
+
+    /// Offset and drift of the reference against true time as of the epoch.
+    fn reference_offset_and_drift(&self) -> [f64; 2] {
+        let priors: [fn(&Clock) -> f64; 2] = [|clock| clock.prior, |clock| clock.drift_prior];
+        std::array::from_fn(|i| {
+            let (weights, _) = self.weights(priors[i]);
+            -weights.iter().map(|(clock, weight)| weight * self.relative(clock, i, 0.0)).sum::<f64>()
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> CameraName {
+        text.parse().unwrap()
+    }
+
+    /// Three clocks of 0.1 s, of which the second and the third are learnt against the first, the reference.
+    fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
+        let mut belief = Belief::default();
+        for (camera, pose) in ["a", "b", "c"].into_iter().zip(poses) {
+            belief.add(&name(camera), [0.1, 3e-5], pose);
+        }
+        belief.advance(Timestamp::EPOCH);
+        let components: Vec<usize> =
+            ["b", "c"].into_iter().filter_map(|c| belief.place(&name(c))).flat_map(|k| [k, k + 1]).collect();
+        let mean = DVector::from_vec(vec![0.06, 1e-5, -0.03, 0.0]);
+        belief.learn(&components, &mean, &DMatrix::from_diagonal_element(4, 4, 1e-12));
+        (belief, components)
+    }
+
+    fn of(belief: &Belief, camera: &str) -> ClockEstimate {
+        belief.estimate(&name(camera), Timestamp::EPOCH).unwrap()
+    }
+
+    #[test]
+    fn offsets_are_against_what_all_clocks_say_and_their_mean_stays_unknown() {
+        let (belief, _) = learnt([None; 3]);
+        for (camera, offset) in [("a", -0.01), ("b", 0.05), ("c", -0.04)] {
+            let estimate = of(&belief, camera);
+            assert!((estimate.offset_s - offset).abs() < 1e-9, "{estimate:?}");
+            assert!((estimate.sd_s - 0.1 / 3.0_f64.sqrt()).abs() < 1e-4, "{estimate:?}");
+            assert!(estimate.relative_sd_s < 1e-5, "{estimate:?}");
+        }
+        let later = belief.estimate(&name("b"), Timestamp::from_seconds(100.0)).unwrap();
+        assert!((later.offset_s - of(&belief, "b").offset_s - 100.0 * later.drift).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_doubted_clock_is_as_badly_known_as_it_was_reported_and_the_others_stay() {
+        for doubted in ["a", "b"] {
+            let (mut belief, _) = learnt([Some(Matrix6::identity() * 1e-6), None, None]);
+            belief.doubt(&name(doubted));
+            assert!(of(&belief, doubted).relative_sd_s > 0.06, "{:?}", of(&belief, doubted));
+            let (b, c) = (of(&belief, "b"), of(&belief, "c"));
+            if doubted == "a" {
+                assert!((b.offset_s - c.offset_s - 0.09).abs() < 1e-9);
+            }
+            assert!(belief.covariance.clone().cholesky().is_some());
+        }
+    }
+
+    #[test]
+    fn beginning_anew_and_calibrating_leave_a_regular_covariance() {
+        let pose = Some(Matrix6::identity() * 1e-6);
+        let (mut belief, _) = learnt([pose, None, pose]);
+        belief.calibrate(&name("b"), pose);
+        belief.calibrate(&name("c"), None);
+        assert_eq!(belief.pose(&name("c")), None);
+        assert!(belief.covariance.clone().cholesky().is_some());
+        belief.begin_anew();
+        assert!(belief.covariance.clone().cholesky().is_some());
+        assert_eq!(of(&belief, "b").offset_s, 0.0);
+        assert!(belief.pose(&name("b")).is_some());
+    }
+}

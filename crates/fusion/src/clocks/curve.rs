@@ -1,0 +1,145 @@
+//! A target's way through a window of time, as a cubic spline.
+
+use nalgebra::{DMatrix, DVector, Vector3};
+
+/// Length of a piece, s: a weave of 1 rad/s and 10 m is followed to 2 mm, its beginning and its end
+/// (steps of the acceleration) to a few centimetres.
+const PIECE_S: f64 = 0.5;
+/// Differences of the coefficients that a piece's third derivative is made of.
+const THIRD: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
+const SECOND: [f64; 3] = [1.0, -2.0, 1.0];
+const FIRST: [f64; 2] = [-1.0, 1.0];
+/// Nothing accelerates or flies beyond this, m/s^2 and m/s: it holds what no bearing tells.
+const VAGUE_ACCELERATION: f64 = 50.0;
+const VAGUE_SPEED: f64 = 300.0;
+/// Variance of a coefficient round where it begins, m^2: it holds what nothing else does.
+const VAGUE_PLACE_SD_M: f64 = 1e4;
+
+/// A uniform cubic B-spline over an interval of time, and beyond it along its last pieces. Its
+/// coefficients are points in space, one after the other in a vector.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Curve {
+    start_s: f64,
+    pieces: usize,
+}
+
+/// How much each of four coefficients counts for the place (1) and for the velocity (1/s) at a time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Basis {
+    /// The first of the four coefficients.
+    pub(super) first: usize,
+    pub(super) place: [f64; 4],
+    pub(super) velocity: [f64; 4],
+}
+
+impl Curve {
+    /// A curve from one time to another, s.
+    pub(super) fn over(start_s: f64, end_s: f64) -> Self {
+        Self { start_s, pieces: ((end_s - start_s) / PIECE_S).ceil().max(1.0) as usize }
+    }
+
+    /// How many points its coefficients are.
+    pub(super) fn points(&self) -> usize {
+        self.pieces + 3
+    }
+
+    pub(super) fn basis(&self, time_s: f64) -> Basis {
+        let along = (time_s - self.start_s) / PIECE_S;
+        let first = (along.max(0.0) as usize).min(self.pieces - 1);
+        let u = along - first as f64;
+        let (v, u2) = (1.0 - u, u * u);
+        let u3 = u2 * u;
+        let place = [v * v * v, 3.0 * u3 - 6.0 * u2 + 4.0, 3.0 * (u + u2 - u3) + 1.0, u3].map(|b| b / 6.0);
+        let velocity =
+            [-v * v, 3.0 * u2 - 4.0 * u, 1.0 + 2.0 * u - 3.0 * u2, u2].map(|b| b / (2.0 * PIECE_S));
+        Basis { first, place, velocity }
+    }
+
+    /// Adds to a matrix of information what is known of the coefficients beforehand: a white jerk of
+    /// this power spectral density (m^2/s^5), and that nothing flies beyond all bounds.
+    pub(super) fn add_prior(&self, information: &mut DMatrix<f64>, jerk_density: f64) {
+        let share = (self.points() as f64).recip();
+        add_differences(information, self.points(), &THIRD, (jerk_density * PIECE_S.powi(5)).recip());
+        let bend = share / (VAGUE_ACCELERATION * PIECE_S * PIECE_S).powi(2);
+        add_differences(information, self.points(), &SECOND, bend);
+        add_differences(information, self.points(), &FIRST, share / (VAGUE_SPEED * PIECE_S).powi(2));
+    }
+
+    /// How the information of a jerk's density enters the evidence: minus twice the logarithm of the
+    /// prior's density, but for what is the same for all.
+    pub(super) fn log_width(&self, jerk_density: f64) -> f64 {
+        3.0 * (self.points() - THIRD.len() + 1) as f64 * jerk_density.ln()
+    }
+
+    /// The coefficients that pass nearest to places at times, all with this standard deviation, m.
+    pub(super) fn fit(
+        &self,
+        places: impl Iterator<Item = (f64, Vector3<f64>)>,
+        sd_m: f64,
+    ) -> Option<DVector<f64>> {
+        let n = 3 * self.points();
+        let mut information = DMatrix::zeros(n, n);
+        let mut pull = DVector::zeros(n);
+        for (time_s, place) in places {
+            let Basis { first, place: weights, .. } = self.basis(time_s);
+            for i in 0..4 {
+                for axis in 0..3 {
+                    pull[3 * (first + i) + axis] += weights[i] * place[axis] / sd_m.powi(2);
+                    for k in 0..4 {
+                        information[(3 * (first + i) + axis, 3 * (first + k) + axis)] +=
+                            weights[i] * weights[k] / sd_m.powi(2);
+                    }
+                }
+            }
+        }
+        self.add_prior(&mut information, 1.0);
+        for i in 0..n {
+            information[(i, i)] += VAGUE_PLACE_SD_M.powi(-2);
+        }
+        Some(information.cholesky()?.solve(&pull))
+    }
+}
+
+/// Adds the information that these differences of neighbouring coefficients are zero.
+fn add_differences(information: &mut DMatrix<f64>, points: usize, difference: &[f64], weight: f64) {
+    for start in 0..(points + 1).saturating_sub(difference.len()) {
+        for (i, a) in difference.iter().enumerate() {
+            for (k, b) in difference.iter().enumerate() {
+                for axis in 0..3 {
+                    information[(3 * (start + i) + axis, 3 * (start + k) + axis)] += weight * a * b;
+                }
+            }
+        }
+    }
+}
+
+impl Basis {
+    /// Place and velocity for the coefficients at the beginning of a vector.
+    pub(super) fn at(&self, coefficients: &DVector<f64>) -> (Vector3<f64>, Vector3<f64>) {
+        let (mut place, mut velocity) = (Vector3::zeros(), Vector3::zeros());
+        for i in 0..4 {
+            let point = coefficients.fixed_rows::<3>(3 * (self.first + i));
+            place += point * self.place[i];
+            velocity += point * self.velocity[i];
+        }
+        (place, velocity)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_parabola_is_followed_exactly_inside_and_beyond() {
+        let curve = Curve::over(-1.0, 3.0);
+        let at = |t: f64| Vector3::new(1.0 + 10.0 * t, -t * t, 40.0);
+        let places = (0..40).map(|k| (-1.0 + 0.1 * f64::from(k), at(-1.0 + 0.1 * f64::from(k))));
+        let coefficients = curve.fit(places, 1e-3).unwrap();
+        for t in [-1.2, -0.3, 0.77, 3.1] {
+            let (place, velocity) = curve.basis(t).at(&coefficients);
+            assert!((place - at(t)).norm() < 1e-2, "{t}: {place}");
+            assert!((velocity - Vector3::new(10.0, -2.0 * t, 0.0)).norm() < 1e-2, "{t}: {velocity}");
+        }
+    }
+}

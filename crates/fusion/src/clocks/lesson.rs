@@ -1,0 +1,192 @@
+//! What a window teaches of the clocks: how believable that is, and whether a clock has jumped.
+
+use crossfix_message::CameraName;
+use nalgebra::DMatrix;
+
+use super::adjustment::{Adjusted, Adjustment, Prior, Unknowns};
+use super::belief::Belief;
+use super::curve::Curve;
+use super::window::Window;
+
+/// Bearings of less than this say nothing that can be checked, s.
+const LEAST_WINDOW_S: f64 = 1.0;
+/// Residuals larger than this (squared, over what was reported) are not the noise's but a mistake's.
+const MAX_SCALE: f64 = 16.0;
+/// When more than this share of a camera's bearings do not fit, the camera does not.
+const MAX_STRANGERS: f64 = 0.3;
+/// Residuals larger than this, or clocks farther than this from what was believed of them (both
+/// squared, over what was expected), may be those of a clock that has jumped.
+const SUSPICIOUS_SCALE: f64 = 1.5;
+const SUSPICIOUS_PULL: f64 = 6.0;
+/// How much likelier (twice the logarithm) a jump must make a window: clocks jump once a day.
+const JUMP: f64 = 18.0;
+/// Cameras that are tried for a jump, the least fitting first.
+const MAX_SUSPECTS: usize = 4;
+/// A part of a camera's bearings that fits so much better (squared) than all of them is after a jump.
+const BETTER: f64 = 1.5;
+/// A curve reaches beyond its bearings as far as the clocks may move, and no farther than this, s.
+const MAX_MARGIN_S: f64 = 1.0;
+/// No window is longer than this, s: the number of a curve's pieces is bounded.
+const LONGEST_S: f64 = 12.0;
+/// Density of jerk that is tried first, m^2/s^5, as a power of ten.
+const FIRST_DENSITY: i32 = 0;
+
+/// Evidence (twice the logarithm) as good as equal.
+const EVEN: f64 = 1.0;
+
+/// What a window says to a belief.
+pub(super) enum Lesson {
+    /// What is believed with it.
+    Learnt(Box<Belief>),
+    /// It is too short, sees no clock that could be learnt, or is no target's.
+    Nothing,
+    /// It fits only if all that was learnt before is forgotten: this is what it says then.
+    Anew(Box<Belief>),
+}
+
+/// A belief before a window, and the part of the state that the window tells of.
+struct Pupil<'a> {
+    belief: Belief,
+    components: Vec<usize>,
+    window: &'a Window,
+}
+
+/// A belief after a window. If the window does not fit it well, the clock of a camera may have jumped.
+pub(super) fn lesson(belief: &Belief, window: &Window) -> Lesson {
+    let window = window.checked();
+    let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S) else {
+        return Lesson::Nothing;
+    };
+    let mut belief = belief.clone();
+    belief.advance(window.start.plus_seconds(last));
+    let clocks = window.cameras.iter().filter(|camera| belief.place(camera).is_some()).count();
+    if clocks == 0 || window.cameras.len() < 2 {
+        return Lesson::Nothing;
+    }
+    let components = components(&belief, &window);
+    Pupil { belief, components, window: &window }.learn()
+}
+
+impl Pupil<'_> {
+    fn learn(mut self) -> Lesson {
+        let plain = adjust(&self.belief, self.window, &self.components);
+        let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
+        if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
+            return Lesson::Learnt(Box::new(self.learnt(self.belief.clone(), adjusted)));
+        }
+        let suspects = self.suspects(plain.as_ref());
+        if let Some(belief) = suspects.first().and_then(|camera| self.jumped_within(camera, plain.as_ref())) {
+            return Lesson::Learnt(Box::new(belief));
+        }
+        let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
+        for camera in suspects {
+            let mut doubting = self.belief.clone();
+            doubting.doubt(camera);
+            let Some(adjusted) = adjust(&doubting, self.window, &self.components).filter(fits) else {
+                continue;
+            };
+            let evidence = adjusted.evidence - JUMP;
+            if best.as_ref().is_none_or(|(best, _)| evidence > best.evidence) {
+                best = Some((Adjusted { evidence, ..adjusted }, doubting));
+            }
+        }
+        if let Some((adjusted, belief)) = best {
+            return Lesson::Learnt(Box::new(self.learnt(belief, &adjusted)));
+        }
+        self.belief.begin_anew();
+        self.components = components(&self.belief, self.window);
+        let anew = adjust(&self.belief, self.window, &self.components).filter(fits);
+        anew.map_or(Lesson::Nothing, |adjusted| {
+            Lesson::Anew(Box::new(self.learnt(self.belief.clone(), &adjusted)))
+        })
+    }
+
+    fn learnt(&self, mut belief: Belief, adjusted: &Adjusted) -> Belief {
+        belief.learn(&self.components, &adjusted.cameras, &adjusted.covariance);
+        belief
+    }
+
+    /// What is believed if a camera's clock has jumped in the first half of the window: its bearings
+    /// of the second half fit much better than all, and not by the clock as it was.
+    fn jumped_within(&self, camera: &CameraName, plain: Option<&Adjusted>) -> Option<Belief> {
+        let index = self.window.cameras.iter().position(|known| known == camera)?;
+        let strange = |adjusted: &Adjusted| adjusted.scales[index];
+        if plain.is_some_and(|plain| fits(plain) && strange(plain) < SUSPICIOUS_SCALE) {
+            return None;
+        }
+        let (first, last) = self.window.span()?;
+        let later = self.window.without_early((first + last) / 2.0, camera);
+        let mut doubting = self.belief.clone();
+        doubting.doubt(camera);
+        let after = adjust(&doubting, &later, &self.components).filter(fits)?;
+        let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
+        let before = adjust(&self.belief, &later, &self.components).filter(fits);
+        // Where nothing was known yet of the clock, nothing speaks for it as it was.
+        let jumped = before.is_none_or(|before| after.evidence + EVEN > before.evidence);
+        (much_better && jumped).then(|| self.learnt(doubting, &after))
+    }
+
+    /// The cameras of the window whose clocks may have jumped, the least fitting first.
+    fn suspects(&self, adjusted: Option<&Adjusted>) -> Vec<&CameraName> {
+        let strange = |index: usize| {
+            adjusted.map_or(0.0, |adjusted| adjusted.scales[index] + MAX_SCALE * adjusted.strangers[index])
+        };
+        let cameras = self.window.cameras.iter().enumerate();
+        let mut suspects: Vec<(f64, &CameraName)> = cameras
+            .filter(|(_, camera)| self.belief.is_uncertain(camera))
+            .map(|(index, camera)| (strange(index), camera))
+            .collect();
+        suspects.sort_by(|a, b| b.0.total_cmp(&a.0));
+        suspects.into_iter().take(MAX_SUSPECTS).map(|(_, camera)| camera).collect()
+    }
+}
+
+/// The components of the state that are a window's cameras': of each its clock's, then its pose's.
+fn components(belief: &Belief, window: &Window) -> Vec<usize> {
+    let of_camera = |camera: &CameraName| {
+        let clock = belief.place(camera).map(|place| place..place + 2);
+        let pose = belief.pose(camera).map(|place| place..place + 6);
+        clock.into_iter().chain(pose).flatten()
+    };
+    window.cameras.iter().flat_map(of_camera).collect()
+}
+
+fn fits(adjusted: &Adjusted) -> bool {
+    adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
+        && adjusted.strangers.iter().all(|share| *share < MAX_STRANGERS)
+}
+
+fn is_suspicious(adjusted: &Adjusted) -> bool {
+    adjusted.scales.iter().any(|scale| *scale > SUSPICIOUS_SCALE)
+        || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
+}
+
+/// Fits a window with what is believed of clocks and poses.
+fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adjusted> {
+    let (mean, covariance) = belief.marginal(components);
+    let mut next = 0;
+    let mut room = |place: Option<usize>, size: usize| {
+        let first = place.map(|_| next);
+        next += first.map_or(0, |_| size);
+        first
+    };
+    let unknowns = |camera: &CameraName| Unknowns {
+        clock: room(belief.place(camera), 2),
+        pose: room(belief.pose(camera), 6),
+    };
+    let cameras: Vec<Unknowns> = window.cameras.iter().map(unknowns).collect();
+    let sd = |place: usize| covariance[(place, place)].max(0.0).sqrt();
+    let widest = cameras.iter().filter_map(|unknowns| unknowns.clock).map(sd).fold(0.0, f64::max);
+    let margin = (2.0 * widest).min(MAX_MARGIN_S);
+    let offset = |unknowns: &Unknowns| unknowns.clock.map_or(0.0, |place| mean[place]);
+    let offsets: Vec<f64> = cameras.iter().map(offset).collect();
+    let times = || window.sights.iter().map(|sight| sight.time_s - offsets[sight.camera]);
+    let first = times().fold(f64::INFINITY, f64::min) - margin;
+    let last = times().fold(f64::NEG_INFINITY, f64::max) + margin;
+    let precision: DMatrix<f64> = covariance.cholesky()?.inverse();
+    let epoch_s = belief.epoch()?.seconds_since(window.start);
+    let prior = Prior { mean, precision, epoch_s, cameras };
+    let reach = LONGEST_S + 2.0 * MAX_MARGIN_S;
+    let curve = Curve::over(first, last.min(first + reach));
+    Adjustment::new(&window.sights, curve, &prior).solve(FIRST_DENSITY)
+}

@@ -1,0 +1,237 @@
+//! The cameras' clocks, from the tracks themselves: a moving target seen by several cameras lies
+//! off their sight lines by its velocity times their clocks' offsets.
+//!
+//! The bearings of a few tracks are gathered for some seconds ([`window`]) by the cameras' own
+//! clocks, and the target's way ([`curve`]) and all clocks are fitted to them at once
+//! ([`adjustment`]); what that tells of the clocks goes into what is believed of them ([`belief`]).
+//! A recursive filter was here before: an offset of 200 ms times a velocity not yet known is no
+//! linear matter, and of straight passes of 30 m/s it was sure of a wrong answer in three of eight.
+
+mod adjustment;
+mod belief;
+mod curve;
+mod lesson;
+mod window;
+
+use std::collections::BTreeSet;
+
+use crossfix_geometry::SightLine;
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Matrix6;
+
+use self::belief::Belief;
+use self::lesson::{Lesson, lesson};
+use self::window::Window;
+use crate::config::Clocks;
+use crate::ingress::Exposure;
+use crate::track::{Track, TrackId};
+use crate::tracker::Tracker;
+use crate::uncertainty::CameraUncertainty;
+
+/// Targets looked at at a time.
+const MAX_WINDOWS: usize = 3;
+/// A target slower than this says next to nothing of clocks, m/s.
+const LEAST_SPEED: f64 = 2.0;
+/// How long the bearings of a target are gathered before what they say is kept, s.
+const WINDOW_S: f64 = 8.0;
+/// As long as a clock is worse known than this, s, ...
+const SURE_S: f64 = 0.002;
+/// ... what has been gathered so far is looked at so often, s; ...
+const LOOK_EVERY_S: f64 = 1.0;
+/// ... and so often where all are known, for one may jump.
+const CHECK_EVERY_S: f64 = 4.0;
+/// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
+const MAX_REFUSED: u32 = 2;
+
+/// What is known of a camera's clock.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClockEstimate {
+    /// How far the clock is ahead, s: taken off its capture times.
+    pub offset_s: f64,
+    /// Standard deviation of the offset against true time, s. What all clocks may have in common
+    /// nobody can see: it stays as large as the clocks' reported deviations leave it.
+    pub sd_s: f64,
+    /// Standard deviation of the offset against what all clocks of the site say together, s.
+    pub relative_sd_s: f64,
+    /// How fast the clock gains, s/s.
+    pub drift: f64,
+    /// Standard deviation of the drift, s/s.
+    pub drift_sd: f64,
+}
+
+/// Estimates the clocks of all cameras.
+#[derive(Clone, Debug)]
+pub(crate) struct ClockEstimator {
+    config: Clocks,
+    /// What closed windows have told.
+    belief: Belief,
+    /// The same with what the open windows tell so far.
+    provisional: Option<Belief>,
+    windows: Vec<Window>,
+    /// Cameras whose clocks may have jumped, ...
+    suspects: BTreeSet<CameraName>,
+    /// ... and those of which the open windows tell all the same.
+    cleared: BTreeSet<CameraName>,
+    now: Timestamp,
+    next_look: Timestamp,
+    needed: bool,
+    /// Windows one after the other that fitted nothing that was learnt before.
+    refused: u32,
+}
+
+impl ClockEstimator {
+    pub(crate) fn new(config: Clocks) -> Self {
+        Self {
+            config,
+            belief: Belief::default(),
+            provisional: None,
+            windows: Vec::new(),
+            suspects: BTreeSet::new(),
+            cleared: BTreeSet::new(),
+            now: Timestamp::MIN,
+            next_look: Timestamp::MIN,
+            needed: false,
+            refused: 0,
+        }
+    }
+
+    /// Whether any clock is uncertain enough to be estimated.
+    pub(crate) fn is_needed(&self) -> bool {
+        self.needed
+    }
+
+    /// Makes a camera's clock and pose known by the deviations it reports; later reports change nothing.
+    pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
+        let reported_sd_s = reported.time_sd_s;
+        if !self.config.estimate || self.belief.knows(camera) {
+            return;
+        }
+        let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
+        self.needed |= uncertain;
+        let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
+        self.belief.add(camera, deviations, reported.pose);
+        self.provisional = None;
+    }
+
+    /// A camera has been calibrated anew: its bearings so far say nothing of the pose that follows.
+    pub(crate) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
+        if self.belief.knows(camera) {
+            self.belief.calibrate(camera, pose);
+            self.provisional = None;
+            self.windows.clear();
+        }
+    }
+
+    fn newest(&self) -> &Belief {
+        self.provisional.as_ref().unwrap_or(&self.belief)
+    }
+
+    /// The estimate of a camera's clock.
+    pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
+        let estimate = self.newest().estimate(camera, self.now)?;
+        let suspected = self.suspects.contains(camera) && !self.cleared.contains(camera);
+        let reported = self.belief.reported_sd(camera).filter(|_| suspected);
+        let widened = |sd: f64| reported.map_or(sd, |reported| reported.max(sd));
+        let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
+        Some(ClockEstimate { sd_s, relative_sd_s, ..estimate })
+    }
+
+    /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
+    /// behind its reported one.
+    pub(crate) fn largest_offset(&self) -> f64 {
+        self.newest().largest_offset(self.now)
+    }
+
+    /// Moves on to a time: closes windows that are full or whose target too few cameras see, and
+    /// looks at the others now and then.
+    pub(crate) fn advance(&mut self, time: Timestamp, tracker: &Tracker) {
+        self.now = self.now.max(time);
+        let followed = |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
+        let now = self.now;
+        let full = |window: &Window| now.seconds_since(window.start) >= WINDOW_S;
+        let mut closed = 0;
+        while let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
+            let window = self.windows.remove(index);
+            self.close(&window);
+            closed += 1;
+        }
+        if closed > 0 || self.now >= self.next_look {
+            self.look();
+            let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
+            self.next_look = self.now.plus_seconds(pause);
+        }
+    }
+
+    /// Takes a bearing of a track in, by the time that the camera gave it.
+    pub(crate) fn update(&mut self, track: &Track, exposure: &Exposure, line: &SightLine) {
+        let time = exposure.time.plus_seconds(exposure.correction_s);
+        let camera = &exposure.camera;
+        let index = self.windows.iter().position(|window| window.track == track.id).or_else(|| {
+            let fast = track.state().velocity().norm() >= LEAST_SPEED;
+            let worth = fast && track.is_confirmed() && track.is_held();
+            (worth && self.windows.len() < MAX_WINDOWS).then(|| {
+                self.windows.push(Window::new(track.id, time));
+                self.windows.len() - 1
+            })
+        });
+        if let Some(window) = index.and_then(|index| self.windows.get_mut(index)) {
+            window.add(camera, time, *line, track.position_at(exposure.time).coords);
+        }
+    }
+
+    /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
+    /// as it was in the beginning, until a window tells.
+    pub(crate) fn suspect(&mut self, camera: &CameraName) {
+        if self.belief.is_uncertain(camera) {
+            self.suspects.insert(camera.clone());
+            self.cleared.remove(camera);
+            self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
+            // Up to now its bearings may be by the clock as it was.
+            self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
+        }
+    }
+
+    /// Keeps what a window has told.
+    fn close(&mut self, window: &Window) {
+        match lesson(&self.belief, window) {
+            Lesson::Learnt(belief) => {
+                self.belief = *belief;
+                self.refused = 0;
+                for camera in window.checked_cameras() {
+                    self.suspects.remove(&camera);
+                }
+            }
+            Lesson::Nothing => {}
+            Lesson::Anew(belief) => {
+                self.refused += 1;
+                if self.refused >= MAX_REFUSED {
+                    self.refused = 0;
+                    self.belief = *belief;
+                }
+            }
+        }
+    }
+
+    /// Whether the clock of a camera that sees one of the targets is not well known.
+    fn is_unsure(&self) -> bool {
+        let unsure = |camera: &CameraName| {
+            let clock = self.belief.estimate(camera, self.now);
+            self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
+        };
+        self.windows.iter().flat_map(|window| &window.cameras).any(unsure)
+    }
+
+    /// Looks at what the open windows tell so far.
+    fn look(&mut self) {
+        let mut belief = None;
+        let mut cleared = BTreeSet::new();
+        for window in &self.windows {
+            if let Lesson::Learnt(next) = lesson(belief.as_ref().unwrap_or(&self.belief), window) {
+                belief = Some(*next);
+                cleared.extend(window.checked_cameras());
+            }
+        }
+        self.provisional = belief;
+        self.cleared = cleared;
+    }
+}

@@ -1,0 +1,150 @@
+//! The bearings of one track over a few seconds, by the cameras' own clocks.
+
+use crossfix_geometry::SightLine;
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Vector3;
+
+use crate::track::TrackId;
+
+/// A window holds no more bearings than this: when it is full, every other one of each camera is let
+/// go, and from then on as many are not taken.
+const MAX_SIGHTS: usize = 1500;
+/// A window is of so many cameras, the first that see its target: eight unknowns each, in time that
+/// is bounded. The others have their turn with another window.
+const MAX_CAMERAS: usize = 12;
+/// A camera says nothing of its clock that can be checked with fewer bearings than this.
+const LEAST_SIGHTS: usize = 5;
+/// Bearings this far from the window's beginning are not of it, s.
+const MAX_SPAN_S: f64 = 30.0;
+
+/// A bearing of a target.
+#[derive(Clone, Debug)]
+pub(super) struct Sight {
+    /// When it was taken by the camera's own clock, s after the window's beginning.
+    pub(super) time_s: f64,
+    /// Which camera of the window took it.
+    pub(super) camera: usize,
+    /// With the covariance that was reported.
+    pub(super) line: SightLine,
+    /// Where the track had the target then.
+    pub(super) place: Vector3<f64>,
+}
+
+/// The bearings of a track.
+#[derive(Clone, Debug)]
+pub(super) struct Window {
+    pub(super) track: TrackId,
+    pub(super) start: Timestamp,
+    pub(super) cameras: Vec<CameraName>,
+    pub(super) sights: Vec<Sight>,
+    /// One in so many bearings of each camera is taken.
+    thinned: usize,
+    /// Bearings of each camera that were offered.
+    offered: Vec<usize>,
+}
+
+impl Window {
+    pub(super) fn new(track: TrackId, start: Timestamp) -> Self {
+        Self { track, start, cameras: Vec::new(), sights: Vec::new(), thinned: 1, offered: Vec::new() }
+    }
+
+    /// Takes in a bearing of a camera by its own clock, with where the track has the target.
+    pub(super) fn add(&mut self, camera: &CameraName, time: Timestamp, line: SightLine, place: Vector3<f64>) {
+        let time_s = time.seconds_since(self.start);
+        if time_s.abs() > MAX_SPAN_S {
+            return;
+        }
+        let known = self.cameras.iter().position(|known| known == camera);
+        if known.is_none() && self.cameras.len() >= MAX_CAMERAS {
+            return;
+        }
+        let index = known.unwrap_or_else(|| {
+            self.cameras.push(camera.clone());
+            self.offered.push(0);
+            self.cameras.len() - 1
+        });
+        let number = self.offered[index];
+        self.offered[index] += 1;
+        if number.is_multiple_of(self.thinned) {
+            self.sights.push(Sight { time_s, camera: index, line, place });
+        }
+        if self.sights.len() >= MAX_SIGHTS {
+            self.thin();
+        }
+    }
+
+    /// Lets every other bearing of each camera go.
+    fn thin(&mut self) {
+        self.thinned *= 2;
+        let mut seen = vec![0_usize; self.cameras.len()];
+        self.sights.retain(|sight| {
+            seen[sight.camera] += 1;
+            seen[sight.camera] % 2 == 1
+        });
+    }
+
+    /// Earliest and latest time of its bearings, s.
+    pub(super) fn span(&self) -> Option<(f64, f64)> {
+        let times = || self.sights.iter().map(|sight| sight.time_s);
+        (!self.sights.is_empty())
+            .then(|| (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max)))
+    }
+
+    /// Which cameras have given enough bearings for what they say to be checked.
+    fn checked_indices(&self) -> Vec<usize> {
+        let count = |index: usize| self.sights.iter().filter(|sight| sight.camera == index).count();
+        (0..self.cameras.len()).filter(|index| count(*index) >= LEAST_SIGHTS).collect()
+    }
+
+    /// Cameras that have given enough bearings for what they say to be checked.
+    pub(super) fn checked_cameras(&self) -> Vec<CameraName> {
+        self.checked_indices().into_iter().map(|index| self.cameras[index].clone()).collect()
+    }
+
+    /// The window without the bearings that a camera took before a time, s.
+    pub(super) fn without_early(&self, time_s: f64, camera: &CameraName) -> Self {
+        let mut later = self.clone();
+        let index = self.cameras.iter().position(|known| known == camera);
+        later.sights.retain(|sight| Some(sight.camera) != index || sight.time_s >= time_s);
+        later
+    }
+
+    /// The window without the cameras that have given it too few bearings.
+    pub(super) fn checked(&self) -> Self {
+        let kept = self.checked_indices();
+        let moved = |sight: &Sight| {
+            let camera = kept.iter().position(|index| *index == sight.camera)?;
+            Some(Sight { camera, ..sight.clone() })
+        };
+        Self {
+            cameras: self.checked_cameras(),
+            sights: self.sights.iter().filter_map(moved).collect(),
+            offered: kept.iter().map(|index| self.offered[*index]).collect(),
+            ..*self
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+    use crate::spatial::tests_support::line_at;
+
+    #[test]
+    fn a_window_stays_bounded_and_spans_all_its_time() {
+        let mut window = Window::new(TrackId(1), Timestamp::EPOCH);
+        let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
+        for k in 0..9000_u32 {
+            let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
+            let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
+            window.add(&camera, time, line, Vector3::zeros());
+        }
+        assert!((MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()), "{}", window.sights.len());
+        let (first, last) = window.span().unwrap();
+        assert!(first < 0.01 && last > 8.9, "{first} {last}");
+        let of_b = window.sights.iter().filter(|sight| sight.camera == 1).count();
+        assert!(of_b.abs_diff(window.sights.len() / 3) <= 2, "{of_b}");
+    }
+}
