@@ -212,9 +212,12 @@ impl EventBuffer {
     }
 
     fn second_newest(&self) -> Option<Timestamp> {
-        let mut times: Vec<Timestamp> = self.streams.values().map(|stream| stream.newest).collect();
-        times.sort_unstable_by(|a, b| b.cmp(a));
-        times.get(1).copied()
+        let times = self.streams.values().map(|stream| stream.newest);
+        let (_, second) = times.fold((None, None), |(newest, second), time| match newest {
+            Some(newest) if time <= newest => (Some(newest), second.max(Some(time))),
+            _ => (Some(time), newest),
+        });
+        second
     }
 
     fn watermark(&self) -> Option<Timestamp> {

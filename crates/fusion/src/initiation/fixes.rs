@@ -30,7 +30,7 @@ pub(super) struct FixFinder {
 
 impl FixFinder {
     pub(super) fn new(config: &FusionConfig) -> Self {
-        Self { config: config.initiation.clone(), seeds: SeedFinder::new(config, 3) }
+        Self { config: config.initiation.clone(), seeds: SeedFinder::new(config, 3, f64::NEG_INFINITY) }
     }
 
     /// Every fix that the exposures of one period can make.

@@ -78,10 +78,6 @@ pub(super) struct Hypotheses {
 }
 
 impl Hypothesis {
-    fn shares(&self, lines: &BTreeSet<&LineId>) -> usize {
-        self.lines.iter().filter(|(_, id)| lines.contains(id)).count()
-    }
-
     /// The cameras that have lately given it a line.
     fn cameras(&self) -> BTreeSet<&CameraName> {
         self.lines.iter().map(|(_, (camera, ..))| camera).collect()
@@ -95,7 +91,7 @@ impl Hypothesis {
 impl Hypotheses {
     pub(super) fn new(config: &FusionConfig) -> Self {
         Self {
-            finder: SeedFinder::new(config, 2),
+            finder: SeedFinder::new(config, 2, LEAST_SCORE),
             gate: Gate::with_probability(config.tracking.gate_probability),
             tracking: config.tracking.clone(),
             span: config.initiation.periods as u64,
@@ -223,7 +219,7 @@ impl Hypotheses {
     /// Begins a hypothesis with every seed.
     fn begin(&mut self, seeds: Vec<Seed>, motion: &Motion) {
         for seed in seeds {
-            let Some(time) = seed.time().filter(|_| seed.score > LEAST_SCORE) else {
+            let Some(time) = seed.time() else {
                 continue;
             };
             self.families += 1;
@@ -266,7 +262,9 @@ impl Hypotheses {
 
     /// The best hypotheses without common lines that are likely enough and have no rival.
     fn confirm(&mut self, now: Timestamp, motion: &Motion) -> Vec<Start> {
-        let scored = self.hypotheses.iter().map(|h| (h.track.score, h.lines.as_slice()));
+        // The best come first, and the others are never chosen.
+        let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
+        let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));
         let selection = Selection::new(scored, self.shared_lines);
         let sure: Vec<usize> = selection
             .chosen()
@@ -289,11 +287,14 @@ impl Hypotheses {
         let lines: BTreeSet<LineId> =
             sure.iter().flat_map(|&i| &self.hypotheses[i].lines).map(|(_, id)| id.clone()).collect();
         let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
-        let claimed: BTreeSet<&LineId> = lines.iter().collect();
-        self.hypotheses.retain(|h| h.shares(&claimed) == 0);
-        let alive: BTreeSet<&LineId> =
-            self.hypotheses.iter().flat_map(|h| &h.lines).map(|(_, id)| id).collect();
-        self.claims.retain(|id, _| alive.contains(id));
+        if !lines.is_empty() {
+            self.hypotheses.retain(|h| h.lines.iter().all(|(_, id)| !lines.contains(id)));
+        }
+        if !self.claims.is_empty() {
+            let alive: BTreeSet<&LineId> =
+                self.hypotheses.iter().flat_map(|h| &h.lines).map(|(_, id)| id).collect();
+            self.claims.retain(|id, _| alive.contains(id));
+        }
         starts
     }
 

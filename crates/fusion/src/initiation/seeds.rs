@@ -58,6 +58,7 @@ pub(super) struct SeedFinder {
     /// The largest sum of squares of n true lines, by n, with the gate's probability.
     set_gates: Vec<f64>,
     least_cameras: usize,
+    least_score: f64,
 }
 
 /// A pair of lines that pass each other closely, as they are extended.
@@ -68,7 +69,8 @@ struct Growing<'a> {
 }
 
 impl SeedFinder {
-    pub(super) fn new(config: &FusionConfig, least_cameras: usize) -> Self {
+    /// Of sets of so many cameras at least that are so likely at least (log-likelihood ratio).
+    pub(super) fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
         let initiation = config.initiation.clone();
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
         // n lines have 2 n - 3 degrees of freedom, as the velocity has a prior.
@@ -82,6 +84,7 @@ impl SeedFinder {
             line_gate,
             set_gates,
             least_cameras,
+            least_score,
         }
     }
 
@@ -295,7 +298,7 @@ impl SeedFinder {
         });
         let score = self.log_evidence(&lines, &solution)?
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
-        Some(Seed { lines, solution, score })
+        (score > self.least_score).then_some(Seed { lines, solution, score })
     }
 
     /// Log-likelihood ratio of the lines being a new target's against their being clutter: the

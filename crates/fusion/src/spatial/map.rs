@@ -3,8 +3,10 @@ use nalgebra::{Matrix2x6, Matrix6, Point3, Vector6};
 
 use super::{Observability, TimedLine};
 
-/// Re-weightings: the ranges settle to a part in a million after three.
+/// Re-weightings at most: the ranges settle to a part in a million after three.
 const ITERATIONS: usize = 4;
+/// The ranges have settled when the state moves by less than this share of the nearest.
+const SETTLED: f64 = 1e-5;
 
 /// Position and velocity with the greatest posterior density.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,6 +54,7 @@ pub fn map(
         data = Matrix6::zeros();
         let mut right = Vector6::zeros();
         let mut squares = 0.0;
+        let mut nearest = f64::INFINITY;
         for timed @ TimedLine { line, time, .. } in lines {
             let dt = time.seconds_since(reference);
             let offset = |x: &Vector6<f64>| {
@@ -59,6 +62,7 @@ pub fn map(
             };
             // The first round weighs all lines as if they were of one range.
             let range = state.as_ref().map_or(1.0, |x| offset(x).dot(&line.direction).max(1e-3));
+            nearest = nearest.min(range);
             // E' (p + v dt - c) / range = 0
             let tangents = line.basis.transpose() / range;
             let mut h = Matrix2x6::zeros();
@@ -77,7 +81,13 @@ pub fn map(
         if let Some(x) = &state {
             chi_square = squares + (x.transpose() * prior * x).x;
         }
-        state = Some((data + prior).cholesky()?.solve(&right));
+        let next = (data + prior).cholesky()?.solve(&right);
+        let moved = state.map_or(f64::INFINITY, |x| (next - x).fixed_rows::<3>(0).norm());
+        state = Some(next);
+        // Squares are of the round before: it may not have been far off.
+        if moved < SETTLED * nearest {
+            break;
+        }
     }
     let mean = state?;
     let in_front = lines.iter().all(|TimedLine { line, time, .. }| {
