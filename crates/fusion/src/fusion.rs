@@ -262,9 +262,7 @@ impl Fusion {
         if exposure.sightings.is_empty() {
             return;
         }
-        for nis in evidence {
-            self.standings.learn(&exposure.camera, *nis);
-        }
+        self.standings.learn(&exposure.camera, evidence);
         if let Some(standing) = self.standings.review(&exposure.camera) {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_excluded",
