@@ -40,7 +40,7 @@ impl fmt::Display for TrackId {
 /// The life of a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrackStatus {
-    /// Started from a group of fixes, not yet sure.
+    /// Begun, and not yet sure.
     Tentative,
     /// Sure.
     Confirmed,
