@@ -17,6 +17,8 @@ use super::super::runs::{self, Noise};
 use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
 
+/// Mean NEES of position and velocity where the covariance is honest: what 4000 runs leave to chance.
+const HONEST: Limit = Limit::Near { value: 6.0, tolerance: 0.15 };
 /// Standard deviation of the batch solution's prior on the velocity, m/s: the fusion's default.
 const PRIOR_SD: f64 = 15.0;
 /// An error of so many of its own standard deviations, or of so many metres, has diverged.
@@ -199,7 +201,7 @@ impl Rows {
             self.ratios.push(ratio.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = known.iter().map(|o| o.nees).collect();
-        self.consistency.push(Row::new(layout.name, at, mean(&nees)));
+        self.consistency.push(Row::new(layout.name, at, mean(&nees)).limit(HONEST));
     }
 }
 
@@ -223,7 +225,7 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
         shares.push(confirmed(layout, at, &outcomes));
     }
     for row in &mut rows.consistency {
-        row.limit = Some(Limit::Near { value: 6.0, tolerance: 0.15 });
+        row.limit = Some(HONEST);
     }
     let Rows { ratios, errors, consistency } = rows;
     vec![
