@@ -108,7 +108,11 @@ impl Fusion {
                 }
                 // As far as is known by now: it is settled when the exposure's turn comes.
                 exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
-                match self.buffer.insert(exposure) {
+                let arrival = self.buffer.insert(exposure);
+                if let Some(time) = self.buffer.take_restart() {
+                    self.restart(time, &mut outputs);
+                }
+                match arrival {
                     Ok(Arrival::InOrder) => {}
                     Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
                     Err(reason) => outputs.push(self.reject(frame, reason)),
@@ -175,6 +179,18 @@ impl Fusion {
         while let Some(next) = self.buffer.release() {
             self.handle(next, outputs);
         }
+    }
+
+    /// Takes the order of time up anew from a time long passed: what was made of a time that never was
+    /// is forgotten.
+    fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
+        self.counters.count("event_time_restarts");
+        for (_, exposure) in std::mem::take(&mut self.corrected) {
+            let by_s = exposure.time.seconds_since(time);
+            self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
+        }
+        self.initiator = Initiator::new(&self.config);
+        self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
     fn handle(&mut self, next: Result<Exposure, (Exposure, RejectionReason)>, outputs: &mut Vec<Output>) {
@@ -278,8 +294,8 @@ impl Fusion {
         }
     }
 
-    /// Tells what has happened, and where all tracks are now.
-    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
+    /// Tells what has happened.
+    fn tell(&mut self, happenings: Vec<Happening>, time: Timestamp, outputs: &mut Vec<Output>) {
         for happening in happenings {
             self.counters.count(match happening.kind {
                 crossfix_message::TrackEventKind::Born => "tracks_born",
@@ -288,8 +304,13 @@ impl Fusion {
                 crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
                 _ => "tracks_lost",
             });
-            outputs.push(Output::Event(event(happening, exposure)));
+            outputs.push(Output::Event(event(happening, time)));
         }
+    }
+
+    /// Tells what has happened, and where all tracks are now.
+    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
+        self.tell(happenings, exposure.time, outputs);
         let due = self.tracker.due(exposure.time);
         let tracks: Vec<crossfix_message::Track> = due
             .iter()
@@ -311,9 +332,9 @@ impl Fusion {
     }
 }
 
-fn event(happening: Happening, exposure: &Exposure) -> TrackEvent {
+fn event(happening: Happening, time: Timestamp) -> TrackEvent {
     TrackEvent {
-        time_ns: exposure.time.nanos(),
+        time_ns: time.nanos(),
         kind: happening.kind.into(),
         track_id: happening.track.0,
         other_id: happening.other.map_or(0, |id| id.0),
