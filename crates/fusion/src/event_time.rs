@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::{CameraName, Timestamp};
 
+use crate::ingress::Load;
 use crate::{EventTime, Exposure, RejectionReason};
 
-/// More exposures than this are not held back, whatever the clocks say, nor are more remembered of
-/// those that came out: memory is bounded.
-const MAX_HELD: usize = 20_000;
+/// More exposures than this are not remembered of those that came out: memory is bounded.
+const MAX_TAKEN: usize = 20_000;
 
 /// A camera that has been silent for so many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
@@ -110,6 +110,7 @@ impl Stream {
 pub(crate) struct EventBuffer {
     config: EventTime,
     held: BTreeMap<Order, Held>,
+    load: Load,
     /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
     taken: BTreeSet<Order>,
     streams: BTreeMap<CameraName, Stream>,
@@ -148,6 +149,7 @@ impl EventBuffer {
         Self {
             config,
             held: BTreeMap::new(),
+            load: Load::default(),
             taken: BTreeSet::new(),
             streams: BTreeMap::new(),
             trusted: BTreeMap::new(),
@@ -193,6 +195,7 @@ impl EventBuffer {
         if let Some(by_s) = self.late_s(&exposure) {
             return Err(RejectionReason::Late { by_s });
         }
+        self.load.add(&exposure);
         self.held.insert(order, Held { exposure, compared });
         Ok(arrival)
     }
@@ -254,6 +257,7 @@ impl EventBuffer {
             let by_s = exposure.time.seconds_since(time);
             self.dropped.push((exposure, RejectionReason::Future { by_s }));
         }
+        self.load = Load::default();
         self.taken.clear();
         self.trusted.clear();
         self.behind_since_s = None;
@@ -280,6 +284,12 @@ impl EventBuffer {
         self.passed = self.passed.max(corrected);
     }
 
+    /// By how much a time, less the clock's offset, lies before what has been worked on, s: more than the
+    /// lateness, or `None`.
+    pub(crate) fn passed_by_s(&self, corrected: Timestamp) -> Option<f64> {
+        Some(self.passed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
+    }
+
     /// Marks a camera as come to its end: nobody waits for it any more.
     pub(crate) fn end(&mut self, camera: &CameraName) {
         self.ended.insert(camera.clone());
@@ -291,7 +301,7 @@ impl EventBuffer {
             return Some(Err(dropped));
         }
         let (order, _) = self.held.first_key_value()?;
-        if self.held.len() <= MAX_HELD && !self.everyone_ended() && order.0 > self.watermark()? {
+        if !self.load.is_too_much() && !self.everyone_ended() && order.0 > self.watermark()? {
             return None;
         }
         self.pop()
@@ -303,6 +313,7 @@ impl EventBuffer {
             return Some(Err(dropped));
         }
         let (order, Held { exposure, compared }) = self.held.pop_first()?;
+        self.load.remove(&exposure);
         // A frame taken in before a second camera was heard may turn out to be from the future.
         if !compared && let Some(reference) = self.reference {
             let ahead = exposure.time.seconds_since(reference.time);
@@ -318,7 +329,7 @@ impl EventBuffer {
     fn remember(&mut self, order: Order) {
         self.taken.insert(order);
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
-        while self.taken.len() > MAX_HELD || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
+        while self.taken.len() > MAX_TAKEN || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
             self.taken.pop_first();
         }
     }
@@ -645,6 +656,53 @@ mod tests {
         run(&mut buffer, 3, 5..9, |camera, t| (camera > 0).then_some(t));
         run(&mut buffer, 3, 9..20, |_, t| Some(t));
         assert_eq!(buffer.take_restart(), None);
+    }
+
+    fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
+        let line = crossfix_geometry::SightLine {
+            origin: nalgebra::Point3::origin(),
+            direction: nalgebra::Vector3::x_axis(),
+            basis: nalgebra::Matrix3x2::identity(),
+            covariance: nalgebra::Matrix2::identity(),
+        };
+        let sighting = crate::Sighting { image_track: 1, line };
+        Exposure { sightings: vec![sighting; sightings], ..exposure(camera, time_s) }
+    }
+
+    #[test]
+    fn sightings_that_wait_are_counted_and_bounded() {
+        let patient = EventTime { lateness_s: 60.0, ..EventTime::default() };
+        let mut buffer = EventBuffer::new(patient);
+        buffer.insert(exposure("b", 0.0)).unwrap();
+        let mut most = 0;
+        for k in 1..40 {
+            buffer.insert(crowded("a", 0.1 * f64::from(k), 10_000)).unwrap();
+            drain(&mut buffer);
+            let held: usize = buffer.held.values().map(|held| held.exposure.sightings.len()).sum();
+            most = most.max(held);
+        }
+        assert_eq!(most, 100_000);
+        while buffer.pop().is_some() {}
+        assert_eq!(buffer.load, Load::default());
+    }
+
+    #[test]
+    fn exposures_that_wait_are_counted_and_bounded() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        buffer.insert(exposure("b", 0.0)).unwrap();
+        for k in 1..10_000 {
+            buffer.insert(exposure("a", 1e-6 * f64::from(k))).unwrap();
+            drain(&mut buffer);
+        }
+        assert_eq!(buffer.held.len(), 6_000);
+    }
+
+    #[test]
+    fn a_camera_alone_is_followed_after_the_lateness() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        buffer.expect(&"b".parse().unwrap());
+        assert_eq!(run(&mut buffer, 1, 0..60, |_, t| Some(t)), 0);
+        assert!((5..7).contains(&buffer.held.len()), "{}", buffer.held.len());
     }
 
     proptest! {

@@ -7,7 +7,7 @@ use crossfix_message::{
 
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
-use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
+use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::spatial::Quantity;
@@ -56,6 +56,7 @@ pub struct Fusion {
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
     corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
+    corrected_load: Load,
     counters: Counters,
     sequence: u64,
 }
@@ -76,6 +77,7 @@ impl Fusion {
             clocks: ClockEstimator::new(config.clocks.clone()),
             standings: Standings::default(),
             corrected: BTreeMap::new(),
+            corrected_load: Load::default(),
             counters: Counters::default(),
             sequence: 0,
             config,
@@ -138,7 +140,7 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, &mut outputs);
         }
-        while let Some((_, exposure)) = self.corrected.pop_first() {
+        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
             self.process(&exposure, &mut outputs);
         }
         outputs
@@ -185,7 +187,7 @@ impl Fusion {
     /// is forgotten.
     fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
-        for (_, exposure) in std::mem::take(&mut self.corrected) {
+        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
             let by_s = exposure.time.seconds_since(time);
             self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
         }
@@ -218,12 +220,28 @@ impl Fusion {
         exposure.correction_s = clock.offset_s;
         exposure.time = reported.plus_seconds(-clock.offset_s);
         exposure.uncertainty.time_sd_s = clock.relative_sd_s;
-        self.corrected.insert((exposure.time, exposure.camera.clone(), reported), exposure);
+        if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
+            return self.handle(Err((exposure, RejectionReason::Late { by_s })), outputs);
+        }
+        let order = (exposure.time, exposure.camera.clone(), reported);
+        if self.corrected.contains_key(&order) {
+            return self.handle(Err((exposure, RejectionReason::Duplicate)), outputs);
+        }
+        self.corrected_load.add(&exposure);
+        self.corrected.insert(order, exposure);
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
-        while let Some(entry) = self.corrected.first_entry().filter(|entry| entry.key().0 <= settled) {
-            let next = entry.remove();
+        while let Some(next) = self.next_corrected(settled) {
             self.process(&next, outputs);
         }
+    }
+
+    /// The next of the corrected exposures up to a time, or if more wait than may.
+    fn next_corrected(&mut self, settled: Timestamp) -> Option<Exposure> {
+        let crowded = self.corrected_load.is_too_much();
+        let entry = self.corrected.first_entry().filter(|entry| crowded || entry.key().0 <= settled)?;
+        let exposure = entry.remove();
+        self.corrected_load.remove(&exposure);
+        Some(exposure)
     }
 
     /// What is known of a camera's clock, if clocks are in doubt.

@@ -282,6 +282,64 @@ fn ten_thousand_false_bearings_of_every_camera_are_survived_in_bounded_time() {
 }
 
 #[test]
+fn a_frame_of_more_bearings_than_a_picture_has_is_cut_and_told() {
+    let mut fusion = of_the_site();
+    let one = bearing(Vector3::z(), 1);
+    let frame = BearingFrame { camera: "a".into(), tracks: vec![one; 10_300], ..Default::default() };
+    let outputs = fusion.ingest(&frame);
+    let reasons = outputs.iter().filter_map(|output| match output {
+        Output::Rejected(rejection) => Some(&rejection.reason),
+        _ => None,
+    });
+    assert_eq!(reasons.collect::<Vec<_>>(), [&RejectionReason::Crowded { left_out: 300 }]);
+    assert_eq!(fusion.counters().get("frames_crowded"), 1);
+}
+
+/// Frames that have come, and have neither been worked on nor refused.
+fn waiting(fusion: &Fusion) -> u64 {
+    let count = |name| fusion.counters().get(name);
+    count("frames") - count("exposures") - count("rejected_late") - count("rejected_future")
+}
+
+#[test]
+fn of_a_camera_alone_little_waits() {
+    let mut fusion = of_the_site();
+    for k in 0..200 {
+        let tracks = vec![bearing(Vector3::z(), 1); 20];
+        let capture_time_ns = k * 33_000_000;
+        let frame = BearingFrame { camera: "a".into(), capture_time_ns, tracks, ..Default::default() };
+        fusion.ingest(&frame);
+        assert!(waiting(&fusion) <= 17, "{}", waiting(&fusion));
+    }
+}
+
+#[test]
+fn of_a_learnt_clock_that_is_flooded_no_more_waits_than_may() {
+    let circling = |t: f64| Point3::new(40.0 * (0.3 * t).cos(), 40.0 * (0.3 * t).sin(), 45.0);
+    let scene = Scene::new(vec![Box::new(move |t| Some(circling(t)))], 20.0);
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    let mut last = 0;
+    for mut frame in scene.frames(1) {
+        if frame.camera == "b" {
+            frame.capture_time_ns += 200_000_000;
+        }
+        frame.capture_time_sd_s = if frame.camera == "a" { 0.0 } else { 0.2 };
+        last = last.max(frame.capture_time_ns);
+        fusion.ingest(&frame);
+    }
+    let learnt = fusion.cameras().filter_map(|camera| camera.clock).any(|clock| clock.offset_s > 0.15);
+    assert!(learnt, "{:?}", fusion.cameras().collect::<Vec<_>>());
+    for k in 1..=20_000 {
+        let camera = if k % 2 == 0 { "b" } else { "a" }.into();
+        let capture_time_ns = last + 1_000 * k;
+        let frame = BearingFrame { camera, capture_time_ns, capture_time_sd_s: 0.2, ..Default::default() };
+        fusion.ingest(&frame);
+    }
+    // Six thousand for their order, and as many for the clocks.
+    assert!((6_000..=12_000).contains(&waiting(&fusion)), "{}", waiting(&fusion));
+}
+
+#[test]
 fn two_hundred_bearings_that_are_all_alike_are_survived_in_bounded_time_by_every_method() {
     let solvers = [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
     let mut configs = vec![FusionConfig::default(); 5];
