@@ -47,8 +47,8 @@ pub struct EventTime {
     /// camera has overtaken where that has happened within the last 20 times this, s of capture time. 0.001
     /// to 60. Default 0.5: longer than any network hiccup that a track would not survive anyway.
     pub lateness_s: f64,
-    /// A frame this far ahead of the second newest camera is from the future and refused, s. 0.001 to 3600.
-    /// Default 10.
+    /// A frame this far ahead of what the cameras say together (the second newest, and what half of them
+    /// have reached) is from the future and refused, s. 0.001 to 3600. Default 10.
     pub max_ahead_s: f64,
 }
 

@@ -5,17 +5,21 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::{CameraName, Timestamp};
 
+use crate::ingress::Load;
 use crate::{EventTime, Exposure, RejectionReason};
 
-/// More exposures than this are not held back, whatever the clocks say, nor are more remembered of
-/// those that came out: memory is bounded.
-const MAX_HELD: usize = 20_000;
+/// More exposures than this are not remembered of those that came out: memory is bounded.
+const MAX_TAKEN: usize = 20_000;
 
 /// A camera that has been silent for so many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
 
 /// For so many times the lateness a camera is waited for as one whose frames overtake each other.
 const DISORDER_LASTS: f64 = 20.0;
+
+/// So many frames of a camera one after the other far behind its newest say that its clock was ahead,
+/// even where they come too late.
+const MOST_FAR_BEHIND: u32 = 3;
 
 type Order = (Timestamp, CameraName);
 
@@ -39,6 +43,12 @@ pub(crate) enum Arrival {
 #[derive(Clone, Copy, Debug)]
 struct Stream {
     newest: Timestamp,
+    /// From the last but one to the newest, s, as far as that is no jump.
+    step_s: f64,
+    /// [`EventBuffer::run_s`] when it was heard last.
+    heard_s: f64,
+    /// Frames far behind the newest, one after the other.
+    far_behind: u32,
     /// How far behind the newest others came, at most, s, and the newest when one did last; from a
     /// frame on that came too late for it.
     disorder: Option<(f64, Timestamp)>,
@@ -46,20 +56,23 @@ struct Stream {
 
 impl Stream {
     fn beginning(newest: Timestamp) -> Self {
-        Self { newest, disorder: None }
+        Self { newest, step_s: 0.0, heard_s: 0.0, far_behind: 0, disorder: None }
     }
 
     /// Takes note of a frame that came `late_s` too late.
     fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
         let behind_s = self.newest.seconds_since(time);
         let known_s = self.disorder_s(lateness_s);
+        let far_behind = if behind_s > lateness_s { self.far_behind + 1 } else { 0 };
+        self.far_behind = far_behind;
         if behind_s <= 0.0 {
             self.newest = time;
+            self.step_s = (-behind_s).min(PATIENCES * lateness_s);
         } else if behind_s <= lateness_s {
             if late_s.is_some() || known_s > 0.0 {
                 self.disorder = Some((behind_s.max(known_s), self.newest));
             }
-        } else if late_s.is_none_or(|late_s| late_s <= lateness_s) {
+        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s) {
             // No network reorders so far: the clock was ahead, and now it is not.
             *self = Self::beginning(time);
         }
@@ -75,9 +88,17 @@ impl Stream {
 
 /// The buffer that puts exposures into order.
 ///
-/// The time up to which exposures are released follows the *second* newest camera, so that one
-/// camera with a wrong clock cannot drag the others into the past: up to the slowest camera that
-/// is still heard, or `lateness_s` behind that second newest, whichever is later.
+/// The time up to which exposures are released follows the reference: the second newest of the live
+/// cameras, and no more than half of them must be beyond what the others have reached. So a minority
+/// of wrong clocks cannot drag the others into the past. It is the time of the slowest camera that is
+/// still heard, or `lateness_s` behind the reference, whichever is later.
+///
+/// Frames that are refused count for the reference too: where most cameras jump, time has jumped. If
+/// most of them have been behind what was released for a while, that was the mistake, and the order is
+/// taken up anew from their time.
+///
+/// A camera is live until the cameras heard since have gone on, on average, by [`PATIENCES`] times the
+/// lateness by their own clocks, jumps left out: there is no other clock here.
 ///
 /// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
 /// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be as
@@ -89,12 +110,23 @@ impl Stream {
 pub(crate) struct EventBuffer {
     config: EventTime,
     held: BTreeMap<Order, Held>,
+    load: Load,
     /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
     taken: BTreeSet<Order>,
     streams: BTreeMap<CameraName, Stream>,
     /// The newest time of each camera that agreed with another camera's.
     trusted: BTreeMap<CameraName, Timestamp>,
     ended: BTreeSet<CameraName>,
+    /// How far all cameras together have gone on, each by its own clock and without jumps, s.
+    run_s: f64,
+    /// The time that the live cameras agree on, and how many they were, when a frame last came.
+    reference: Option<Reference>,
+    /// [`Self::run_s`] since when most live cameras have been behind what was released.
+    behind_since_s: Option<f64>,
+    /// What was held when the order was taken up anew.
+    dropped: Vec<(Exposure, RejectionReason)>,
+    /// Where the order was taken up anew, until somebody asks.
+    restarted: Option<Timestamp>,
     /// Cameras that should be heard soon.
     expected: BTreeSet<CameraName>,
     /// The oldest time heard.
@@ -105,15 +137,28 @@ pub(crate) struct EventBuffer {
     passed: Timestamp,
 }
 
+/// What the live cameras say the time is.
+#[derive(Clone, Copy, Debug)]
+struct Reference {
+    time: Timestamp,
+    live: usize,
+}
+
 impl EventBuffer {
     pub(crate) fn new(config: EventTime) -> Self {
         Self {
             config,
             held: BTreeMap::new(),
+            load: Load::default(),
             taken: BTreeSet::new(),
             streams: BTreeMap::new(),
             trusted: BTreeMap::new(),
             ended: BTreeSet::new(),
+            run_s: 0.0,
+            reference: None,
+            behind_since_s: None,
+            dropped: Vec::new(),
+            restarted: None,
             expected: BTreeSet::new(),
             first: None,
             released: Timestamp::MIN,
@@ -134,27 +179,96 @@ impl EventBuffer {
         if self.held.contains_key(&order) || self.taken.contains(&order) {
             return Err(RejectionReason::Duplicate);
         }
-        let late_s = self.late_s(&exposure);
-        let new = Stream::beginning(time);
-        let stream = self.streams.entry(exposure.camera.clone()).or_insert(new);
-        let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
-        stream.hear(time, late_s, self.config.lateness_s);
-        self.first = Some(self.first.map_or(time, |first| first.min(time)));
-        let reference = self.second_newest();
-        if let Some(reference) = reference {
+        let arrival = self.hear(&exposure);
+        let compared = self.reference.is_some_and(|reference| reference.live > 1);
+        if let Some(reference) = self.reference {
             // A camera that goes on by itself, step by step, is not from the future.
             let trusted = self.trusted.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
-            let by_s = time.seconds_since(reference.max(trusted));
+            let by_s = time.seconds_since(reference.time.max(trusted));
             if by_s > self.config.max_ahead_s {
                 return Err(RejectionReason::Future { by_s });
             }
-            self.trusted.insert(exposure.camera.clone(), trusted.max(time));
+            if compared || time.seconds_since(trusted) <= self.config.max_ahead_s {
+                self.trusted.insert(exposure.camera.clone(), trusted.max(time));
+            }
         }
-        if let Some(by_s) = late_s {
+        if let Some(by_s) = self.late_s(&exposure) {
             return Err(RejectionReason::Late { by_s });
         }
-        self.held.insert(order, Held { exposure, compared: reference.is_some() });
+        self.load.add(&exposure);
+        self.held.insert(order, Held { exposure, compared });
         Ok(arrival)
+    }
+
+    /// Takes note of an exposure's time, whatever becomes of it.
+    fn hear(&mut self, exposure: &Exposure) -> Arrival {
+        let (time, lateness_s) = (exposure.time, self.config.lateness_s);
+        let late_s = self.late_s(exposure);
+        let stream = self.streams.entry(exposure.camera.clone()).or_insert(Stream::beginning(time));
+        let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
+        // A clock that races makes nobody else look silent.
+        self.run_s += time.seconds_since(stream.newest).clamp(0.0, lateness_s);
+        stream.hear(time, late_s, lateness_s);
+        stream.heard_s = self.run_s;
+        self.first = Some(self.first.map_or(time, |first| first.min(time)));
+        self.refer();
+        arrival
+    }
+
+    /// Asks the live cameras for the time.
+    fn refer(&mut self) {
+        let patience_s = PATIENCES * self.config.lateness_s;
+        let heard = self.streams.iter().filter(|(camera, _)| !self.ended.contains(*camera));
+        let mut heard: Vec<&Stream> = heard.map(|(_, stream)| stream).collect();
+        heard.sort_by(|one, other| other.heard_s.total_cmp(&one.heard_s));
+        let is_live = |(since, stream): &(usize, &Stream)| {
+            self.run_s - stream.heard_s <= patience_s * (*since).max(1) as f64
+        };
+        let live: Vec<&Stream> = heard.into_iter().enumerate().take_while(is_live).map(|(_, s)| s).collect();
+        let newest_first = |mut times: Vec<Timestamp>| {
+            times.sort_by(|one, other| other.cmp(one));
+            times
+        };
+        let newest = newest_first(live.iter().map(|stream| stream.newest).collect());
+        // What a camera has reached: its next frame is not due before.
+        let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)).collect());
+        let half = live.len() / 2;
+        let time = match (newest.as_slice(), reached.get(half)) {
+            ([_, second, ..], Some(reached)) => Some(*second.min(reached)),
+            ([alone], _) => Some(*alone),
+            _ => None,
+        };
+        let is_behind = |time: &Timestamp| self.released.seconds_since(*time) > patience_s;
+        let behind = newest.iter().filter(|time| is_behind(time)).count();
+        self.reference = time.map(|time| Reference { time, live: live.len() });
+        if behind <= half {
+            self.behind_since_s = None;
+            return;
+        }
+        let since_s = *self.behind_since_s.get_or_insert(self.run_s);
+        if let Some(time) = time.filter(|_| self.run_s - since_s > patience_s * behind as f64) {
+            self.restart(time);
+        }
+    }
+
+    /// Takes the order up anew from a time before what was released.
+    fn restart(&mut self, time: Timestamp) {
+        for (_, Held { exposure, .. }) in std::mem::take(&mut self.held) {
+            let by_s = exposure.time.seconds_since(time);
+            self.dropped.push((exposure, RejectionReason::Future { by_s }));
+        }
+        self.load = Load::default();
+        self.taken.clear();
+        self.trusted.clear();
+        self.behind_since_s = None;
+        (self.released, self.passed) = (Timestamp::MIN, Timestamp::MIN);
+        self.restarted = Some(time);
+    }
+
+    /// The time at which the order was taken up anew with the last frame, if it was: what has been made of
+    /// later times is to be forgotten.
+    pub(crate) fn take_restart(&mut self) -> Option<Timestamp> {
+        self.restarted.take()
     }
 
     /// By how much an exposure comes too late, s: what follows it has been worked on. What came out may
@@ -170,6 +284,12 @@ impl EventBuffer {
         self.passed = self.passed.max(corrected);
     }
 
+    /// By how much a time, less the clock's offset, lies before what has been worked on, s: more than the
+    /// lateness, or `None`.
+    pub(crate) fn passed_by_s(&self, corrected: Timestamp) -> Option<f64> {
+        Some(self.passed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
+    }
+
     /// Marks a camera as come to its end: nobody waits for it any more.
     pub(crate) fn end(&mut self, camera: &CameraName) {
         self.ended.insert(camera.clone());
@@ -177,8 +297,11 @@ impl EventBuffer {
 
     /// The next exposure that nothing can overtake any more.
     pub(crate) fn release(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
+        if let Some(dropped) = self.dropped.pop() {
+            return Some(Err(dropped));
+        }
         let (order, _) = self.held.first_key_value()?;
-        if self.held.len() <= MAX_HELD && !self.everyone_ended() && order.0 > self.watermark()? {
+        if !self.load.is_too_much() && !self.everyone_ended() && order.0 > self.watermark()? {
             return None;
         }
         self.pop()
@@ -186,10 +309,14 @@ impl EventBuffer {
 
     /// The next exposure, whatever may still come.
     pub(crate) fn pop(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
+        if let Some(dropped) = self.dropped.pop() {
+            return Some(Err(dropped));
+        }
         let (order, Held { exposure, compared }) = self.held.pop_first()?;
+        self.load.remove(&exposure);
         // A frame taken in before a second camera was heard may turn out to be from the future.
-        if !compared && let Some(reference) = self.second_newest() {
-            let ahead = exposure.time.seconds_since(reference);
+        if !compared && let Some(reference) = self.reference {
+            let ahead = exposure.time.seconds_since(reference.time);
             if ahead > self.config.max_ahead_s {
                 return Some(Err((exposure, RejectionReason::Future { by_s: ahead })));
             }
@@ -202,7 +329,7 @@ impl EventBuffer {
     fn remember(&mut self, order: Order) {
         self.taken.insert(order);
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
-        while self.taken.len() > MAX_HELD || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
+        while self.taken.len() > MAX_TAKEN || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
             self.taken.pop_first();
         }
     }
@@ -211,24 +338,18 @@ impl EventBuffer {
         self.streams.len() > 1 && self.streams.keys().all(|camera| self.ended.contains(camera))
     }
 
-    fn second_newest(&self) -> Option<Timestamp> {
-        let times = self.streams.values().map(|stream| stream.newest);
-        let (_, second) = times.fold((None, None), |(newest, second), time| match newest {
-            Some(newest) if time <= newest => (Some(newest), second.max(Some(time))),
-            _ => (Some(time), newest),
-        });
-        second
-    }
-
     fn watermark(&self) -> Option<Timestamp> {
         let lateness_s = self.config.lateness_s;
-        let reference = self.second_newest()?;
+        let Reference { time: reference, live } = self.reference?;
         let patience = reference.plus_seconds(-lateness_s);
         let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
         let never_heard = |camera: &CameraName| !self.streams.contains_key(camera);
         let waits_for_new = self.first.is_some_and(|first| first > forgotten)
             && self.expected.iter().any(|camera| never_heard(camera) && !self.ended.contains(camera));
-        if waits_for_new {
+        let going_on = self.streams.keys().filter(|camera| !self.ended.contains(*camera)).count();
+        // A camera alone is not followed at once: the others may come back, or be heard at last.
+        let is_alone = live == 1 && (going_on > 1 || self.streams.len() == 1);
+        if waits_for_new || is_alone {
             return Some(patience);
         }
         let heard = self.streams.iter().filter(|(camera, _)| !self.ended.contains(camera));
@@ -427,6 +548,161 @@ mod tests {
         buffer.insert(exposure("b", 60.01)).unwrap();
         buffer.insert(exposure("a", 60.02)).unwrap();
         assert!(drain(&mut buffer).contains(&60.01));
+    }
+
+    /// Ten frames a second of `cameras`, as `change` makes them (`None`: none); how many are refused.
+    fn run(
+        buffer: &mut EventBuffer,
+        cameras: usize,
+        seconds: std::ops::Range<u32>,
+        change: impl Fn(usize, f64) -> Option<f64>,
+    ) -> usize {
+        let mut refused = 0;
+        for k in seconds.start * 10..seconds.end * 10 {
+            for camera in 0..cameras {
+                let t = 0.1 * f64::from(k) + 0.1 * camera as f64 / cameras as f64;
+                let Some(time_s) = change(camera, t) else { continue };
+                let name = format!("c{camera:02}");
+                refused += usize::from(buffer.insert(exposure(&name, time_s)).is_err());
+                while let Some(next) = buffer.release() {
+                    match next {
+                        Ok(exposure) => buffer.pass(exposure.time),
+                        Err(_) => refused += 1,
+                    }
+                }
+            }
+        }
+        refused
+    }
+
+    fn between(range: std::ops::Range<f64>, t: f64, ahead_s: f64) -> f64 {
+        if range.contains(&t) { t + ahead_s } else { t }
+    }
+
+    #[test]
+    fn a_minority_of_clocks_ahead_costs_its_own_frames_alone() {
+        for (ahead_s, until_s, wrong) in [(60.0, 5.3, 6), (3600.0, 6.0, 20), (1.503, 6.0, 0)] {
+            let mut buffer = EventBuffer::new(EventTime::default());
+            let lie = |camera, t| Some(if camera > 2 { between(5.0..until_s, t, ahead_s) } else { t });
+            let refused = run(&mut buffer, 5, 0..40, lie);
+            assert!((wrong..=wrong + 2).contains(&refused), "{ahead_s}: {refused}");
+        }
+    }
+
+    #[test]
+    fn a_clock_ahead_is_not_vouched_for_by_one_that_is_dead() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        let lie = |camera, t| match camera {
+            3 => (t < 5.1).then(|| between(5.0..5.1, t, 3600.0)),
+            4 => Some(between(10.0..10.1, t, 3590.0)),
+            _ => Some(t),
+        };
+        assert_eq!(run(&mut buffer, 5, 0..40, lie), 2);
+    }
+
+    #[test]
+    fn sixteen_cameras_are_not_dragged_by_seven() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        let lie = |camera, t| Some(if camera < 7 { between(5.0..6.0, t, 9.003) } else { t });
+        assert_eq!(run(&mut buffer, 16, 0..20, lie), 0, "within what may be ahead they wait");
+        assert!(drain(&mut buffer).is_empty() && buffer.held.len() <= 16, "{}", buffer.held.len());
+    }
+
+    #[test]
+    fn the_last_of_three_cameras_is_followed_after_a_while() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        let dead = |camera, t| (camera == 0 || t < 5.0).then_some(t);
+        assert_eq!(run(&mut buffer, 3, 0..20, dead), 0);
+        assert!(buffer.released > Timestamp::from_seconds(19.3), "{:?}", buffer.released);
+        // The others come back and are waited for again.
+        assert_eq!(run(&mut buffer, 3, 20..25, |_, t| Some(t)), 0);
+        assert!(buffer.released > Timestamp::from_seconds(24.8), "{:?}", buffer.released);
+    }
+
+    #[test]
+    fn a_camera_that_comes_back_with_a_later_clock_drags_nobody() {
+        for (ahead_s, all) in [(3.0, 0), (100.0, 150)] {
+            let mut buffer = EventBuffer::new(EventTime::default());
+            let later = |camera, t| match camera {
+                2 if (5.0..10.0).contains(&t) => None,
+                2 => Some(between(10.0..f64::INFINITY, t, ahead_s)),
+                _ => Some(t),
+            };
+            let refused = run(&mut buffer, 3, 0..25, later);
+            assert!((all..all + 2).contains(&refused), "{ahead_s}: {refused}");
+            assert!(buffer.released > Timestamp::from_seconds(24.8), "{:?}", buffer.released);
+        }
+    }
+
+    #[test]
+    fn where_most_clocks_come_back_from_ahead_the_order_is_taken_up_anew() {
+        for cameras in [1, 2, 3, 5] {
+            let mut buffer = EventBuffer::new(EventTime::default());
+            let refused = run(&mut buffer, cameras, 0..40, |_, t| Some(between(5.0..7.0, t, 600.0)));
+            assert!(buffer.take_restart().is_some(), "{cameras} cameras");
+            // For the 2 s that they must be behind, for which they are waited for, and a few frames.
+            assert!(refused < 40 * cameras, "{cameras} cameras: {refused}");
+            assert!(buffer.released > Timestamp::from_seconds(39.0), "{:?}", buffer.released);
+            assert!(buffer.released < Timestamp::from_seconds(40.1), "{:?}", buffer.released);
+        }
+    }
+
+    #[test]
+    fn what_a_network_held_back_is_late_and_not_a_clock_that_was_ahead() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        run(&mut buffer, 3, 0..5, |_, t| Some(t));
+        run(&mut buffer, 3, 5..9, |camera, t| (camera == 0).then_some(t));
+        // Four seconds of two cameras come at once.
+        run(&mut buffer, 3, 5..9, |camera, t| (camera > 0).then_some(t));
+        run(&mut buffer, 3, 9..20, |_, t| Some(t));
+        assert_eq!(buffer.take_restart(), None);
+    }
+
+    fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
+        let line = crossfix_geometry::SightLine {
+            origin: nalgebra::Point3::origin(),
+            direction: nalgebra::Vector3::x_axis(),
+            basis: nalgebra::Matrix3x2::identity(),
+            covariance: nalgebra::Matrix2::identity(),
+        };
+        let sighting = crate::Sighting { image_track: 1, line };
+        Exposure { sightings: vec![sighting; sightings], ..exposure(camera, time_s) }
+    }
+
+    #[test]
+    fn sightings_that_wait_are_counted_and_bounded() {
+        let patient = EventTime { lateness_s: 60.0, ..EventTime::default() };
+        let mut buffer = EventBuffer::new(patient);
+        buffer.insert(exposure("b", 0.0)).unwrap();
+        let mut most = 0;
+        for k in 1..40 {
+            buffer.insert(crowded("a", 0.1 * f64::from(k), 10_000)).unwrap();
+            drain(&mut buffer);
+            let held: usize = buffer.held.values().map(|held| held.exposure.sightings.len()).sum();
+            most = most.max(held);
+        }
+        assert_eq!(most, 100_000);
+        while buffer.pop().is_some() {}
+        assert_eq!(buffer.load, Load::default());
+    }
+
+    #[test]
+    fn exposures_that_wait_are_counted_and_bounded() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        buffer.insert(exposure("b", 0.0)).unwrap();
+        for k in 1..10_000 {
+            buffer.insert(exposure("a", 1e-6 * f64::from(k))).unwrap();
+            drain(&mut buffer);
+        }
+        assert_eq!(buffer.held.len(), 6_000);
+    }
+
+    #[test]
+    fn a_camera_alone_is_followed_after_the_lateness() {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        buffer.expect(&"b".parse().unwrap());
+        assert_eq!(run(&mut buffer, 1, 0..60, |_, t| Some(t)), 0);
+        assert!((5..7).contains(&buffer.held.len()), "{}", buffer.held.len());
     }
 
     proptest! {

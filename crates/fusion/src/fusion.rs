@@ -7,7 +7,7 @@ use crossfix_message::{
 
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
-use crate::ingress::{self, Exposure, KnownCamera, Rejection, RejectionReason};
+use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::spatial::Quantity;
@@ -56,6 +56,7 @@ pub struct Fusion {
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
     corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
+    corrected_load: Load,
     counters: Counters,
     sequence: u64,
 }
@@ -76,6 +77,7 @@ impl Fusion {
             clocks: ClockEstimator::new(config.clocks.clone()),
             standings: Standings::default(),
             corrected: BTreeMap::new(),
+            corrected_load: Load::default(),
             counters: Counters::default(),
             sequence: 0,
             config,
@@ -108,7 +110,11 @@ impl Fusion {
                 }
                 // As far as is known by now: it is settled when the exposure's turn comes.
                 exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
-                match self.buffer.insert(exposure) {
+                let arrival = self.buffer.insert(exposure);
+                if let Some(time) = self.buffer.take_restart() {
+                    self.restart(time, &mut outputs);
+                }
+                match arrival {
                     Ok(Arrival::InOrder) => {}
                     Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
                     Err(reason) => outputs.push(self.reject(frame, reason)),
@@ -134,7 +140,7 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, &mut outputs);
         }
-        while let Some((_, exposure)) = self.corrected.pop_first() {
+        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
             self.process(&exposure, &mut outputs);
         }
         outputs
@@ -177,6 +183,18 @@ impl Fusion {
         }
     }
 
+    /// Takes the order of time up anew from a time long passed: what was made of a time that never was
+    /// is forgotten.
+    fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
+        self.counters.count("event_time_restarts");
+        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
+            let by_s = exposure.time.seconds_since(time);
+            self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
+        }
+        self.initiator = Initiator::new(&self.config);
+        self.clocks = ClockEstimator::new(self.config.clocks.clone());
+    }
+
     fn handle(&mut self, next: Result<Exposure, (Exposure, RejectionReason)>, outputs: &mut Vec<Output>) {
         match next {
             Ok(exposure) => self.correct(exposure, outputs),
@@ -202,12 +220,28 @@ impl Fusion {
         exposure.correction_s = clock.offset_s;
         exposure.time = reported.plus_seconds(-clock.offset_s);
         exposure.uncertainty.time_sd_s = clock.relative_sd_s;
-        self.corrected.insert((exposure.time, exposure.camera.clone(), reported), exposure);
+        if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
+            return self.handle(Err((exposure, RejectionReason::Late { by_s })), outputs);
+        }
+        let order = (exposure.time, exposure.camera.clone(), reported);
+        if self.corrected.contains_key(&order) {
+            return self.handle(Err((exposure, RejectionReason::Duplicate)), outputs);
+        }
+        self.corrected_load.add(&exposure);
+        self.corrected.insert(order, exposure);
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
-        while let Some(entry) = self.corrected.first_entry().filter(|entry| entry.key().0 <= settled) {
-            let next = entry.remove();
+        while let Some(next) = self.next_corrected(settled) {
             self.process(&next, outputs);
         }
+    }
+
+    /// The next of the corrected exposures up to a time, or if more wait than may.
+    fn next_corrected(&mut self, settled: Timestamp) -> Option<Exposure> {
+        let crowded = self.corrected_load.is_too_much();
+        let entry = self.corrected.first_entry().filter(|entry| crowded || entry.key().0 <= settled)?;
+        let exposure = entry.remove();
+        self.corrected_load.remove(&exposure);
+        Some(exposure)
     }
 
     /// What is known of a camera's clock, if clocks are in doubt.
@@ -283,8 +317,8 @@ impl Fusion {
         }
     }
 
-    /// Tells what has happened, and where all tracks are now.
-    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
+    /// Tells what has happened.
+    fn tell(&mut self, happenings: Vec<Happening>, time: Timestamp, outputs: &mut Vec<Output>) {
         for happening in happenings {
             self.counters.count(match happening.kind {
                 crossfix_message::TrackEventKind::Born => "tracks_born",
@@ -293,8 +327,13 @@ impl Fusion {
                 crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
                 _ => "tracks_lost",
             });
-            outputs.push(Output::Event(event(happening, exposure)));
+            outputs.push(Output::Event(event(happening, time)));
         }
+    }
+
+    /// Tells what has happened, and where all tracks are now.
+    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
+        self.tell(happenings, exposure.time, outputs);
         let due = self.tracker.due(exposure.time);
         let tracks: Vec<crossfix_message::Track> = due
             .iter()
@@ -316,9 +355,9 @@ impl Fusion {
     }
 }
 
-fn event(happening: Happening, exposure: &Exposure) -> TrackEvent {
+fn event(happening: Happening, time: Timestamp) -> TrackEvent {
     TrackEvent {
-        time_ns: exposure.time.nanos(),
+        time_ns: time.nanos(),
         kind: happening.kind.into(),
         track_id: happening.track.0,
         other_id: happening.other.map_or(0, |id| id.0),

@@ -9,6 +9,16 @@ use nalgebra::{Matrix2, Matrix6, Point3};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
+/// Bearings of one frame that are read: more is no picture, and memory is bounded.
+const MAX_BEARINGS: usize = 10_000;
+
+/// Exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default lateness, three of
+/// 30 Hz 5400 within the longest.
+const MAX_WAITING: usize = 6_000;
+
+/// Sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in all.
+const MAX_SIGHTINGS_WAITING: usize = 100_000;
+
 /// One measured target in one exposure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sighting {
@@ -33,6 +43,30 @@ pub struct Exposure {
     pub(crate) correction_s: f64,
     /// The targets, in the frame's order.
     pub sightings: Vec<Sighting>,
+}
+
+/// What waits in a queue of exposures.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Load {
+    exposures: usize,
+    sightings: usize,
+}
+
+impl Load {
+    pub(crate) fn add(&mut self, exposure: &Exposure) {
+        self.exposures += 1;
+        self.sightings += exposure.sightings.len();
+    }
+
+    pub(crate) fn remove(&mut self, exposure: &Exposure) {
+        self.exposures = self.exposures.saturating_sub(1);
+        self.sightings = self.sightings.saturating_sub(exposure.sightings.len());
+    }
+
+    /// Whether it is more than may wait, whatever the clocks say.
+    pub(crate) fn is_too_much(self) -> bool {
+        self.exposures > MAX_WAITING || self.sightings > MAX_SIGHTINGS_WAITING
+    }
 }
 
 /// A camera as its calibration describes it.
@@ -79,6 +113,11 @@ pub enum RejectionReason {
     Time,
     /// One bearing is impossible; the others of the frame are used.
     Bearing(GeometryError),
+    /// The frame has more bearings than a picture can have; the first ones are used.
+    Crowded {
+        /// How many are left out.
+        left_out: usize,
+    },
 }
 
 impl RejectionReason {
@@ -91,6 +130,7 @@ impl RejectionReason {
             Self::Duplicate => "rejected_duplicate",
             Self::Time => "rejected_time",
             Self::Bearing(_) => "rejected_bearing",
+            Self::Crowded { .. } => "frames_crowded",
         }
     }
 }
@@ -120,6 +160,9 @@ impl fmt::Display for Rejection {
             }
             RejectionReason::Duplicate => f.write_str("its capture time came before"),
             RejectionReason::Time => f.write_str("its capture time or its SD is impossible"),
+            RejectionReason::Crowded { left_out } => {
+                write!(f, "{left_out} bearings are not used: more than {MAX_BEARINGS} are no picture")
+            }
             RejectionReason::Bearing(error) => write!(f, "a bearing is impossible: {error}"),
         }
     }
@@ -152,15 +195,24 @@ pub(crate) fn read(
     }
     let mut rejected = Vec::new();
     let mut sightings = Vec::new();
+    let (mut measured, mut left_out) = (0, 0);
     for track in &frame.tracks {
         if track.state() != ImageTrackState::Tracking {
             counters.count("bearings_predicted_only");
+            continue;
+        }
+        measured += 1;
+        if measured > MAX_BEARINGS {
+            left_out += 1;
             continue;
         }
         match sighting(track, camera, config) {
             Ok(sighting) => sightings.push(sighting),
             Err(error) => rejected.push(RejectionReason::Bearing(error)),
         }
+    }
+    if left_out > 0 {
+        rejected.push(RejectionReason::Crowded { left_out });
     }
     let exposure = Exposure {
         camera: name.clone(),

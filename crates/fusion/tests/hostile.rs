@@ -147,6 +147,72 @@ fn a_camera_whose_clock_jumps_is_refused_while_it_is_wrong_and_stops_nobody() {
     finds_an_ordinary_target(&mut fusion, 10.0);
 }
 
+/// Two cameras more than [`site`].
+fn five() -> Vec<Eye> {
+    let mut eyes = site();
+    eyes.push(eye("d", [-40.0, 150.0, 4.0], [0.0, 0.0, 40.0], 0.015));
+    eyes.push(eye("e", [-30.0, -160.0, 2.0], [0.0, 0.0, 40.0], 0.08));
+    eyes
+}
+
+#[test]
+fn two_clocks_ahead_vouch_for_each_other_and_blind_nobody() {
+    for (ahead_s, until_s, refused) in [(60.0, 2.3, 6), (3600.0, 3.0, 20)] {
+        let scene = Scene { eyes: five(), ..two_targets(0.0..9.0) };
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        for mut frame in scene.frames(3) {
+            let t = frame.capture_time_ns as f64 / 1e9;
+            if ["d", "e"].contains(&frame.camera.as_str()) && (2.0..until_s).contains(&t) {
+                frame.capture_time_ns += (ahead_s * 1e9) as i64;
+            }
+            fusion.ingest(&frame);
+        }
+        assert_eq!(fusion.counters().get("rejected_future"), refused);
+        assert_eq!(fusion.counters().get("rejected_late"), 0);
+        assert_eq!(fusion.counters().get("tracks_born"), 2);
+        assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    }
+}
+
+#[test]
+fn a_clock_ahead_after_one_that_died_ahead_blinds_nobody() {
+    let scene = Scene { eyes: five(), ..two_targets(0.0..9.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for mut frame in scene.frames(3) {
+        let t = frame.capture_time_ns as f64 / 1e9;
+        match frame.camera.as_str() {
+            "d" if t >= 2.1 => continue,
+            "d" if t >= 2.0 => frame.capture_time_ns += 3_600_000_000_000,
+            "e" if (7.0..7.1).contains(&t) => frame.capture_time_ns += 3_590_000_000_000,
+            _ => {}
+        }
+        fusion.ingest(&frame);
+    }
+    assert_eq!(fusion.counters().get("rejected_future"), 2);
+    assert_eq!(fusion.counters().get("rejected_late"), 0);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+}
+
+#[test]
+fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found() {
+    let scene = two_targets(0.0..10.0);
+    let mut fusion = of_the_site();
+    for mut frame in scene.frames(3) {
+        if (2_000_000_000..3_000_000_000).contains(&frame.capture_time_ns) {
+            frame.capture_time_ns += 600_000_000_000;
+        }
+        fusion.ingest(&frame);
+    }
+    assert_eq!(fusion.counters().get("event_time_restarts"), 1);
+    // Two seconds and a few frames, not ten minutes.
+    assert!(fusion.counters().get("rejected_late") < 75, "{:?}", fusion.counters());
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    fusion.flush();
+    let count = |name| fusion.counters().get(name);
+    let refused = count("rejected_late") + count("rejected_future");
+    assert_eq!(count("frames"), count("exposures") + refused, "{:?}", fusion.counters());
+}
+
 #[test]
 fn two_cameras_at_the_same_place_make_no_target_of_their_own() {
     let mut scene = two_targets(0.0..6.0);
@@ -213,6 +279,64 @@ fn ten_thousand_false_bearings_of_every_camera_are_survived_in_bounded_time() {
     assert!(slowest < BOUNDED, "{slowest:?}");
     assert_eq!(fusion.counters().get("tracks_born"), 2, "no combination of clutter lasts");
     finds_an_ordinary_target(&mut fusion, 5.0);
+}
+
+#[test]
+fn a_frame_of_more_bearings_than_a_picture_has_is_cut_and_told() {
+    let mut fusion = of_the_site();
+    let one = bearing(Vector3::z(), 1);
+    let frame = BearingFrame { camera: "a".into(), tracks: vec![one; 10_300], ..Default::default() };
+    let outputs = fusion.ingest(&frame);
+    let reasons = outputs.iter().filter_map(|output| match output {
+        Output::Rejected(rejection) => Some(&rejection.reason),
+        _ => None,
+    });
+    assert_eq!(reasons.collect::<Vec<_>>(), [&RejectionReason::Crowded { left_out: 300 }]);
+    assert_eq!(fusion.counters().get("frames_crowded"), 1);
+}
+
+/// Frames that have come, and have neither been worked on nor refused.
+fn waiting(fusion: &Fusion) -> u64 {
+    let count = |name| fusion.counters().get(name);
+    count("frames") - count("exposures") - count("rejected_late") - count("rejected_future")
+}
+
+#[test]
+fn of_a_camera_alone_little_waits() {
+    let mut fusion = of_the_site();
+    for k in 0..200 {
+        let tracks = vec![bearing(Vector3::z(), 1); 20];
+        let capture_time_ns = k * 33_000_000;
+        let frame = BearingFrame { camera: "a".into(), capture_time_ns, tracks, ..Default::default() };
+        fusion.ingest(&frame);
+        assert!(waiting(&fusion) <= 17, "{}", waiting(&fusion));
+    }
+}
+
+#[test]
+fn of_a_learnt_clock_that_is_flooded_no_more_waits_than_may() {
+    let circling = |t: f64| Point3::new(40.0 * (0.3 * t).cos(), 40.0 * (0.3 * t).sin(), 45.0);
+    let scene = Scene::new(vec![Box::new(move |t| Some(circling(t)))], 20.0);
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    let mut last = 0;
+    for mut frame in scene.frames(1) {
+        if frame.camera == "b" {
+            frame.capture_time_ns += 200_000_000;
+        }
+        frame.capture_time_sd_s = if frame.camera == "a" { 0.0 } else { 0.2 };
+        last = last.max(frame.capture_time_ns);
+        fusion.ingest(&frame);
+    }
+    let learnt = fusion.cameras().filter_map(|camera| camera.clock).any(|clock| clock.offset_s > 0.15);
+    assert!(learnt, "{:?}", fusion.cameras().collect::<Vec<_>>());
+    for k in 1..=20_000 {
+        let camera = if k % 2 == 0 { "b" } else { "a" }.into();
+        let capture_time_ns = last + 1_000 * k;
+        let frame = BearingFrame { camera, capture_time_ns, capture_time_sd_s: 0.2, ..Default::default() };
+        fusion.ingest(&frame);
+    }
+    // Six thousand for their order, and as many for the clocks.
+    assert!((6_000..=12_000).contains(&waiting(&fusion)), "{}", waiting(&fusion));
 }
 
 #[test]

@@ -44,6 +44,7 @@ struct Centre {
     malformed: u64,
     newer: u64,
     foreign: u64,
+    mismatched: u64,
     frames: u64,
     now: Timestamp,
 }
@@ -68,6 +69,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         malformed: 0,
         newer: 0,
         foreign: 0,
+        mismatched: 0,
         frames: 0,
         now: Timestamp::EPOCH,
     };
@@ -100,6 +102,43 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A message that names the camera that it is of.
+trait OfCamera: Payload {
+    fn camera(&self) -> &str;
+}
+
+impl OfCamera for BearingFrame {
+    fn camera(&self) -> &str {
+        &self.camera
+    }
+}
+
+impl OfCamera for CameraCalibration {
+    fn camera(&self) -> &str {
+        &self.camera
+    }
+}
+
+/// Why a message is not used.
+#[derive(Debug, thiserror::Error)]
+enum Unread {
+    #[error(transparent)]
+    Decode(DecodeError),
+    #[error("a message under the key of camera `{key}` says that it is of `{message}`")]
+    Mismatched { key: CameraName, message: String },
+}
+
+/// Reads a message that came under a camera's key: what a transport lets a camera send is of that
+/// camera and of no other.
+fn read_of<M: OfCamera>(camera: &CameraName, data: &[u8]) -> Result<M, Unread> {
+    let message: M = decode(data).map_err(Unread::Decode)?;
+    if message.camera() == camera.as_str() {
+        return Ok(message);
+    }
+    let said = message.camera().chars().take(100).collect();
+    Err(Unread::Mismatched { key: camera.clone(), message: said })
+}
+
 impl Centre {
     fn take(&mut self, received: &Received) -> anyhow::Result<()> {
         let outputs = match &received.key.channel {
@@ -114,8 +153,8 @@ impl Centre {
                 self.foreign += 1;
                 return Ok(());
             }
-            Channel::Calibration(_) => {
-                if let Some(message) = self.read::<CameraCalibration>(&received.data)
+            Channel::Calibration(camera) => {
+                if let Some(message) = self.used(read_of::<CameraCalibration>(camera, &received.data))
                     && let Err(error) = self.fusion.calibrate(&message)
                 {
                     tracing::warn!("a calibration was not used: {error}");
@@ -123,7 +162,7 @@ impl Centre {
                 return Ok(());
             }
             Channel::Bearings(camera) => {
-                let Some(frame) = self.read::<BearingFrame>(&received.data) else {
+                let Some(frame) = self.used(read_of::<BearingFrame>(camera, &received.data)) else {
                     return Ok(());
                 };
                 let missing = self.gaps.see(camera.as_str(), frame.sequence);
@@ -135,31 +174,33 @@ impl Centre {
                 }
                 self.fusion.ingest(&frame)
             }
-            Channel::CameraHealth(camera) => match self.read::<Health>(&received.data) {
-                Some(health) if health.ended => self.fusion.camera_ended(camera),
-                _ => return Ok(()),
-            },
+            Channel::CameraHealth(camera) => {
+                match self.used(decode::<Health>(&received.data).map_err(Unread::Decode)) {
+                    Some(health) if health.ended => self.fusion.camera_ended(camera),
+                    _ => return Ok(()),
+                }
+            }
             _ => return Ok(()),
         };
         self.publish(outputs)
     }
 
-    /// Reads a message, or counts why it cannot be read.
-    fn read<M: Payload>(&mut self, data: &[u8]) -> Option<M> {
-        match decode(data) {
-            Ok(message) => Some(message),
-            Err(error) => {
-                let counter = match error {
-                    DecodeError::Malformed { .. } => &mut self.malformed,
-                    DecodeError::NewerMajor { .. } => &mut self.newer,
-                };
-                if *counter == 0 {
-                    tracing::warn!("{error}; not used, and counted from now on");
-                }
-                *counter += 1;
-                None
-            }
+    /// A message that was read, or `None` and why not is counted.
+    fn used<M>(&mut self, read: Result<M, Unread>) -> Option<M> {
+        let error = match read {
+            Ok(message) => return Some(message),
+            Err(error) => error,
+        };
+        let counter = match error {
+            Unread::Decode(DecodeError::Malformed { .. }) => &mut self.malformed,
+            Unread::Decode(DecodeError::NewerMajor { .. }) => &mut self.newer,
+            Unread::Mismatched { .. } => &mut self.mismatched,
+        };
+        if *counter == 0 {
+            tracing::warn!("{error}; not used, and counted from now on");
         }
+        *counter += 1;
+        None
     }
 
     fn publish(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
@@ -186,6 +227,7 @@ impl Centre {
             ("received_dropped", dropped),
             ("received_foreign_camera", self.foreign),
             ("received_malformed", self.malformed),
+            ("received_mismatched", self.mismatched),
             ("received_missing", self.gaps.missing()),
             ("received_newer_version", self.newer),
         ];
@@ -205,5 +247,27 @@ impl Centre {
             ..Default::default()
         };
         Ok(self.health.put(health.encode())?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_comes_under_one_cameras_key_speaks_for_no_other() {
+        let [north, east]: [CameraName; 2] = ["north", "east"].map(|name| name.parse().unwrap());
+        let frame = BearingFrame { camera: "north".into(), ..Default::default() }.encode();
+        let calibration = CameraCalibration { camera: "north".into(), ..Default::default() }.encode();
+        assert!(read_of::<BearingFrame>(&north, &frame).is_ok());
+        assert!(read_of::<CameraCalibration>(&north, &calibration).is_ok());
+        let refused = [
+            read_of::<BearingFrame>(&east, &frame).map(drop),
+            read_of::<CameraCalibration>(&east, &calibration).map(drop),
+        ];
+        for result in refused {
+            assert!(matches!(&result, Err(Unread::Mismatched { message, .. }) if message == "north"));
+        }
+        assert!(matches!(read_of::<BearingFrame>(&north, &[0xff; 40]), Err(Unread::Decode(_))));
     }
 }
