@@ -191,6 +191,8 @@ impl Fusion {
             let by_s = exposure.time.seconds_since(time);
             self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
         }
+        let happenings = self.tracker.restart(time);
+        self.tell(happenings, time, outputs);
         self.initiator = Initiator::new(&self.config);
         self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }

@@ -151,6 +151,21 @@ impl Tracker {
         &self.motion
     }
 
+    /// Goes back to a time: gives up the tracks that bearings of later times have updated, and forgets
+    /// what the cameras reported beside them.
+    pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<Happening> {
+        self.watches.clear();
+        let mut happenings = Vec::new();
+        for track in self.tracks.values_mut() {
+            track.published = None;
+            if track.updated > time && track.status != TrackStatus::Lost {
+                track.status = TrackStatus::Lost;
+                happenings.push(Happening::new(TrackEventKind::Lost, track.id));
+            }
+        }
+        happenings
+    }
+
     /// Takes in one exposure: what of it belongs to tracks updates them.
     pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
