@@ -201,7 +201,8 @@ impl Fusion {
         let reported = exposure.time;
         exposure.correction_s = clock.offset_s;
         exposure.time = reported.plus_seconds(-clock.offset_s);
-        exposure.uncertainty.time_sd_s = clock.relative_sd_s;
+        let said = exposure.uncertainty.time_sd_s;
+        exposure.uncertainty.time_sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said);
         self.corrected.insert((exposure.time, exposure.camera.clone(), reported), exposure);
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
         while let Some(entry) = self.corrected.first_entry().filter(|entry| entry.key().0 <= settled) {

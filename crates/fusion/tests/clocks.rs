@@ -8,7 +8,8 @@ mod paths;
 #[path = "clocks/tally.rs"]
 mod tally;
 
-use common::{Path, Scene, site};
+use common::{Path, Scene, found, fusion_of, site};
+use crossfix_fusion::{CameraStanding, ClockEstimate, Fusion, FusionConfig};
 use paths::{circle, fast_pass, pass, racing, scene, shuttle, six, six_passes, spiral, weaving};
 use tally::{Clock, Tally, random_clocks};
 
@@ -151,6 +152,65 @@ fn a_clock_that_jumps_is_learnt_anew_within_twenty_seconds() {
         assert_honest(&tally);
         assert!(tally.settled.iter().all(|time| *time < 45.0), "{:?}", tally.settled);
         assert_there(&tally);
+    }
+}
+
+/// Four cameras before a circling target for 40 s, of which `d` changes at 15 s: its clock is ahead by
+/// 20 ms from then on, and it says so. What the others say, s; returns the fusion centre at the end.
+fn losing_its_time(others_sd_s: f64) -> Fusion {
+    let mut eyes = site();
+    eyes.push(six().remove(3));
+    let scene = Scene { time_s: 0.0..40.0, ..scene(eyes, vec![circle()], 10.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for mut frame in scene.frames(1) {
+        let time = frame.capture_time_ns as f64 / 1e9;
+        let lost = frame.camera == "d" && time > 15.0;
+        frame.capture_time_ns += if lost { 20_000_000 } else { 0 };
+        frame.capture_time_sd_s = match frame.camera.as_str() {
+            "d" => {
+                if lost {
+                    0.02
+                } else {
+                    0.5e-3
+                }
+            }
+            _ => others_sd_s,
+        };
+        fusion.ingest(&frame);
+        if time > 20.0 {
+            assert!(found(&fusion, &scene.paths[0]).is_some(), "{time}");
+        }
+    }
+    fusion
+}
+
+fn clock_of(fusion: &Fusion, camera: &str) -> ClockEstimate {
+    fusion.cameras().find(|report| report.camera.as_str() == camera).unwrap().clock.unwrap()
+}
+
+#[test]
+fn a_clock_that_loses_its_source_of_time_and_says_so_is_learnt_from_then_on() {
+    for others_sd_s in [0.0, 0.5e-3, 2e-3] {
+        let fusion = losing_its_time(others_sd_s);
+        let [a, d] = ["a", "d"].map(|camera| clock_of(&fusion, camera));
+        let error = d.offset_s - a.offset_s - 0.02;
+        assert!(d.relative_sd_s < 2e-3, "{d:?}");
+        assert!(error.abs() < 3.5 * d.relative_sd_s.hypot(a.relative_sd_s), "{others_sd_s}: {a:?} {d:?}");
+        assert!(fusion.cameras().all(|report| report.standing != CameraStanding::Excluded));
+    }
+}
+
+#[test]
+fn clocks_taken_at_their_word_stay_as_good_as_they_say_beside_one_that_is_unsure() {
+    let scene = Scene { time_s: 0.0..10.0, ..scene(site(), vec![circle()], 10.0) };
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    for mut frame in scene.frames(1) {
+        frame.capture_time_sd_s = if frame.camera == "c" { 0.1 } else { 0.9e-3 };
+        fusion.ingest(&frame);
+    }
+    for camera in ["a", "b"] {
+        let clock = clock_of(&fusion, camera);
+        assert_eq!((clock.sd_s, clock.relative_sd_s), (0.9e-3, 0.9e-3), "{camera}");
     }
 }
 

@@ -13,7 +13,7 @@ mod curve;
 mod lesson;
 mod window;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -40,6 +40,8 @@ const SURE_S: f64 = 0.002;
 const LOOK_EVERY_S: f64 = 1.0;
 /// ... and so often where all are known, for one may jump.
 const CHECK_EVERY_S: f64 = 4.0;
+/// A clock is worse than it was when its camera reports it this many times worse.
+const WORSE: f64 = 3.0;
 /// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
 const MAX_REFUSED: u32 = 2;
 
@@ -68,6 +70,8 @@ pub(crate) struct ClockEstimator {
     /// The same with what the open windows tell so far.
     provisional: Option<Belief>,
     windows: Vec<Window>,
+    /// The standard deviations reported of the clocks, s, that the belief begins with.
+    reported: BTreeMap<CameraName, f64>,
     /// Cameras whose clocks may have jumped, ...
     suspects: BTreeSet<CameraName>,
     /// ... and those of which the open windows tell all the same.
@@ -86,6 +90,7 @@ impl ClockEstimator {
             belief: Belief::default(),
             provisional: None,
             windows: Vec::new(),
+            reported: BTreeMap::new(),
             suspects: BTreeSet::new(),
             cleared: BTreeSet::new(),
             now: Timestamp::MIN,
@@ -100,17 +105,40 @@ impl ClockEstimator {
         self.needed
     }
 
-    /// Makes a camera's clock and pose known by the deviations it reports; later reports change nothing.
+    /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only one
+    /// counts that makes the clock much worse than it was: its source of time is lost.
     pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
         let reported_sd_s = reported.time_sd_s;
-        if !self.config.estimate || self.belief.knows(camera) {
+        if !self.config.estimate {
             return;
         }
         let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
-        self.needed |= uncertain;
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
-        self.belief.add(camera, deviations, reported.pose);
-        self.provisional = None;
+        let Some(before) = self.reported.get(camera) else {
+            self.needed |= uncertain;
+            self.reported.insert(camera.clone(), reported_sd_s);
+            self.belief.add(camera, deviations, reported.pose);
+            self.provisional = None;
+            return;
+        };
+        if uncertain && reported_sd_s >= WORSE * before {
+            self.needed = true;
+            self.reported.insert(camera.clone(), reported_sd_s);
+            self.belief.reopen(camera, deviations);
+            self.provisional = None;
+            self.suspect(camera);
+        }
+    }
+
+    /// The standard deviation of an exposure's time against the other cameras', s, by what is known of
+    /// its clock and by what its camera says of it: a clock that is not estimated is as good as it says.
+    pub(crate) fn time_sd_s(&self, camera: &CameraName, known: &ClockEstimate, reported_sd_s: f64) -> f64 {
+        if self.is_at_its_word(camera) { known.relative_sd_s.max(reported_sd_s) } else { known.relative_sd_s }
+    }
+
+    /// Whether a clock is not estimated, for its camera says that it is good.
+    fn is_at_its_word(&self, camera: &CameraName) -> bool {
+        !self.belief.is_uncertain(camera) && !self.config.trusted.contains(camera)
     }
 
     /// A camera has been calibrated anew: its bearings so far say nothing of the pose that follows.
@@ -130,7 +158,8 @@ impl ClockEstimator {
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
         let estimate = self.newest().estimate(camera, self.now)?;
         let suspected = self.suspects.contains(camera) && !self.cleared.contains(camera);
-        let reported = self.belief.reported_sd(camera).filter(|_| suspected);
+        let at_its_word = self.is_at_its_word(camera);
+        let reported = self.reported.get(camera).copied().filter(|_| suspected || at_its_word);
         let widened = |sd: f64| reported.map_or(sd, |reported| reported.max(sd));
         let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
         Some(ClockEstimate { sd_s, relative_sd_s, ..estimate })
@@ -233,5 +262,33 @@ impl ClockEstimator {
         }
         self.provisional = belief;
         self.cleared = cleared;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_at_its_word_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
+        let [word, trusted, unsure] = ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
+        let config = Clocks { trusted: vec![trusted.clone()], ..Clocks::default() };
+        let mut clocks = ClockEstimator::new(config);
+        for (camera, sd_s) in [(&word, 0.9e-3), (&trusted, 0.3), (&unsure, 0.1)] {
+            clocks.see(camera, &CameraUncertainty::of_time(sd_s));
+        }
+        let sd_s = |clocks: &ClockEstimator, camera: &CameraName, said| {
+            clocks.time_sd_s(camera, &clocks.estimate(camera).unwrap(), said)
+        };
+        assert_eq!(sd_s(&clocks, &word, 0.9e-3), 0.9e-3);
+        assert_eq!(sd_s(&clocks, &word, 2e-3), 2e-3);
+        assert!(sd_s(&clocks, &trusted, 0.3) < 1e-5);
+        assert!((sd_s(&clocks, &unsure, 1e-4) - 0.1).abs() < 1e-3);
+        // Twice as bad is not much worse; a lost source of time is.
+        for (said, expected) in [(2e-3, 2e-3), (0.3, 0.3), (1e-3, 0.3)] {
+            clocks.see(&word, &CameraUncertainty::of_time(said));
+            assert!((sd_s(&clocks, &word, said) - expected).abs() < 0.01 * expected, "{said}");
+        }
+        assert!(clocks.is_needed());
     }
 }
