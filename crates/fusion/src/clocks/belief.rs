@@ -154,15 +154,16 @@ impl Belief {
         }
         self.epoch = Some(time);
         self.site[0] += self.site[1] * dt;
-        let n = self.mean.len();
-        let mut transition = DMatrix::<f64>::identity(n, n);
+        // Each offset grows by its drift: of mean and covariance only the rows and columns of offsets change.
         let clocks: Vec<usize> = self.clock_places().collect();
         for &k in &clocks {
-            transition[(k, k + 1)] = dt;
+            self.mean[k] += dt * self.mean[k + 1];
+            let (mut offset, drift) = self.covariance.columns_range_pair_mut(k, k + 1);
+            offset.axpy(dt, &drift, 1.0);
         }
-        self.mean = &transition * &self.mean;
-        self.covariance = &transition * &self.covariance * transition.transpose();
-        for k in clocks {
+        for &k in &clocks {
+            let (mut offset, drift) = self.covariance.rows_range_pair_mut(k, k + 1);
+            offset += drift * dt;
             self.covariance[(k, k)] += OFFSET_WALK * dt;
             self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
         }

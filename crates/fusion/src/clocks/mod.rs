@@ -21,7 +21,7 @@ use nalgebra::Matrix6;
 
 use self::belief::Belief;
 use self::lesson::{Lesson, lesson};
-use self::window::Window;
+use self::window::{Role, Window};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
 use crate::track::{Track, TrackId};
@@ -40,6 +40,8 @@ const SURE_S: f64 = 0.002;
 const LOOK_EVERY_S: f64 = 1.0;
 /// ... and so often where all are known, for one may jump.
 const CHECK_EVERY_S: f64 = 4.0;
+/// Time between two windows that are adjusted, s: many exposures may come at once.
+const PAUSE_S: f64 = 0.02;
 /// A clock is worse than it was when its camera reports it this many times worse.
 const WORSE: f64 = 3.0;
 /// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
@@ -61,6 +63,17 @@ pub struct ClockEstimate {
     pub drift_sd: f64,
 }
 
+/// A look at the open windows, one window an exposure: an adjustment takes milliseconds.
+#[derive(Clone, Debug, Default)]
+struct Round {
+    /// The window that is next.
+    next: usize,
+    /// What is believed with those before it.
+    belief: Option<Belief>,
+    /// Cameras of which they tell.
+    cleared: BTreeSet<CameraName>,
+}
+
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockEstimator {
@@ -78,6 +91,10 @@ pub(crate) struct ClockEstimator {
     cleared: BTreeSet<CameraName>,
     now: Timestamp,
     next_look: Timestamp,
+    /// When the next window may be adjusted.
+    next_adjustment: Timestamp,
+    /// The look under way.
+    round: Option<Round>,
     needed: bool,
     /// Windows one after the other that fitted nothing that was learnt before.
     refused: u32,
@@ -95,6 +112,8 @@ impl ClockEstimator {
             cleared: BTreeSet::new(),
             now: Timestamp::MIN,
             next_look: Timestamp::MIN,
+            next_adjustment: Timestamp::MIN,
+            round: None,
             needed: false,
             refused: 0,
         }
@@ -118,14 +137,14 @@ impl ClockEstimator {
             self.needed |= uncertain;
             self.reported.insert(camera.clone(), reported_sd_s);
             self.belief.add(camera, deviations, reported.pose);
-            self.provisional = None;
+            self.forget_provisional();
             return;
         };
         if uncertain && reported_sd_s >= WORSE * before {
             self.needed = true;
             self.reported.insert(camera.clone(), reported_sd_s);
             self.belief.reopen(camera, deviations);
-            self.provisional = None;
+            self.forget_provisional();
             self.suspect(camera);
         }
     }
@@ -145,9 +164,15 @@ impl ClockEstimator {
     pub(crate) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
         if self.belief.knows(camera) {
             self.belief.calibrate(camera, pose);
-            self.provisional = None;
+            self.forget_provisional();
             self.windows.clear();
         }
+    }
+
+    /// What the open windows have told so far was of other cameras, or of cameras as they were.
+    fn forget_provisional(&mut self) {
+        self.provisional = None;
+        self.round = None;
     }
 
     fn newest(&self) -> &Belief {
@@ -171,23 +196,29 @@ impl ClockEstimator {
         self.newest().largest_offset(self.now)
     }
 
-    /// Moves on to a time: closes windows that are full or whose target too few cameras see, and
-    /// looks at the others now and then.
+    /// Moves on to a time: closes a window that is full or whose target too few cameras see, or looks
+    /// at one that is open, now and then. One window at a time, for an exposure waits for it.
     pub(crate) fn advance(&mut self, time: Timestamp, tracker: &Tracker) {
         self.now = self.now.max(time);
+        if self.now < self.next_adjustment {
+            return;
+        }
         let followed = |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
         let now = self.now;
         let full = |window: &Window| now.seconds_since(window.start) >= WINDOW_S;
-        let mut closed = 0;
-        while let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
+        if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
             let window = self.windows.remove(index);
             self.close(&window);
-            closed += 1;
+            self.round = Some(Round::default());
+            self.next_adjustment = now.plus_seconds(PAUSE_S);
+            return;
         }
-        if closed > 0 || self.now >= self.next_look {
-            self.look();
-            let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
-            self.next_look = self.now.plus_seconds(pause);
+        if self.round.is_none() && self.now >= self.next_look {
+            self.round = Some(Round::default());
+        }
+        if let Some(round) = self.round.take() {
+            self.look(round);
+            self.next_adjustment = now.plus_seconds(PAUSE_S);
         }
     }
 
@@ -203,9 +234,18 @@ impl ClockEstimator {
                 self.windows.len() - 1
             })
         });
-        if let Some(window) = index.and_then(|index| self.windows.get_mut(index)) {
-            window.add(camera, time, *line, track.position_at(exposure.time).coords);
-        }
+        let Some(index) = index else {
+            return;
+        };
+        let is_new = !self.windows[index].cameras.contains(camera);
+        let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
+        self.windows[index].add(camera, role, time, *line, track.position_at(exposure.time).coords);
+    }
+
+    /// Whether a window is for a camera's clock, which is not well known and no other window's.
+    fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
+        let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
+        self.is_unsure_of(camera) && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
     /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
@@ -217,6 +257,7 @@ impl ClockEstimator {
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
             // Up to now its bearings may be by the clock as it was.
             self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
+            self.round = None;
         }
     }
 
@@ -243,25 +284,30 @@ impl ClockEstimator {
 
     /// Whether the clock of a camera that sees one of the targets is not well known.
     fn is_unsure(&self) -> bool {
-        let unsure = |camera: &CameraName| {
-            let clock = self.belief.estimate(camera, self.now);
-            self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
-        };
-        self.windows.iter().flat_map(|window| &window.cameras).any(unsure)
+        self.windows.iter().flat_map(|window| &window.cameras).any(|camera| self.is_unsure_of(camera))
     }
 
-    /// Looks at what the open windows tell so far.
-    fn look(&mut self) {
-        let mut belief = None;
-        let mut cleared = BTreeSet::new();
-        for window in &self.windows {
-            if let Lesson::Learnt(next) = lesson(belief.as_ref().unwrap_or(&self.belief), window) {
-                belief = Some(*next);
-                cleared.extend(window.checked_cameras());
+    fn is_unsure_of(&self, camera: &CameraName) -> bool {
+        let clock = self.belief.estimate(camera, self.now);
+        self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
+    }
+
+    /// Looks at what the next open window tells so far; after the last it counts.
+    fn look(&mut self, mut round: Round) {
+        if let Some(window) = self.windows.get(round.next) {
+            if let Lesson::Learnt(next) = lesson(round.belief.as_ref().unwrap_or(&self.belief), window) {
+                round.belief = Some(*next);
+                round.cleared.extend(window.checked_cameras());
             }
+            round.next += 1;
         }
-        self.provisional = belief;
-        self.cleared = cleared;
+        if round.next < self.windows.len() {
+            self.round = Some(round);
+            return;
+        }
+        (self.provisional, self.cleared) = (round.belief, round.cleared);
+        let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
+        self.next_look = self.now.plus_seconds(pause);
     }
 }
 
