@@ -83,6 +83,8 @@ pub(crate) struct ClockEstimator {
     /// The same with what the open windows tell so far.
     provisional: Option<Belief>,
     windows: Vec<Window>,
+    /// How badly the worst clock was known when the last window was closed, s.
+    worst_sd_s: f64,
     /// The standard deviations reported of the clocks, s, that the belief begins with.
     reported: BTreeMap<CameraName, f64>,
     /// Cameras whose clocks may have jumped, ...
@@ -107,6 +109,7 @@ impl ClockEstimator {
             belief: Belief::default(),
             provisional: None,
             windows: Vec::new(),
+            worst_sd_s: 0.0,
             reported: BTreeMap::new(),
             suspects: BTreeSet::new(),
             cleared: BTreeSet::new(),
@@ -209,6 +212,7 @@ impl ClockEstimator {
         if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
             let window = self.windows.remove(index);
             self.close(&window);
+            self.worst_sd_s = self.worst_sd();
             self.round = Some(Round::default());
             self.next_adjustment = now.plus_seconds(PAUSE_S);
             return;
@@ -242,10 +246,18 @@ impl ClockEstimator {
         self.windows[index].add(camera, role, time, *line, track.position_at(exposure.time).coords);
     }
 
-    /// Whether a window is for a camera's clock, which is not well known and no other window's.
+    /// The worst standard deviation of a clock among all cameras, s.
+    fn worst_sd(&self) -> f64 {
+        let sd = |camera| self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        self.reported.keys().map(sd).fold(0.0, f64::max)
+    }
+
+    /// Whether a window is for a camera's clock, which is among the worst known and no other window's.
     fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
-        self.is_unsure_of(camera) && !others().any(|(_, window)| window.cameras.contains(camera))
+        let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        let is_bad = self.suspects.contains(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
+        is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
     /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
