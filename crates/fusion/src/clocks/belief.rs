@@ -398,6 +398,23 @@ mod tests {
     }
 
     #[test]
+    fn moving_on_is_the_transition_of_all_offsets_by_their_drifts() {
+        let (mut belief, components) = learnt([Some(Matrix6::identity() * 1e-6), None, None]);
+        let (mean, covariance) = (belief.mean.clone(), belief.covariance.clone());
+        let mut transition = DMatrix::<f64>::identity(mean.len(), mean.len());
+        let mut walk = DMatrix::<f64>::zeros(mean.len(), mean.len());
+        for pair in components.chunks(2) {
+            transition[(pair[0], pair[1])] = 20.0;
+            walk[(pair[0], pair[0])] = 20.0 * OFFSET_WALK;
+            walk[(pair[1], pair[1])] = 20.0 * DRIFT_WALK;
+        }
+        belief.advance(Timestamp::from_seconds(20.0));
+        assert!((&belief.mean - &transition * mean).amax() < 1e-15);
+        let expected = &transition * covariance * transition.transpose() + walk;
+        assert!((&belief.covariance - expected).amax() < 1e-18);
+    }
+
+    #[test]
     fn a_clock_that_says_that_it_has_become_worse_may_be_off_from_where_it_stood() {
         for reopened in ["a", "b"] {
             let (mut belief, _) = learnt([None; 3]);
