@@ -141,7 +141,7 @@ pub struct Initiation {
     pub velocity_prior_sd_mps: f64,
     /// Fixes farther than this from a camera are ghosts, m. 0.01 to 1000000. Default 2000.
     pub max_range_m: f64,
-    /// Probability with which a true combination passes the spatial gate, `map` only. Default 0.999.
+    /// Probability with which a true combination passes the gates of `hypotheses` and of `map`. Default 0.999.
     pub spatial_gate_probability: f64,
     /// The spatial gate of `pair`, `J <= beta`, m^2 (002, below equation 9). 1e-9 to 1e9. Default 16.
     pub pair_gate_m2: f64,
@@ -203,7 +203,8 @@ pub struct FlightModel {
 pub struct Tracking {
     /// `models` (default), `smoothed-residual`, `innovation` or `none`.
     pub manoeuvres: Manoeuvres,
-    /// The ways of flying of `models`. Default: straight (1e-6), drifting (0.3), manoeuvring (5).
+    /// The ways of flying of `models`. Default: straight (1e-6, 0.998 of the time), drifting (0.3, 0.001) and
+    /// manoeuvring (5, 0.001).
     pub models: Vec<FlightModel>,
     /// How often a target changes its way of flying, 1/s. 1e-9 to 100. Default 0.01.
     pub switching_rate_per_s: f64,
@@ -228,7 +229,8 @@ pub struct Tracking {
     pub clutter_per_sr: f64,
     /// Log-likelihood ratio (target against clutter) that confirms a track. 0.001 to 1000. Default 25.
     pub confirm_score: f64,
-    /// A confirmed track not updated for this long is coasting, s. 0.001 to 3600. Default 1.5.
+    /// A confirmed track not updated for this long is coasting, and a camera that has not seen a target for this
+    /// long does not hold its track in place any more, s. 0.001 to 3600. Default 1.5.
     pub coasting_after_s: f64,
     /// A track not updated for this long is lost, s. 0.001 to 3600. Default 4.
     pub lost_after_s: f64,

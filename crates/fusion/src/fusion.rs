@@ -240,7 +240,7 @@ impl Fusion {
             (step.evidence, step.used)
         };
         self.compare_clocks(&exposure, &used);
-        self.judge(&exposure, &evidence, outputs);
+        self.judge(&exposure, &evidence, &used, outputs);
         self.say(&exposure, happenings, outputs);
     }
 
@@ -258,14 +258,19 @@ impl Fusion {
     }
 
     /// Learns from an exposure how far its camera can be believed.
-    fn judge(&mut self, exposure: &Exposure, evidence: &[Option<f64>], outputs: &mut Vec<Output>) {
-        // A camera that sees nothing at all says nothing of its pose or clock.
-        if exposure.sightings.is_empty() {
-            return;
-        }
-        for nis in evidence {
-            self.standings.learn(&exposure.camera, *nis);
-        }
+    fn judge(
+        &mut self,
+        exposure: &Exposure,
+        evidence: &[Option<f64>],
+        used: &[(usize, TrackId)],
+        outputs: &mut Vec<Output>,
+    ) {
+        // One that is turned away sees the targets elsewhere. Where all its bearings are known targets',
+        // those that it misses are hidden from it; and one that sees nothing says nothing.
+        let strangers = exposure.sightings.len() > used.len();
+        let telling: Vec<Option<f64>> =
+            evidence.iter().copied().filter(|nis| nis.is_some() || strangers).collect();
+        self.standings.learn(&exposure.camera, &telling);
         if let Some(standing) = self.standings.review(&exposure.camera) {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_excluded",

@@ -6,9 +6,11 @@
 //! what follows from each; the same frames give the same output, bit for bit.
 //!
 //! Inside: bearings that belong to known tracks update them one exposure at a
-//! time ([`Track`], an iterated extended Kalman filter); the others are
-//! gathered into observation periods, solved for fixes ([`spatial`]), and the
-//! fixes of several periods are grouped into new tracks ([`temporal`]).
+//! time ([`Track`], interacting models of iterated extended Kalman filters);
+//! the others are gathered into observation periods, in which sets of them
+//! begin hypotheses that are followed until one reading of the bearings is by
+//! far the best. The papers' way is there too: periods solved for fixes
+//! ([`spatial`]), and fixes grouped into tracks ([`temporal`]).
 //!
 //! ```
 //! use crossfix_fusion::{Fusion, FusionConfig};

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crossfix_message::CameraName;
 
-/// Bearings that the running means look back on.
+/// Exposures that the running means look back on.
 const MEMORY: f64 = 50.0;
 /// Evidence that a verdict needs.
 const LEAST_EVIDENCE: u32 = 30;
@@ -52,25 +52,31 @@ impl Record {
         Self { ratio: 1.0, hits: 1.0, evidence: 0, excluded: false }
     }
 
-    fn learn(&mut self, ratio: Option<f64>) {
+    /// What all tracks of one exposure say is one piece of evidence: they share its pose and time.
+    fn learn(&mut self, ratios: &[Option<f64>]) {
+        if ratios.is_empty() {
+            return;
+        }
         self.evidence = self.evidence.saturating_add(1);
         let rate = 1.0 / MEMORY;
-        self.hits += rate * (f64::from(u8::from(ratio.is_some())) - self.hits);
-        if let Some(ratio) = ratio {
-            self.ratio += rate * (ratio - self.ratio);
+        let (came, sum) = ratios.iter().flatten().fold((0.0, 0.0), |(n, sum), ratio| (n + 1.0, sum + ratio));
+        self.hits += rate * (came / ratios.len() as f64 - self.hits);
+        if came > 0.0 {
+            self.ratio += rate * (sum / came - self.ratio);
         }
     }
 }
 
 impl Standings {
-    /// A track that others hold was expected in an exposure: the bearing's squared distance by the
-    /// reported noise (two degrees of freedom), or `None` if none was near.
-    pub(crate) fn learn(&mut self, camera: &CameraName, reported_nis: Option<f64>) {
+    /// For each track that others hold and an exposure should show: the bearing's squared distance by
+    /// the reported noise (two degrees of freedom), or `None` if none was near.
+    pub(crate) fn learn(&mut self, camera: &CameraName, reported_nis: &[Option<f64>]) {
         if !self.records.contains_key(camera) {
             self.records.insert(camera.clone(), Record::new());
         }
         if let Some(record) = self.records.get_mut(camera) {
-            record.learn(reported_nis.map(|nis| nis / 2.0));
+            let ratios: Vec<Option<f64>> = reported_nis.iter().map(|nis| nis.map(|nis| nis / 2.0)).collect();
+            record.learn(&ratios);
         }
     }
 
@@ -130,9 +136,9 @@ mod tests {
     fn after(bad: Option<f64>) -> Standings {
         let mut standings = Standings::default();
         for _ in 0..200 {
-            standings.learn(&name("a"), Some(2.0));
-            standings.learn(&name("b"), Some(2.2));
-            standings.learn(&name("c"), bad);
+            standings.learn(&name("a"), &[Some(2.0)]);
+            standings.learn(&name("b"), &[Some(2.2)]);
+            standings.learn(&name("c"), &[bad]);
             standings.review(&name("c"));
         }
         standings
@@ -154,11 +160,19 @@ mod tests {
     }
 
     #[test]
+    fn one_exposure_is_one_piece_of_evidence_however_many_tracks_it_misses() {
+        let mut standings = after(Some(2.0));
+        standings.learn(&name("b"), &[None; 100]);
+        assert_eq!(standings.review(&name("b")), None);
+        assert_eq!(standings.of(&name("b")), CameraStanding::Good);
+    }
+
+    #[test]
     fn it_comes_back_by_evidence() {
         let mut standings = after(None);
         let mut changes = Vec::new();
         for _ in 0..200 {
-            standings.learn(&name("c"), Some(2.0));
+            standings.learn(&name("c"), &[Some(2.0)]);
             changes.extend(standings.review(&name("c")));
         }
         assert_eq!(changes, [CameraStanding::Good]);
@@ -170,14 +184,14 @@ mod tests {
         let mut standings = Standings::default();
         for _ in 0..200 {
             for camera in ["a", "b", "c"] {
-                standings.learn(&name(camera), Some(20.0));
+                standings.learn(&name(camera), &[Some(20.0)]);
             }
         }
         assert!((standings.factor(&name("b")) - 1.0).abs() < 1e-12);
         let mut two = Standings::default();
         for _ in 0..200 {
-            two.learn(&name("a"), Some(2.0));
-            two.learn(&name("b"), None);
+            two.learn(&name("a"), &[Some(2.0)]);
+            two.learn(&name("b"), &[None]);
             assert_eq!(two.review(&name("b")), None);
         }
     }

@@ -10,6 +10,7 @@ use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_V
 use crate::prediction::BearingPrediction;
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 use crate::uncertainty::{CameraUncertainty, View};
+use crate::watch::independent_share;
 
 /// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
 /// nearly parallel lines of two targets cross too.
@@ -39,7 +40,7 @@ impl fmt::Display for TrackId {
 /// The life of a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrackStatus {
-    /// Started from a group of fixes, not yet sure.
+    /// Begun, and not yet sure.
     Tentative,
     /// Sure.
     Confirmed,
@@ -101,6 +102,8 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// When evidence for or against it came last.
+    judged: Option<Timestamp>,
     /// What unsure clocks may shift the position by, m^2; `None` where all are sure.
     shift: Option<Matrix3<f64>>,
     /// When its state went out, and as what.
@@ -135,6 +138,11 @@ impl Linearised {
 }
 
 impl Linearised {
+    /// Squared Mahalanobis distance of the offset.
+    fn distance(&self, spread: Matrix2<f64>) -> Option<f64> {
+        Some(self.offset.dot(&spread.cholesky()?.solve(&self.offset)))
+    }
+
     /// The note of this bearing in the track.
     fn residual(
         &self,
@@ -218,6 +226,7 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            judged: None,
             shift: None,
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
@@ -284,8 +293,44 @@ impl Track {
         Some(self.shift.iter().fold(prediction, |prediction, shift| prediction.widened(shift)))
     }
 
-    /// Takes a bearing in. Leaves the track as it was and returns `None` if the numbers fail;
-    /// otherwise whether the target has begun to manoeuvre.
+    /// A bearing against what is expected at its time, with the covariance of that, rad^2.
+    fn innovation(
+        &self,
+        time: Timestamp,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> Option<(Linearised, Matrix2<f64>)> {
+        let before = self.predicted(time, motion);
+        let seen = Linearised::at(&before, line, uncertainty)?;
+        let known = before.position_covariance() + self.shift.unwrap_or_else(Matrix3::zeros);
+        let known = seen.jacobian * known * seen.jacobian.transpose();
+        Some((seen, known))
+    }
+
+    /// Squared Mahalanobis distance of a bearing by the noise that its camera reports.
+    pub(crate) fn reported_nis(
+        &self,
+        time: Timestamp,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> Option<f64> {
+        let (seen, known) = self.innovation(time, line, uncertainty, motion)?;
+        seen.distance(known + line.covariance + uncertainty.common(&seen.view))
+    }
+
+    /// Takes evidence (a log-likelihood ratio) for or against the track in. Of a sure track it counts
+    /// for the time since the evidence before; its score is at most `most`.
+    pub(crate) fn judge(&mut self, now: Timestamp, change: f64, most: f64) {
+        let share = self.judged.map_or(1.0, |before| independent_share(now.seconds_since(before)));
+        self.judged = Some(now);
+        let share = if self.is_confirmed() { share } else { 1.0 };
+        self.score = (self.score + change * share).min(most);
+    }
+
+    /// Takes a bearing in, and tells whether the target has begun to manoeuvre. `None` if the numbers
+    /// fail: then no bearing is taken in, though a detector may have widened the covariance.
     pub(crate) fn measurement_update(
         &mut self,
         camera: &CameraName,
@@ -294,17 +339,12 @@ impl Track {
         motion: &Motion,
     ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
-        let before = self.imm.predicted(interval, motion.models(self.held));
-        let seen = Linearised::at(&before, line, uncertainty)?;
-        let offset = seen.offset;
-        let known = before.position_covariance() + self.shift.unwrap_or_else(Matrix3::zeros);
-        let known = seen.jacobian * known * seen.jacobian.transpose();
-        let distance = |noise: Matrix2<f64>| Some(offset.dot(&(known + noise).cholesky()?.solve(&offset)));
-        let nis = distance(seen.noise)?;
-        let reported_nis = distance(line.covariance + uncertainty.common(&seen.view))?;
+        let (seen, known) = self.innovation(time, line, uncertainty, motion)?;
+        let nis = seen.distance(known + seen.noise)?;
+        let reported_nis = seen.distance(known + line.covariance + uncertainty.common(&seen.view))?;
         let manoeuvre = self.detector.as_mut().is_some_and(|detector| match detector {
             Detector::Residual(detector) => {
-                let in_deviations = line.basis * -offset / line.standard_deviation();
+                let in_deviations = line.basis * -seen.offset / line.standard_deviation();
                 detector.see(in_deviations)
             }
             Detector::Innovation(detector) => detector.see(nis, 2),

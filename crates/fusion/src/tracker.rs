@@ -12,10 +12,11 @@ use crate::initiation::Start;
 use crate::motion::Motion;
 use crate::prediction::Fit;
 use crate::track::{Track, TrackId, TrackStatus};
+use crate::uncertainty::CameraUncertainty;
 use crate::watch::Watch;
 use crate::{Exposure, Sighting, Tracking};
 
-/// A tentative track whose score falls below this is dropped: a chance of 1 in 100 against clutter.
+/// A track whose score falls below this is dropped: a chance of 1 in 100 against clutter.
 const DROP_SCORE: f64 = -4.6;
 /// Two positions that differ by less than this (squared Mahalanobis, three degrees of freedom,
 /// P = 0.99) are one target if one of the tracks is coasting.
@@ -26,10 +27,6 @@ const REACH: f64 = 1.5;
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// A score beyond this counts no more: a track that has long been good can still be doubted.
 const MAX_SCORE: f64 = 40.0;
-/// What hides a sure target from a camera hides it for about so long, s: exposures that follow each
-/// other more closely tell together no more than one does.
-const HIDDEN_S: f64 = 0.5;
-
 /// A camera brings a track back that it has lost sight of if the line is so many times (logarithm)
 /// more likely the target's than one of the strangers that the camera reports anyway.
 const FOUND_AGAIN_MARGIN: f64 = 8.0;
@@ -133,17 +130,20 @@ impl Tracker {
                 && track.is_held_without(&exposure.camera, &self.motion)
                 && known.expects(track.position_at(exposure.time), self.max_range_m)
         });
+        // By what the camera reports, however much it is doubted.
+        let reported = CameraUncertainty { factor: 1.0, ..exposure.uncertainty };
         let nearest = |track: &Track| {
             let origin = known.camera.pose().position();
-            let prediction =
-                track.bearing_prediction(exposure.time, origin, &exposure.uncertainty, &self.motion)?;
+            let prediction = track.bearing_prediction(exposure.time, origin, &reported, &self.motion)?;
             let fits = exposure.sightings.iter().enumerate();
             let fits = fits.filter_map(|(i, s)| Some((prediction.fit(&s.line, self.gate)?.gate_distance, i)));
-            fits.min_by(|a, b| a.0.total_cmp(&b.0))
+            let (_, nearest) = fits.min_by(|a, b| a.0.total_cmp(&b.0))?;
+            let line = &exposure.sightings[nearest].line;
+            Some((nearest, track.reported_nis(exposure.time, line, &reported, &self.motion)?))
         };
-        let nearest: Vec<(TrackId, Option<(f64, usize)>)> = seen.map(|t| (t.id, nearest(t))).collect();
-        let used = nearest.iter().filter_map(|(id, fit)| Some(((*fit)?.1, *id))).collect();
-        (nearest.into_iter().map(|(_, fit)| fit.map(|(distance, _)| distance)).collect(), used)
+        let nearest: Vec<(TrackId, Option<(usize, f64)>)> = seen.map(|t| (t.id, nearest(t))).collect();
+        let used = nearest.iter().filter_map(|(id, fit)| Some(((*fit)?.0, *id))).collect();
+        (nearest.into_iter().map(|(_, fit)| fit.map(|(_, nis)| nis)).collect(), used)
     }
 
     /// How targets move.
@@ -184,6 +184,7 @@ impl Tracker {
         Step { free, claims, used, evidence, happenings }
     }
 
+    /// Gives bearings that are still open to the sure tracks or the others, and judges these by it.
     fn associate(
         &mut self,
         exposure: &Exposure,
@@ -194,39 +195,8 @@ impl Tracker {
     ) -> Vec<Happening> {
         let ids: Vec<TrackId> =
             self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
-        let miss = (1.0 - self.config.detection_probability).ln();
-        let watch = self.watches.get(&exposure.camera);
-        let interval_s = watch.map_or(f64::INFINITY, |watch| watch.seconds_to(exposure.time));
-        // What a line must be worth to bring a track back that the camera has lost sight of.
-        let stranger = watch.map_or(0.0, |watch| watch.strangers_per_sr(known).ln()) + FOUND_AGAIN_MARGIN;
-        let mut candidates = Vec::new();
-        for (row, id) in ids.iter().enumerate() {
-            let prediction = self.tracks.get(id).and_then(|track| {
-                let away = (track.position_at(exposure.time) - known.camera.pose().position()).norm();
-                if away > REACH * self.max_range_m {
-                    return None;
-                }
-                track.bearing_prediction(
-                    exposure.time,
-                    known.camera.pose().position(),
-                    &exposure.uncertainty,
-                    &self.motion,
-                )
-            });
-            let Some(prediction) = prediction else {
-                continue;
-            };
-            let lost_sight =
-                self.tracks.get(id).is_some_and(|t| t.is_lost_sight_of_by(&exposure.camera, &self.motion));
-            let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
-            for (column, sighting) in open {
-                let fit = prediction.fit(&sighting.line, self.gate);
-                if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
-                    let gain = log_likelihood_ratio(&fit, &self.config) - miss;
-                    candidates.push(Candidate { row, column, gain });
-                }
-            }
-        }
+        let miss = self.miss();
+        let candidates = self.candidates(exposure, known, owners, &ids);
         let gains: BTreeMap<(usize, usize), f64> =
             candidates.iter().map(|c| ((c.row, c.column), c.gain)).collect();
         let partner: BTreeMap<usize, usize> = assign(&candidates).into_iter().collect();
@@ -236,32 +206,76 @@ impl Tracker {
                 continue;
             };
             let column = partner.get(&row).copied();
-            let update = column.and_then(|column| {
-                owners[column] = Some(*id);
+            let taken = column.and_then(|column| {
                 let sighting = &exposure.sightings[column];
                 let time = (exposure.time, &exposure.uncertainty);
-                track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)
+                let taken = track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)?;
+                owners[column] = Some(*id);
+                Some(taken)
             });
-            let gain = update.and(column).and_then(|column| gains.get(&(row, column)));
+            let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
             let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
-            if sure && (update.is_some() || sees) && track.is_held_without(&exposure.camera, &self.motion) {
-                evidence.push(update.map(|taken| taken.reported_nis));
+            let held = track.is_held_without(&exposure.camera, &self.motion);
+            if sure && (taken.is_some() || sees) && held {
+                evidence.push(taken.map(|taken| taken.reported_nis));
             }
+            let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
             let change = match gain {
                 // What one camera alone follows may be anything along its sight line.
-                Some(_) if sure && !track.is_held_without(&exposure.camera, &self.motion) => 0.0,
-                Some(gain) => gain + miss,
-                // Outside its field of view a camera has missed nothing.
-                None if !sees => 0.0,
-                None => miss,
+                Some(_) if sure && !held => Some(0.0),
+                Some(gain) => Some(gain + miss),
+                // Outside its field of view a camera has missed nothing, and of what nobody sees time
+                // decides.
+                None => (sees && !(sure && silent)).then_some(miss),
             };
-            let weight = if sure { (interval_s / HIDDEN_S).min(1.0) } else { 1.0 };
-            track.score = (track.score + change * weight).min(MAX_SCORE);
-            if update.is_some_and(|taken| taken.manoeuvre) {
+            if let Some(change) = change {
+                track.judge(exposure.time, change, MAX_SCORE);
+            }
+            if taken.is_some_and(|taken| taken.manoeuvre) {
                 happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
             }
         }
         happenings
+    }
+
+    /// Log-likelihood ratio of a camera's missing a target.
+    fn miss(&self) -> f64 {
+        (1.0 - self.config.detection_probability).ln()
+    }
+
+    /// What the open bearings in the gates of these tracks are worth to them.
+    fn candidates(
+        &self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        owners: &[Option<TrackId>],
+        ids: &[TrackId],
+    ) -> Vec<Candidate> {
+        let watch = self.watches.get(&exposure.camera);
+        // What a line must be worth to bring a track back that the camera has lost sight of.
+        let stranger = watch.map_or(0.0, |watch| watch.strangers_per_sr(known).ln()) + FOUND_AGAIN_MARGIN;
+        let origin = known.camera.pose().position();
+        let (mut candidates, miss) = (Vec::new(), self.miss());
+        for (row, track) in ids.iter().enumerate().filter_map(|(row, id)| Some((row, self.tracks.get(id)?))) {
+            if (track.position_at(exposure.time) - origin).norm() > REACH * self.max_range_m {
+                continue;
+            }
+            let prediction =
+                track.bearing_prediction(exposure.time, origin, &exposure.uncertainty, &self.motion);
+            let Some(prediction) = prediction else {
+                continue;
+            };
+            let lost_sight = track.is_lost_sight_of_by(&exposure.camera, &self.motion);
+            let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
+            for (column, sighting) in open {
+                let fit = prediction.fit(&sighting.line, self.gate);
+                if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
+                    let gain = log_likelihood_ratio(&fit, &self.config) - miss;
+                    candidates.push(Candidate { row, column, gain });
+                }
+            }
+        }
+        candidates
     }
 
     /// Confirms, coasts and gives up.
@@ -272,17 +286,14 @@ impl Tracker {
             let hopeless = silent_s > self.config.lost_after_s
                 || position_sd(track, now, &self.motion) > self.config.max_position_sd_m;
             match track.status {
-                TrackStatus::Tentative if hopeless || track.score < DROP_SCORE => {
+                TrackStatus::Lost => {}
+                _ if hopeless || track.score < DROP_SCORE => {
                     track.status = TrackStatus::Lost;
                     happenings.push(Happening::new(TrackEventKind::Lost, track.id));
                 }
                 TrackStatus::Tentative if track.score >= self.config.confirm_score => {
                     track.status = TrackStatus::Confirmed;
                     happenings.push(Happening::new(TrackEventKind::Confirmed, track.id));
-                }
-                TrackStatus::Confirmed | TrackStatus::Coasting if hopeless || track.score < DROP_SCORE => {
-                    track.status = TrackStatus::Lost;
-                    happenings.push(Happening::new(TrackEventKind::Lost, track.id));
                 }
                 TrackStatus::Confirmed | TrackStatus::Coasting => {
                     track.status = if silent_s > self.config.coasting_after_s {
@@ -291,7 +302,7 @@ impl Tracker {
                         TrackStatus::Confirmed
                     };
                 }
-                TrackStatus::Tentative | TrackStatus::Lost => {}
+                TrackStatus::Tentative => {}
             }
         }
         happenings
@@ -322,8 +333,9 @@ impl Tracker {
 
     /// Takes a track over that the initiation has found, and numbers it. Where it has used the
     /// bearings of a track that one camera alone was following and lies where that may have gone, it
-    /// is the same target found again: it goes on under the old number. Where it lies elsewhere, two
-    /// cameras are not enough to say so: their lines cross anywhere.
+    /// is the same target found again: it goes on under the old number. Where it lies elsewhere, the
+    /// old one was wrong and is given up; but two cameras are not enough to say so, as their lines
+    /// cross anywhere.
     pub(crate) fn adopt(&mut self, Start { mut track, cameras, claimed_by }: Start) -> Vec<Happening> {
         let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
         let unheld: Vec<&Track> = owners.filter(|old| old.is_confirmed() && !old.is_held()).collect();
@@ -337,13 +349,20 @@ impl Tracker {
             self.tracks.insert(track.id, track);
             return Vec::new();
         }
-        if !unheld.is_empty() && cameras < 3 {
+        let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();
+        if !wrong.is_empty() && cameras < 3 {
             return Vec::new();
         }
         let id = TrackId(self.next_id);
         self.next_id += 1;
         track.id = id;
         let mut happenings = vec![Happening::new(TrackEventKind::Born, id)];
+        for old in wrong {
+            if let Some(track) = self.tracks.get_mut(&old) {
+                track.status = TrackStatus::Lost;
+            }
+            happenings.push(Happening::new(TrackEventKind::Lost, old));
+        }
         if track.is_confirmed() {
             happenings.push(Happening::new(TrackEventKind::Confirmed, id));
         }

@@ -9,6 +9,15 @@ const MEMORY_S: f64 = 3.0;
 /// Strangers in an exposure that may always be, however few there were.
 const LEAST_STRANGERS: f64 = 0.05;
 
+/// What hides a target from cameras hides it for about so long, s.
+const HIDDEN_S: f64 = 0.25;
+
+/// How much of a piece of evidence counts that follows another of the same target after an interval
+/// of seconds: exposures close together tell no more than one.
+pub(crate) fn independent_share(interval_s: f64) -> f64 {
+    (interval_s / HIDDEN_S).clamp(0.0, 1.0)
+}
+
 /// A camera's exposures so far.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Watch {
@@ -25,14 +34,9 @@ impl Watch {
 
     /// Its next one.
     pub(crate) fn see(&mut self, time: Timestamp, strangers: usize) {
-        let weight = (self.seconds_to(time) / MEMORY_S).clamp(0.0, 1.0);
+        let weight = (time.seconds_since(self.time) / MEMORY_S).clamp(0.0, 1.0);
         self.strangers += (strangers as f64 - self.strangers) * weight;
         self.time = time;
-    }
-
-    /// Seconds from the newest exposure to a time.
-    pub(crate) fn seconds_to(&self, time: Timestamp) -> f64 {
-        time.seconds_since(self.time)
     }
 
     /// How many bearings are nobody's, 1/sr about the optical axis.

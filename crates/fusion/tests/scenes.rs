@@ -108,6 +108,27 @@ fn a_target_out_of_sight_for_three_seconds_keeps_its_number() {
 }
 
 #[test]
+fn however_many_cameras_miss_it_a_hidden_target_keeps_its_number() {
+    for cameras in [4, 8, 16] {
+        let eyes: Vec<Eye> = (0..cameras)
+            .map(|i| {
+                let (sin, cos) = (f64::from(i) / f64::from(cameras) * std::f64::consts::TAU).sin_cos();
+                let phase_s = 0.1 * f64::from(i) / f64::from(cameras);
+                eye(&format!("ring-{i}"), [150.0 * cos, 150.0 * sin, 3.0], [0.0, 0.0, 40.0], phase_s)
+            })
+            .collect();
+        for seed in 0..3 {
+            let path = straight([-20.0, 10.0, 40.0], [4.0, -1.0, 0.0]);
+            let scene = Scene { eyes: eyes.clone(), ..good_day(vec![hidden(path, 4.0, 7.0)], 10.0) };
+            let mut flight = Flight::new(scene, seed);
+            let before = assert_one_each(flight.until(4.0), 1, seed);
+            let after = assert_one_each(flight.until(9.5), 1, seed);
+            assert_eq!(before, after, "{cameras} cameras, seed {seed}");
+        }
+    }
+}
+
+#[test]
 fn a_target_that_leaves_the_field_of_view_for_long_is_lost_and_found_as_another() {
     for (clutter, seed) in NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed))) {
         // Up out of all cameras' sight, which ends at some 105 m, and down again, within half a minute.

@@ -5,10 +5,8 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Unit, Vector3};
 
 use crate::prediction::{BearingPrediction, log_density};
+use crate::watch::independent_share;
 
-/// What hides a target from a camera hides it for about so long, s: exposures that follow each
-/// other more closely tell together no more than one does.
-pub(super) const HIDDEN_S: f64 = 0.5;
 /// Logarithm of the probability that a camera is blind for a target that it should see.
 const BLIND: f64 = -4.6;
 /// A camera's bearings that are shifted by so many times their own variance agree with nothing.
@@ -52,9 +50,11 @@ impl Sight {
     fn predict(&mut self, time: Timestamp, density: f64) {
         let dt = time.seconds_since(self.time);
         self.direction = Unit::new_normalize(self.direction.into_inner() + self.rate * dt);
-        self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + density * dt.powi(3) / 3.0;
-        self.tie += dt * self.rate_variance + density * dt * dt / 2.0;
-        self.rate_variance += density * dt;
+        // A clock's correction may take it back in time: that makes it no surer.
+        let noise = density * dt.abs();
+        self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + noise * dt * dt / 3.0;
+        self.tie += dt * self.rate_variance + noise * dt / 2.0;
+        self.rate_variance += noise;
         self.time = time;
     }
 
@@ -147,7 +147,7 @@ impl Coincidence {
         if self.sights.iter().any(|(name, _)| name == camera) {
             return;
         }
-        let more = log_miss * (interval_s / HIDDEN_S).min(1.0);
+        let more = log_miss * independent_share(interval_s);
         match self.silent.iter_mut().find(|(name, _)| name == camera) {
             Some((_, log)) => *log = (*log + more).max(BLIND),
             None => self.silent.push((camera.clone(), more.max(BLIND))),

@@ -27,7 +27,7 @@ const MAX_ALIKE: usize = 20;
 /// A way this much less likely than its family's best (log-likelihood) is given up.
 const FAMILY_MARGIN: f64 = 15.0;
 /// A hypothesis less likely than this is clutter.
-const LEAST_SCORE: f64 = -8.0;
+const LEAST_SCORE: f64 = -12.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
@@ -35,7 +35,7 @@ const RIVAL_MARGIN: f64 = 8.0;
 /// each sees another.
 const COINCIDENCE_MARGIN: f64 = 5.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
-const MAX_HYPOTHESES: usize = 3_000;
+const MAX_HYPOTHESES: usize = 6_000;
 
 /// One reading of the bearings: these are one target's.
 #[derive(Clone, Debug)]

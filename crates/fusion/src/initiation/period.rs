@@ -4,10 +4,21 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// A camera whose newest exposure is older than this many frame intervals of another is silent.
+/// A camera whose newest exposure is older than so many frame intervals (of most cameras) is silent.
 const SILENT_INTERVALS: f64 = 5.0;
 /// A period is closed where the exposures lie within this factor of as close as they ever do.
 const SPREAD_FACTOR: f64 = 1.2;
+
+/// How fast a camera's usual frame interval follows its last one.
+const INTERVAL_RATE: f64 = 0.2;
+
+/// A camera that is heard.
+#[derive(Clone, Copy, Debug)]
+struct Heard {
+    time: Timestamp,
+    /// Its usual frame interval, s.
+    interval_s: Option<f64>,
+}
 
 /// Gathers exposures into observation periods: one exposure of each camera that is heard, closed
 /// where these lie closest together, which for cameras that scan in turn is at the end of a scan.
@@ -17,7 +28,7 @@ pub(crate) struct Periods {
     cameras: usize,
     /// The newest exposure of each camera that no period has used.
     unused: BTreeMap<CameraName, Exposure>,
-    heard: BTreeMap<CameraName, Timestamp>,
+    heard: BTreeMap<CameraName, Heard>,
     /// How far apart the cameras' newest exposures lay, s, at each of the last exposures.
     spreads: VecDeque<f64>,
     closed: Option<Timestamp>,
@@ -44,12 +55,12 @@ impl Periods {
     pub(crate) fn add(&mut self, exposure: Exposure, known: usize) -> Option<BTreeMap<CameraName, Exposure>> {
         let now = exposure.time;
         let before = self.heard.len();
-        let previous = self.heard.insert(exposure.camera.clone(), now);
+        let previous = self.hear(&exposure.camera, now);
         self.unused.insert(exposure.camera.clone(), exposure);
-        if let Some(interval) = previous.map(|time| now.seconds_since(time)) {
-            self.heard.retain(|_, time| now.seconds_since(*time) <= SILENT_INTERVALS * interval);
+        if let Some(interval_s) = self.usual_interval_s().filter(|_| previous) {
+            self.heard.retain(|_, heard| now.seconds_since(heard.time) <= SILENT_INTERVALS * interval_s);
         }
-        self.repeated |= previous.is_some();
+        self.repeated |= previous;
         if self.heard.len() != before {
             // Other cameras lie otherwise.
             self.spreads.clear();
@@ -58,7 +69,7 @@ impl Periods {
         if self.heard.len() < self.cameras || !(self.repeated || self.heard.len() >= known) {
             return None;
         }
-        self.spreads.push_back(spread_of(self.heard.values().min().copied()));
+        self.spreads.push_back(spread_of(self.heard.values().map(|heard| heard.time).min()));
         while self.spreads.len() > 2 * self.heard.len() {
             self.spreads.pop_front();
         }
@@ -73,5 +84,26 @@ impl Periods {
         }
         self.closed = Some(now);
         Some(std::mem::take(&mut self.unused))
+    }
+
+    /// Notes an exposure; tells whether the camera has been heard before.
+    fn hear(&mut self, camera: &CameraName, now: Timestamp) -> bool {
+        let Some(heard) = self.heard.get_mut(camera) else {
+            self.heard.insert(camera.clone(), Heard { time: now, interval_s: None });
+            return false;
+        };
+        // A corrected clock may go back.
+        let last_s = now.seconds_since(heard.time).max(0.0);
+        let usual_s = heard.interval_s.unwrap_or(last_s);
+        heard.interval_s = Some(usual_s + INTERVAL_RATE * (last_s - usual_s));
+        heard.time = now;
+        true
+    }
+
+    /// The median of the cameras' usual intervals, s: one camera with odd times changes little.
+    fn usual_interval_s(&self) -> Option<f64> {
+        let mut intervals: Vec<f64> = self.heard.values().filter_map(|heard| heard.interval_s).collect();
+        intervals.sort_unstable_by(f64::total_cmp);
+        intervals.get(intervals.len() / 2).copied()
     }
 }
