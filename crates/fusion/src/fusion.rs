@@ -221,7 +221,8 @@ impl Fusion {
         let reported = exposure.time;
         exposure.correction_s = clock.offset_s;
         exposure.time = reported.plus_seconds(-clock.offset_s);
-        exposure.uncertainty.time_sd_s = clock.relative_sd_s;
+        let said = exposure.uncertainty.time_sd_s;
+        exposure.uncertainty.time_sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said);
         if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
             return self.handle(Err((exposure, RejectionReason::Late { by_s })), outputs);
         }

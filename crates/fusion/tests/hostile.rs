@@ -26,6 +26,8 @@ proptest! {
     #[test]
     fn any_bytes_are_survived(data in prop::collection::vec(any::<u8>(), 0..160)) {
         driver::drive(&data);
+        // The same with clocks, poses and numbers of the configuration by its last bytes.
+        driver::drive(&[&data, driver::MARK].concat());
     }
 }
 

@@ -27,7 +27,8 @@ struct Clock {
     place: Option<usize>,
     /// The place of its camera's pose in the state, where that is uncertain.
     pose: Option<usize>,
-    /// Variance of its offset against true time before anything is seen, s^2.
+    /// Variance of its offset against true time before anything is seen, s^2; 0 where the camera is
+    /// taken at its word.
     prior: f64,
     /// The same of its drift.
     drift_prior: f64,
@@ -44,6 +45,9 @@ pub(super) struct Belief {
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     epoch: Option<Timestamp>,
+    /// By how much the common time of all clocks, offset and drift, is not what the clocks' reported
+    /// deviations make of them now: it does not step when a clock becomes worse known than it was.
+    site: [f64; 2],
     /// The poses' covariances as they were reported.
     poses: BTreeMap<CameraName, Matrix6<f64>>,
 }
@@ -149,15 +153,17 @@ impl Belief {
             return;
         }
         self.epoch = Some(time);
-        let n = self.mean.len();
-        let mut transition = DMatrix::<f64>::identity(n, n);
+        self.site[0] += self.site[1] * dt;
+        // Each offset grows by its drift: of mean and covariance only the rows and columns of offsets change.
         let clocks: Vec<usize> = self.clock_places().collect();
         for &k in &clocks {
-            transition[(k, k + 1)] = dt;
+            self.mean[k] += dt * self.mean[k + 1];
+            let (mut offset, drift) = self.covariance.columns_range_pair_mut(k, k + 1);
+            offset.axpy(dt, &drift, 1.0);
         }
-        self.mean = &transition * &self.mean;
-        self.covariance = &transition * &self.covariance * transition.transpose();
-        for k in clocks {
+        for &k in &clocks {
+            let (mut offset, drift) = self.covariance.rows_range_pair_mut(k, k + 1);
+            offset += drift * dt;
             self.covariance[(k, k)] += OFFSET_WALK * dt;
             self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
         }
@@ -187,6 +193,25 @@ impl Belief {
         if possible && next_mean.iter().chain(next.iter()).all(|value| value.is_finite()) {
             self.mean = next_mean;
             self.covariance = (&next + next.transpose()) / 2.0;
+        }
+    }
+
+    /// A camera says that its clock is worse than it was: standard deviations of offset (s) and drift
+    /// (s/s). It may be off by so much from where it stood.
+    pub(super) fn reopen(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) {
+        let site = self.reference_offset_and_drift();
+        let Some(clock) = self.cameras.get_mut(camera) else {
+            return;
+        };
+        (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
+        let place = clock.place;
+        for (i, stepped) in self.reference_offset_and_drift().into_iter().enumerate() {
+            self.site[i] += site[i] - stepped;
+        }
+        let stood = place.map(|place| [self.mean[place], self.mean[place + 1]]);
+        self.doubt(camera);
+        for (place, [offset, drift]) in place.into_iter().zip(stood) {
+            (self.mean[place], self.mean[place + 1]) = (offset, drift);
         }
     }
 
@@ -232,18 +257,16 @@ impl Belief {
         *self = anew;
     }
 
-    /// How much each clock says of true time, by the variances reported of them, and the variance of
-    /// what all say together. A clock that is right by definition says all.
-    fn weights(&self, prior: fn(&Clock) -> f64) -> (Vec<(Clock, f64)>, f64) {
+    /// How much each clock says of true time, by the variances reported of them. A clock that is right
+    /// by definition says all.
+    fn weights(&self) -> Vec<(Clock, f64)> {
         let clocks: Vec<Clock> = self.cameras.values().copied().collect();
-        let exact = clocks.iter().filter(|clock| prior(clock) <= 0.0).count();
-        let weight = |clock: &Clock| match exact {
-            0 => prior(clock).recip(),
-            _ => f64::from(u8::from(prior(clock) <= 0.0)),
+        let any_is_right = clocks.iter().any(|clock| clock.prior <= 0.0);
+        let weight = |clock: &Clock| {
+            if any_is_right { f64::from(u8::from(clock.prior <= 0.0)) } else { clock.prior.recip() }
         };
         let total: f64 = clocks.iter().map(weight).sum();
-        let variance = if exact == 0 { total.recip() } else { 0.0 };
-        (clocks.into_iter().map(|clock| (clock, weight(&clock) / total)).collect(), variance)
+        clocks.into_iter().map(|clock| (clock, weight(&clock) / total)).collect()
     }
 
     /// A clock's components in the state, with the offset as of `ahead` seconds after the epoch.
@@ -261,8 +284,9 @@ impl Belief {
     /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
     /// variance and the variance of that common time.
     fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
+        let weights = self.weights();
         let prior = [|clock: &Clock| clock.prior, |clock: &Clock| clock.drift_prior][component];
-        let (weights, common) = self.weights(prior);
+        let common = weights.iter().map(|(clock, weight)| weight.powi(2) * prior(clock)).sum();
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let mut put = |clock: &Clock, weight: f64| {
             if let Some(place) = clock.place.filter(|_| weight != 0.0) {
@@ -274,7 +298,8 @@ impl Belief {
         };
         put(clock, 1.0);
         weights.iter().for_each(|(other, weight)| put(other, -weight));
-        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum();
+        let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
+        let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
         let along = |(&i, a): (&usize, &f64)| -> f64 {
             a * row.iter().map(|(&k, b)| b * self.covariance[(i, k)]).sum::<f64>()
         };
@@ -302,18 +327,19 @@ impl Belief {
     /// behind its reported one.
     pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
-        let (weights, _) = self.weights(|clock| clock.prior);
+        let weights = self.weights();
         let offset = |clock: &Clock| self.relative(clock, 0, ahead);
-        let common: f64 = weights.iter().map(|(clock, weight)| weight * offset(clock)).sum();
+        let common = weights.iter().map(|(clock, weight)| weight * offset(clock)).sum::<f64>()
+            - (self.site[0] + self.site[1] * ahead);
         self.cameras.values().map(|clock| offset(clock) - common).fold(0.0, f64::max).min(MAX_OFFSET_S)
     }
 
     /// Offset and drift of the reference against true time as of the epoch.
     fn reference_offset_and_drift(&self) -> [f64; 2] {
-        let priors: [fn(&Clock) -> f64; 2] = [|clock| clock.prior, |clock| clock.drift_prior];
+        let weights = self.weights();
         std::array::from_fn(|i| {
-            let (weights, _) = self.weights(priors[i]);
-            -weights.iter().map(|(clock, weight)| weight * self.relative(clock, i, 0.0)).sum::<f64>()
+            self.site[i]
+                - weights.iter().map(|(clock, weight)| weight * self.relative(clock, i, 0.0)).sum::<f64>()
         })
     }
 }
@@ -368,6 +394,46 @@ mod tests {
                 assert!((b.offset_s - c.offset_s - 0.09).abs() < 1e-9);
             }
             assert!(belief.covariance.clone().cholesky().is_some());
+        }
+    }
+
+    #[test]
+    fn moving_on_is_the_transition_of_all_offsets_by_their_drifts() {
+        let (mut belief, components) = learnt([Some(Matrix6::identity() * 1e-6), None, None]);
+        let (mean, covariance) = (belief.mean.clone(), belief.covariance.clone());
+        let mut transition = DMatrix::<f64>::identity(mean.len(), mean.len());
+        let mut walk = DMatrix::<f64>::zeros(mean.len(), mean.len());
+        for pair in components.chunks(2) {
+            transition[(pair[0], pair[1])] = 20.0;
+            walk[(pair[0], pair[0])] = 20.0 * OFFSET_WALK;
+            walk[(pair[1], pair[1])] = 20.0 * DRIFT_WALK;
+        }
+        belief.advance(Timestamp::from_seconds(20.0));
+        assert!((&belief.mean - &transition * mean).amax() < 1e-15);
+        let expected = &transition * covariance * transition.transpose() + walk;
+        assert!((&belief.covariance - expected).amax() < 1e-18);
+    }
+
+    #[test]
+    fn a_clock_that_says_that_it_has_become_worse_may_be_off_from_where_it_stood() {
+        for reopened in ["a", "b"] {
+            let (mut belief, _) = learnt([None; 3]);
+            let before = ["a", "b", "c"].map(|camera| of(&belief, camera));
+            belief.reopen(&name(reopened), [0.5, 3e-5]);
+            for (camera, before) in ["a", "b", "c"].into_iter().zip(before) {
+                let after = of(&belief, camera);
+                // Nobody's time steps, and only this clock's is unsure.
+                assert!((after.offset_s - before.offset_s).abs() < 1e-9, "{camera}: {after:?} {before:?}");
+                assert!((after.drift - before.drift).abs() < 1e-12, "{camera}: {after:?} {before:?}");
+                let unsure = if camera == reopened { 0.4..0.5 } else { 0.0..0.05 };
+                assert!(unsure.contains(&after.relative_sd_s), "{camera}: {after:?}");
+            }
+            assert!(belief.covariance.clone().cholesky().is_some());
+            let (b, later) = (of(&belief, "b"), belief.estimate(&name("b"), Timestamp::from_seconds(60.0)));
+            assert!((later.unwrap().offset_s - b.offset_s - 60.0 * b.drift).abs() < 1e-9);
+            belief.advance(Timestamp::from_seconds(60.0));
+            let moved = belief.estimate(&name("b"), Timestamp::from_seconds(60.0)).unwrap();
+            assert!((moved.offset_s - later.unwrap().offset_s).abs() < 1e-9);
         }
     }
 

@@ -13,7 +13,7 @@ mod curve;
 mod lesson;
 mod window;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -21,7 +21,7 @@ use nalgebra::Matrix6;
 
 use self::belief::Belief;
 use self::lesson::{Lesson, lesson};
-use self::window::Window;
+use self::window::{Role, Window};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
 use crate::track::{Track, TrackId};
@@ -40,6 +40,10 @@ const SURE_S: f64 = 0.002;
 const LOOK_EVERY_S: f64 = 1.0;
 /// ... and so often where all are known, for one may jump.
 const CHECK_EVERY_S: f64 = 4.0;
+/// Time between two windows that are adjusted, s: many exposures may come at once.
+const PAUSE_S: f64 = 0.02;
+/// A clock is worse than it was when its camera reports it this many times worse.
+const WORSE: f64 = 3.0;
 /// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
 const MAX_REFUSED: u32 = 2;
 
@@ -59,6 +63,17 @@ pub struct ClockEstimate {
     pub drift_sd: f64,
 }
 
+/// A look at the open windows, one window an exposure: an adjustment takes milliseconds.
+#[derive(Clone, Debug, Default)]
+struct Round {
+    /// The window that is next.
+    next: usize,
+    /// What is believed with those before it.
+    belief: Option<Belief>,
+    /// Cameras of which they tell.
+    cleared: BTreeSet<CameraName>,
+}
+
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockEstimator {
@@ -68,12 +83,20 @@ pub(crate) struct ClockEstimator {
     /// The same with what the open windows tell so far.
     provisional: Option<Belief>,
     windows: Vec<Window>,
+    /// How badly the worst clock was known when the last window was closed, s.
+    worst_sd_s: f64,
+    /// The standard deviations reported of the clocks, s, that the belief begins with.
+    reported: BTreeMap<CameraName, f64>,
     /// Cameras whose clocks may have jumped, ...
     suspects: BTreeSet<CameraName>,
     /// ... and those of which the open windows tell all the same.
     cleared: BTreeSet<CameraName>,
     now: Timestamp,
     next_look: Timestamp,
+    /// When the next window may be adjusted.
+    next_adjustment: Timestamp,
+    /// The look under way.
+    round: Option<Round>,
     needed: bool,
     /// Windows one after the other that fitted nothing that was learnt before.
     refused: u32,
@@ -86,10 +109,14 @@ impl ClockEstimator {
             belief: Belief::default(),
             provisional: None,
             windows: Vec::new(),
+            worst_sd_s: 0.0,
+            reported: BTreeMap::new(),
             suspects: BTreeSet::new(),
             cleared: BTreeSet::new(),
             now: Timestamp::MIN,
             next_look: Timestamp::MIN,
+            next_adjustment: Timestamp::MIN,
+            round: None,
             needed: false,
             refused: 0,
         }
@@ -100,26 +127,55 @@ impl ClockEstimator {
         self.needed
     }
 
-    /// Makes a camera's clock and pose known by the deviations it reports; later reports change nothing.
+    /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only one
+    /// counts that makes the clock much worse than it was: its source of time is lost.
     pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
         let reported_sd_s = reported.time_sd_s;
-        if !self.config.estimate || self.belief.knows(camera) {
+        if !self.config.estimate {
             return;
         }
         let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
-        self.needed |= uncertain;
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
-        self.belief.add(camera, deviations, reported.pose);
-        self.provisional = None;
+        let Some(before) = self.reported.get(camera) else {
+            self.needed |= uncertain;
+            self.reported.insert(camera.clone(), reported_sd_s);
+            self.belief.add(camera, deviations, reported.pose);
+            self.forget_provisional();
+            return;
+        };
+        if uncertain && reported_sd_s >= WORSE * before {
+            self.needed = true;
+            self.reported.insert(camera.clone(), reported_sd_s);
+            self.belief.reopen(camera, deviations);
+            self.forget_provisional();
+            self.suspect(camera);
+        }
+    }
+
+    /// The standard deviation of an exposure's time against the other cameras', s, by what is known of
+    /// its clock and by what its camera says of it: a clock that is not estimated is as good as it says.
+    pub(crate) fn time_sd_s(&self, camera: &CameraName, known: &ClockEstimate, reported_sd_s: f64) -> f64 {
+        if self.is_at_its_word(camera) { known.relative_sd_s.max(reported_sd_s) } else { known.relative_sd_s }
+    }
+
+    /// Whether a clock is not estimated, for its camera says that it is good.
+    fn is_at_its_word(&self, camera: &CameraName) -> bool {
+        !self.belief.is_uncertain(camera) && !self.config.trusted.contains(camera)
     }
 
     /// A camera has been calibrated anew: its bearings so far say nothing of the pose that follows.
     pub(crate) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
         if self.belief.knows(camera) {
             self.belief.calibrate(camera, pose);
-            self.provisional = None;
+            self.forget_provisional();
             self.windows.clear();
         }
+    }
+
+    /// What the open windows have told so far was of other cameras, or of cameras as they were.
+    fn forget_provisional(&mut self) {
+        self.provisional = None;
+        self.round = None;
     }
 
     fn newest(&self) -> &Belief {
@@ -130,7 +186,8 @@ impl ClockEstimator {
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
         let estimate = self.newest().estimate(camera, self.now)?;
         let suspected = self.suspects.contains(camera) && !self.cleared.contains(camera);
-        let reported = self.belief.reported_sd(camera).filter(|_| suspected);
+        let at_its_word = self.is_at_its_word(camera);
+        let reported = self.reported.get(camera).copied().filter(|_| suspected || at_its_word);
         let widened = |sd: f64| reported.map_or(sd, |reported| reported.max(sd));
         let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
         Some(ClockEstimate { sd_s, relative_sd_s, ..estimate })
@@ -142,23 +199,30 @@ impl ClockEstimator {
         self.newest().largest_offset(self.now)
     }
 
-    /// Moves on to a time: closes windows that are full or whose target too few cameras see, and
-    /// looks at the others now and then.
+    /// Moves on to a time: closes a window that is full or whose target too few cameras see, or looks
+    /// at one that is open, now and then. One window at a time, for an exposure waits for it.
     pub(crate) fn advance(&mut self, time: Timestamp, tracker: &Tracker) {
         self.now = self.now.max(time);
+        if self.now < self.next_adjustment {
+            return;
+        }
         let followed = |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
         let now = self.now;
         let full = |window: &Window| now.seconds_since(window.start) >= WINDOW_S;
-        let mut closed = 0;
-        while let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
+        if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
             let window = self.windows.remove(index);
             self.close(&window);
-            closed += 1;
+            self.worst_sd_s = self.worst_sd();
+            self.round = Some(Round::default());
+            self.next_adjustment = now.plus_seconds(PAUSE_S);
+            return;
         }
-        if closed > 0 || self.now >= self.next_look {
-            self.look();
-            let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
-            self.next_look = self.now.plus_seconds(pause);
+        if self.round.is_none() && self.now >= self.next_look {
+            self.round = Some(Round::default());
+        }
+        if let Some(round) = self.round.take() {
+            self.look(round);
+            self.next_adjustment = now.plus_seconds(PAUSE_S);
         }
     }
 
@@ -174,9 +238,26 @@ impl ClockEstimator {
                 self.windows.len() - 1
             })
         });
-        if let Some(window) = index.and_then(|index| self.windows.get_mut(index)) {
-            window.add(camera, time, *line, track.position_at(exposure.time).coords);
-        }
+        let Some(index) = index else {
+            return;
+        };
+        let is_new = !self.windows[index].cameras.contains(camera);
+        let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
+        self.windows[index].add(camera, role, time, *line, track.position_at(exposure.time).coords);
+    }
+
+    /// The worst standard deviation of a clock among all cameras, s.
+    fn worst_sd(&self) -> f64 {
+        let sd = |camera| self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        self.reported.keys().map(sd).fold(0.0, f64::max)
+    }
+
+    /// Whether a window is for a camera's clock, which is among the worst known and no other window's.
+    fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
+        let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
+        let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        let is_bad = self.suspects.contains(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
+        is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
     /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
@@ -188,6 +269,7 @@ impl ClockEstimator {
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
             // Up to now its bearings may be by the clock as it was.
             self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
+            self.round = None;
         }
     }
 
@@ -214,24 +296,57 @@ impl ClockEstimator {
 
     /// Whether the clock of a camera that sees one of the targets is not well known.
     fn is_unsure(&self) -> bool {
-        let unsure = |camera: &CameraName| {
-            let clock = self.belief.estimate(camera, self.now);
-            self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
-        };
-        self.windows.iter().flat_map(|window| &window.cameras).any(unsure)
+        self.windows.iter().flat_map(|window| &window.cameras).any(|camera| self.is_unsure_of(camera))
     }
 
-    /// Looks at what the open windows tell so far.
-    fn look(&mut self) {
-        let mut belief = None;
-        let mut cleared = BTreeSet::new();
-        for window in &self.windows {
-            if let Lesson::Learnt(next) = lesson(belief.as_ref().unwrap_or(&self.belief), window) {
-                belief = Some(*next);
-                cleared.extend(window.checked_cameras());
+    fn is_unsure_of(&self, camera: &CameraName) -> bool {
+        let clock = self.belief.estimate(camera, self.now);
+        self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
+    }
+
+    /// Looks at what the next open window tells so far; after the last it counts.
+    fn look(&mut self, mut round: Round) {
+        if let Some(window) = self.windows.get(round.next) {
+            if let Lesson::Learnt(next) = lesson(round.belief.as_ref().unwrap_or(&self.belief), window) {
+                round.belief = Some(*next);
+                round.cleared.extend(window.checked_cameras());
             }
+            round.next += 1;
         }
-        self.provisional = belief;
-        self.cleared = cleared;
+        if round.next < self.windows.len() {
+            self.round = Some(round);
+            return;
+        }
+        (self.provisional, self.cleared) = (round.belief, round.cleared);
+        let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
+        self.next_look = self.now.plus_seconds(pause);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_at_its_word_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
+        let [word, trusted, unsure] = ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
+        let config = Clocks { trusted: vec![trusted.clone()], ..Clocks::default() };
+        let mut clocks = ClockEstimator::new(config);
+        for (camera, sd_s) in [(&word, 0.9e-3), (&trusted, 0.3), (&unsure, 0.1)] {
+            clocks.see(camera, &CameraUncertainty::of_time(sd_s));
+        }
+        let sd_s = |clocks: &ClockEstimator, camera: &CameraName, said| {
+            clocks.time_sd_s(camera, &clocks.estimate(camera).unwrap(), said)
+        };
+        assert_eq!(sd_s(&clocks, &word, 0.9e-3), 0.9e-3);
+        assert_eq!(sd_s(&clocks, &word, 2e-3), 2e-3);
+        assert!(sd_s(&clocks, &trusted, 0.3) < 1e-5);
+        assert!((sd_s(&clocks, &unsure, 1e-4) - 0.1).abs() < 1e-3);
+        // Twice as bad is not much worse; a lost source of time is.
+        for (said, expected) in [(2e-3, 2e-3), (0.3, 0.3), (1e-3, 0.3)] {
+            clocks.see(&word, &CameraUncertainty::of_time(said));
+            assert!((sd_s(&clocks, &word, said) - expected).abs() < 0.01 * expected, "{said}");
+        }
+        assert!(clocks.is_needed());
     }
 }

@@ -9,9 +9,13 @@ use crate::track::TrackId;
 /// A window holds no more bearings than this: when it is full, every other one of each camera is let
 /// go, and from then on as many are not taken.
 const MAX_SIGHTS: usize = 1500;
-/// A window is of so many cameras, the first that see its target: eight unknowns each, in time that
-/// is bounded. The others have their turn with another window.
-const MAX_CAMERAS: usize = 12;
+/// A window is of so many cameras: eight unknowns each, in time that is bounded. The others have
+/// their turn with another window.
+const MAX_CAMERAS: usize = 8;
+/// So many of them may be links in the beginning, ...
+const MAX_LINKS: usize = 4;
+/// ... until all that are wanted and see the target have been heard, s.
+const ROLL_CALL_S: f64 = 0.5;
 /// A camera says nothing of its clock that can be checked with fewer bearings than this.
 const LEAST_SIGHTS: usize = 5;
 /// Bearings this far from the window's beginning are not of it, s.
@@ -30,6 +34,15 @@ pub(super) struct Sight {
     pub(super) place: Vector3<f64>,
 }
 
+/// What a camera is to a window.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Role {
+    /// Its clock is to be learnt.
+    Wanted,
+    /// Its clock is known or another window's: against it the others are learnt.
+    Link,
+}
+
 /// The bearings of a track.
 #[derive(Clone, Debug)]
 pub(super) struct Window {
@@ -39,26 +52,45 @@ pub(super) struct Window {
     pub(super) sights: Vec<Sight>,
     /// One in so many bearings of each camera is taken.
     thinned: usize,
+    /// How many of its cameras are links.
+    links: usize,
     /// Bearings of each camera that were offered.
     offered: Vec<usize>,
 }
 
 impl Window {
     pub(super) fn new(track: TrackId, start: Timestamp) -> Self {
-        Self { track, start, cameras: Vec::new(), sights: Vec::new(), thinned: 1, offered: Vec::new() }
+        Self {
+            track,
+            start,
+            cameras: Vec::new(),
+            sights: Vec::new(),
+            thinned: 1,
+            links: 0,
+            offered: Vec::new(),
+        }
     }
 
     /// Takes in a bearing of a camera by its own clock, with where the track has the target.
-    pub(super) fn add(&mut self, camera: &CameraName, time: Timestamp, line: SightLine, place: Vector3<f64>) {
+    pub(super) fn add(
+        &mut self,
+        camera: &CameraName,
+        role: Role,
+        time: Timestamp,
+        line: SightLine,
+        place: Vector3<f64>,
+    ) {
         let time_s = time.seconds_since(self.start);
         if time_s.abs() > MAX_SPAN_S {
             return;
         }
         let known = self.cameras.iter().position(|known| known == camera);
-        if known.is_none() && self.cameras.len() >= MAX_CAMERAS {
+        let no_link = self.links >= MAX_LINKS && time_s < ROLL_CALL_S;
+        if known.is_none() && (self.cameras.len() >= MAX_CAMERAS || (role == Role::Link && no_link)) {
             return;
         }
         let index = known.unwrap_or_else(|| {
+            self.links += usize::from(role == Role::Link);
             self.cameras.push(camera.clone());
             self.offered.push(0);
             self.cameras.len() - 1
@@ -139,12 +171,27 @@ mod tests {
         for k in 0..9000_u32 {
             let camera = ["a", "b", "c"][k as usize % 3].parse().unwrap();
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
-            window.add(&camera, time, line, Vector3::zeros());
+            window.add(&camera, Role::Wanted, time, line, Vector3::zeros());
         }
         assert!((MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()), "{}", window.sights.len());
         let (first, last) = window.span().unwrap();
         assert!(first < 0.01 && last > 8.9, "{first} {last}");
         let of_b = window.sights.iter().filter(|sight| sight.camera == 1).count();
         assert!(of_b.abs_diff(window.sights.len() / 3) <= 2, "{of_b}");
+    }
+
+    #[test]
+    fn clocks_that_are_to_be_learnt_go_before_links() {
+        let mut window = Window::new(TrackId(1), Timestamp::EPOCH);
+        let line = line_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0), 0.0).line;
+        // Sixteen cameras, of which the last two are to be learnt, three times in half a second.
+        for k in 0..60_u32 {
+            let camera = format!("{:02}", k % 16).parse().unwrap();
+            let role = if k % 16 < 14 { Role::Link } else { Role::Wanted };
+            window.add(&camera, role, Timestamp::from_seconds(f64::from(k) / 60.0), line, Vector3::zeros());
+        }
+        let names: Vec<&str> = window.cameras.iter().map(CameraName::as_str).collect();
+        assert_eq!(names[..6], ["00", "01", "02", "03", "14", "15"]);
+        assert_eq!(names.len(), MAX_CAMERAS, "then the others");
     }
 }

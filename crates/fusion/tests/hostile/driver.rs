@@ -56,6 +56,21 @@ const MOST_ALIKE: usize = 200;
 /// Operations of a run.
 const MOST_OPERATIONS: usize = 60;
 
+/// An input that ends with this has an appendix before it, of what older inputs do not have: they
+/// mean what they meant.
+pub const MARK: &[u8] = b"\xc5+";
+/// The appendix: two numbers of the configuration, four poses, clocks.
+const APPENDIX: usize = 11;
+
+/// What is driven: operations, and what the appendix says.
+fn split(data: &[u8]) -> (Bytes<'_>, Bytes<'_>) {
+    let Some(rest) = data.strip_suffix(MARK).filter(|rest| rest.len() >= APPENDIX) else {
+        return (Bytes(data), Bytes(&[]));
+    };
+    let (operations, appendix) = rest.split_at(rest.len() - APPENDIX);
+    (Bytes(operations), Bytes(appendix))
+}
+
 /// The bytes, one after the other; when they are used up, zeros.
 struct Bytes<'a>(&'a [u8]);
 
@@ -123,6 +138,38 @@ fn config(bytes: &mut Bytes<'_>) -> FusionConfig {
     config
 }
 
+/// Numbers of the configuration that came later: two pairs of a field and a value, four bytes.
+fn configure_more(config: &mut FusionConfig, bytes: &mut Bytes<'_>) {
+    for _ in 0..2 {
+        let (field, value) = (bytes.below(8), bytes.odd());
+        match field {
+            1 => config.clocks.estimate = false,
+            2 => config.clocks.trusted = NAMES[..2].iter().filter_map(|name| name.parse().ok()).collect(),
+            3 => config.clocks.least_sd_s = value,
+            4 => config.clocks.drift_sd = value,
+            5 => config.initiation.pair_s = value,
+            6 => config.tracking.detection_probability = value,
+            7 => config.tracking.detection_probability = 0.5,
+            _ => {}
+        }
+    }
+}
+
+/// Standard deviations of clocks, s: good, unsure, very unsure.
+const CLOCKS: [f64; 6] = [0.0, 0.9e-3, 2e-3, 0.02, 0.1, 9.9];
+/// Standard deviations of poses, rad and m: of a survey, of a guess, and of nothing.
+const POSES: [(f64, f64); 5] = [(1e-3, 0.05), (1e-6, 1e-5), (0.1, 3.0), (0.0, 0.0), (3.0, 1e6)];
+
+/// A camera's pose as well known as a byte says.
+fn with_pose(message: CameraCalibration, choice: u8, odd: f64) -> CameraCalibration {
+    match usize::from(choice % 8) {
+        0 => message,
+        known @ 1..=5 => message.with_pose_sd(POSES[known - 1].0, POSES[known - 1].1),
+        6 => message.with_pose_sd(odd, odd),
+        _ => CameraCalibration { pose_covariance: vec![odd; 36], ..message },
+    }
+}
+
 fn camera(at: [f64; 3]) -> Option<Camera> {
     let pose = Pose::looking_at(Point3::from(at), Point3::new(0.0, 0.0, 40.0)).ok()?;
     let size = ImageSize { width: 1920, height: 1080 };
@@ -164,10 +211,15 @@ struct Run<'a> {
     clutter_left: usize,
     /// Whether no two tracks may begin with the same sight lines.
     lines_are_owned: bool,
+    /// Whether the input has an appendix.
+    is_appended: bool,
     time: i64,
     /// What cameras say of their bearings' and times' errors.
     covariance: [f64; 3],
     time_sd: f64,
+    /// What each camera says of its time beside that, and how far its clock is ahead, ns.
+    clock_sds: [f64; 5],
+    ahead: [i64; 5],
     sent: Vec<BearingFrame>,
     bearings: usize,
     rejected: BTreeMap<&'static str, u64>,
@@ -177,7 +229,34 @@ struct Run<'a> {
 
 impl Run<'_> {
     fn operate(&mut self) {
-        match self.bytes.next() % 13 {
+        // The byte was taken by 13 when there were 13 operations: those below 13 mean what they meant.
+        match self.bytes.next() {
+            kind if self.is_appended && kind >= 247 => self.of_cameras(kind),
+            kind => self.operate_on(kind % 13),
+        }
+    }
+
+    /// What cameras say of their poses and clocks in flight.
+    fn of_cameras(&mut self, kind: u8) {
+        let (eye, choice) = (self.bytes.below(4), self.bytes.next());
+        let value = self.bytes.odd();
+        match kind % 3 {
+            0 => {
+                let Some((camera, Ok(name))) = camera(PLACES[eye]).zip(Some(NAMES[eye].parse())) else {
+                    return;
+                };
+                let message = CameraCalibration::new(&name, &camera, Timestamp::EPOCH);
+                // What describes no camera changes nothing.
+                let _ = self.fusion.calibrate(&with_pose(message, choice, value));
+            }
+            1 => self.clock_sds[eye] = CLOCKS[usize::from(choice) % CLOCKS.len()],
+            // Up to a quarter of a second.
+            _ => self.ahead[eye] = i64::from(choice) * 2_000_000 - 256_000_000,
+        }
+    }
+
+    fn operate_on(&mut self, kind: u8) {
+        match kind {
             0..=2 => self.fly(),
             3 => self.glimpse(),
             4 => self.odd_frame(),
@@ -250,8 +329,9 @@ impl Run<'_> {
         let frame = BearingFrame {
             camera: NAMES[eye].into(),
             sequence: self.sent.len() as u64,
-            capture_time_ns: self.time,
-            capture_time_sd_s: self.time_sd,
+            capture_time_ns: self.time.saturating_add(self.ahead[eye]),
+            // What is odd of a standard deviation stays odd.
+            capture_time_sd_s: if self.time_sd == 0.0 { self.clock_sds[eye] } else { self.time_sd },
             tracks,
             ..Default::default()
         };
@@ -388,6 +468,13 @@ impl Run<'_> {
             assert!(state.mean.iter().all(|v| v.is_finite()), "{track:?}");
             assert!(is_possible(&state.covariance), "{track:?}");
         }
+        for report in self.fusion.cameras() {
+            assert!(report.noise_factor.is_finite() && report.noise_factor >= 0.0, "{report:?}");
+            let Some(clock) = report.clock else { continue };
+            let sds = [clock.sd_s, clock.relative_sd_s, clock.drift_sd];
+            assert!(sds.iter().all(|sd| sd.is_finite() && *sd >= 0.0), "{report:?}");
+            assert!(clock.offset_s.is_finite() && clock.drift.is_finite(), "{report:?}");
+        }
         let alive = tracks.iter().filter(|track| track.status != TrackStatus::Lost).count() as u64;
         let count = |name| self.fusion.counters().get(name);
         assert_eq!(alive, count("tracks_born") - count("tracks_lost") - count("tracks_merged"));
@@ -434,24 +521,39 @@ fn assert_sound(track: &Track) {
 
 /// Runs a fusion centre on bytes. Panics if it does, or if it answers with what cannot be.
 pub fn drive(data: &[u8]) {
-    let mut bytes = Bytes(data);
-    let config = config(&mut bytes);
+    let (mut bytes, mut appendix) = split(data);
+    let is_appended = !appendix.0.is_empty();
+    let mut config = config(&mut bytes);
+    configure_more(&mut config, &mut appendix);
     let lines_are_owned = config.initiation.shared_lines == 0;
     let Ok(mut fusion) = Fusion::new(config) else { return };
-    for (name, place) in NAMES.iter().zip(PLACES).take(4) {
+    let (mut clock_sds, mut ahead) = ([0.0; 5], [0; 5]);
+    let odd = appendix.odd();
+    for (index, (name, place)) in NAMES.iter().zip(PLACES).take(4).enumerate() {
+        let choice = appendix.next();
         if let Some((camera, Ok(name))) = camera(place).zip(Some(name.parse())) {
             let message = CameraCalibration::new(&name, &camera, Timestamp::EPOCH);
-            assert!(fusion.calibrate(&message).is_ok());
+            let known = fusion.calibrate(&with_pose(message.clone(), choice, odd)).is_ok();
+            // A pose that cannot be is refused; the camera is known without.
+            assert!(known || (choice % 8 >= 6 && fusion.calibrate(&message).is_ok()));
         }
+        clock_sds[index] = CLOCKS[usize::from(choice >> 3) % CLOCKS.len()];
+    }
+    // Two clocks are off by up to a quarter of a second.
+    for (index, choice) in [appendix.next(), appendix.next()].into_iter().enumerate() {
+        ahead[index + 1] = i64::from(choice as i8) * 2_000_000;
     }
     let mut run = Run {
         bytes,
         fusion,
         clutter_left: MOST_CLUTTER,
         lines_are_owned,
+        is_appended,
         time: 0,
         covariance: ORDINARY,
         time_sd: 0.0,
+        clock_sds,
+        ahead,
         sent: Vec::new(),
         bearings: 0,
         rejected: BTreeMap::new(),
