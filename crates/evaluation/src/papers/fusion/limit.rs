@@ -224,9 +224,6 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
         rows.add(layout, at, &outcomes);
         shares.push(confirmed(layout, at, &outcomes));
     }
-    for row in &mut rows.consistency {
-        row.limit = Some(HONEST);
-    }
     let Rows { ratios, errors, consistency } = rows;
     vec![
         table("fusion-bound", "Whole fusion: RMS error over the bound of all periods", "ratio", ratios),
@@ -274,7 +271,7 @@ pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
             ratios.push(row.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = both.iter().map(|(ours, _)| ours.nees).collect();
-        consistency.push(Row::new(layout.name, at, mean(&nees)));
+        consistency.push(Row::new(layout.name, at, mean(&nees)).limit(HONEST));
         divergences.push(diverged(layout, at, &ours));
         shares.push(confirmed(layout, at, &ours));
     }
