@@ -90,14 +90,9 @@ pub fn map(
         }
     }
     let mean = state?;
-    let in_front = lines.iter().all(|TimedLine { line, time, .. }| {
-        let dt = time.seconds_since(reference);
-        let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
-        (position - line.origin).dot(&line.direction) > 0.0
-    });
     let scale =
         lines.iter().map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm()).fold(0.0, f64::max);
-    in_front.then_some(())?;
+    in_front(lines, reference, &mean).then_some(())?;
     // A nearly singular system is inverted to something that rounding leaves not quite symmetric.
     let inverse = (data + prior).cholesky()?.inverse();
     let covariance = (inverse + inverse.transpose()) / 2.0;
@@ -106,6 +101,15 @@ pub fn map(
         chi_square,
         information: data,
         scales: (scale, velocity_sd),
+    })
+}
+
+/// Whether a state at `reference` lies in front of every line's camera at the line's time.
+fn in_front(lines: &[TimedLine], reference: crossfix_message::Timestamp, mean: &Vector6<f64>) -> bool {
+    lines.iter().all(|TimedLine { line, time, .. }| {
+        let dt = time.seconds_since(reference);
+        let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
+        (position - line.origin).dot(&line.direction) > 0.0
     })
 }
 
