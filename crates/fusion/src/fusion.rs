@@ -5,6 +5,7 @@ use crossfix_message::{
     TrackEvent, TrackFrame, TrackState,
 };
 
+use crate::calibrations::KnownCameras;
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
@@ -47,7 +48,7 @@ pub struct CameraReport {
 #[derive(Debug)]
 pub struct Fusion {
     config: FusionConfig,
-    cameras: BTreeMap<CameraName, KnownCamera>,
+    cameras: KnownCameras,
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
@@ -70,7 +71,7 @@ impl Fusion {
         config.validate()?;
         let motion = Motion::new(&config.tracking)?;
         Ok(Self {
-            cameras: BTreeMap::new(),
+            cameras: KnownCameras::default(),
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),
@@ -84,7 +85,8 @@ impl Fusion {
         })
     }
 
-    /// Makes a camera known, or replaces what is known of it for the frames that follow.
+    /// Makes a camera known, or replaces what is known of it for the frames that it captures from the
+    /// calibration's `valid_from_ns` on.
     ///
     /// # Errors
     /// [`CalibrationError`] if the message describes no camera; what was known stays.
@@ -92,10 +94,7 @@ impl Fusion {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
         let known = KnownCamera { camera: calibration.camera, pose_covariance: calibration.pose_covariance };
-        if self.cameras.get(&calibration.name).is_some_and(|before| before.is_elsewhere(&known)) {
-            self.clocks.calibrate(&calibration.name, known.pose_covariance);
-        }
-        self.cameras.insert(calibration.name, known);
+        self.cameras.insert(calibration.name, calibration.valid_from, known);
         Ok(())
     }
 
@@ -148,7 +147,7 @@ impl Fusion {
 
     /// What is thought of each camera, ordered by name.
     pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
-        self.cameras.keys().map(|camera| CameraReport {
+        self.cameras.now().keys().map(|camera| CameraReport {
             camera: camera.clone(),
             standing: self.standings.of(camera),
             noise_factor: self.standings.factor(camera),
@@ -168,7 +167,8 @@ impl Fusion {
 
     fn read(&mut self, frame: &BearingFrame) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
         let name: CameraName = frame.camera.parse().map_err(|_| RejectionReason::UnknownCamera)?;
-        let camera = self.cameras.get(&name).ok_or(RejectionReason::UnknownCamera)?;
+        let captured = Timestamp::from_nanos(frame.capture_time_ns);
+        let camera = self.cameras.at(&name, captured).ok_or(RejectionReason::UnknownCamera)?;
         ingress::read(frame, &name, camera, &self.config.bearings, &mut self.counters)
     }
 
@@ -255,7 +255,12 @@ impl Fusion {
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
         self.buffer.pass(exposure.time);
-        let Some(known) = self.cameras.get(&exposure.camera) else {
+        self.tracker.begin(exposure.time);
+        for moved in self.cameras.advance(exposure.time) {
+            let pose_covariance = self.cameras.now().get(&moved).and_then(|known| known.pose_covariance);
+            self.clocks.calibrate(&moved, pose_covariance);
+        }
+        let Some(known) = self.cameras.at(&exposure.camera, exposure.time) else {
             return;
         };
         self.counters.count("exposures");
@@ -270,7 +275,7 @@ impl Fusion {
             let step = self.tracker.step(&exposure, known);
             happenings = step.happenings;
             let rest = Exposure { sightings: step.free, ..exposure.clone() };
-            for start in self.initiator.add(rest, &step.claims, &self.cameras, self.tracker.motion()) {
+            for start in self.initiator.add(rest, &step.claims, self.cameras.now(), self.tracker.motion()) {
                 happenings.extend(self.tracker.adopt(start));
             }
             (step.evidence, step.used)

@@ -28,6 +28,7 @@
 //! [`BearingFrame`]: crossfix_message::BearingFrame
 
 mod assignment;
+mod calibrations;
 mod clocks;
 mod config;
 mod counters;

@@ -3,7 +3,7 @@ use std::fmt;
 
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::SightLine;
-use crossfix_message::{CameraName, Solver, Timestamp};
+use crossfix_message::{CameraName, Solver, Timestamp, TrackNumber};
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Matrix6x3, Vector2};
 
 use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
@@ -27,13 +27,14 @@ const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
 const POSITION_SCALE_M: f64 = 20.0;
 
-/// Number of a 3D track, unique within a run.
+/// Identity of a 3D track, unique over restarts: see [`crossfix_message::track_id`]. Shown as its number
+/// within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TrackId(pub u64);
 
 impl fmt::Display for TrackId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
+        TrackNumber(self.0).fmt(f)
     }
 }
 

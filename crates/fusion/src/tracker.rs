@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use crossfix_filter::{Gate, KinematicState};
-use crossfix_message::{CameraName, Timestamp, TrackEventKind};
+use crossfix_message::{CameraName, Timestamp, TrackEventKind, track_id};
 
 use crate::assignment::{Candidate, assign};
 use crate::ingress::KnownCamera;
@@ -58,7 +58,10 @@ pub(crate) struct Tracker {
     /// Beyond this range no camera is expected to see a target, m.
     max_range_m: f64,
     tracks: BTreeMap<TrackId, Track>,
-    next_id: u64,
+    /// When the first exposure of the run was.
+    began: Option<Timestamp>,
+    /// Of the next track in this run.
+    next_number: u64,
     watches: BTreeMap<CameraName, Watch>,
 }
 
@@ -86,9 +89,16 @@ impl Tracker {
             gate,
             max_range_m,
             tracks: BTreeMap::new(),
-            next_id: 1,
+            began: None,
+            next_number: 1,
             watches: BTreeMap::new(),
         }
+    }
+
+    /// Says when the run begins: at the first exposure that it handles. The tracks' identities count from
+    /// there.
+    pub(crate) fn begin(&mut self, time: Timestamp) {
+        self.began.get_or_insert(time);
     }
 
     /// All tracks, ordered by id; those lost in this step are there once more, as lost.
@@ -368,8 +378,8 @@ impl Tracker {
         if !wrong.is_empty() && cameras < 3 {
             return Vec::new();
         }
-        let id = TrackId(self.next_id);
-        self.next_id += 1;
+        let id = TrackId(track_id(self.began.unwrap_or(track.updated), self.next_number));
+        self.next_number += 1;
         track.id = id;
         let mut happenings = vec![Happening::new(TrackEventKind::Born, id)];
         for old in wrong {

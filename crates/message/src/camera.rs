@@ -35,6 +35,12 @@ pub enum CalibrationError {
         #[source]
         source: GeometryError,
     },
+    /// The pose's covariance is none: not finite, not symmetric, or negative along some axis.
+    #[error("the calibration of camera `{camera}`: pose_covariance is no covariance")]
+    Covariance {
+        /// The camera.
+        camera: CameraName,
+    },
     /// A list has the wrong number of elements, or a part is missing.
     #[error("the calibration of camera `{camera}`: {part} is missing or has the wrong length")]
     Shape {
@@ -114,7 +120,11 @@ impl CameraCalibration {
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
         let pose_covariance = match self.pose_covariance.as_slice() {
             [] => None,
-            values => Some(read_pose_covariance(values, &camera).ok_or_else(|| shape("pose_covariance"))?),
+            values => {
+                let values = values.try_into().map_err(|_| shape("pose_covariance"))?;
+                let covariance = read_pose_covariance(values, &camera);
+                Some(covariance.ok_or_else(|| CalibrationError::Covariance { camera: name.clone() })?)
+            }
         };
         let valid_from = Timestamp::from_nanos(self.valid_from_ns);
         Ok(Calibration { name, camera, pose_covariance, valid_from })
@@ -137,12 +147,13 @@ impl CameraCalibration {
 
 /// The covariance on the wire (rotation about the camera's axes) turned into the world's axes;
 /// `None` if it is no covariance.
-fn read_pose_covariance(values: &[f64], camera: &Camera) -> Option<Matrix6<f64>> {
-    let values: &[f64; 36] = values.try_into().ok()?;
+fn read_pose_covariance(values: &[f64; 36], camera: &Camera) -> Option<Matrix6<f64>> {
     let own = Matrix6::from_row_slice(values);
     let scale = own.amax();
     let symmetric = (own - own.transpose()).amax() <= 1e-9 * scale;
-    let possible = scale.is_finite() && symmetric && own.symmetric_eigenvalues().min() >= -1e-9 * scale;
+    let possible = own.iter().all(|value| value.is_finite())
+        && symmetric
+        && own.symmetric_eigenvalues().min() >= -1e-9 * scale;
     let mut turn = Matrix6::identity();
     turn.fixed_view_mut::<3, 3>(0, 0).copy_from(camera.pose().rotation().matrix());
     possible.then(|| turn * own * turn.transpose())
@@ -213,7 +224,12 @@ mod tests {
         assert!(matches!(torn.parse(), Err(CalibrationError::Shape { part: "pose_covariance", .. })));
         let mut negative = uncertain;
         negative.pose_covariance[0] = -1.0;
-        assert!(negative.parse().is_err());
+        assert!(matches!(negative.parse(), Err(CalibrationError::Covariance { .. })));
+        for place in [0, 1, 35] {
+            let mut nan = message().with_pose_sd(0.01, 0.1);
+            nan.pose_covariance[place] = f64::NAN;
+            assert!(matches!(nan.parse(), Err(CalibrationError::Covariance { .. })), "{place}");
+        }
     }
 
     #[test]

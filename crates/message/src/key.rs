@@ -29,6 +29,8 @@ pub enum Channel {
     FusionAlive,
     /// `truth/states`: [`crate::TruthFrame`].
     Truth,
+    /// `recorder/health`: [`crate::Health`], once a second.
+    RecorderHealth,
     /// `recorder/alive`: a liveliness token, no message.
     RecorderAlive,
 }
@@ -67,6 +69,20 @@ pub enum KeyError {
     },
 }
 
+impl Channel {
+    /// The camera whose channel it is, if it is a camera's.
+    pub fn camera(&self) -> Option<&CameraName> {
+        match self {
+            Self::Bearings(camera)
+            | Self::Calibration(camera)
+            | Self::Preview(camera)
+            | Self::CameraHealth(camera)
+            | Self::Alive(camera) => Some(camera),
+            _ => None,
+        }
+    }
+}
+
 impl Key {
     /// The key of a channel of a site.
     pub fn new(site: SiteName, channel: Channel) -> Self {
@@ -100,6 +116,7 @@ impl fmt::Display for Key {
             Channel::FusionHealth => write!(f, "{FUSION}/health"),
             Channel::FusionAlive => write!(f, "{FUSION}/alive"),
             Channel::Truth => write!(f, "{TRUTH}/states"),
+            Channel::RecorderHealth => write!(f, "{RECORDER}/health"),
             Channel::RecorderAlive => write!(f, "{RECORDER}/alive"),
         }
     }
@@ -122,6 +139,7 @@ impl FromStr for Key {
             (FUSION, "health") => Channel::FusionHealth,
             (FUSION, "alive") => Channel::FusionAlive,
             (TRUTH, "states") => Channel::Truth,
+            (RECORDER, "health") => Channel::RecorderHealth,
             (RECORDER, "alive") => Channel::RecorderAlive,
             (_, "bearings") => Channel::Bearings(camera()?),
             (_, "calibration") => Channel::Calibration(camera()?),
@@ -154,6 +172,7 @@ mod tests {
             Just(Channel::FusionHealth),
             Just(Channel::FusionAlive),
             Just(Channel::Truth),
+            Just(Channel::RecorderHealth),
             Just(Channel::RecorderAlive),
         ]
     }

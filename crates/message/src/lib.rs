@@ -16,16 +16,22 @@
 //! ```
 
 mod camera;
+mod glance;
 mod key;
 mod name;
 mod payload;
+mod size;
 mod time;
+mod track;
 
 pub use camera::{Calibration, CalibrationError};
+pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};
 pub use name::{CameraName, NameError, SiteName};
 pub use payload::{DecodeError, Payload, decode, file_descriptor_set};
+pub use size::{MAX_DECODED_BYTES, MAX_MESSAGE_BYTES, Repeated};
 pub use time::Timestamp;
+pub use track::{TrackNumber, track_id};
 pub use wire::*;
 
 /// The generated types; their documentation is the definition file's.
@@ -35,4 +41,4 @@ mod wire {
 }
 
 /// The version of the message definitions that this build speaks.
-pub const VERSION: Version = Version { major: 1, minor: 0 };
+pub const VERSION: Version = Version { major: 1, minor: 1 };

@@ -1,6 +1,7 @@
 use prost::Message;
 use thiserror::Error;
 
+use crate::size::{self, MAX_DECODED_BYTES, Repeated};
 use crate::{
     BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION, Version,
 };
@@ -9,6 +10,10 @@ use crate::{
 pub trait Payload: Message + Default + Clone {
     /// Its full protobuf name, the schema's name in a recording.
     const SCHEMA: &'static str;
+    /// The field that says which time it speaks of.
+    const TIME_TAG: u32;
+    /// Its lists, so that its size is known before it is decoded.
+    const LISTS: &'static [Repeated];
 
     /// The version its sender was built with, if it says.
     fn version(&self) -> Option<Version>;
@@ -29,9 +34,11 @@ pub trait Payload: Message + Default + Clone {
 }
 
 macro_rules! payload {
-    ($($type:ident),*) => {$(
+    ($($type:ident, time $time_tag:literal, $lists:ident;)*) => {$(
         impl Payload for $type {
             const SCHEMA: &'static str = concat!("crossfix.v1.", stringify!($type));
+            const TIME_TAG: u32 = $time_tag;
+            const LISTS: &'static [Repeated] = size::$lists;
 
             fn version(&self) -> Option<Version> {
                 self.version
@@ -45,7 +52,15 @@ macro_rules! payload {
     )*};
 }
 
-payload!(BearingFrame, CameraCalibration, TrackFrame, TrackEvent, Health, Preview, TruthFrame);
+payload! {
+    BearingFrame, time 4, BEARING_FRAME;
+    CameraCalibration, time 14, NOTHING;
+    TrackFrame, time 3, TRACK_FRAME;
+    TrackEvent, time 2, NOTHING;
+    Health, time 3, HEALTH;
+    Preview, time 3, NOTHING;
+    TruthFrame, time 2, TRUTH_FRAME;
+}
 
 /// Why bytes are not a message that this build can read.
 #[derive(Debug, Error)]
@@ -59,6 +74,14 @@ pub enum DecodeError {
         #[source]
         source: prost::DecodeError,
     },
+    /// The message would take more memory than any true one.
+    #[error("a {schema} of {wire_bytes} bytes would take more than {MAX_DECODED_BYTES} bytes of memory")]
+    TooLarge {
+        /// The message that was expected.
+        schema: &'static str,
+        /// How long it is.
+        wire_bytes: usize,
+    },
     /// The sender speaks a newer major version.
     #[error("{schema} of version {theirs}, this build reads up to {ours}: update this side")]
     NewerMajor {
@@ -71,12 +94,18 @@ pub enum DecodeError {
     },
 }
 
-/// Reads a message from the bytes of wire or recording.
+/// Reads a message from the bytes of wire or recording. What it would take in memory is reckoned
+/// before it is decoded: at most [`MAX_DECODED_BYTES`], and twice that while it is read.
 ///
 /// # Errors
-/// [`DecodeError`] if the bytes are no such message or of a newer major version.
+/// [`DecodeError`] if the bytes are no such message, too large, or of a newer major version.
 pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
-    let message = M::decode(bytes).map_err(|source| DecodeError::Malformed { schema: M::SCHEMA, source })?;
+    let malformed = |source| DecodeError::Malformed { schema: M::SCHEMA, source };
+    let decoded = size::decoded_bytes(bytes, M::LISTS, MAX_DECODED_BYTES).map_err(malformed)?;
+    if decoded > MAX_DECODED_BYTES {
+        return Err(DecodeError::TooLarge { schema: M::SCHEMA, wire_bytes: bytes.len() });
+    }
+    let message = M::decode(bytes).map_err(malformed)?;
     match message.version() {
         Some(version) if version.major > VERSION.major => {
             Err(DecodeError::NewerMajor { schema: M::SCHEMA, theirs: version.major, ours: VERSION.major })

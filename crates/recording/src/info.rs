@@ -2,10 +2,10 @@ use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::path::Path;
 
-use crossfix_message::Timestamp;
+use crossfix_message::{Channel, Health, Timestamp, decode};
 use serde::Serialize;
 
-use crate::{ReadFailure, RecordingError, RecordingReader, schema};
+use crate::{Damage, Entry, ReadFailure, RecordingError, RecordingReader, Source, schema};
 
 /// What one channel of a recording holds.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -24,6 +24,30 @@ pub struct ChannelInfo {
     pub last: Timestamp,
 }
 
+/// What a component said of itself last.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct LastHealth {
+    /// What it counted, without what it never met.
+    pub counters: BTreeMap<String, u64>,
+    /// What was wrong then.
+    pub problems: Vec<String>,
+}
+
+impl LastHealth {
+    fn read(entry: &Entry) -> Option<(String, Self)> {
+        if !matches!(
+            entry.key.channel,
+            Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth
+        ) {
+            return None;
+        }
+        let health: Health = decode(&entry.data).ok()?;
+        let counters = health.counters.into_iter().filter(|counter| counter.value > 0);
+        let counters = counters.map(|counter| (counter.name, counter.value)).collect();
+        Some((health.component, Self { counters, problems: health.problems }))
+    }
+}
+
 /// What a recording holds.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RecordingInfo {
@@ -31,18 +55,26 @@ pub struct RecordingInfo {
     pub channels: Vec<ChannelInfo>,
     /// Messages on topics that are not Crossfix's.
     pub foreign: u64,
-    /// Where and why reading had to stop early, if it had to.
-    pub damage: Option<String>,
+    /// Who wrote it, if it says.
+    pub source: Option<Source>,
+    /// What each component said of itself last, by its name: what it counted, and what was wrong.
+    pub health: BTreeMap<String, LastHealth>,
+    /// What could not be read, if there is any.
+    pub damage: Option<Damage>,
 }
 
 impl RecordingInfo {
-    /// Goes through a recording and says what it holds; a torn one is told up to the damage.
+    /// Goes through a recording and says what it holds, and what of it is damaged.
     ///
     /// # Errors
     /// [`RecordingError`] if it is not there or no MCAP file.
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut channels: BTreeMap<String, ChannelInfo> = BTreeMap::new();
+        let mut health = BTreeMap::new();
         let report = RecordingReader::open(path)?.for_each(|entry| {
+            if let Some(said) = LastHealth::read(&entry) {
+                health.insert(said.0, said.1);
+            }
             let topic = entry.key.to_string();
             let channel = channels.entry(topic.clone()).or_insert_with(|| ChannelInfo {
                 topic,
@@ -62,6 +94,8 @@ impl RecordingInfo {
             Ok(report) => Ok(Self {
                 channels: channels.into_values().collect(),
                 foreign: report.foreign,
+                source: report.source,
+                health,
                 damage: report.damage,
             }),
             Err(ReadFailure::Recording(error)) => Err(error),

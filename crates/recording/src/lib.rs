@@ -30,18 +30,26 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod chunk;
+mod damage;
 mod error;
 mod info;
 mod reader;
 mod schema;
+mod source;
 mod writer;
 
+pub use damage::Damage;
 pub use error::RecordingError;
-pub use info::{ChannelInfo, RecordingInfo};
+pub use info::{ChannelInfo, LastHealth, RecordingInfo};
 pub use reader::{ReadFailure, ReadReport, RecordingReader};
+pub use source::Source;
 pub use writer::RecordingWriter;
 
 use crossfix_message::{Key, Timestamp};
+
+/// The name of the metadata record that says the channels once more: their ids and topics.
+pub(crate) const CHANNELS: &str = "crossfix.channels";
 
 /// One message of a recording.
 #[derive(Clone, Debug, PartialEq)]

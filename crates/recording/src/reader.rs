@@ -1,27 +1,31 @@
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use crossfix_message::{Key, Timestamp};
-use mcap::records::{Record, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::MAGIC;
+use mcap::records::{Metadata, Record, op};
 use thiserror::Error;
 
-use crate::{Entry, RecordingError};
+use crate::chunk::{self, Framing, HEAD_BYTES, MAX_RECORD_BYTES};
+use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 
-/// A record longer than this is damage: the largest true one is a preview picture.
-const MAX_RECORD_BYTES: usize = 64 << 20;
+/// Damaged records may claim what is not theirs, so that what lies in them is read again: this many
+/// times the whole file at most.
+const MOST_READINGS: u64 = 16;
 
-/// What a recording held, and how it ended.
+/// What a recording held, and what it lacks.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReadReport {
     /// Messages handed on.
     pub messages: u64,
     /// Messages on topics that are not Crossfix's, left out.
     pub foreign: u64,
-    /// Where and why reading had to stop early; everything before was handed on.
-    pub damage: Option<String>,
+    /// Who wrote it, if it says.
+    pub source: Option<Source>,
+    /// What could not be read; everything else was handed on.
+    pub damage: Option<Damage>,
 }
 
 /// Why going through a recording stopped.
@@ -35,95 +39,310 @@ pub enum ReadFailure<E: std::error::Error + 'static> {
     Handler(#[source] E),
 }
 
-/// Reads a recording from its first to its last message, in constant memory; a torn one up to the
-/// damage.
+/// Reads a recording from its first to its last message, in constant memory. Damage costs the chunk
+/// that it is in, about a second: the next one is found again, by its place or by what it looks like.
 #[derive(Debug)]
-pub struct RecordingReader<R: Read> {
+pub struct RecordingReader<R: Read + Seek> {
     source: R,
     path: PathBuf,
+    size: u64,
+    /// Where the next record begins.
+    at: u64,
+    /// The keys of the file's channels; `None` for those that are not Crossfix's.
+    keys: BTreeMap<u16, Option<Key>>,
+    report: ReadReport,
+    /// Whether the record that ends the messages has been seen.
+    is_complete: bool,
+    /// Whether it ends as a whole file does.
+    has_footer: bool,
+    /// Bytes of damaged records, which may have to be read again.
+    spent: u64,
 }
 
 impl RecordingReader<BufReader<File>> {
     /// Opens a file.
     ///
     /// # Errors
-    /// [`RecordingError::Open`] if it is not there.
+    /// [`RecordingError`] if it is not there, empty, or no MCAP file.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let open = |source| RecordingError::Open { path: path.to_owned(), source };
-        Ok(Self::new(BufReader::new(File::open(path).map_err(open)?), path))
+        let file = File::open(path).map_err(open)?;
+        if file.metadata().map_err(open)?.is_dir() {
+            return Err(open(std::io::Error::from(std::io::ErrorKind::IsADirectory)));
+        }
+        Self::new(BufReader::new(file), path)
     }
 }
 
-impl<R: Read> RecordingReader<R> {
+impl<R: Read + Seek> RecordingReader<R> {
     /// Reads from anything; `path` is for messages.
-    pub fn new(source: R, path: &Path) -> Self {
-        Self { source, path: path.to_owned() }
-    }
-
-    /// Hands every message on, in the order of the file, until the end, the damage or the
-    /// handler's first error.
     ///
     /// # Errors
-    /// [`ReadFailure`]; a torn file is no error but a report.
+    /// [`RecordingError`] if it cannot be read, is empty, or no MCAP file.
+    pub fn new(source: R, path: &Path) -> Result<Self, RecordingError> {
+        let report = ReadReport::default();
+        let mut reader = Self {
+            source,
+            path: path.to_owned(),
+            size: 0,
+            at: 0,
+            keys: BTreeMap::new(),
+            report,
+            is_complete: false,
+            has_footer: false,
+            spent: 0,
+        };
+        reader.begin()?;
+        Ok(reader)
+    }
+
+    fn begin(&mut self) -> Result<(), RecordingError> {
+        self.size = self.io(|source| source.seek(SeekFrom::End(0)))?;
+        if self.size == 0 {
+            return Err(RecordingError::Empty { path: self.path.clone() });
+        }
+        let mut magic = [0; MAGIC.len()];
+        let has_magic = self.fill(0, &mut magic)? && magic == MAGIC;
+        self.at = MAGIC.len() as u64;
+        if !has_magic {
+            // A damaged first byte costs no more than any other, if the file has the looks of one.
+            self.at = 0;
+            self.lose("it does not begin as an MCAP file", 0)?;
+            if self.at >= self.size {
+                return Err(RecordingError::NotMcap { path: self.path.clone() });
+            }
+        }
+        // The channels are said in the first chunk, and again at the end: first, in case that chunk is lost.
+        self.learn_channels()
+    }
+
+    /// Hands every message on, in the order of the file, until the end or the handler's first error.
+    ///
+    /// # Errors
+    /// [`ReadFailure`]; damage is no error but a report.
     pub fn for_each<E: std::error::Error + 'static>(
         mut self,
         mut handle: impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<ReadReport, ReadFailure<E>> {
-        let options = LinearReaderOptions::default()
-            .with_skip_end_magic(true)
-            .with_record_length_limit(MAX_RECORD_BYTES)
-            .with_prevalidate_chunk_crcs(true);
-        let mut reader = LinearReader::new_with_options(options);
-        let mut report = ReadReport::default();
-        let mut topics: BTreeMap<u16, Option<Key>> = BTreeMap::new();
-        let mut complete = false;
-        while let Some(event) = reader.next_event() {
-            let record = match event {
-                Ok(LinearReadEvent::ReadRequest(wanted)) => {
-                    let got = self.source.read(reader.insert(wanted)).map_err(|source| {
-                        ReadFailure::Recording(RecordingError::Read { path: self.path.clone(), source })
-                    })?;
-                    reader.notify_read(got);
-                    continue;
-                }
-                // The library's parser would panic on a torn attachment, and we have none.
-                Ok(LinearReadEvent::Record { opcode: op::ATTACHMENT, .. }) => continue,
-                Ok(LinearReadEvent::Record { opcode, data }) => mcap::parse_record(opcode, data),
-                Err(error) => Err(error),
-            };
-            match record {
-                Ok(Record::Channel(channel)) => {
-                    topics.insert(channel.id, channel.topic.parse().ok());
-                }
-                Ok(Record::Message { header, data }) => match topics.get(&header.channel_id) {
-                    Some(Some(key)) => {
-                        let time =
-                            |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
-                        let entry = Entry {
-                            key: key.clone(),
-                            data_time: time(header.log_time),
-                            arrival: time(header.publish_time),
-                            data: data.into_owned(),
-                        };
-                        report.messages += 1;
-                        handle(entry).map_err(ReadFailure::Handler)?;
+        while let Some(Framing { opcode, body, next }) = self.next_record().map_err(ReadFailure::Recording)? {
+            let read = if opcode == op::CHUNK {
+                chunk::for_each_record(&body, |opcode, record| {
+                    let read = self.take(opcode, record, &mut handle)?;
+                    if let Err(what) = read {
+                        self.note(self.at, record.len() as u64, &what);
                     }
-                    _ => report.foreign += 1,
-                },
-                Ok(Record::DataEnd(_)) => complete = true,
-                Ok(_) => {}
-                Err(mcap::McapError::BadMagic) if report == ReadReport::default() && topics.is_empty() => {
-                    return Err(ReadFailure::Recording(RecordingError::NotMcap { path: self.path }));
-                }
-                Err(error) => {
-                    report.damage = Some(error.to_string());
-                    return Ok(report);
+                    Ok(())
+                })?
+                .map_err(|error| error.to_string())
+            } else {
+                self.take(opcode, &body, &mut handle)?
+            };
+            self.go_on(opcode, &body, next, read);
+        }
+        if !self.is_complete || !self.has_footer {
+            self.note(self.size, 0, "the file ends before its end record");
+        }
+        Ok(self.report)
+    }
+
+    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it claims.
+    fn go_on(&mut self, opcode: u8, body: &[u8], next: u64, read: Result<(), String>) {
+        let inside = (opcode != op::CHUNK || read.is_err())
+            .then(|| chunk::find(body, self.size - self.at - HEAD_BYTES as u64))
+            .flatten();
+        let resumed = inside.map_or(next, |offset| self.at + (HEAD_BYTES + offset) as u64);
+        let what = match read {
+            Err(what) => Some(what),
+            Ok(()) => inside.map(|_| "a record claims more than is its own".to_owned()),
+        };
+        if let Some(what) = what {
+            self.note(self.at, resumed - self.at, &what);
+            self.spent += next - self.at;
+        }
+        self.at = resumed;
+        // Of a file made so that everything in it is read many times, the rest is given up.
+        if self.spent > self.size.saturating_mul(MOST_READINGS) {
+            self.note(self.at, self.size - self.at, "it is damaged in too many places");
+            self.at = self.size;
+        }
+    }
+
+    /// One record that is no chunk; what is wrong with it is the inner error.
+    fn take<E: std::error::Error + 'static>(
+        &mut self,
+        opcode: u8,
+        body: &[u8],
+        handle: &mut impl FnMut(Entry) -> Result<(), E>,
+    ) -> Result<Result<(), String>, ReadFailure<E>> {
+        // The library's parser would panic on a torn attachment, and we have none.
+        if opcode == op::ATTACHMENT {
+            return Ok(Ok(()));
+        }
+        match mcap::parse_record(opcode, body) {
+            Ok(Record::Message { header, data }) => {
+                let Some(Some(key)) = self.keys.get(&header.channel_id) else {
+                    self.report.foreign += 1;
+                    return Ok(Ok(()));
+                };
+                let time = |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
+                let entry = Entry {
+                    key: key.clone(),
+                    data_time: time(header.log_time),
+                    arrival: time(header.publish_time),
+                    data: data.into_owned(),
+                };
+                self.report.messages += 1;
+                handle(entry).map_err(ReadFailure::Handler)?;
+            }
+            Ok(Record::DataEnd(_)) => self.is_complete = true,
+            Ok(record) => self.learn(&record),
+            Err(error) => return Ok(Err(error.to_string())),
+        }
+        Ok(Ok(()))
+    }
+
+    /// What a record says of the file itself.
+    fn learn(&mut self, record: &Record<'_>) {
+        match record {
+            Record::Channel(channel) => {
+                self.keys.insert(channel.id, channel.topic.parse().ok());
+            }
+            Record::Metadata(Metadata { name, metadata }) if name == CHANNELS => {
+                for (id, topic) in metadata {
+                    if let Ok(id) = id.parse() {
+                        self.keys.entry(id).or_insert_with(|| topic.parse().ok());
+                    }
                 }
             }
+            Record::Metadata(metadata) => {
+                self.report.source = Source::read(metadata).or(self.report.source.take());
+            }
+            _ => {}
         }
-        if !complete {
-            report.damage = Some("the file ends before its end record".to_owned());
+    }
+
+    /// Reads the channels that a whole file says again after its messages.
+    fn learn_channels(&mut self) -> Result<(), RecordingError> {
+        // The footer: a record of 20 bytes, then the magic.
+        const FOOTER_BYTES: u64 = HEAD_BYTES as u64 + 20 + MAGIC.len() as u64;
+        let mut footer = [0; FOOTER_BYTES as usize];
+        let Some(place) = self.size.checked_sub(FOOTER_BYTES) else {
+            return Ok(());
+        };
+        if !self.fill(place, &mut footer)? || footer[0] != op::FOOTER || !footer.ends_with(MAGIC) {
+            return Ok(());
         }
-        Ok(report)
+        let begins = self.at;
+        let Ok(Record::Footer(found)) = mcap::parse_record(op::FOOTER, &footer[HEAD_BYTES..HEAD_BYTES + 20])
+        else {
+            return Ok(());
+        };
+        self.has_footer = true;
+        self.at = if found.summary_start == 0 { place } else { found.summary_start };
+        while self.at < place {
+            let Some((opcode, length)) = self.head(self.at)? else {
+                break;
+            };
+            let body = self.body(self.at, length)?;
+            if matches!(opcode, op::CHANNEL)
+                && let Ok(record) = mcap::parse_record(opcode, &body)
+            {
+                self.learn(&record);
+            }
+            self.at += HEAD_BYTES as u64 + length;
+        }
+        self.at = begins;
+        Ok(())
+    }
+
+    /// The next whole record; damage before it is noted.
+    fn next_record(&mut self) -> Result<Option<Framing>, RecordingError> {
+        loop {
+            // What follows the end record is an index, and the channels again.
+            if self.is_complete || self.at >= self.size {
+                return Ok(None);
+            }
+            match self.head(self.at)? {
+                Some((opcode, length)) if length <= MAX_RECORD_BYTES => {
+                    let next = self.at + HEAD_BYTES as u64 + length;
+                    return Ok(Some(Framing { opcode, body: self.body(self.at, length)?, next }));
+                }
+                Some((_, length)) => {
+                    self.note(self.at, length, "a record is too long to be true");
+                    self.at += HEAD_BYTES as u64 + length;
+                }
+                None => self.lose("no record begins where one must", self.at + 1)?,
+            }
+        }
+    }
+
+    /// The kind and length of the record at a place, if there is one that ends within the file.
+    fn head(&mut self, at: u64) -> Result<Option<(u8, u64)>, RecordingError> {
+        let mut head = [0; HEAD_BYTES];
+        if !self.fill(at, &mut head)? {
+            return Ok(None);
+        }
+        let [opcode, length @ ..] = head;
+        let length = u64::from_le_bytes(length);
+        let fits = length <= self.size - at - HEAD_BYTES as u64;
+        Ok((chunk::is_opcode(opcode) && fits).then_some((opcode, length)))
+    }
+
+    fn body(&mut self, at: u64, length: u64) -> Result<Vec<u8>, RecordingError> {
+        let mut body = vec![0; usize::try_from(length).unwrap_or(0)];
+        self.fill(at + HEAD_BYTES as u64, &mut body)?;
+        Ok(body)
+    }
+
+    /// Gives up what lies between here and the next thing that looks like a chunk.
+    fn lose(&mut self, what: &str, search_from: u64) -> Result<(), RecordingError> {
+        let begun = self.at;
+        let found = self.find_chunk(search_from)?;
+        self.at = found.unwrap_or(self.size);
+        // The rest of a file that was cut off is not damage within it: the missing end says it all.
+        if found.is_some() {
+            self.note(begun, self.at - begun, what);
+        }
+        Ok(())
+    }
+
+    /// The place of the first chunk at or after a place.
+    fn find_chunk(&mut self, from: u64) -> Result<Option<u64>, RecordingError> {
+        const WINDOW: usize = 1 << 20;
+        let mut window = vec![0; WINDOW + chunk::LOOKS_BYTES];
+        let mut at = from;
+        while at < self.size {
+            let length = usize::try_from(self.size - at).unwrap_or(usize::MAX).min(window.len());
+            self.fill(at, &mut window[..length])?;
+            if let Some(offset) = chunk::find(&window[..length], self.size - at) {
+                return Ok(Some(at + offset as u64));
+            }
+            at += WINDOW as u64;
+        }
+        Ok(None)
+    }
+
+    /// Fills a buffer from a place; `false` if the file ends before.
+    fn fill(&mut self, at: u64, buffer: &mut [u8]) -> Result<bool, RecordingError> {
+        if at.saturating_add(buffer.len() as u64) > self.size {
+            return Ok(false);
+        }
+        self.io(|source| {
+            // Within the buffer where it can be: the file is read from its beginning to its end.
+            let here = source.stream_position()?;
+            if here != at {
+                source.seek(SeekFrom::Start(at))?;
+            }
+            source.read_exact(buffer)
+        })?;
+        Ok(true)
+    }
+
+    fn io<T>(&mut self, action: impl FnOnce(&mut R) -> std::io::Result<T>) -> Result<T, RecordingError> {
+        action(&mut self.source).map_err(|source| RecordingError::Read { path: self.path.clone(), source })
+    }
+
+    fn note(&mut self, at: u64, bytes: u64, what: &str) {
+        Damage::note(&mut self.report.damage, at, bytes, what);
     }
 }

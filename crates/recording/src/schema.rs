@@ -8,7 +8,7 @@ pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
         Channel::Bearings(_) => BearingFrame::SCHEMA,
         Channel::Calibration(_) => CameraCalibration::SCHEMA,
         Channel::Preview(_) => Preview::SCHEMA,
-        Channel::CameraHealth(_) | Channel::FusionHealth => Health::SCHEMA,
+        Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => Health::SCHEMA,
         Channel::Tracks => TrackFrame::SCHEMA,
         Channel::Events => TrackEvent::SCHEMA,
         Channel::Truth => TruthFrame::SCHEMA,

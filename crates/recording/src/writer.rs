@@ -1,13 +1,13 @@
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufWriter, Seek, Write};
+use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::Path;
 
-use crossfix_message::{Key, file_descriptor_set};
-use mcap::records::MessageHeader;
-use mcap::{Compression, WriteOptions, Writer};
+use crossfix_message::{Key, MAX_MESSAGE_BYTES, file_descriptor_set};
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, McapResult, WriteOptions, Writer};
 
-use crate::{Entry, RecordingError, schema};
+use crate::{CHANNELS, Entry, RecordingError, Source, schema};
 
 /// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
 const CHUNK_BYTES: u64 = 512 * 1024;
@@ -16,6 +16,8 @@ const CHUNK_BYTES: u64 = 512 * 1024;
 pub struct RecordingWriter<W: Write + Seek> {
     writer: Writer<W>,
     channels: BTreeMap<Key, (u16, u32)>,
+    /// Whether a channel has been added since they were last said outside of the chunks.
+    has_new_channels: bool,
     messages: u64,
 }
 
@@ -23,10 +25,22 @@ impl RecordingWriter<BufWriter<File>> {
     /// A new file; an existing one is replaced.
     ///
     /// # Errors
-    /// [`RecordingError::Open`] if it cannot be made.
+    /// [`RecordingError::Create`] if it cannot be made.
     pub fn create(path: &Path) -> Result<Self, RecordingError> {
-        let open = |source| RecordingError::Open { path: path.to_owned(), source };
-        Self::new(BufWriter::new(File::create(path).map_err(open)?))
+        let create = |source| RecordingError::Create { path: path.to_owned(), source };
+        Self::new(BufWriter::new(File::create(path).map_err(create)?))
+    }
+
+    /// A new file where none is.
+    ///
+    /// # Errors
+    /// [`RecordingError::Exists`] if there is one, [`RecordingError::Create`] if it cannot be made.
+    pub fn create_new(path: &Path) -> Result<Self, RecordingError> {
+        let file = File::create_new(path).map_err(|source| match source.kind() {
+            ErrorKind::AlreadyExists => RecordingError::Exists { path: path.to_owned() },
+            _ => RecordingError::Create { path: path.to_owned(), source },
+        })?;
+        Self::new(BufWriter::new(file))
     }
 }
 
@@ -45,29 +59,32 @@ impl<W: Write + Seek> RecordingWriter<W> {
             .library(concat!("crossfix ", env!("CARGO_PKG_VERSION")))
             .create(sink)
             .map_err(RecordingError::Write)?;
-        Ok(Self { writer, channels: BTreeMap::new(), messages: 0 })
+        Ok(Self { writer, channels: BTreeMap::new(), has_new_channels: false, messages: 0 })
+    }
+
+    /// Says in the file who writes it.
+    ///
+    /// # Errors
+    /// [`RecordingError::Write`].
+    pub fn sign(&mut self, source: &Source) -> Result<(), RecordingError> {
+        self.writer.write_metadata(&source.write()).map_err(RecordingError::Write)
     }
 
     /// Writes one message. Keys that carry no message (liveliness) are left out.
     ///
     /// # Errors
-    /// [`RecordingError::Write`]; nothing can be written after one.
+    /// [`RecordingError::TooLong`]: the message is left out; [`RecordingError::Write`]: nothing can be
+    /// written any more.
     pub fn write(&mut self, entry: &Entry) -> Result<(), RecordingError> {
+        if entry.data.len() > MAX_MESSAGE_BYTES {
+            return Err(RecordingError::TooLong { topic: entry.key.to_string(), bytes: entry.data.len() });
+        }
         let Some(name) = schema::of(&entry.key.channel) else {
             return Ok(());
         };
         let (channel_id, sequence) = match self.channels.get(&entry.key) {
             Some(&known) => known,
-            None => {
-                let writer = &mut self.writer;
-                let channel = writer
-                    .add_schema(name, "protobuf", file_descriptor_set())
-                    .and_then(|id| {
-                        writer.add_channel(id, &entry.key.to_string(), "protobuf", &BTreeMap::new())
-                    })
-                    .map_err(RecordingError::Write)?;
-                (channel, 0)
-            }
+            None => (self.add_channel(name, &entry.key).map_err(RecordingError::Write)?, 0),
         };
         // MCAP has no time before the epoch.
         let nanos = |time: crossfix_message::Timestamp| u64::try_from(time.nanos()).unwrap_or(0);
@@ -83,12 +100,28 @@ impl<W: Write + Seek> RecordingWriter<W> {
         Ok(())
     }
 
+    fn add_channel(&mut self, schema: &str, key: &Key) -> McapResult<u16> {
+        self.has_new_channels = true;
+        let schema = self.writer.add_schema(schema, "protobuf", file_descriptor_set())?;
+        self.writer.add_channel(schema, &key.to_string(), "protobuf", &BTreeMap::new())
+    }
+
+    /// Says the channels outside of the chunks: of a torn file, which has no end to say them again, a
+    /// damaged first chunk must not take all later ones with it.
+    fn say_channels(&mut self) -> McapResult<()> {
+        if !std::mem::take(&mut self.has_new_channels) {
+            return Ok(());
+        }
+        let said = self.channels.iter().map(|(key, (id, _))| (id.to_string(), key.to_string()));
+        self.writer.write_metadata(&Metadata { name: CHANNELS.to_owned(), metadata: said.collect() })
+    }
+
     /// Closes the chunk and hands all bytes to the system.
     ///
     /// # Errors
     /// [`RecordingError::Write`].
     pub fn flush(&mut self) -> Result<(), RecordingError> {
-        self.writer.flush().map_err(RecordingError::Write)
+        self.say_channels().and_then(|()| self.writer.flush()).map_err(RecordingError::Write)
     }
 
     /// Messages written so far.
@@ -102,6 +135,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
     /// [`RecordingError::Write`].
     pub fn finish(mut self) -> Result<u64, RecordingError> {
         self.writer.finish().map_err(RecordingError::Write)?;
+        // Dropped, a buffer keeps to itself what the disk did not take.
+        self.writer.into_inner().flush().map_err(|error| RecordingError::Write(error.into()))?;
         Ok(self.messages)
     }
 }

@@ -1,0 +1,81 @@
+//! The records of an MCAP file as they lie in it, and how a chunk is known by its looks.
+
+use std::io::Read;
+
+use mcap::McapResult;
+use mcap::records::op;
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+/// Kind and length of a record.
+pub(crate) const HEAD_BYTES: usize = 9;
+/// A record longer than this is skipped, and a chunk that says it holds more is not unpacked. The
+/// writer closes a chunk at half a megabyte and takes no message above 8, so its own are shorter.
+pub(crate) const MAX_RECORD_BYTES: u64 = 64 << 20;
+/// Of a chunk: head, first and last time, size, checksum, the name of the compression and its length.
+pub(crate) const LOOKS_BYTES: usize = HEAD_BYTES + 8 + 8 + 8 + 4 + 4 + COMPRESSION.len() + 8;
+/// The only compression that Crossfix writes.
+const COMPRESSION: &[u8] = b"zstd";
+/// Of a chunk's body, all that is not its packed records.
+const FIXED_BYTES: u64 = (LOOKS_BYTES - HEAD_BYTES) as u64;
+
+/// A record as it lies in the file.
+pub(crate) struct Framing {
+    pub(crate) opcode: u8,
+    pub(crate) body: Vec<u8>,
+    /// Where the record after it begins.
+    pub(crate) next: u64,
+}
+
+/// Whether a record may be of this kind: those of the format's first version, and private ones.
+pub(crate) fn is_opcode(opcode: u8) -> bool {
+    matches!(opcode, op::HEADER..=op::DATA_END | 0x80..)
+}
+
+/// The first place in some bytes where a chunk begins, of which `left` bytes are left in the file.
+pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
+    let u64_at = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
+    (0..bytes.len().saturating_sub(LOOKS_BYTES - 1)).find(|&at| {
+        let name = at + LOOKS_BYTES - 8 - COMPRESSION.len();
+        let named = bytes[at] == op::CHUNK
+            && bytes[name - 4..name] == [4, 0, 0, 0]
+            && bytes[name..].starts_with(COMPRESSION);
+        // The record's length and that of its packed part must agree.
+        named
+            && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(|(length, packed)| {
+                length == packed.saturating_add(FIXED_BYTES)
+                    && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
+            })
+    })
+}
+
+/// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a damaged
+/// chunk none is handed on.
+///
+/// # Errors
+/// The inner error is what is wrong with the chunk, the outer one what the handler says.
+pub(crate) fn for_each_record<E>(
+    body: &[u8],
+    mut handle: impl FnMut(u8, &[u8]) -> Result<(), E>,
+) -> Result<McapResult<()>, E> {
+    let options = LinearReaderOptions::default()
+        .with_skip_start_magic(true)
+        .with_skip_end_magic(true)
+        .with_record_length_limit(MAX_RECORD_BYTES as usize)
+        .with_prevalidate_chunk_crcs(true);
+    let mut reader = LinearReader::new_with_options(options);
+    let head = [&[op::CHUNK][..], &(body.len() as u64).to_le_bytes()].concat();
+    let mut given = head.as_slice().chain(body);
+    while let Some(event) = reader.next_event() {
+        match event {
+            Ok(LinearReadEvent::ReadRequest(wanted)) => match given.read(reader.insert(wanted)) {
+                // The reader would go on to the record after the chunk.
+                Ok(0) => break,
+                Ok(got) => reader.notify_read(got),
+                Err(error) => return Ok(Err(error.into())),
+            },
+            Ok(LinearReadEvent::Record { opcode, data }) => handle(opcode, data)?,
+            Err(error) => return Ok(Err(error)),
+        }
+    }
+    Ok(Ok(()))
+}
