@@ -3,7 +3,7 @@
 use std::io::Read;
 
 use mcap::McapResult;
-use mcap::records::op;
+use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 /// Kind and length of a record.
@@ -46,6 +46,17 @@ pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
                     && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
             })
     })
+}
+
+/// How much of a record's body is the chunk's own, by what the chunk says.
+pub(crate) fn own_bytes(body: &[u8]) -> u64 {
+    match mcap::parse_record(op::CHUNK, body) {
+        Ok(Record::Chunk { header, .. }) => {
+            let name = header.compression.len() as u64;
+            (FIXED_BYTES - COMPRESSION.len() as u64) + name + header.compressed_size
+        }
+        _ => body.len() as u64,
+    }
 }
 
 /// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a damaged

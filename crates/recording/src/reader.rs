@@ -51,10 +51,12 @@ pub struct RecordingReader<R: Read + Seek> {
     /// The keys of the file's channels; `None` for those that are not Crossfix's.
     keys: BTreeMap<u16, Option<Key>>,
     report: ReadReport,
+    /// All chunks that begin before this place have been found: a chunk has a checksum.
+    sure_until: u64,
     /// Whether the record that ends the messages has been seen.
     is_complete: bool,
-    /// Whether it ends as a whole file does.
-    has_footer: bool,
+    /// Where the index begins, if the file ends as a whole one does.
+    index_at: Option<u64>,
     /// Bytes of damaged records, which may have to be read again.
     spent: u64,
 }
@@ -86,10 +88,11 @@ impl<R: Read + Seek> RecordingReader<R> {
             path: path.to_owned(),
             size: 0,
             at: 0,
+            sure_until: 0,
             keys: BTreeMap::new(),
             report,
             is_complete: false,
-            has_footer: false,
+            index_at: None,
             spent: 0,
         };
         reader.begin()?;
@@ -139,14 +142,18 @@ impl<R: Read + Seek> RecordingReader<R> {
             };
             self.go_on(opcode, &body, next, read);
         }
-        if !self.is_complete || !self.has_footer {
+        if !self.is_complete || self.index_at.is_none() {
             self.note(self.size, 0, "the file ends before its end record");
         }
         Ok(self.report)
     }
 
-    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it claims.
-    fn go_on(&mut self, opcode: u8, body: &[u8], next: u64, read: Result<(), String>) {
+    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it claims;
+    /// a chunk that was read well says again inside, under its checksum, how long it is.
+    fn go_on(&mut self, opcode: u8, body: &[u8], mut next: u64, read: Result<(), String>) {
+        if opcode == op::CHUNK && read.is_ok() {
+            next = next.min(self.at + HEAD_BYTES as u64 + chunk::own_bytes(body));
+        }
         let inside = (opcode != op::CHUNK || read.is_err())
             .then(|| chunk::find(body, self.size - self.at - HEAD_BYTES as u64))
             .flatten();
@@ -158,6 +165,9 @@ impl<R: Read + Seek> RecordingReader<R> {
         if let Some(what) = what {
             self.note(self.at, resumed - self.at, &what);
             self.spent += next - self.at;
+        }
+        if opcode == op::CHUNK {
+            self.sure_until = if inside.is_some() { self.at + 1 } else { resumed };
         }
         self.at = resumed;
         // Of a file made so that everything in it is read many times, the rest is given up.
@@ -194,7 +204,11 @@ impl<R: Read + Seek> RecordingReader<R> {
                 self.report.messages += 1;
                 handle(entry).map_err(ReadFailure::Handler)?;
             }
-            Ok(Record::DataEnd(_)) => self.is_complete = true,
+            // What follows the end record is an index, and the channels again.
+            Ok(Record::DataEnd(_)) => {
+                let next = self.at + (HEAD_BYTES + body.len()) as u64;
+                self.is_complete = self.index_at.is_none_or(|index| index == next);
+            }
             Ok(record) => self.learn(&record),
             Err(error) => return Ok(Err(error.to_string())),
         }
@@ -237,8 +251,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         else {
             return Ok(());
         };
-        self.has_footer = true;
         self.at = if found.summary_start == 0 { place } else { found.summary_start };
+        self.index_at = Some(self.at);
         while self.at < place {
             let Some((opcode, length)) = self.head(self.at)? else {
                 break;
@@ -258,7 +272,6 @@ impl<R: Read + Seek> RecordingReader<R> {
     /// The next whole record; damage before it is noted.
     fn next_record(&mut self) -> Result<Option<Framing>, RecordingError> {
         loop {
-            // What follows the end record is an index, and the channels again.
             if self.is_complete || self.at >= self.size {
                 return Ok(None);
             }
@@ -269,9 +282,11 @@ impl<R: Read + Seek> RecordingReader<R> {
                 }
                 Some((_, length)) => {
                     self.note(self.at, length, "a record is too long to be true");
+                    self.sure_until = self.at + 1;
                     self.at += HEAD_BYTES as u64 + length;
                 }
-                None => self.lose("no record begins where one must", self.at + 1)?,
+                // The record before may have claimed the beginning of the one that is missing.
+                None => self.lose("no record begins where one must", self.sure_until)?,
             }
         }
     }
@@ -296,12 +311,12 @@ impl<R: Read + Seek> RecordingReader<R> {
 
     /// Gives up what lies between here and the next thing that looks like a chunk.
     fn lose(&mut self, what: &str, search_from: u64) -> Result<(), RecordingError> {
-        let begun = self.at;
+        let begun = self.at.max(search_from);
         let found = self.find_chunk(search_from)?;
         self.at = found.unwrap_or(self.size);
         // The rest of a file that was cut off is not damage within it: the missing end says it all.
         if found.is_some() {
-            self.note(begun, self.at - begun, what);
+            self.note(begun, self.at.saturating_sub(begun), what);
         }
         Ok(())
     }
