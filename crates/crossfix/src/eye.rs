@@ -26,18 +26,27 @@ pub struct CameraIdentity {
 }
 
 impl CameraIdentity {
-    /// The message of one exposure.
-    pub fn bearing_frame(&self, sequence: u64, capture: CaptureTime, tracks: &[ImageTrack]) -> BearingFrame {
-        let tracks = tracks.iter().filter_map(|track| self.bearing_track(track).ok());
-        BearingFrame {
+    /// The message of one exposure, and how many tracks are not in it, as the lens shows no direction at
+    /// their pixels.
+    pub fn bearing_frame(
+        &self,
+        sequence: u64,
+        capture: CaptureTime,
+        tracks: &[ImageTrack],
+    ) -> (BearingFrame, u64) {
+        let seen: Vec<BearingTrack> =
+            tracks.iter().filter_map(|track| self.bearing_track(track).ok()).collect();
+        let unseen = (tracks.len() - seen.len()) as u64;
+        let frame = BearingFrame {
             camera: self.name.to_string(),
             sequence,
             capture_time_ns: capture.time.nanos(),
             capture_time_sd_s: capture.sd_s,
             clock_source: self.clock_source.into(),
-            tracks: tracks.collect(),
+            tracks: seen,
             ..Default::default()
-        }
+        };
+        (frame, unseen)
     }
 
     /// A track as it goes over the wire: the measurement where there is one, else the prediction,

@@ -1,12 +1,17 @@
 //! The one command of Crossfix.
 
+mod centre;
 mod commands;
 mod config;
 mod eye;
 mod import;
 mod logging;
+mod lookout;
+mod network;
 mod output;
 mod pace;
+mod recorded;
+mod repeats;
 mod scenario;
 mod shutdown;
 
@@ -75,7 +80,7 @@ fn main() -> ExitCode {
     // Misuse ends in clap, with exit code 2.
     let cli = Cli::parse();
     logging::start(&cli.logging);
-    match run(cli) {
+    match shutdown::supervise(move || run(cli)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             output::error(&error);

@@ -1,7 +1,9 @@
 //! What people and programs read: results on stdout, the last error on stderr.
 
 use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 
+use anyhow::{Context, ensure};
 use serde::Serialize;
 
 /// Writes a line of the result. A reader that went away (`| head`) is no error.
@@ -22,6 +24,64 @@ pub fn error(error: &anyhow::Error) {
     for cause in error.chain().skip(1) {
         let _ = writeln!(stderr, "  because: {cause}");
     }
+}
+
+/// A file that is being written. It has a name of its own until it is whole, so that what stood under the
+/// name that was asked for stays until then, and nobody takes half a file for a whole one.
+#[derive(Debug)]
+pub struct Draft {
+    path: PathBuf,
+    /// `None`: written in place, as a pipe or a device can only be.
+    part: Option<PathBuf>,
+}
+
+impl Draft {
+    /// A draft of a file that is made from others.
+    pub fn new(path: &Path, inputs: &[&Path]) -> anyhow::Result<Self> {
+        for input in inputs {
+            ensure!(
+                !same_file::is_same_file(path, input).unwrap_or(false),
+                "{} is what is read: write to another file",
+                path.display()
+            );
+        }
+        let in_place = path.exists() && !path.is_file();
+        ensure!(!path.is_dir(), "cannot write {}: it is a folder", path.display());
+        // What a link names is replaced, and not the link.
+        let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        let mut part = path.clone().into_os_string();
+        part.push(".part");
+        Ok(Self { path, part: (!in_place).then(|| part.into()) })
+    }
+
+    /// Where to write.
+    pub fn path(&self) -> &Path {
+        self.part.as_deref().unwrap_or(&self.path)
+    }
+
+    /// The file is whole: it gets its name.
+    pub fn keep(mut self) -> anyhow::Result<()> {
+        if let Some(part) = self.part.take() {
+            std::fs::rename(&part, &self.path)
+                .with_context(|| format!("cannot write {}", self.path.display()))?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Draft {
+    fn drop(&mut self) {
+        if let Some(part) = &self.part {
+            let _ = std::fs::remove_file(part);
+        }
+    }
+}
+
+/// Writes a whole file.
+pub fn write_file(path: &Path, inputs: &[&Path], bytes: &[u8]) -> anyhow::Result<()> {
+    let draft = Draft::new(path, inputs)?;
+    std::fs::write(draft.path(), bytes).with_context(|| format!("cannot write {}", path.display()))?;
+    draft.keep()
 }
 
 /// A number for a table, or a dash.
@@ -51,4 +111,44 @@ pub fn table(rows: &[Vec<String>]) -> String {
         lines.insert(1, "-".repeat(total));
     }
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_has_its_name_only_once_it_is_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.csv");
+        std::fs::write(&path, "before").unwrap();
+        let draft = Draft::new(&path, &[]).unwrap();
+        std::fs::write(draft.path(), "half").unwrap();
+        drop(draft);
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "before");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left lying about");
+        write_file(&path, &[], b"after").unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "after");
+    }
+
+    #[test]
+    fn nothing_is_written_onto_what_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mcap");
+        std::fs::write(&path, "dear").unwrap();
+        let detour = folder.path().join(".").join("a.mcap");
+        assert!(Draft::new(&detour, &[&path]).is_err());
+        let link = folder.path().join("link.mcap");
+        std::fs::hard_link(&path, &link).unwrap();
+        assert!(Draft::new(&link, &[&path]).unwrap_err().to_string().contains("is what is read"));
+    }
+
+    #[test]
+    fn devices_are_written_in_place() {
+        let null = Path::new("/dev/null");
+        if null.exists() {
+            write_file(null, &[], b"gone").unwrap();
+            assert!(!null.is_file() && !Path::new("/dev/null.part").exists());
+        }
+    }
 }

@@ -15,14 +15,15 @@ pub struct Latency {
 /// Pairs bearing frames with the track frames that name them.
 #[derive(Clone, Debug, Default)]
 pub struct LatencyRecorder {
-    bearings: BTreeMap<(String, u64), Timestamp>,
+    /// A camera that was started again counts its frames anew: then there are several of a number.
+    bearings: BTreeMap<(String, u64), Vec<Timestamp>>,
     tracks: Vec<((String, u64), Timestamp)>,
 }
 
 impl LatencyRecorder {
     /// A bearing frame arrived.
     pub fn bearing(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
-        self.bearings.insert((camera.to_owned(), sequence), arrival);
+        self.bearings.entry((camera.to_owned(), sequence)).or_default().push(arrival);
     }
 
     /// A track frame arrived that followed from a camera's frame. The order in which both arrive
@@ -36,11 +37,36 @@ impl LatencyRecorder {
         let pairs = self
             .tracks
             .iter()
-            .filter_map(|(key, arrival)| Some(arrival.seconds_since(*self.bearings.get(key)?) * 1e3));
+            .filter_map(|(key, arrival)| Some(arrival.seconds_since(self.cause(key, *arrival)?) * 1e3));
         let mut milliseconds: Vec<f64> = pairs.collect();
         milliseconds.sort_by(f64::total_cmp);
         let last = milliseconds.len().checked_sub(1)?;
         let quantile = |q: f64| milliseconds[(q * last as f64).round() as usize];
         Some(Latency { p50_ms: quantile(0.5), p99_ms: quantile(0.99) })
+    }
+    /// When the frame arrived from which tracks followed that arrived at a time: the last one before it,
+    /// or where they overtook it, the first.
+    fn cause(&self, key: &(String, u64), tracks: Timestamp) -> Option<Timestamp> {
+        let arrivals = self.bearings.get(key)?;
+        arrivals.iter().rev().find(|arrival| **arrival <= tracks).or_else(|| arrivals.first()).copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_that_was_started_again_has_no_latency_of_minutes() {
+        let mut recorder = LatencyRecorder::default();
+        for run_s in [0.0, 600.0] {
+            for sequence in 0..10 {
+                let arrival = Timestamp::from_seconds(run_s + 0.1 * sequence as f64);
+                recorder.bearing("a", sequence, arrival);
+                recorder.tracks("a", sequence, arrival.plus_seconds(0.02));
+            }
+        }
+        let latency = recorder.latency().unwrap();
+        assert!((latency.p50_ms - 20.0).abs() < 0.01 && (latency.p99_ms - 20.0).abs() < 0.01, "{latency:?}");
     }
 }

@@ -32,8 +32,12 @@ const fn list<T>(tag: u32, inside: &'static [Repeated]) -> Repeated {
 pub(crate) const NOTHING: &[Repeated] = &[];
 pub(crate) const BEARING_FRAME: &[Repeated] = &[list::<BearingTrack>(8, NOTHING)];
 pub(crate) const TRACK_FRAME: &[Repeated] = &[list::<Track>(6, &[list::<CameraResidual>(6, NOTHING)])];
-pub(crate) const HEALTH: &[Repeated] =
-    &[list::<Counter>(5, NOTHING), list::<CameraHealth>(7, NOTHING), list::<String>(10, NOTHING)];
+pub(crate) const HEALTH: &[Repeated] = &[
+    list::<Counter>(5, NOTHING),
+    list::<CameraHealth>(7, NOTHING),
+    list::<String>(10, NOTHING),
+    list::<String>(12, NOTHING),
+];
 pub(crate) const TRUTH_FRAME: &[Repeated] = &[list::<TrueState>(3, NOTHING)];
 
 /// Bytes that a message takes once it is decoded, at least as many as it has on the wire. Stops early

@@ -2,9 +2,9 @@
 
 use std::io::Read;
 
-use mcap::McapResult;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{McapError, McapResult};
 
 /// Kind and length of a record.
 pub(crate) const HEAD_BYTES: usize = 9;
@@ -15,6 +15,8 @@ pub(crate) const MAX_RECORD_BYTES: u64 = 64 << 20;
 pub(crate) const LOOKS_BYTES: usize = HEAD_BYTES + 8 + 8 + 8 + 4 + 4 + COMPRESSION.len() + 8;
 /// The only compression that Crossfix writes.
 const COMPRESSION: &[u8] = b"zstd";
+/// The longest name of a compression, bytes: the format has `zstd` and `lz4`.
+const LONGEST_NAME: usize = 32;
 /// Of a chunk's body, all that is not its packed records.
 const FIXED_BYTES: u64 = (LOOKS_BYTES - HEAD_BYTES) as u64;
 
@@ -26,9 +28,19 @@ pub(crate) struct Framing {
     pub(crate) next: u64,
 }
 
-/// Whether a record may be of this kind: those of the format's first version, and private ones.
+/// Whether a record may be of this kind. Private ones, which we never write, would hide damage.
 pub(crate) fn is_opcode(opcode: u8) -> bool {
-    matches!(opcode, op::HEADER..=op::DATA_END | 0x80..)
+    matches!(opcode, op::HEADER..=op::DATA_END)
+}
+
+/// Whether a record's body has the shape of a chunk's, whatever its kind says.
+pub(crate) fn has_shape(body: &[u8]) -> bool {
+    let name = (FIXED_BYTES as usize) - 8 - COMPRESSION.len();
+    let packed = body.get(name + COMPRESSION.len()..FIXED_BYTES as usize);
+    body.get(name - 4..name) == Some(&[4, 0, 0, 0])
+        && body[name..].starts_with(COMPRESSION)
+        && packed.and_then(|bytes| bytes.try_into().ok()).map(u64::from_le_bytes)
+            == (body.len() as u64).checked_sub(FIXED_BYTES)
 }
 
 /// The first place in some bytes where a chunk begins, of which `left` bytes are left in the file.
@@ -36,19 +48,18 @@ pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
     let u64_at = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
     (0..bytes.len().saturating_sub(LOOKS_BYTES - 1)).find(|&at| {
         let name = at + LOOKS_BYTES - 8 - COMPRESSION.len();
-        let named = bytes[at] == op::CHUNK
-            && bytes[name - 4..name] == [4, 0, 0, 0]
-            && bytes[name..].starts_with(COMPRESSION);
-        // The record's length and that of its packed part must agree.
-        named
+        // Its kind may be what is damaged. The record's length and that of its packed part must agree.
+        bytes[name - 4..name] == [4, 0, 0, 0]
+            && bytes[name..].starts_with(COMPRESSION)
             && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(|(length, packed)| {
                 length == packed.saturating_add(FIXED_BYTES)
+                    && length <= MAX_RECORD_BYTES
                     && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
             })
     })
 }
 
-/// How much of a record's body is the chunk's own, by what the chunk says.
+/// How much of a record's body is the chunk's own, by what the chunk says: of one that was read well.
 pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     match mcap::parse_record(op::CHUNK, body) {
         Ok(Record::Chunk { header, .. }) => {
@@ -68,6 +79,11 @@ pub(crate) fn for_each_record<E>(
     body: &[u8],
     mut handle: impl FnMut(u8, &[u8]) -> Result<(), E>,
 ) -> Result<McapResult<()>, E> {
+    // The library would reserve as much memory as a damaged length says.
+    let name_bytes = body.get(28..32).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
+    if name_bytes.is_none_or(|bytes| bytes as usize > LONGEST_NAME) {
+        return Ok(Err(McapError::UnexpectedEoc));
+    }
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)

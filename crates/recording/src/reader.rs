@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 
 use crossfix_message::{Key, Timestamp};
 use mcap::MAGIC;
-use mcap::records::{Metadata, Record, op};
+use mcap::records::{Channel, Record, op};
 use thiserror::Error;
 
 use crate::chunk::{self, Framing, HEAD_BYTES, MAX_RECORD_BYTES};
+use crate::source::Texts;
 use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 
 /// Damaged records may claim what is not theirs, so that what lies in them is read again: this many
@@ -59,6 +60,13 @@ pub struct RecordingReader<R: Read + Seek> {
     index_at: Option<u64>,
     /// Bytes of damaged records, which may have to be read again.
     spent: u64,
+}
+
+impl<R: Read + Seek> RecordingReader<R> {
+    /// The keys of a whole file's channels; none of a torn one, which says them among its messages.
+    pub fn keys(&self) -> impl Iterator<Item = &Key> {
+        self.keys.values().flatten()
+    }
 }
 
 impl RecordingReader<BufReader<File>> {
@@ -127,10 +135,16 @@ impl<R: Read + Seek> RecordingReader<R> {
         mut self,
         mut handle: impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<ReadReport, ReadFailure<E>> {
-        while let Some(Framing { opcode, body, next }) = self.next_record().map_err(ReadFailure::Recording)? {
+        while let Some(Framing { mut opcode, body, next }) =
+            self.next_record().map_err(ReadFailure::Recording)?
+        {
+            if opcode != op::CHUNK && chunk::has_shape(&body) {
+                self.note(self.at, 0, "a chunk says that it is none");
+                opcode = op::CHUNK;
+            }
             let read = if opcode == op::CHUNK {
                 chunk::for_each_record(&body, |opcode, record| {
-                    let read = self.take(opcode, record, &mut handle)?;
+                    let read = self.take_inner(opcode, record, &mut handle)?;
                     if let Err(what) = read {
                         self.note(self.at, record.len() as u64, &what);
                     }
@@ -138,7 +152,7 @@ impl<R: Read + Seek> RecordingReader<R> {
                 })?
                 .map_err(|error| error.to_string())
             } else {
-                self.take(opcode, &body, &mut handle)?
+                self.take_outer(opcode, &body, &mut handle)?
             };
             self.go_on(opcode, &body, next, read);
         }
@@ -177,18 +191,19 @@ impl<R: Read + Seek> RecordingReader<R> {
         }
     }
 
-    /// One record that is no chunk; what is wrong with it is the inner error.
-    fn take<E: std::error::Error + 'static>(
+    /// One record of a chunk; what is wrong with it is the inner error. The library's parser is given
+    /// nothing else, as it believes what damaged records say of their lengths.
+    fn take_inner<E: std::error::Error + 'static>(
         &mut self,
         opcode: u8,
         body: &[u8],
         handle: &mut impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<Result<(), String>, ReadFailure<E>> {
-        // The library's parser would panic on a torn attachment, and we have none.
-        if opcode == op::ATTACHMENT {
+        if !matches!(opcode, op::CHANNEL | op::MESSAGE) {
             return Ok(Ok(()));
         }
         match mcap::parse_record(opcode, body) {
+            Ok(Record::Channel(channel)) => self.learn(&channel),
             Ok(Record::Message { header, data }) => {
                 let Some(Some(key)) = self.keys.get(&header.channel_id) else {
                     self.report.foreign += 1;
@@ -204,35 +219,49 @@ impl<R: Read + Seek> RecordingReader<R> {
                 self.report.messages += 1;
                 handle(entry).map_err(ReadFailure::Handler)?;
             }
-            // What follows the end record is an index, and the channels again.
-            Ok(Record::DataEnd(_)) => {
-                let next = self.at + (HEAD_BYTES + body.len()) as u64;
-                self.is_complete = self.index_at.is_none_or(|index| index == next);
-            }
-            Ok(record) => self.learn(&record),
+            Ok(_) => {}
             Err(error) => return Ok(Err(error.to_string())),
         }
         Ok(Ok(()))
     }
 
-    /// What a record says of the file itself.
-    fn learn(&mut self, record: &Record<'_>) {
-        match record {
-            Record::Channel(channel) => {
-                self.keys.insert(channel.id, channel.topic.parse().ok());
+    /// One record outside of the chunks; a file without chunks has its messages there.
+    fn take_outer<E: std::error::Error + 'static>(
+        &mut self,
+        opcode: u8,
+        body: &[u8],
+        handle: &mut impl FnMut(Entry) -> Result<(), E>,
+    ) -> Result<Result<(), String>, ReadFailure<E>> {
+        match opcode {
+            op::CHANNEL | op::MESSAGE => self.take_inner(opcode, body, handle),
+            op::METADATA => {
+                let texts = Texts::read(body);
+                texts.iter().for_each(|texts| self.learn_texts(texts));
+                Ok(texts.map(drop).ok_or_else(|| "a metadata record is damaged".to_owned()))
             }
-            Record::Metadata(Metadata { name, metadata }) if name == CHANNELS => {
-                for (id, topic) in metadata {
-                    if let Ok(id) = id.parse() {
-                        self.keys.entry(id).or_insert_with(|| topic.parse().ok());
-                    }
+            // What follows the end record is an index, and the channels again.
+            op::DATA_END => {
+                let next = self.at + (HEAD_BYTES + body.len()) as u64;
+                self.is_complete = self.index_at.is_none_or(|index| index == next);
+                Ok(Ok(()))
+            }
+            _ => Ok(Ok(())),
+        }
+    }
+
+    fn learn(&mut self, channel: &Channel) {
+        self.keys.insert(channel.id, channel.topic.parse().ok());
+    }
+
+    fn learn_texts(&mut self, texts: &Texts) {
+        if texts.name == CHANNELS {
+            for (id, topic) in &texts.pairs {
+                if let Ok(id) = id.parse() {
+                    self.keys.entry(id).or_insert_with(|| topic.parse().ok());
                 }
             }
-            Record::Metadata(metadata) => {
-                self.report.source = Source::read(metadata).or(self.report.source.take());
-            }
-            _ => {}
         }
+        self.report.source = Source::read(texts).or(self.report.source.take());
     }
 
     /// Reads the channels that a whole file says again after its messages.
@@ -258,10 +287,10 @@ impl<R: Read + Seek> RecordingReader<R> {
                 break;
             };
             let body = self.body(self.at, length)?;
-            if matches!(opcode, op::CHANNEL)
-                && let Ok(record) = mcap::parse_record(opcode, &body)
+            if opcode == op::CHANNEL
+                && let Ok(Record::Channel(channel)) = mcap::parse_record(opcode, &body)
             {
-                self.learn(&record);
+                self.learn(&channel);
             }
             self.at += HEAD_BYTES as u64 + length;
         }
@@ -286,9 +315,24 @@ impl<R: Read + Seek> RecordingReader<R> {
                     self.at += HEAD_BYTES as u64 + length;
                 }
                 // The record before may have claimed the beginning of the one that is missing.
-                None => self.lose("no record begins where one must", self.sure_until)?,
+                None => {
+                    self.lose("no record begins where one must", self.sure_until)?;
+                    return self.chunk_here();
+                }
             }
         }
+    }
+
+    /// The chunk that was found by its shape, whatever its kind says.
+    fn chunk_here(&mut self) -> Result<Option<Framing>, RecordingError> {
+        let mut head = [0; HEAD_BYTES];
+        if self.at >= self.size || !self.fill(self.at, &mut head)? {
+            return Ok(None);
+        }
+        let [_, length @ ..] = head;
+        let length = u64::from_le_bytes(length);
+        let body = self.body(self.at, length)?;
+        Ok(Some(Framing { opcode: op::CHUNK, body, next: self.at + HEAD_BYTES as u64 + length }))
     }
 
     /// The kind and length of the record at a place, if there is one that ends within the file.

@@ -28,13 +28,45 @@ impl Source {
         Metadata { name: NAME.to_owned(), metadata }
     }
 
-    pub(crate) fn read(metadata: &Metadata) -> Option<Self> {
-        let field = |name: &str| metadata.metadata.get(name).cloned().unwrap_or_default();
-        (metadata.name == NAME).then(|| Self {
+    pub(crate) fn read(record: &Texts) -> Option<Self> {
+        let field = |name: &str| record.pairs.get(name).cloned().unwrap_or_default();
+        (record.name == NAME).then(|| Self {
             command: field("command"),
             version: field("version"),
             run: field("run"),
             host: field("host"),
         })
     }
+}
+
+/// A metadata record, read without believing what it says of its lengths: the library would reserve
+/// gigabytes for a damaged one.
+#[derive(Debug)]
+pub(crate) struct Texts {
+    pub(crate) name: String,
+    pub(crate) pairs: BTreeMap<String, String>,
+}
+
+impl Texts {
+    pub(crate) fn read(mut body: &[u8]) -> Option<Self> {
+        let name = text(&mut body)?;
+        let mut inside = bytes(&mut body)?;
+        let mut pairs = BTreeMap::new();
+        while !inside.is_empty() {
+            pairs.insert(text(&mut inside)?, text(&mut inside)?);
+        }
+        Some(Self { name, pairs })
+    }
+}
+
+/// Bytes that have their length before them.
+fn bytes<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
+    let (length, after) = rest.split_first_chunk::<4>()?;
+    let (bytes, after) = after.split_at_checked(u32::from_le_bytes(*length) as usize)?;
+    *rest = after;
+    Some(bytes)
+}
+
+fn text(rest: &mut &[u8]) -> Option<String> {
+    String::from_utf8(bytes(rest)?.to_vec()).ok()
 }

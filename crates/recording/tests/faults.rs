@@ -101,6 +101,20 @@ fn one_wrong_bit_anywhere_costs_one_chunk_at_most_and_is_said() {
 }
 
 #[test]
+fn a_chunk_that_says_it_is_something_else_is_known_by_its_shape() {
+    let whole = recording(100);
+    for (chunk, bit) in
+        chunks(&whole).into_iter().flat_map(|chunk| (0..8).map(move |bit| (chunk.clone(), bit)))
+    {
+        let mut bytes = whole.clone();
+        bytes[chunk.start] ^= 1 << bit;
+        let (entries, report) = read(&bytes).unwrap();
+        assert!(entries.len() >= 90, "byte {}, bit {bit}: {}", chunk.start, entries.len());
+        assert!(report.damage.is_some(), "byte {}, bit {bit}", chunk.start);
+    }
+}
+
+#[test]
 fn a_torn_file_whose_first_chunk_is_damaged_keeps_the_rest() {
     let whole = recording(100);
     let chunks = chunks(&whole);

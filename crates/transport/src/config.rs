@@ -79,10 +79,10 @@ pub enum Role {
 }
 
 fn is_endpoint(text: &str) -> bool {
-    let Some((_, port)) = text.strip_prefix("tcp/").and_then(|rest| rest.rsplit_once(':')) else {
+    let Some((host, port)) = text.strip_prefix("tcp/").and_then(|rest| rest.rsplit_once(':')) else {
         return false;
     };
-    port.parse::<u16>().is_ok_and(|port| port > 0)
+    !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0)
 }
 
 impl NetworkConfig {
@@ -93,6 +93,9 @@ impl NetworkConfig {
     pub fn validate(&self) -> Result<(), NetworkError> {
         if self.mode == Mode::Client && self.routers.is_empty() {
             return Err(NetworkError::NoRouter);
+        }
+        if let Some(router) = self.routers.iter().find(|router| !is_endpoint(router)) {
+            return Err(NetworkError::Endpoint { of: "routers".to_owned(), endpoint: router.clone() });
         }
         let mut seen: BTreeMap<&str, String> = BTreeMap::new();
         let fusion = std::iter::once(("fusion".to_owned(), &self.fusion));
@@ -165,6 +168,12 @@ mod tests {
         let mut bad = network();
         bad.fusion = "127.0.0.1:7450".into();
         assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { of, .. }) if of == "fusion"));
+        for endpoint in ["tcp/:7451", "tcp/a/b:7451", "udp/127.0.0.1:7451", "tcp/127.0.0.1:99999"] {
+            let bad = NetworkConfig { fusion: endpoint.into(), ..network() };
+            assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { .. })), "{endpoint}");
+            let bad = NetworkConfig { routers: vec![endpoint.into()], ..network() };
+            assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { .. })), "{endpoint}");
+        }
         let mut shared = network();
         shared.fusion = "tcp/127.0.0.1:7451".into();
         assert!(matches!(shared.validate(), Err(NetworkError::Shared { .. })));

@@ -1,5 +1,5 @@
-//! Zenoh: sessions by explicit endpoints, publishers that lose nothing or may
-//! drop, subscribers, liveliness, gap counters.
+//! Zenoh: sessions by explicit endpoints, publishers whom no slow receiver holds
+//! up, subscribers that count what they lost, liveliness.
 //!
 //! # Topology
 //!
@@ -11,16 +11,25 @@
 //!
 //! # Delivery
 //!
-//! Bearings, calibrations, tracks and events block the publisher rather than
-//! being dropped ([`Delivery::Every`]); pictures may be dropped
-//! ([`Delivery::MayDrop`]). A published message that nobody subscribes to is
-//! gone: file sources wait with [`Link::wait_for`] until those who must hear
-//! them are alive.
+//! Nobody's slowness holds another up: each receiver has a queue of its own in
+//! the publisher's session, and loses what does not fit ([`Delivery::Queued`]).
+//! Each message goes with the run that sent it and its number on its key
+//! ([`Origin`]), so that the receiver counts what it lost and notices a second
+//! publisher ([`Reception`]). Only what is played as fast as it goes waits for
+//! the slowest ([`Delivery::Every`]). A published message that nobody
+//! subscribes to is gone: file sources wait with [`Link::wait_for`] until
+//! those who must hear them are alive.
 
 mod config;
-mod gaps;
 mod link;
+mod origin;
+mod presence;
+mod reception;
+mod subscription;
 
 pub use config::{Mode, NetworkConfig, NetworkError, Role};
-pub use gaps::GapCounter;
-pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher, Received, Subscription};
+pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher};
+pub use origin::{Origin, RunId};
+pub use presence::Presence;
+pub use reception::Reception;
+pub use subscription::{Received, Refused, Subscription};

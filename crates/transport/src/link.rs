@@ -1,21 +1,37 @@
 use std::error::Error;
-use std::sync::Arc;
+use std::io;
+use std::net::TcpListener;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use crossfix_message::{Channel, Key, SiteName};
+use crossfix_message::{Channel, Key, MAX_MESSAGE_BYTES, SiteName};
 use thiserror::Error;
 use zenoh::liveliness::LivelinessToken;
-use zenoh::pubsub::{Publisher, Subscriber};
-use zenoh::qos::CongestionControl;
-use zenoh::sample::{Sample, SampleKind};
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
 
-use crate::{Mode, NetworkConfig, NetworkError, Role};
+use crate::subscription::Intake;
+use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
 
-/// Messages that wait for the program before new ones are dropped and counted.
-const QUEUE: usize = 1 << 16;
+/// Batches of 64 kB that wait for one slow receiver of bearings and tracks before it loses the next: 1 MB,
+/// the most that Zenoh takes. Half as much, and a burst of a thousand tracks is lost to a good receiver.
+const QUEUED_BATCHES: u32 = 16;
+/// The same of pictures: what a slow receiver sees is at most this much old.
+const PICTURE_BATCHES: u32 = 4;
+/// Bytes that the system holds for one receiver beyond that. Left to itself it takes four megabytes, and a
+/// receiver behind 5 kB a second would be told of tracks a quarter of an hour old before it loses one.
+const SEND_BUFFER_BYTES: u32 = 256 << 10;
+/// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three seconds.
+const OPEN_TIMEOUT_MS: u32 = 10_000;
+/// A peer that has not been heard for this long is gone, ms.
+const LEASE_MS: u32 = 3000;
+/// How long a session takes its leave of peers that do not listen.
+const CLOSE_PATIENCE: Duration = Duration::from_millis(500);
+/// How often a router that does not answer is tried.
+const RETRY_PERIOD: Duration = Duration::from_millis(500);
+
 /// How often a liveliness query is repeated while waiting.
 const ALIVE_PERIOD: Duration = Duration::from_millis(200);
 
@@ -34,6 +50,23 @@ pub enum LinkError {
         #[source]
         source: Box<dyn Error + Send + Sync>,
     },
+    /// An endpoint of our own that cannot be listened on.
+    #[error("cannot listen on {endpoint}: {}", why_not(source))]
+    Listen {
+        /// The endpoint.
+        endpoint: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// No router answers.
+    #[error("no Zenoh router answers at {}", routers.join(", "))]
+    NoRouter {
+        /// Where they were looked for.
+        routers: Vec<String>,
+        /// What Zenoh says.
+        #[source]
+        source: Box<dyn Error + Send + Sync>,
+    },
     /// Somebody did not come.
     #[error("`{0}` is not alive")]
     NotAlive(String),
@@ -44,22 +77,26 @@ fn zenoh(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> LinkError {
     move |source| LinkError::Zenoh { what, source }
 }
 
+/// What people can do about an endpoint that cannot be listened on.
+fn why_not(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::AddrInUse => "another program on this machine uses it".to_owned(),
+        io::ErrorKind::AddrNotAvailable => "it is no address of this machine".to_owned(),
+        io::ErrorKind::PermissionDenied => "ports below 1024 are the system's".to_owned(),
+        _ => format!("{error}: is the host's name right?"),
+    }
+}
+
 /// What becomes of a message when a receiver is slow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// The publisher waits.
+    /// It waits for that receiver, and if too many wait, that receiver loses it and counts it. Nobody
+    /// else is held up: for all that is published while life goes on.
+    Queued,
+    /// The publisher waits, and so do all other receivers: for sources that are played as fast as it goes.
     Every,
-    /// The message is dropped.
-    MayDrop,
-}
-
-/// A message that came over a key of Crossfix.
-#[derive(Clone, Debug)]
-pub struct Received {
-    /// The key.
-    pub key: Key,
-    /// The bytes.
-    pub data: Vec<u8>,
+    /// As queued, but behind everything else: pictures.
+    Picture,
 }
 
 /// A session with the site's network. Lost connections are made again by themselves.
@@ -67,6 +104,7 @@ pub struct Received {
 pub struct Link {
     session: Session,
     site: SiteName,
+    run: RunId,
 }
 
 fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
@@ -76,42 +114,77 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
         Mode::Peer => "peer",
         Mode::Client => "client",
     };
+    // A client is told at once that no router is there, and tries again itself: Zenoh would not come back.
+    let patience = match network.mode {
+        Mode::Peer => "-1",
+        Mode::Client => "0",
+    };
     let mut config = Config::default();
+    let queue = |priority: &str| format!("transport/link/tx/queue/size/{priority}");
     let settings = [
-        ("mode", format!("{mode:?}")),
+        ("mode".to_owned(), format!("{mode:?}")),
         // Always set: the default listens on all interfaces.
-        ("listen/endpoints", format!("{listen:?}")),
-        ("connect/endpoints", format!("{connect:?}")),
-        ("connect/timeout_ms", "-1".to_owned()),
-        ("connect/exit_on_failure", "false".to_owned()),
+        ("listen/endpoints".to_owned(), format!("{listen:?}")),
+        ("connect/endpoints".to_owned(), format!("{connect:?}")),
+        ("connect/timeout_ms".to_owned(), patience.to_owned()),
+        ("connect/exit_on_failure".to_owned(), "false".to_owned()),
         (
-            "connect/retry",
+            "connect/retry".to_owned(),
             "{period_init_ms: 200, period_max_ms: 1000, period_increase_factor: 1.5}".to_owned(),
         ),
-        ("transport/unicast/open_timeout", "2000".to_owned()),
-        ("transport/link/tx/lease", "3000".to_owned()),
-        ("transport/link/tx/queue/size/data", "8".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
+        ("transport/unicast/open_timeout".to_owned(), OPEN_TIMEOUT_MS.to_string()),
+        ("transport/link/tx/lease".to_owned(), LEASE_MS.to_string()),
+        (queue("data"), QUEUED_BATCHES.to_string()),
+        (queue("data_low"), PICTURE_BATCHES.to_string()),
+        ("transport/link/tcp/so_sndbuf".to_owned(), SEND_BUFFER_BYTES.to_string()),
+        // A longer message is given up before it is whole.
+        ("transport/link/rx/max_message_size".to_owned(), (2 * MAX_MESSAGE_BYTES).to_string()),
+        ("scouting/multicast/enabled".to_owned(), "false".to_owned()),
+        ("scouting/gossip/enabled".to_owned(), "false".to_owned()),
         // How long opening waits for peers that are not up yet.
-        ("scouting/delay", "200".to_owned()),
+        ("scouting/delay".to_owned(), "200".to_owned()),
     ];
     for (key, value) in settings {
-        config.insert_json5(key, &value).map_err(zenoh(format!("cannot set Zenoh's `{key}`")))?;
+        config.insert_json5(&key, &value).map_err(zenoh(format!("cannot set Zenoh's `{key}`")))?;
     }
     Ok(config)
 }
 
 impl Link {
-    /// Opens a session. Those it connects to need not be there yet.
+    /// Opens a session. Those it connects to need not be there yet, but for a router.
     ///
     /// # Errors
-    /// [`LinkError`] if the configuration is impossible or an endpoint is taken.
+    /// [`LinkError`] if the configuration is impossible, an endpoint cannot be listened on, or no router
+    /// answers.
     pub fn open(network: &NetworkConfig, role: &Role) -> Result<Self, LinkError> {
         let config = config(network, role)?;
-        let what = format!("cannot open a Zenoh session as {role:?}: is the endpoint taken?");
-        let session = zenoh::open(config).wait().map_err(zenoh(what))?;
-        Ok(Self { session, site: network.site.clone() })
+        let session = zenoh::open(config).wait().map_err(|source| explain(network, role, source))?;
+        // The first half of what Zenoh draws for every session.
+        let bytes = session.zid().to_le_bytes();
+        let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
+        Ok(Self { session, site: network.site.clone(), run: RunId(run) })
+    }
+
+    /// Opens a session, and tries again where no router answers for as long as `go_on` says.
+    ///
+    /// # Errors
+    /// [`LinkError`] of the last try.
+    pub fn open_while(
+        network: &NetworkConfig,
+        role: &Role,
+        mut go_on: impl FnMut(&LinkError) -> bool,
+    ) -> Result<Self, LinkError> {
+        loop {
+            match Self::open(network, role) {
+                Err(error @ LinkError::NoRouter { .. }) if go_on(&error) => std::thread::sleep(RETRY_PERIOD),
+                opened => return opened,
+            }
+        }
+    }
+
+    /// This session's run.
+    pub fn run(&self) -> RunId {
+        self.run
     }
 
     /// The site's name.
@@ -125,20 +198,22 @@ impl Link {
     /// [`LinkError::Zenoh`].
     pub fn publisher(&self, channel: Channel, delivery: Delivery) -> Result<LinkPublisher, LinkError> {
         let key = Key::new(self.site.clone(), channel).to_string();
-        let control = match delivery {
-            Delivery::Every => CongestionControl::Block,
-            Delivery::MayDrop => CongestionControl::Drop,
+        let (control, priority) = match delivery {
+            Delivery::Queued => (CongestionControl::Drop, Priority::Data),
+            Delivery::Every => (CongestionControl::Block, Priority::Data),
+            Delivery::Picture => (CongestionControl::Drop, Priority::DataLow),
         };
         let publisher = self
             .session
             .declare_publisher(key.clone())
             .congestion_control(control)
+            .priority(priority)
             .wait()
             .map_err(zenoh(format!("cannot publish on `{key}`")))?;
-        Ok(LinkPublisher { publisher })
+        Ok(LinkPublisher { publisher, run: self.run, published: AtomicU64::new(0) })
     }
 
-    /// Publishes one message on any key of any site: a replay.
+    /// Publishes one message on any key of any site, without saying who sends it, as other programs do.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -156,33 +231,28 @@ impl Link {
     /// # Errors
     /// [`LinkError::Zenoh`].
     pub fn subscribe(&self, expressions: &[String]) -> Result<Subscription, LinkError> {
-        let (sender, receiver) = sync_channel(QUEUE);
-        let dropped = Arc::new(AtomicU64::new(0));
-        let mut subscribers = Vec::new();
+        let (intake, mut subscription) = Intake::new();
         for expression in expressions {
-            let (sender, counter) = (sender.clone(), Arc::clone(&dropped));
-            // Runs on Zenoh's receiving thread: it must not wait for the program.
-            let forward = move |sample: Sample| {
-                if sample.kind() != SampleKind::Put {
-                    return;
-                }
-                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-                    return;
-                };
-                let data = sample.payload().to_bytes().into_owned();
-                if sender.try_send(Received { key, data }).is_err() {
-                    counter.fetch_add(1, Ordering::Relaxed);
-                }
-            };
+            let intake = intake.clone();
             let subscriber = self
                 .session
                 .declare_subscriber(expression.clone())
-                .callback(forward)
+                .callback(move |sample| intake.take(&sample))
                 .wait()
                 .map_err(zenoh(format!("cannot subscribe to `{expression}`")))?;
-            subscribers.push(subscriber);
+            subscription.add(subscriber);
         }
-        Ok(Subscription { receiver, dropped, _subscribers: subscribers })
+        Ok(subscription)
+    }
+
+    /// Watches who is there.
+    ///
+    /// # Errors
+    /// [`LinkError::Zenoh`].
+    pub fn presence(&self) -> Result<Presence, LinkError> {
+        let expression = Key::of_all_cameras(&self.site, "alive");
+        Presence::watch(&self.session, &expression)
+            .map_err(zenoh(format!("cannot watch who is there on `{expression}`")))
     }
 
     /// Says that this component is alive for as long as the token lives.
@@ -239,19 +309,44 @@ impl Link {
         Ok(())
     }
 
-    /// Sends what still waits and says goodbye.
+    /// Sends what still waits and says goodbye; gives up on peers that do not listen.
     ///
     /// # Errors
-    /// [`LinkError::Zenoh`] if that takes too long.
+    /// [`LinkError::Zenoh`] if Zenoh cannot close it.
     pub fn close(self) -> Result<(), LinkError> {
-        self.session.close().wait().map_err(zenoh("the Zenoh session did not close"))
+        let (done, closed) = channel();
+        // Its own patience is ten seconds, and not kept.
+        std::thread::spawn(move || done.send(self.session.close().wait()));
+        match closed.recv_timeout(CLOSE_PATIENCE) {
+            Ok(result) => result.map_err(zenoh("the Zenoh session did not close")),
+            Err(_) => {
+                tracing::debug!("a peer did not take what was sent to it last");
+                Ok(())
+            }
+        }
     }
+}
+
+/// Why a session did not open.
+fn explain(network: &NetworkConfig, role: &Role, source: zenoh::Error) -> LinkError {
+    if network.mode == Mode::Client {
+        return LinkError::NoRouter { routers: network.routers.clone(), source };
+    }
+    let listened = network.endpoints(role).map(|(listen, _)| listen).unwrap_or_default();
+    for endpoint in listened {
+        if let Err(source) = TcpListener::bind(endpoint.trim_start_matches("tcp/")) {
+            return LinkError::Listen { endpoint, source };
+        }
+    }
+    LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source }
 }
 
 /// Publishes on one key.
 #[derive(Debug)]
 pub struct LinkPublisher {
     publisher: Publisher<'static>,
+    run: RunId,
+    published: AtomicU64,
 }
 
 impl LinkPublisher {
@@ -260,8 +355,11 @@ impl LinkPublisher {
     /// # Errors
     /// [`LinkError::Zenoh`] if the session is closed.
     pub fn put(&self, data: Vec<u8>) -> Result<(), LinkError> {
-        let key = self.publisher.key_expr().to_string();
-        self.publisher.put(data).wait().map_err(zenoh(format!("cannot publish on `{key}`")))
+        let origin = Origin { run: self.run, sequence: self.published.fetch_add(1, Ordering::Relaxed) };
+        let put = self.publisher.put(data).attachment(origin.to_bytes());
+        put.wait().map_err(|source| {
+            zenoh(format!("cannot publish on `{}`", self.publisher.key_expr()))(source)
+        })
     }
 
     /// Whether anybody subscribes to it.
@@ -271,26 +369,6 @@ impl LinkPublisher {
     pub fn has_subscribers(&self) -> Result<bool, LinkError> {
         let status = self.publisher.matching_status().wait();
         status.map(|status| status.matching()).map_err(zenoh("cannot ask for subscribers"))
-    }
-}
-
-/// What comes in over a key expression.
-#[derive(Debug)]
-pub struct Subscription {
-    receiver: Receiver<Received>,
-    dropped: Arc<AtomicU64>,
-    _subscribers: Vec<Subscriber<()>>,
-}
-
-impl Subscription {
-    /// The next message, if one comes in time.
-    pub fn next(&self, patience: Duration) -> Option<Received> {
-        self.receiver.recv_timeout(patience).ok()
-    }
-
-    /// Messages that were dropped as this program was too slow.
-    pub fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What each thing looks like.
 
 use crossfix_geometry::{Camera, ImageSize};
-use crossfix_message::{BearingFrame, BearingTrack, Track, TrackState};
+use crossfix_message::{BearingFrame, BearingTrack, Track, TrackNumber, TrackState};
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 use rerun::{
     Arrows3D, Boxes2D, Color, Ellipsoids3D, FillMode, LineStrips3D, Pinhole, Points3D, Quaternion, Radius,
@@ -130,10 +130,11 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]])
     let path = format!("world/tracks/{}", track.id);
     let sure = track.state() == TrackState::Confirmed;
     let tint: Color = if sure { colour::of(track.id + 3) } else { colour::faint(track.id + 3, 110) };
+    let number = TrackNumber(track.id);
     let label = match track.state() {
-        TrackState::Tentative => format!("{}?", track.id),
-        TrackState::Coasting => format!("{} (coasting)", track.id),
-        _ => format!("{}  {:.0} m/s  {:.0} m", track.id, velocity.norm(), position.z),
+        TrackState::Tentative => format!("{number}?"),
+        TrackState::Coasting => format!("{number} (coasting)"),
+        _ => format!("{number}  {:.0} m/s  {:.0} m", velocity.norm(), position.z),
     };
     stream.log(
         format!("{path}/position"),

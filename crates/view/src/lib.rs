@@ -6,6 +6,7 @@
 //! the bytes of the wire. What it draws a second is bounded, so that a viewer
 //! left open does not fill the memory.
 
+mod arrivals;
 mod blueprint;
 mod colour;
 mod draw;
@@ -17,6 +18,6 @@ mod tracking;
 mod volume;
 
 pub use picture::Picture;
-pub use sink::{ViewError, connect, save, spawn_viewer};
+pub use sink::{ViewError, ViewerWatch, connect, save, save_without_end, spawn_viewer};
 pub use tracking::{FollowedTarget, ImageBox, Sight, TrackingPicture};
 pub use volume::{Landmark, VolumeCell, VolumePicture};

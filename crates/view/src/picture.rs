@@ -1,9 +1,10 @@
 use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, DecodeError, Preview, Timestamp, TrackEvent, TrackFrame,
-    TrackState, TruthFrame, decode,
+    TrackNumber, TrackState, TruthFrame, decode,
 };
 use nalgebra::Point3;
 use rerun::components::MediaType;
@@ -11,9 +12,10 @@ use rerun::{
     Clear, Color, EncodedImage, Points3D, Radius, RecordingStream, Scalars, TextLog, ViewCoordinates,
 };
 
+use crate::arrivals::Arrivals;
 use crate::limiter::Limiter;
 use crate::paths::{TIMELINE, image_path};
-use crate::{ViewError, blueprint, draw};
+use crate::{ViewError, ViewerWatch, blueprint, draw};
 
 /// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
 const PREVIEW_RATE_HZ: f64 = 5.0;
@@ -23,13 +25,24 @@ const TRACK_RATE_HZ: f64 = 15.0;
 const TRAIL_POINTS: usize = 150;
 /// Sight lines reach this far where no track says how far, m.
 const DEFAULT_REACH_M: f64 = 150.0;
-/// Bearings remembered for the latency plot.
-const MAX_ARRIVALS: usize = 10_000;
+/// A track that has not been heard of for this long is not drawn any more, s: each is said twice a
+/// second, so the fusion centre that held it is gone.
+const GHOST_S: f64 = 3.0;
 
 struct CameraView {
     index: u64,
     camera: Camera,
     scale: f64,
+    /// Of the calibration that is drawn.
+    hash: Vec<u8>,
+}
+
+/// Where a track is drawn.
+struct DrawnTrack {
+    time: Timestamp,
+    place: Point3<f64>,
+    /// When it was last heard of.
+    heard: Timestamp,
 }
 
 /// Draws what goes over the wire.
@@ -37,9 +50,10 @@ pub struct Picture {
     stream: RecordingStream,
     cameras: BTreeMap<String, CameraView>,
     trails: BTreeMap<u64, VecDeque<[f32; 3]>>,
-    drawn: BTreeMap<u64, (Timestamp, Point3<f64>)>,
+    drawn: BTreeMap<u64, DrawnTrack>,
     limiter: Limiter,
-    arrivals: BTreeMap<(String, u64), Timestamp>,
+    arrivals: Arrivals,
+    viewer: ViewerWatch,
 }
 
 impl Picture {
@@ -56,7 +70,8 @@ impl Picture {
             trails: BTreeMap::new(),
             drawn: BTreeMap::new(),
             limiter: Limiter::default(),
-            arrivals: BTreeMap::new(),
+            arrivals: Arrivals::default(),
+            viewer: ViewerWatch::default(),
         })
     }
 
@@ -93,6 +108,20 @@ impl Picture {
         self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
+    /// Waits a moment until everything is drawn, as a viewer that does not look must not hold us up.
+    ///
+    /// # Errors
+    /// [`ViewError::Flush`].
+    pub fn finish_within(self, patience: Duration) -> Result<(), ViewError> {
+        self.stream.flush_with_timeout(patience).map_err(|error| ViewError::Flush(error.to_string()))
+    }
+
+    /// Whether the viewer is gone for good; to be asked about once a second.
+    pub fn has_lost_its_viewer(&self) -> bool {
+        self.viewer.look(&self.stream);
+        self.viewer.is_gone()
+    }
+
     fn at(&self, time_ns: i64) -> Timestamp {
         self.stream.set_timestamp_nanos_since_epoch(TIMELINE, time_ns);
         Timestamp::from_nanos(time_ns)
@@ -110,9 +139,11 @@ impl Picture {
             index: known,
             camera: parsed.camera.clone(),
             scale: 1.0,
+            hash: Vec::new(),
         });
         view.camera = parsed.camera;
-        if new {
+        if new || view.hash != message.hash {
+            view.hash.clone_from(&message.hash);
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
             draw::residual_plot(&self.stream, &name, view.index)?;
             let place = |(name, view): (&String, &CameraView)| (name.clone(), view.camera.pose().position());
@@ -140,10 +171,8 @@ impl Picture {
     }
 
     fn bearings(&mut self, frame: &BearingFrame, arrival: Timestamp) -> Result<(), ViewError> {
-        self.arrivals.insert((frame.camera.clone(), frame.sequence), arrival);
-        while self.arrivals.len() > MAX_ARRIVALS {
-            self.arrivals.pop_first();
-        }
+        self.arrivals.note(&frame.camera, frame.sequence, arrival);
+        self.clear_ghosts(arrival)?;
         let time = self.at(frame.capture_time_ns);
         let Some(view) = self.cameras.get(&frame.camera) else {
             return Ok(());
@@ -153,7 +182,7 @@ impl Picture {
         }
         // As far as the farthest track, so that the crossings are seen.
         let origin = view.camera.pose().position();
-        let farthest = self.drawn.values().map(|(_, place)| (place - origin).norm()).fold(0.0, f64::max);
+        let farthest = self.drawn.values().map(|track| (track.place - origin).norm()).fold(0.0, f64::max);
         let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
         draw::bearings(&self.stream, frame, view.index, &view.camera, reach, view.scale)
     }
@@ -168,16 +197,17 @@ impl Picture {
             .map(|track| track.id)
             .collect();
         for id in ended {
-            self.trails.remove(&id);
-            if self.drawn.remove(&id).is_some() {
-                self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
-            }
+            self.clear(id)?;
         }
         for track in frame.tracks.iter().filter(|track| track.state() != TrackState::Lost) {
             let Some(position) = track.position else {
                 continue;
             };
-            let since = self.drawn.get(&track.id).map(|(then, _)| time.seconds_since(*then));
+            let drawn = self.drawn.get_mut(&track.id);
+            let since = drawn.map(|drawn| {
+                drawn.heard = arrival;
+                time.seconds_since(drawn.time)
+            });
             if since.is_some_and(|since| (0.0..TRACK_RATE_HZ.recip()).contains(&since)) {
                 continue;
             }
@@ -186,14 +216,29 @@ impl Picture {
             while trail.len() > TRAIL_POINTS {
                 trail.pop_front();
             }
-            self.drawn.insert(track.id, (time, position.into()));
+            self.drawn.insert(track.id, DrawnTrack { time, place: position.into(), heard: arrival });
             draw::track(&self.stream, track, trail.make_contiguous())?;
         }
         Ok(())
     }
 
+    /// Takes away the tracks of which nobody speaks any more.
+    fn clear_ghosts(&mut self, now: Timestamp) -> Result<(), ViewError> {
+        let silent = self.drawn.iter().filter(|(_, drawn)| now.seconds_since(drawn.heard) > GHOST_S);
+        let silent: Vec<u64> = silent.map(|(&id, _)| id).collect();
+        silent.into_iter().try_for_each(|id| self.clear(id))
+    }
+
+    fn clear(&mut self, id: u64) -> Result<(), ViewError> {
+        self.trails.remove(&id);
+        if self.drawn.remove(&id).is_some() {
+            self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
+        }
+        Ok(())
+    }
+
     fn plots(&mut self, frame: &TrackFrame, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
-        if let Some(bearing) = self.arrivals.remove(&(frame.camera.clone(), frame.camera_sequence)) {
+        if let Some(bearing) = self.arrivals.take(&frame.camera, frame.camera_sequence) {
             let latency = arrival.seconds_since(bearing) * 1e3;
             if latency > 0.0 && self.limiter.allows("latency", time, LINE_RATE_HZ) {
                 self.stream.log("plots/latency", &Scalars::single(latency))?;
@@ -217,8 +262,8 @@ impl Picture {
         self.at(event.time_ns);
         let what = event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_").to_lowercase();
         let text = match event.other_id {
-            0 => format!("track {} {what}", event.track_id),
-            other => format!("track {} {what} into {other}", event.track_id),
+            0 => format!("track {} {what}", TrackNumber(event.track_id)),
+            other => format!("track {} {what} into {}", TrackNumber(event.track_id), TrackNumber(other)),
         };
         Ok(self.stream.log("events", &TextLog::new(text))?)
     }

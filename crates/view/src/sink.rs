@@ -1,10 +1,18 @@
+use std::any::Any;
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rerun::log::ChunkBatcherConfig;
+use rerun::sink::{FileSink, FileSinkOptions, GrpcSink, GrpcSinkConnectionState};
 use rerun::{RecordingStream, RecordingStreamBuilder, RecordingStreamError, SpawnOptions};
 use thiserror::Error;
 
+/// Bytes on their way to a viewer, as Rerun reckons them (it takes several times as much), before
+/// drawing waits for it: some seconds of a site of three cameras.
+const MOST_IN_FLIGHT: u64 = 8 << 20;
 /// Most memory that a viewer started by us takes.
 const VIEWER_MEMORY: &str = "1GB";
 
@@ -23,6 +31,15 @@ pub enum ViewError {
     /// Nobody listens at the address.
     #[error("no Rerun viewer listens at {0}")]
     NobodyListens(SocketAddr),
+    /// The file cannot be made.
+    #[error("cannot write {}", path.display())]
+    Create {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What Rerun says.
+        #[source]
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// What was drawn did not all arrive.
     #[error("the picture is not complete: {0}")]
     Flush(String),
@@ -46,14 +63,54 @@ pub fn save(path: &Path) -> Result<RecordingStream, ViewError> {
     Ok(builder().save(path)?)
 }
 
-/// A picture in a viewer that listens at an address of this machine or another.
+/// A picture without an end that is written to an `.rrd` file. It has no index, which Rerun would keep in
+/// memory until the file's end and which grows by a gigabyte an hour.
+///
+/// # Errors
+/// [`ViewError`] if the file cannot be made.
+pub fn save_without_end(path: &Path) -> Result<RecordingStream, ViewError> {
+    let create = |source| ViewError::Create { path: path.to_owned(), source };
+    let sink = FileSink::with_options(path, FileSinkOptions { write_footer: false })
+        .map_err(|error| create(Box::new(error)))?;
+    let stream = builder().buffered()?;
+    stream.set_sink(Box::new(sink));
+    Ok(stream)
+}
+
+/// A picture in a viewer that listens at an address of this machine or another. A viewer that does not
+/// take the picture makes drawing wait; what waits is bounded.
 ///
 /// # Errors
 /// [`ViewError::NobodyListens`]: the stream would wait for ever.
 pub fn connect(address: SocketAddr) -> Result<RecordingStream, ViewError> {
     TcpStream::connect_timeout(&address, Duration::from_millis(500))
         .map_err(|_| ViewError::NobodyListens(address))?;
-    Ok(builder().connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
+    let bounded = ChunkBatcherConfig { max_bytes_in_flight: MOST_IN_FLIGHT, ..ChunkBatcherConfig::LOW_LATENCY };
+    Ok(builder().batcher_config(bounded).connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
+}
+
+/// Whether the viewer at the end of a stream is gone for good: Rerun does not connect again.
+#[derive(Clone, Debug, Default)]
+pub struct ViewerWatch(Arc<AtomicBool>);
+
+impl ViewerWatch {
+    /// Looks again. The answer comes when the stream's own thread has the time.
+    pub fn look(&self, stream: &RecordingStream) {
+        let gone = Arc::clone(&self.0);
+        stream.inspect_sink(move |sink| {
+            let sink: &dyn Any = sink;
+            if let Some(viewer) = sink.downcast_ref::<GrpcSink>()
+                && matches!(viewer.status(), GrpcSinkConnectionState::Disconnected(_))
+            {
+                gone.store(true, Ordering::Relaxed);
+            }
+        });
+    }
+
+    /// Whether it was gone when it was looked at last.
+    pub fn is_gone(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
 }
 
 /// Starts a viewer on this machine, with bounded memory, for this machine only; one that runs

@@ -2,17 +2,16 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use crossfix_fusion::{Fusion, Output};
-use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraName, Channel, Counter, DecodeError, Health, Key, Payload,
-    Timestamp, decode,
-};
-use crossfix_transport::{Delivery, GapCounter, Link, LinkPublisher, Received, Role};
+use crossfix_fusion::Output;
+use crossfix_message::{Channel, Key, Payload};
+use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Role, Subscription};
 
-use crate::commands::rejections::{RejectionLog, camera_health, report_camera};
+use crate::centre::Centre;
 use crate::config::{self, FusionFile};
+use crate::lookout::Lookout;
+use crate::network::{self, rivalry};
 use crate::output;
-use crate::shutdown::Shutdown;
+use crate::shutdown::{LAST_WORDS, Shutdown};
 
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(20);
@@ -24,7 +23,7 @@ pub struct Args {
     /// The fusion centre's configuration (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Override a key of the configuration, e.g. tracking.acceleration_density=2.
+    /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
     /// Stop when stdin ends.
@@ -32,21 +31,15 @@ pub struct Args {
     stop_with_stdin: bool,
 }
 
-/// What the fusion centre has open.
-struct Centre {
-    fusion: Fusion,
-    cameras: Vec<CameraName>,
+/// The fusion centre on its network.
+struct Station {
+    centre: Centre,
+    link: Link,
     tracks: LinkPublisher,
     events: LinkPublisher,
     health: LinkPublisher,
-    gaps: GapCounter,
-    rejections: RejectionLog,
-    malformed: u64,
-    newer: u64,
-    foreign: u64,
-    mismatched: u64,
-    frames: u64,
-    now: Timestamp,
+    reception: Reception,
+    lookout: Lookout,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -56,218 +49,112 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         format!("{}: key `network` is missing: name the network file", args.config.display())
     })?;
     let network = config::load_network(network)?;
-    let link = Link::open(&network, &Role::Fusion)?;
     let cameras = file.cameras.clone().unwrap_or_else(|| network.cameras.keys().cloned().collect());
-    let mut centre = Centre {
-        fusion: Fusion::new(file.fusion())?,
-        cameras,
-        tracks: link.publisher(Channel::Tracks, Delivery::Every)?,
-        events: link.publisher(Channel::Events, Delivery::Every)?,
-        health: link.publisher(Channel::FusionHealth, Delivery::Every)?,
-        gaps: GapCounter::default(),
-        rejections: RejectionLog::default(),
-        malformed: 0,
-        newer: 0,
-        foreign: 0,
-        mismatched: 0,
-        frames: 0,
-        now: Timestamp::EPOCH,
+    let Some(link) = network::open(&network, &Role::Fusion, &shutdown)? else {
+        return Ok(());
+    };
+    let lookout = Lookout::for_cameras(&link, &network, &cameras)?;
+    let mut station = Station {
+        centre: Centre::new(file.fusion(), Some(cameras))?,
+        tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
+        events: link.publisher(Channel::Events, Delivery::Queued)?,
+        health: link.publisher(Channel::FusionHealth, Delivery::Queued)?,
+        reception: Reception::default(),
+        lookout,
+        link,
     };
     let kinds = ["bearings", "calibration", "health"];
-    let subscription = link.subscribe(&kinds.map(|kind| Key::of_all_cameras(link.site(), kind)))?;
-    let alive = link.declare_alive(Channel::FusionAlive)?;
-    tracing::info!("the fusion centre of `{}` is up", link.site());
+    let site = station.link.site().clone();
+    let mut subscription = station.link.subscribe(&kinds.map(|kind| Key::of_all_cameras(&site, kind)))?;
+    let alive = station.link.declare_alive(Channel::FusionAlive)?;
+    tracing::info!("the fusion centre of `{site}` is up, run {}", station.link.run());
 
-    let mut healthy_at = Instant::now();
-    while !shutdown.requested() {
-        if let Some(received) = subscription.next(POLL) {
-            centre.take(&received)?;
-        }
-        if healthy_at.elapsed() >= HEALTH_PERIOD {
-            healthy_at = Instant::now();
-            centre.say_health(subscription.dropped(), false)?;
-        }
-    }
-    // What has arrived is still handled: a stop loses nothing.
-    while let Some(received) = subscription.next(POLL) {
-        centre.take(&received)?;
-    }
-    let last = centre.fusion.flush();
-    centre.publish(last)?;
-    centre.say_health(subscription.dropped(), true)?;
-    let frames = centre.frames;
-    drop((alive, subscription, centre));
+    station.work(&subscription, &shutdown)?;
+    station.finish(&mut subscription, &shutdown)?;
+    let frames = station.centre.frames();
+    let Station { link, tracks, events, health, lookout, .. } = station;
+    drop((alive, subscription, tracks, events, health, lookout));
     link.close()?;
     output::line(format!("fusion centre: {frames} track frames published"));
     Ok(())
 }
 
-/// A message that names the camera that it is of.
-trait OfCamera: Payload {
-    fn camera(&self) -> &str;
-}
-
-impl OfCamera for BearingFrame {
-    fn camera(&self) -> &str {
-        &self.camera
-    }
-}
-
-impl OfCamera for CameraCalibration {
-    fn camera(&self) -> &str {
-        &self.camera
-    }
-}
-
-/// Why a message is not used.
-#[derive(Debug, thiserror::Error)]
-enum Unread {
-    #[error(transparent)]
-    Decode(DecodeError),
-    #[error("a message under the key of camera `{key}` says that it is of `{message}`")]
-    Mismatched { key: CameraName, message: String },
-}
-
-/// Reads a message that came under a camera's key: what a transport lets a camera send is of that
-/// camera and of no other.
-fn read_of<M: OfCamera>(camera: &CameraName, data: &[u8]) -> Result<M, Unread> {
-    let message: M = decode(data).map_err(Unread::Decode)?;
-    if message.camera() == camera.as_str() {
-        return Ok(message);
-    }
-    let said = message.camera().chars().take(100).collect();
-    Err(Unread::Mismatched { key: camera.clone(), message: said })
-}
-
-impl Centre {
-    fn take(&mut self, received: &Received) -> anyhow::Result<()> {
-        let outputs = match &received.key.channel {
-            Channel::Bearings(camera) | Channel::Calibration(camera) | Channel::CameraHealth(camera)
-                if !self.cameras.contains(camera) =>
-            {
-                if self.foreign == 0 {
-                    tracing::warn!(
-                        "camera `{camera}` is not configured here: not used, and counted from now on"
-                    );
-                }
-                self.foreign += 1;
-                return Ok(());
+impl Station {
+    fn work(&mut self, subscription: &Subscription, shutdown: &Shutdown) -> anyhow::Result<()> {
+        let mut healthy_at = Instant::now();
+        while !shutdown.requested() {
+            if let Some(received) = subscription.next(POLL) {
+                self.take(&received)?;
             }
-            Channel::Calibration(camera) => {
-                if let Some(message) = self.used(read_of::<CameraCalibration>(camera, &received.data))
-                    && let Err(error) = self.fusion.calibrate(&message)
-                {
-                    tracing::warn!("a calibration was not used: {error}");
-                }
-                return Ok(());
-            }
-            Channel::Bearings(camera) => {
-                let Some(frame) = self.used(read_of::<BearingFrame>(camera, &received.data)) else {
-                    return Ok(());
-                };
-                let missing = self.gaps.see(camera.as_str(), frame.sequence);
-                if missing > 0 {
-                    tracing::warn!(
-                        "{missing} frames of camera `{camera}` are missing before {}",
-                        frame.sequence
-                    );
-                }
-                self.fusion.ingest(&frame)
-            }
-            Channel::CameraHealth(camera) => {
-                match self.used(decode::<Health>(&received.data).map_err(Unread::Decode)) {
-                    Some(health) if health.ended => self.fusion.camera_ended(camera),
-                    _ => return Ok(()),
-                }
-            }
-            _ => return Ok(()),
-        };
-        self.publish(outputs)
-    }
-
-    /// A message that was read, or `None` and why not is counted.
-    fn used<M>(&mut self, read: Result<M, Unread>) -> Option<M> {
-        let error = match read {
-            Ok(message) => return Some(message),
-            Err(error) => error,
-        };
-        let counter = match error {
-            Unread::Decode(DecodeError::Malformed { .. }) => &mut self.malformed,
-            Unread::Decode(DecodeError::NewerMajor { .. }) => &mut self.newer,
-            Unread::Mismatched { .. } => &mut self.mismatched,
-        };
-        if *counter == 0 {
-            tracing::warn!("{error}; not used, and counted from now on");
-        }
-        *counter += 1;
-        None
-    }
-
-    fn publish(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
-        for output in outputs {
-            match output {
-                Output::Tracks(frame) => {
-                    self.now = Timestamp::from_nanos(frame.time_ns);
-                    self.frames += 1;
-                    self.tracks.put(frame.encode())?;
-                }
-                Output::Event(event) => {
-                    tracing::info!("track {} {}", event.track_id, event.kind().as_str_name());
-                    self.events.put(event.encode())?;
-                }
-                Output::Rejected(rejection) => self.rejections.report(&rejection),
-                Output::Camera(camera, standing) => report_camera(&camera, standing),
+            if healthy_at.elapsed() >= HEALTH_PERIOD {
+                healthy_at = Instant::now();
+                self.lookout.look(healthy_at);
+                self.centre.remind(healthy_at);
+                self.say_health(subscription, false)?;
             }
         }
         Ok(())
     }
 
-    fn say_health(&self, dropped: u64, ended: bool) -> anyhow::Result<()> {
-        let own = [
-            ("received_dropped", dropped),
-            ("received_foreign_camera", self.foreign),
-            ("received_malformed", self.malformed),
-            ("received_mismatched", self.mismatched),
-            ("received_missing", self.gaps.missing()),
-            ("received_newer_version", self.newer),
-        ];
-        let mut counters: Vec<Counter> = own
-            .into_iter()
-            .chain(self.fusion.counters().iter())
-            .map(|(name, value)| Counter { name: name.to_owned(), value })
-            .collect();
-        counters.sort_by(|a, b| a.name.cmp(&b.name));
-        let health = Health {
-            component: "fusion".to_owned(),
-            time_ns: self.now.nanos(),
-            handled: self.frames,
-            counters,
-            cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
-            ended,
-            ..Default::default()
-        };
-        Ok(self.health.put(health.encode())?)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_comes_under_one_cameras_key_speaks_for_no_other() {
-        let [north, east]: [CameraName; 2] = ["north", "east"].map(|name| name.parse().unwrap());
-        let frame = BearingFrame { camera: "north".into(), ..Default::default() }.encode();
-        let calibration = CameraCalibration { camera: "north".into(), ..Default::default() }.encode();
-        assert!(read_of::<BearingFrame>(&north, &frame).is_ok());
-        assert!(read_of::<CameraCalibration>(&north, &calibration).is_ok());
-        let refused = [
-            read_of::<BearingFrame>(&east, &frame).map(drop),
-            read_of::<CameraCalibration>(&east, &calibration).map(drop),
-        ];
-        for result in refused {
-            assert!(matches!(&result, Err(Unread::Mismatched { message, .. }) if message == "north"));
+    /// Handles what is on its way, for a moment, and what waits.
+    fn finish(&mut self, subscription: &mut Subscription, shutdown: &Shutdown) -> anyhow::Result<()> {
+        while !shutdown.overdue(LAST_WORDS)
+            && let Some(received) = subscription.next(POLL)
+        {
+            self.take(&received)?;
         }
-        assert!(matches!(read_of::<BearingFrame>(&north, &[0xff; 40]), Err(Unread::Decode(_))));
+        subscription.stop();
+        let last = self.centre.flush();
+        self.publish(last)?;
+        self.say_health(subscription, true)
+    }
+
+    fn take(&mut self, received: &Received) -> anyhow::Result<()> {
+        let Received { key, data, origin, at } = received;
+        if let Some(origin) = *origin {
+            let missing = self.reception.see(key, origin, *at);
+            if missing > 0 {
+                self.centre.warn(&format!("missing {key}"), || {
+                    format!("{missing} messages on `{key}` were lost on the way from run {}", origin.run)
+                });
+            }
+        }
+        let sender = origin.map_or_else(|| " from an unknown program".to_owned(), |o| format!(" from run {}", o.run));
+        let outputs = self.centre.take(&key.channel, data, &sender);
+        self.publish(outputs)
+    }
+
+    fn publish(&self, outputs: Vec<Output>) -> anyhow::Result<()> {
+        for output in outputs {
+            match output {
+                Output::Tracks(frame) => self.tracks.put(frame.encode())?,
+                Output::Event(event) => {
+                    let number = crossfix_message::TrackNumber(event.track_id);
+                    tracing::info!("track {number} {}", event.kind().as_str_name());
+                    self.events.put(event.encode())?;
+                }
+                Output::Rejected(_) | Output::Camera(..) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn say_health(&mut self, subscription: &Subscription, ended: bool) -> anyhow::Result<()> {
+        let refused = subscription.refused();
+        let mut health = self.centre.health(&[
+            ("received_dropped", refused.dropped),
+            ("received_missing", self.reception.missing()),
+            ("received_too_long", refused.too_long),
+        ]);
+        health.ended = ended;
+        health.run = self.link.run().0;
+        health.host = network::host();
+        health.present = self.lookout.cameras_here();
+        for (key, runs) in self.reception.rivals(Instant::now()) {
+            let rivalry = rivalry(key, runs);
+            self.centre.warn(&format!("rivals {key}"), || rivalry.clone());
+            health.problems.push(rivalry);
+        }
+        Ok(self.health.put(health.encode())?)
     }
 }

@@ -10,7 +10,9 @@ use crossfix_geometry::{Camera, Geodetic};
 use nalgebra::Point3;
 
 use self::report::Report;
-use crate::{config, output};
+use crate::commands::numbers::{not_negative, number, positive};
+use crate::output::{self, Draft};
+use crate::config;
 
 /// Frames a second of a camera whose file does not say.
 const DEFAULT_RATE_HZ: f64 = 30.0;
@@ -79,19 +81,6 @@ pub struct Args {
     /// Write the coloured volume as a picture for Rerun (.rrd).
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-}
-
-fn number(text: &str) -> Result<f64, String> {
-    let number: f64 = text.trim().parse().map_err(|_| format!("`{text}` is no number"))?;
-    if number.is_finite() { Ok(number) } else { Err(format!("`{text}` is not finite")) }
-}
-
-fn positive(text: &str) -> Result<f64, String> {
-    number(text).and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
-}
-
-fn not_negative(text: &str) -> Result<f64, String> {
-    number(text).and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
 }
 
 fn window(text: &str) -> Result<f64, String> {
@@ -164,11 +153,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     if let (Some(path), Some(anchor)) = (&args.geojson, args.anchor) {
         let json = serde_json::to_vec(&geojson::collection(&report, &cameras, anchor))?;
-        std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
+        output::write_file(path, &[], &json)?;
         tracing::info!("map written to {}", path.display());
     }
     if let Some(path) = &args.save {
-        picture::draw(&report, &cameras, path)?;
+        let draft = Draft::new(path, &[])?;
+        picture::draw(&report, &cameras, draft.path())?;
+        draft.keep()?;
         tracing::info!("picture written to {0}; look at it with: rerun {0}", path.display());
     }
     Ok(())
@@ -182,7 +173,6 @@ mod tests {
     fn numbers_are_read_or_refused() {
         assert_eq!(triple("-80, -80,10"), Ok([-80.0, -80.0, 10.0]));
         assert!(triple("1,2").is_err() && triple("1,2,x").is_err() && triple("1,2,NaN").is_err());
-        assert!(positive("0").is_err() && not_negative("0").is_ok() && not_negative("-1").is_err());
         assert!(window("61").is_err());
         assert!(anchor("95,0,0").unwrap_err().contains("latitude"));
     }

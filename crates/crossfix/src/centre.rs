@@ -1,0 +1,307 @@
+//! The fusion as its two shells need it, live and offline: what comes in is read, refused, counted and
+//! said in one way.
+
+use std::time::Instant;
+
+use crossfix_fusion::{CameraReport, CameraStanding, ConfigError, Fusion, FusionConfig, Output};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, CameraHealth, CameraName, Channel, Counter, DecodeError, Health,
+    Payload, Timestamp, decode,
+};
+
+use crate::repeats::Repeats;
+
+/// The fusion with its doorkeeper.
+pub struct Centre {
+    fusion: Fusion,
+    /// Whom it listens to; `None`: to everybody.
+    cameras: Option<Vec<CameraName>>,
+    refused: Refusals,
+    repeats: Repeats,
+    frames: u64,
+    now: Timestamp,
+    scene_begins: Timestamp,
+}
+
+/// What was turned away before it came to the fusion.
+#[derive(Debug, Default)]
+struct Refusals {
+    malformed: u64,
+    too_large: u64,
+    newer: u64,
+    foreign: u64,
+    mismatched: u64,
+    bad_calibrations: u64,
+}
+
+/// A message that names the camera that it is of.
+trait OfCamera: Payload {
+    fn camera(&self) -> &str;
+}
+
+impl OfCamera for BearingFrame {
+    fn camera(&self) -> &str {
+        &self.camera
+    }
+}
+
+impl OfCamera for CameraCalibration {
+    fn camera(&self) -> &str {
+        &self.camera
+    }
+}
+
+impl OfCamera for Health {
+    fn camera(&self) -> &str {
+        &self.component
+    }
+}
+
+/// Why a message is not used.
+#[derive(Debug, thiserror::Error)]
+enum Unread {
+    #[error(transparent)]
+    Decode(DecodeError),
+    #[error("it says that it is of `{message}`")]
+    Mismatched { message: String },
+}
+
+/// Reads a message that came under a camera's key: what a transport lets a camera send is of that
+/// camera and of no other.
+fn read_of<M: OfCamera>(camera: &CameraName, data: &[u8]) -> Result<M, Unread> {
+    let message: M = decode(data).map_err(Unread::Decode)?;
+    if message.camera() == camera.as_str() {
+        return Ok(message);
+    }
+    Err(Unread::Mismatched { message: message.camera().chars().take(100).collect() })
+}
+
+impl Centre {
+    /// A fusion that listens to some cameras, or to all.
+    pub fn new(config: FusionConfig, cameras: Option<Vec<CameraName>>) -> Result<Self, ConfigError> {
+        Ok(Self {
+            fusion: Fusion::new(config)?,
+            cameras,
+            refused: Refusals::default(),
+            repeats: Repeats::default(),
+            frames: 0,
+            now: Timestamp::EPOCH,
+            scene_begins: Timestamp::EPOCH,
+        })
+    }
+
+    /// Takes a message in and returns what follows from it. `sender` is for the warning, where there is
+    /// something to warn of.
+    pub fn take(&mut self, channel: &Channel, data: &[u8], sender: &str) -> Vec<Output> {
+        let Some(camera) = channel.camera() else {
+            return Vec::new();
+        };
+        if self.cameras.as_ref().is_some_and(|cameras| !cameras.contains(camera)) {
+            self.refused.foreign += 1;
+            self.repeats.warn("foreign", Instant::now(), || {
+                format!("camera `{camera}`{sender} is not configured here: not used")
+            });
+            return Vec::new();
+        }
+        let outputs = match channel {
+            Channel::Bearings(_) => match self.used(camera, read_of::<BearingFrame>(camera, data), sender) {
+                Some(frame) => self.fusion.ingest(&frame),
+                None => Vec::new(),
+            },
+            Channel::Calibration(_) => {
+                self.calibrate(camera, data, sender);
+                Vec::new()
+            }
+            Channel::CameraHealth(_) => match self.used(camera, read_of::<Health>(camera, data), sender) {
+                Some(health) => self.hear_of(camera, &health),
+                None => Vec::new(),
+            },
+            _ => Vec::new(),
+        };
+        self.follow(outputs)
+    }
+
+    /// Takes a calibration in. An impossible one is counted, and what was known of the camera stays.
+    fn calibrate(&mut self, camera: &CameraName, data: &[u8], sender: &str) {
+        let read = read_of::<CameraCalibration>(camera, data);
+        let Some(message) = self.used(camera, read, sender) else {
+            return;
+        };
+        if let Err(error) = self.fusion.calibrate(&message) {
+            self.refused.bad_calibrations += 1;
+            self.repeats.warn(&format!("calibration {camera}"), Instant::now(), || {
+                let cause = std::error::Error::source(&error).map(|source| format!(": {source}"));
+                format!("not used{sender}: {error}{}", cause.unwrap_or_default())
+            });
+        }
+    }
+
+    fn hear_of(&mut self, camera: &CameraName, health: &Health) -> Vec<Output> {
+        if health.scene_begins_ns != 0 {
+            self.scene_begins = Timestamp::from_nanos(health.scene_begins_ns);
+        }
+        if health.ended { self.fusion.camera_ended(camera) } else { Vec::new() }
+    }
+
+    /// A message that was read, or `None` and why not is counted.
+    fn used<M>(&mut self, camera: &CameraName, read: Result<M, Unread>, sender: &str) -> Option<M> {
+        let error = match read {
+            Ok(message) => return Some(message),
+            Err(error) => error,
+        };
+        let (counter, kind) = match error {
+            Unread::Decode(DecodeError::Malformed { .. }) => (&mut self.refused.malformed, "malformed"),
+            Unread::Decode(DecodeError::TooLarge { .. }) => (&mut self.refused.too_large, "too large"),
+            Unread::Decode(DecodeError::NewerMajor { .. }) => (&mut self.refused.newer, "newer"),
+            Unread::Mismatched { .. } => (&mut self.refused.mismatched, "mismatched"),
+        };
+        *counter += 1;
+        self.repeats.warn(&format!("{kind} {camera}"), Instant::now(), || {
+            format!("a message under the key of camera `{camera}`{sender} is not used: {error}")
+        });
+        None
+    }
+
+    /// Handles everything that still waits.
+    pub fn flush(&mut self) -> Vec<Output> {
+        let outputs = self.fusion.flush();
+        self.follow(outputs)
+    }
+
+    /// Keeps count of what the fusion says, and says to people what is theirs.
+    fn follow(&mut self, outputs: Vec<Output>) -> Vec<Output> {
+        for output in &outputs {
+            match output {
+                Output::Tracks(frame) => {
+                    self.now = Timestamp::from_nanos(frame.time_ns);
+                    self.frames += 1;
+                }
+                Output::Rejected(rejection) => {
+                    let kind = format!("{} {}", rejection.camera, rejection.reason.counter());
+                    self.repeats.warn(&kind, Instant::now(), || format!("not used: {rejection}"));
+                }
+                Output::Camera(camera, standing) => report_camera(camera, *standing),
+                Output::Event(_) => {}
+            }
+        }
+        outputs
+    }
+
+    /// What its warnings still have to say.
+    pub fn remind(&mut self, now: Instant) {
+        self.repeats.remind(now);
+    }
+
+    /// What it was asked to warn of.
+    pub fn warn(&mut self, kind: &str, text: impl FnOnce() -> String) {
+        self.repeats.warn(kind, Instant::now(), text);
+    }
+
+    /// Track frames so far.
+    pub fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    /// Data time of the newest of them.
+    pub fn now(&self) -> Timestamp {
+        self.now
+    }
+
+    /// What it says of itself; the shell adds what the transport has counted, in `counted`.
+    pub fn health(&self, counted: &[(&str, u64)]) -> Health {
+        let refused = &self.refused;
+        let own = [
+            ("received_bad_calibration", refused.bad_calibrations),
+            ("received_foreign_camera", refused.foreign),
+            ("received_malformed", refused.malformed),
+            ("received_mismatched", refused.mismatched),
+            ("received_newer_version", refused.newer),
+            ("received_too_large", refused.too_large),
+        ];
+        let counted = own.into_iter().chain(counted.iter().copied()).chain(self.fusion.counters().iter());
+        let counters = counted.map(|(name, value)| Counter { name: name.to_owned(), value });
+        let mut counters: Vec<Counter> = counters.collect();
+        counters.sort_by(|a, b| a.name.cmp(&b.name));
+        let left_out = self.fusion.cameras().filter(|report| report.standing == CameraStanding::Excluded);
+        let problems = left_out.map(|report| format!("camera `{}` is left out", report.camera));
+        Health {
+            component: "fusion".to_owned(),
+            time_ns: self.now.nanos(),
+            handled: self.frames,
+            counters,
+            cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
+            problems: problems.collect(),
+            scene_begins_ns: self.scene_begins.nanos(),
+            ..Default::default()
+        }
+    }
+}
+
+/// Says that a camera is left out, or used again.
+fn report_camera(camera: &CameraName, standing: CameraStanding) {
+    if standing == CameraStanding::Excluded {
+        tracing::warn!(
+            "camera `{camera}` is left out: its bearings do not fit the tracks that the others hold; check its pose and its clock"
+        );
+    } else {
+        tracing::info!("camera `{camera}` is used again: its bearings fit the tracks");
+    }
+}
+
+/// A camera's report as it goes over the wire.
+fn camera_health(report: &CameraReport) -> CameraHealth {
+    let standing = match report.standing {
+        CameraStanding::Good => crossfix_message::CameraStanding::Good,
+        CameraStanding::Doubted => crossfix_message::CameraStanding::Doubted,
+        CameraStanding::Excluded => crossfix_message::CameraStanding::Excluded,
+    };
+    let clock = report.clock;
+    CameraHealth {
+        camera: report.camera.to_string(),
+        standing: standing.into(),
+        noise_factor: report.noise_factor,
+        clock_offset_s: clock.map_or(0.0, |c| c.offset_s),
+        clock_offset_sd_s: clock.map_or(0.0, |c| c.sd_s),
+        clock_relative_sd_s: clock.map_or(0.0, |c| c.relative_sd_s),
+        clock_drift: clock.map_or(0.0, |c| c.drift),
+        clock_drift_sd: clock.map_or(0.0, |c| c.drift_sd),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn count(centre: &Centre, name: &str) -> u64 {
+        centre.health(&[]).counters.iter().find(|counter| counter.name == name).map_or(0, |c| c.value)
+    }
+
+    #[test]
+    fn what_comes_under_one_cameras_key_speaks_for_no_other() {
+        let [north, east]: [CameraName; 2] = ["north", "east"].map(|name| name.parse().unwrap());
+        let mut centre = Centre::new(FusionConfig::default(), None).unwrap();
+        let frame = BearingFrame { camera: "north".into(), ..Default::default() }.encode();
+        let calibration = CameraCalibration { camera: "north".into(), ..Default::default() }.encode();
+        let ended = Health { component: "north".into(), ended: true, ..Default::default() }.encode();
+        let mut take = |channel: Channel, data: &[u8]| drop(centre.take(&channel, data, ""));
+        take(Channel::Bearings(north.clone()), &frame);
+        take(Channel::Bearings(east.clone()), &frame);
+        take(Channel::Calibration(east.clone()), &calibration);
+        take(Channel::CameraHealth(east), &ended);
+        take(Channel::Bearings(north.clone()), &[0xff; 40]);
+        take(Channel::Calibration(north), &calibration);
+        assert_eq!(count(&centre, "received_mismatched"), 3);
+        assert_eq!(count(&centre, "received_malformed"), 1);
+        assert_eq!(count(&centre, "received_bad_calibration"), 1);
+        assert_eq!(count(&centre, "frames"), 1);
+    }
+
+    #[test]
+    fn cameras_that_are_not_configured_are_counted() {
+        let [north, east]: [CameraName; 2] = ["north", "east"].map(|name| name.parse().unwrap());
+        let mut centre = Centre::new(FusionConfig::default(), Some(vec![north])).unwrap();
+        let frame = BearingFrame { camera: "east".into(), ..Default::default() }.encode();
+        centre.take(&Channel::Bearings(east), &frame, "");
+        assert_eq!(count(&centre, "received_foreign_camera"), 1);
+    }
+}

@@ -1,0 +1,391 @@
+mod simulated;
+mod start;
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use crossfix_message::{BearingFrame, Channel, Counter, Health, Payload, Timestamp};
+use crossfix_transport::{Delivery, Link, LinkPublisher, NetworkConfig, Role};
+use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
+use crossfix_vision::ImageTracker;
+
+use self::simulated::{SimulatedSource, TruthPublisher};
+use self::start::Start;
+use crate::commands::numbers;
+use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
+use crate::eye::{CameraIdentity, brightness};
+use crate::network;
+use crate::output;
+use crate::recorded::{self, Lacks};
+use crate::repeats::Repeats;
+use crate::shutdown::Shutdown;
+
+pub use self::simulated::truth_frame;
+
+/// How often the calibration is said again, for those who came late.
+const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
+/// How often the agent says how it does.
+const HEALTH_PERIOD: Duration = Duration::from_secs(1);
+/// An agent that is this far behind its source is too slow for it: the fusion centre waits half a second.
+const BEHIND: Duration = Duration::from_millis(500);
+
+/// Run one camera host: find and follow targets, publish their bearings.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix agent -c configs/site/north.toml")]
+pub struct Args {
+    /// The camera's configuration (TOML).
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Override a key of the configuration, e.g. preview.rate_hz=0.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    sets: Vec<String>,
+    /// Begin without waiting for the fusion centre and the other cameras.
+    #[arg(long)]
+    no_wait: bool,
+    /// Wait for the recorder as well.
+    #[arg(long)]
+    wait_for_recorder: bool,
+    /// When the source begins, seconds since the Unix epoch: the same for all agents of a replay. Without,
+    /// agents of files and scenes wait for each other, and one that is late joins those that play.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::wall_time)]
+    start_at: Option<f64>,
+    /// Stop when stdin ends.
+    #[arg(long, hide = true)]
+    stop_with_stdin: bool,
+}
+
+/// What an agent has open.
+struct Agent {
+    identity: CameraIdentity,
+    calibration: Vec<u8>,
+    link: Link,
+    bearings: LinkPublisher,
+    calibrations: LinkPublisher,
+    health: LinkPublisher,
+    previews: LinkPublisher,
+    calibrated_at: Option<Instant>,
+    healthy_at: Option<Instant>,
+    frames: u64,
+    bad_frames: u64,
+    unseen_bearings: u64,
+    behind: Duration,
+    scene_begins: Timestamp,
+    now: Timestamp,
+    repeats: Repeats,
+    shutdown: Shutdown,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let file = CameraFile::load(&args.config, &args.sets)?;
+    let camera = file.camera(&args.config)?;
+    let network = config::load_network(&file.network)?;
+    let identity = CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
+    let begins = source_begins(&file)?;
+    let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
+        return Ok(());
+    };
+    let _alive = link.declare_alive(Channel::Alive(file.name.clone()))?;
+    let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
+    let Some(start) = agent.begin(args, &file, &network, begins)? else {
+        return agent.finish(Ok(()));
+    };
+    let seen = agent.look(&file, begins, &start);
+    agent.finish(seen)
+}
+
+/// The data time at which a source begins; that of a scene is when it is started.
+fn source_begins(file: &CameraFile) -> anyhow::Result<Timestamp> {
+    match &file.source {
+        SourceConfig::Recording { path, .. } => first_bearing(path),
+        SourceConfig::Video { start_s, .. } => Ok(Timestamp::from_seconds(*start_s)),
+        SourceConfig::Simulation { .. } => Ok(Timestamp::EPOCH),
+    }
+}
+
+/// The image time corrected by what is known of the camera's clock: `own = t (1 + drift) + offset`
+/// from the source's start on.
+fn corrected(own: CaptureTime, start: Timestamp, clock: &ClockConfig) -> CaptureTime {
+    let own_s = own.time.seconds_since(start);
+    let true_s = (own_s - clock.offset_s) / (1.0 + clock.drift_ppm * 1e-6);
+    CaptureTime { time: start.plus_seconds(true_s), sd_s: clock.sd_s }
+}
+
+impl Agent {
+    fn new(
+        identity: CameraIdentity,
+        link: Link,
+        is_unpaced: bool,
+        shutdown: Shutdown,
+    ) -> anyhow::Result<Self> {
+        // What is played as fast as it goes waits for those who listen; life does not.
+        let delivery = if is_unpaced { Delivery::Every } else { Delivery::Queued };
+        let name = identity.name.clone();
+        Ok(Self {
+            bearings: link.publisher(Channel::Bearings(name.clone()), delivery)?,
+            calibrations: link.publisher(Channel::Calibration(name.clone()), delivery)?,
+            health: link.publisher(Channel::CameraHealth(name.clone()), delivery)?,
+            previews: link.publisher(Channel::Preview(name), Delivery::Picture)?,
+            identity,
+            calibration: Vec::new(),
+            link,
+            calibrated_at: None,
+            healthy_at: None,
+            frames: 0,
+            bad_frames: 0,
+            unseen_bearings: 0,
+            behind: Duration::ZERO,
+            scene_begins: Timestamp::EPOCH,
+            now: Timestamp::EPOCH,
+            repeats: Repeats::default(),
+            shutdown,
+        })
+    }
+
+    /// Waits until it is time to begin; `None` if it was asked to stop before.
+    fn begin(
+        &mut self,
+        args: &Args,
+        file: &CameraFile,
+        network: &NetworkConfig,
+        begins: Timestamp,
+    ) -> anyhow::Result<Option<Start>> {
+        let start = if args.no_wait {
+            Some(Start::now())
+        } else {
+            self.wait(args.wait_for_recorder, file, network, begins, args.start_at.is_some())?
+        };
+        let start = start.map(|start| args.start_at.map_or(start, Start::at_wall_time));
+        if let Some(start) = &start {
+            let is_scene = matches!(file.source, SourceConfig::Simulation { .. });
+            let valid_from = if is_scene { Timestamp::from_seconds(start.wall_s) } else { begins };
+            if is_scene {
+                self.scene_begins = valid_from;
+            }
+            self.calibration = file.calibration(&self.identity.camera, valid_from)?.encode();
+            self.now = valid_from;
+        }
+        Ok(start)
+    }
+
+    /// Follows what the source shows until its end.
+    fn look(&mut self, file: &CameraFile, begins: Timestamp, start: &Start) -> anyhow::Result<()> {
+        match &file.source {
+            SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
+            SourceConfig::Video { path, rate_hz, speed, .. } => {
+                let clock =
+                    FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
+                let mut source = crossfix_video::open(path, clock)?;
+                self.watch(file, source.as_mut(), begins, start, *speed)
+            }
+            SourceConfig::Simulation { scene, publish_truth } => {
+                let mut source = SimulatedSource::open(scene, file, start.wall_s)?;
+                let truth = if *publish_truth {
+                    Some(TruthPublisher::new(&self.link, source.world.clone(), start.wall_s)?)
+                } else {
+                    None
+                };
+                let shutdown = self.shutdown.clone();
+                let truth = truth.map(|truth| std::thread::spawn(move || truth.run(&shutdown)));
+                // Its frames carry wall times from the start on.
+                let begins = Timestamp::from_seconds(start.wall_s);
+                let seen = self.watch(file, &mut source, begins, start, 1.0);
+                if let Some(thread) = truth {
+                    let _ = thread.join();
+                }
+                seen
+            }
+        }
+    }
+
+    /// Says calibration and health again when it is time.
+    fn keep_up(&mut self) -> anyhow::Result<()> {
+        let due = |at: Option<Instant>, period: Duration| at.is_none_or(|at| at.elapsed() >= period);
+        if due(self.calibrated_at, CALIBRATION_PERIOD) {
+            self.calibrations.put(self.calibration.clone())?;
+            self.calibrated_at = Some(Instant::now());
+        }
+        if due(self.healthy_at, HEALTH_PERIOD) {
+            self.say_health(false)?;
+            self.healthy_at = Some(Instant::now());
+        }
+        Ok(())
+    }
+
+    fn say_health(&self, ended: bool) -> anyhow::Result<()> {
+        let counters = [
+            ("bad_frames", self.bad_frames),
+            ("behind_ms", u64::try_from(self.behind.as_millis()).unwrap_or(u64::MAX)),
+            ("unseen_bearings", self.unseen_bearings),
+        ];
+        let health = Health {
+            component: self.identity.name.to_string(),
+            time_ns: self.now.nanos(),
+            handled: self.frames,
+            counters: counters
+                .into_iter()
+                .map(|(name, value)| Counter { name: name.to_owned(), value })
+                .collect(),
+            ended,
+            run: self.link.run().0,
+            host: network::host(),
+            problems: self.problems(),
+            scene_begins_ns: self.scene_begins.nanos(),
+            ..Default::default()
+        };
+        Ok(self.health.put(health.encode())?)
+    }
+
+    fn problems(&self) -> Vec<String> {
+        let behind = (self.behind > BEHIND).then(|| {
+            format!("{:.1} s behind its source: this host is too slow for it", self.behind.as_secs_f64())
+        });
+        behind.into_iter().collect()
+    }
+
+    /// Notes how far behind the source the agent is.
+    fn note_behind(&mut self, behind: Duration) {
+        self.behind = behind;
+        if behind > BEHIND {
+            let name = self.identity.name.clone();
+            self.repeats.warn("behind", Instant::now(), || {
+                format!(
+                    "camera `{name}` is {:.1} s behind its source: this host is too slow for it",
+                    behind.as_secs_f64()
+                )
+            });
+        }
+    }
+
+    fn publish(&mut self, frame: &BearingFrame) -> anyhow::Result<()> {
+        self.now = Timestamp::from_nanos(frame.capture_time_ns);
+        self.keep_up()?;
+        self.frames += 1;
+        Ok(self.bearings.put(frame.encode())?)
+    }
+
+    /// Follows targets in a source's frames until its end.
+    fn watch(
+        &mut self,
+        file: &CameraFile,
+        source: &mut dyn FrameSource,
+        begins: Timestamp,
+        start: &Start,
+        speed: f64,
+    ) -> anyhow::Result<()> {
+        let pace = start.pace(speed);
+        let mut tracker = ImageTracker::new(file.tracker.clone())?;
+        for place in file.boxes() {
+            tracker.take_up(place);
+        }
+        let mut shown: Option<Timestamp> = None;
+        loop {
+            let frame = match source.next_frame() {
+                Ok(Some(frame)) => frame,
+                Ok(None) => return Ok(()),
+                Err(error) if error.is_one_frame() => {
+                    self.bad_frames += 1;
+                    self.repeats.warn("bad frame", Instant::now(), || format!("{error}; going on"));
+                    continue;
+                }
+                // What is lost is the rest of this video; the others see on.
+                Err(error) => {
+                    return Err(error).with_context(|| format!("camera `{}` sees no more", self.identity.name));
+                }
+            };
+            self.check_size(&frame)?;
+            let capture = corrected(frame.capture, begins, &file.clock);
+            let since_s = capture.time.seconds_since(begins);
+            if !pace.wait(since_s, &self.shutdown) {
+                return Ok(());
+            }
+            let Some(image) = brightness(&frame) else {
+                continue;
+            };
+            let tracks = tracker.step(&image, capture.time);
+            if since_s < start.joined_s {
+                continue;
+            }
+            self.note_behind(pace.behind(since_s));
+            let (message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
+            self.unseen_bearings += unseen;
+            self.publish(&message)?;
+            let rate = file.preview.rate_hz;
+            let due = shown.is_none_or(|last| capture.time.seconds_since(last) * rate >= 1.0);
+            if rate > 0.0 && due {
+                shown = Some(capture.time);
+                let preview = self.identity.preview(&image, capture, file.preview.divisor as usize);
+                if let Some(preview) = preview {
+                    self.previews.put(preview.encode())?;
+                }
+            }
+        }
+    }
+
+    /// Pixels of another size than the intrinsics' would become wrong bearings without a word.
+    fn check_size(&self, frame: &Frame) -> anyhow::Result<()> {
+        let size = self.identity.camera.model().intrinsics().size;
+        let (width, height) = (size.width as usize, size.height as usize);
+        ensure!(
+            (frame.width, frame.height) == (width, height),
+            "frame {} of camera `{}` has {}x{} pixels, its intrinsics are for {width}x{height}: \
+             calibrate at the size of the video",
+            frame.index,
+            self.identity.name,
+            frame.width,
+            frame.height,
+        );
+        Ok(())
+    }
+
+    /// Publishes the recorded bearings of this camera.
+    fn replay(&mut self, path: &Path, begins: Timestamp, start: &Start, speed: f64) -> anyhow::Result<()> {
+        let pace = start.pace(speed);
+        let key = Channel::Bearings(self.identity.name.clone());
+        let mut lacks = Lacks::default();
+        recorded::for_each(path, &mut lacks, |lacks, entry| {
+            let since_s = entry.data_time.seconds_since(begins);
+            if entry.key.channel != key || since_s < start.joined_s || !pace.wait(since_s, &self.shutdown) {
+                return Ok(());
+            }
+            self.note_behind(pace.behind(since_s));
+            match lacks.read::<BearingFrame>(&entry.data) {
+                Some(frame) => self.publish(&frame),
+                None => {
+                    self.bad_frames += 1;
+                    Ok(())
+                }
+            }
+        })?;
+        lacks.say(path);
+        Ok(())
+    }
+
+    /// Says that nothing more will come, and closes; fails if the source ended by an error, or showed less
+    /// than it hid.
+    fn finish(self, seen: anyhow::Result<()>) -> anyhow::Result<()> {
+        self.say_health(true)?;
+        let name = self.identity.name.clone();
+        let (frames, bad) = (self.frames, self.bad_frames);
+        let Self { bearings, calibrations, health, previews, link, .. } = self;
+        drop((bearings, calibrations, health, previews));
+        link.close()?;
+        output::line(format!("camera `{name}`: {frames} frames published, {bad} bad frames"));
+        seen?;
+        ensure!(bad <= frames, "camera `{name}`: {bad} of {} frames could not be decoded", frames + bad);
+        Ok(())
+    }
+}
+
+/// Data time of the first bearing of any camera of a recording.
+fn first_bearing(path: &Path) -> anyhow::Result<Timestamp> {
+    let mut first: Option<Timestamp> = None;
+    recorded::for_each(path, &mut Lacks::default(), |_, entry| {
+        if matches!(entry.key.channel, Channel::Bearings(_)) {
+            first = Some(first.map_or(entry.data_time, |f| f.min(entry.data_time)));
+        }
+        Ok(())
+    })?;
+    first.with_context(|| format!("{} holds no bearings", path.display()))
+}

@@ -1,0 +1,98 @@
+//! Cameras of a scene, and the truth of it.
+
+use std::path::Path;
+
+use anyhow::Context;
+use crossfix_message::{Channel, Payload, Timestamp, TrueState, TruthFrame};
+use crossfix_simulation::{Scene, SimulatedCamera, World};
+use crossfix_transport::{Delivery, Link, LinkPublisher};
+use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
+
+use crate::config::{self, CameraFile};
+use crate::pace::Pace;
+use crate::shutdown::Shutdown;
+
+/// A simulated camera as a source of frames, with the times that its own clock shows.
+pub struct SimulatedSource {
+    /// The scene.
+    pub world: World,
+    camera: SimulatedCamera,
+    start: Timestamp,
+    next: u64,
+}
+
+impl SimulatedSource {
+    /// A camera's view of a scene that begins `start` seconds after the Unix epoch.
+    pub fn open(path: &Path, file: &CameraFile, start: f64) -> anyhow::Result<Self> {
+        let scene: Scene = config::load(path, &[])?;
+        let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
+        let camera = world
+            .camera(file.name.as_str())
+            .with_context(|| format!("the scene {} has no camera `{}`", path.display(), file.name))?
+            .clone();
+        Ok(Self { world, camera, start: Timestamp::from_seconds(start), next: 0 })
+    }
+}
+
+impl FrameSource for SimulatedSource {
+    fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        if self.next >= self.camera.frames() {
+            return Ok(None);
+        }
+        let rendered = self.camera.frame(self.next);
+        self.next += 1;
+        Ok(Some(Frame {
+            index: rendered.index,
+            capture: CaptureTime { time: self.start.plus_seconds(rendered.own_s), sd_s: 0.0 },
+            width: rendered.width,
+            height: rendered.height,
+            pixels: Pixels::Gray8(rendered.brightness),
+        }))
+    }
+}
+
+/// Publishes where the targets of a scene really are, ten times a second.
+pub struct TruthPublisher {
+    publisher: LinkPublisher,
+    world: World,
+    start: f64,
+}
+
+impl TruthPublisher {
+    const RATE_HZ: f64 = 10.0;
+
+    /// For a scene that begins `start` seconds after the Unix epoch.
+    pub fn new(link: &Link, world: World, start: f64) -> anyhow::Result<Self> {
+        Ok(Self { publisher: link.publisher(Channel::Truth, Delivery::Queued)?, world, start })
+    }
+
+    /// Publishes until the scene ends.
+    pub fn run(self, shutdown: &Shutdown) {
+        let pace = Pace::beginning_at(self.start, 1.0);
+        for step in 0..(self.world.duration_s() * Self::RATE_HZ) as u32 {
+            let t = f64::from(step) / Self::RATE_HZ;
+            if !pace.wait(t, shutdown) {
+                return;
+            }
+            let frame = truth_frame(&self.world, t, self.start);
+            if let Err(error) = self.publisher.put(frame.encode()) {
+                tracing::warn!("truth is not published any more: {error}");
+                return;
+            }
+        }
+    }
+}
+
+/// The truth of a scene at a time from its start, which lies `start` seconds after the Unix epoch.
+pub fn truth_frame(world: &World, t: f64, start: f64) -> TruthFrame {
+    let targets = world.truth(t).into_iter().map(|state| TrueState {
+        id: state.id,
+        position: Some(state.position.into()),
+        velocity: Some(state.velocity.into()),
+    });
+    TruthFrame {
+        time_ns: Timestamp::from_seconds(start).plus_seconds(t).nanos(),
+        targets: targets.collect(),
+        ..Default::default()
+    }
+}

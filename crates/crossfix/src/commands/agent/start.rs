@@ -1,0 +1,193 @@
+//! When an agent begins: with those who must hear it, and in step with the other cameras.
+
+use std::time::{Duration, Instant};
+
+use crossfix_message::{CameraName, Channel, Health, Key, Timestamp, decode};
+use crossfix_transport::NetworkConfig;
+
+use super::Agent;
+use crate::config::{CameraFile, SourceConfig};
+use crate::lookout::Lookout;
+use crate::pace::{Pace, wall_seconds};
+
+const POLL: Duration = Duration::from_millis(50);
+/// A recorder that is there hears an agent without a fusion centre after this long.
+const FUSION_PATIENCE: Duration = Duration::from_secs(10);
+/// Cameras wait this long for those of the network's file that are not there: time to start three of
+/// them by hand.
+const CAMERA_PATIENCE: Duration = Duration::from_secs(20);
+/// A source that is farther from what the site plays is of another time altogether, s: a day.
+const FARTHEST_S: f64 = 86_400.0;
+
+/// Where in the data, and when, an agent begins.
+#[derive(Clone, Copy, Debug)]
+pub struct Start {
+    /// When the data begin by the wall's clock, seconds since the Unix epoch: what a scene counts from.
+    pub wall_s: f64,
+    /// How far the site is in the data already, s: what lies before is not published.
+    pub joined_s: f64,
+    /// Whether the data begin at that time, or the agent is at `joined_s` now.
+    is_at_wall_time: bool,
+}
+
+impl Start {
+    /// At the beginning, now.
+    pub fn now() -> Self {
+        Self { wall_s: wall_seconds(), joined_s: 0.0, is_at_wall_time: false }
+    }
+
+    /// At the beginning, at a time of the wall's clock.
+    pub fn at_wall_time(wall_s: f64) -> Self {
+        Self { wall_s, joined_s: 0.0, is_at_wall_time: true }
+    }
+
+    /// The pace of data that run so many times as fast as life.
+    pub fn pace(&self, speed: f64) -> Pace {
+        if self.is_at_wall_time {
+            Pace::beginning_at(self.wall_s, speed)
+        } else {
+            Pace::beginning_in(-self.joined_s / speed.max(f64::MIN_POSITIVE), speed)
+        }
+    }
+}
+
+/// What the fusion centre's health says of what the site plays.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Site {
+    /// Its time goes on: it is at this time, of a scene that began then, if it is one.
+    Plays { now: Timestamp, scene_begins: Timestamp },
+    /// Its time stands, and all cameras are there.
+    IsComplete,
+    /// Its time stands, or it is not known yet whether it does.
+    Waits,
+}
+
+/// Compares one report of the fusion centre with the one before.
+fn judge(before: Option<&Health>, health: &Health, cameras: &[CameraName]) -> Site {
+    let Some(before) = before else {
+        return Site::Waits;
+    };
+    if health.time_ns > before.time_ns && health.time_ns != 0 {
+        return Site::Plays {
+            now: Timestamp::from_nanos(health.time_ns),
+            scene_begins: Timestamp::from_nanos(health.scene_begins_ns),
+        };
+    }
+    let is_present = |camera: &CameraName| health.present.iter().any(|name| name == camera.as_str());
+    if cameras.iter().all(is_present) { Site::IsComplete } else { Site::Waits }
+}
+
+impl Agent {
+    /// Waits for those who must hear every frame, and for the other cameras; `None` if it was asked to
+    /// stop before.
+    pub(super) fn wait(
+        &mut self,
+        recorder: bool,
+        file: &CameraFile,
+        network: &NetworkConfig,
+        begins: Timestamp,
+        has_start: bool,
+    ) -> anyhow::Result<Option<Start>> {
+        let mut lookout = Lookout::for_fusion(&self.link, network)?;
+        let begun = Instant::now();
+        while !self.shutdown.requested() {
+            lookout.look(Instant::now());
+            let [fusion, recording] =
+                [Channel::FusionAlive, Channel::RecorderAlive].map(|channel| lookout.is_here(&channel));
+            if fusion && (recording || !recorder) {
+                break;
+            }
+            if !fusion && recording && begun.elapsed() >= FUSION_PATIENCE {
+                tracing::warn!("no fusion centre is there: beginning all the same, the recorder hears it");
+                return Ok(Some(Start::now()));
+            }
+            std::thread::sleep(POLL);
+        }
+        // A token comes with its peer's other declarations, but the subscription may come after it.
+        while !self.shutdown.requested() && !self.bearings.has_subscribers()? {
+            std::thread::sleep(POLL);
+        }
+        if self.shutdown.requested() {
+            return Ok(None);
+        }
+        if has_start || file.is_unpaced() {
+            return Ok(Some(Start::now()));
+        }
+        self.wait_for_cameras(file, network, begins)
+    }
+
+    /// Waits until all cameras of the network are there, or joins those that play already.
+    fn wait_for_cameras(
+        &mut self,
+        file: &CameraFile,
+        network: &NetworkConfig,
+        begins: Timestamp,
+    ) -> anyhow::Result<Option<Start>> {
+        let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
+        let key = Key::new(self.link.site().clone(), Channel::FusionHealth);
+        let reports = self.link.subscribe(&[key.to_string()])?;
+        let begun = Instant::now();
+        let mut before: Option<Health> = None;
+        tracing::info!(
+            "camera `{}` waits for the other cameras, {} s at most",
+            self.identity.name,
+            CAMERA_PATIENCE.as_secs()
+        );
+        while !self.shutdown.requested() {
+            if begun.elapsed() >= CAMERA_PATIENCE {
+                tracing::warn!("camera `{}` begins without cameras that are not there", self.identity.name);
+                return Ok(Some(Start::now()));
+            }
+            let Some(health) = reports.next(POLL).and_then(|r| decode::<Health>(&r.data).ok()) else {
+                continue;
+            };
+            match judge(before.as_ref(), &health, &cameras) {
+                Site::Plays { now, scene_begins } => {
+                    return Ok(Some(self.join(file, begins, now, scene_begins)));
+                }
+                Site::IsComplete => return Ok(Some(Start::now())),
+                Site::Waits => before = Some(health),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Begins where the site is.
+    fn join(&self, file: &CameraFile, begins: Timestamp, now: Timestamp, scene_begins: Timestamp) -> Start {
+        let name = &self.identity.name;
+        let is_scene = matches!(file.source, SourceConfig::Simulation { .. });
+        let joined_s = now.seconds_since(if is_scene { scene_begins } else { begins });
+        if !(0.0..FARTHEST_S).contains(&joined_s) {
+            tracing::warn!("camera `{name}` begins at its beginning: the site's data are of another time");
+            return Start::now();
+        }
+        tracing::info!("camera `{name}` joins the others, {joined_s:.1} s after its source's beginning");
+        Start { wall_s: scene_begins.seconds(), joined_s, is_at_wall_time: is_scene }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn health(seconds: f64, present: &[&str]) -> Health {
+        Health {
+            time_ns: Timestamp::from_seconds(seconds).nanos(),
+            present: present.iter().map(|name| (*name).to_owned()).collect(),
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn agents_begin_together_and_one_that_is_late_joins() {
+        let cameras = ["a", "b"].map(|name| name.parse().unwrap());
+        let [one, both] = [health(0.0, &["a"]), health(0.0, &["a", "b"])];
+        assert_eq!(judge(None, &both, &cameras), Site::Waits, "it may be playing");
+        assert_eq!(judge(Some(&one), &one, &cameras), Site::Waits);
+        assert_eq!(judge(Some(&one), &both, &cameras), Site::IsComplete);
+        // A file was played before, to its end.
+        assert_eq!(judge(Some(&health(9.0, &["a"])), &health(9.0, &["a", "b"]), &cameras), Site::IsComplete);
+        let plays = judge(Some(&health(3.0, &[])), &health(4.0, &[]), &cameras);
+        assert!(matches!(plays, Site::Plays { now, .. } if now == Timestamp::from_seconds(4.0)));
+    }
+}

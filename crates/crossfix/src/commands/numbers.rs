@@ -1,0 +1,58 @@
+//! Numbers as people write them on the command line: read, or refused with their range.
+
+/// A time of this century, seconds since the Unix epoch, and what simulations begin with.
+const LAST_WALL_TIME: f64 = 4_102_444_800.0;
+/// The fastest that anything is played: a day in a minute and a half.
+const MOST_SPEED: f64 = 1000.0;
+
+pub fn number(text: &str) -> Result<f64, String> {
+    let number: f64 = text.trim().parse().map_err(|_| format!("`{text}` is no number"))?;
+    if number.is_finite() { Ok(number) } else { Err(format!("`{text}` is not finite")) }
+}
+
+fn within(text: &str, least: f64, most: f64, unit: &str) -> Result<f64, String> {
+    let number = number(text)?;
+    if (least..=most).contains(&number) {
+        Ok(number)
+    } else {
+        Err(format!("it must be from {least} to {most}{unit}"))
+    }
+}
+
+pub fn positive(text: &str) -> Result<f64, String> {
+    number(text).and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
+}
+
+pub fn not_negative(text: &str) -> Result<f64, String> {
+    number(text).and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
+}
+
+/// How many times as fast as in life; 0 is as fast as it goes.
+pub fn speed(text: &str) -> Result<f64, String> {
+    within(text, 0.0, MOST_SPEED, "")
+}
+
+/// Seconds since the Unix epoch.
+pub fn wall_time(text: &str) -> Result<f64, String> {
+    within(text, 0.0, LAST_WALL_TIME, " s since the Unix epoch")
+}
+
+/// Frames a second.
+pub fn rate(text: &str) -> Result<f64, String> {
+    within(text, 0.001, 10_000.0, " frames a second")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_out_of_range_is_refused_with_its_range() {
+        assert!(positive("0").is_err() && not_negative("0").is_ok() && not_negative("-1").is_err());
+        for bad in ["nan", "inf", "-1", "1e300", "fast"] {
+            assert!(speed(bad).is_err() && wall_time(bad).is_err() && rate(bad).is_err(), "{bad}");
+        }
+        assert_eq!(speed("-1").unwrap_err(), "it must be from 0 to 1000");
+        assert_eq!(speed("0"), Ok(0.0));
+    }
+}

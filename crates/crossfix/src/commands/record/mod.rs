@@ -1,0 +1,135 @@
+mod data_time;
+mod recorder;
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use crossfix_message::{Channel, Health, Key, Payload};
+use crossfix_recording::{RecordingError, RecordingWriter, Source};
+use crossfix_transport::{Delivery, LinkPublisher, Role, Subscription};
+
+use self::recorder::{FileWriter, Recorder};
+use crate::config;
+use crate::lookout::Lookout;
+use crate::network;
+use crate::output;
+use crate::shutdown::{LAST_WORDS, Shutdown};
+
+/// What was flushed survives a crash of the machine's programs; health is said as often.
+const PERIOD: Duration = Duration::from_secs(1);
+const POLL: Duration = Duration::from_millis(50);
+/// Names that are tried for a recording whose own is taken.
+const MOST_NAMES: u32 = 10_000;
+
+/// Record everything that a site publishes.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix record -c configs/site/network.toml -o today.mcap")]
+pub struct Args {
+    /// The network's file (TOML).
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// The recording (MCAP) to write. If it is there already it stays, and a new one is written beside
+    /// it: today-2.mcap.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Replace a recording that is there already.
+    #[arg(long)]
+    overwrite: bool,
+    /// Stop when stdin ends.
+    #[arg(long, hide = true)]
+    stop_with_stdin: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let network = config::load_network(&args.config)?;
+    // The file comes last: what cannot record must not touch it.
+    let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
+        return Ok(());
+    };
+    let cameras: Vec<_> = network.cameras.keys().cloned().collect();
+    let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
+    let mut subscription = link.subscribe(&[Key::everything_of(link.site())])?;
+    let health = link.publisher(Channel::RecorderHealth, Delivery::Queued)?;
+    let (mut writer, path) = create(&args.output, args.overwrite)?;
+    writer.sign(&Source {
+        command: "record".to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        run: link.run().to_string(),
+        host: network::host(),
+    })?;
+    let mut recorder = Recorder::new(writer, &network, link.run());
+    let alive = link.declare_alive(Channel::RecorderAlive)?;
+    tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());
+
+    let recorded = work(&mut recorder, &mut subscription, &mut lookout, &health, &shutdown)
+        .context("recording has stopped; the rest of the site goes on");
+    drop((subscription, alive, health, lookout));
+    let finished = recorded.and_then(|()| Ok(recorder.finish()?));
+    link.close()?;
+    output::line(format!("{} messages recorded to {}", finished?, path.display()));
+    Ok(())
+}
+
+/// A new file under the name that was asked for, or under the first of `today-2.mcap`, `today-3.mcap` ..
+/// that is free: a recorder that is started again must not destroy what it recorded before.
+fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)> {
+    // A device or a pipe has nothing that could be lost.
+    if overwrite || (asked.exists() && !asked.is_file()) {
+        return Ok((RecordingWriter::create(asked)?, asked.to_owned()));
+    }
+    let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+    let others = (2..MOST_NAMES).map(|number| asked.with_file_name(format!("{stem}-{number}{extension}")));
+    for path in std::iter::once(asked.to_owned()).chain(others) {
+        match RecordingWriter::create_new(&path) {
+            Err(RecordingError::Exists { .. }) => {}
+            Err(error) => return Err(error.into()),
+            Ok(writer) => {
+                if path != asked {
+                    tracing::warn!(
+                        "{} is there already and stays: recording to {} (--overwrite replaces it)",
+                        asked.display(),
+                        path.display()
+                    );
+                }
+                return Ok((writer, path));
+            }
+        }
+    }
+    anyhow::bail!("{} is there, and so are {MOST_NAMES} more of it", asked.display())
+}
+
+/// Records until it is asked to stop, and for a moment what is still on its way.
+fn work(
+    recorder: &mut Recorder,
+    subscription: &mut Subscription,
+    lookout: &mut Lookout,
+    publisher: &LinkPublisher,
+    shutdown: &Shutdown,
+) -> anyhow::Result<()> {
+    let mut said_at = Instant::now();
+    while !shutdown.requested() {
+        if let Some(received) = subscription.next(POLL) {
+            recorder.take(received)?;
+        }
+        if said_at.elapsed() >= PERIOD {
+            said_at = Instant::now();
+            lookout.look(said_at);
+            say(recorder.health(subscription.refused(), false)?, publisher)?;
+            recorder.flush()?;
+        }
+    }
+    while !shutdown.overdue(LAST_WORDS)
+        && let Some(received) = subscription.next(POLL)
+    {
+        recorder.take(received)?;
+    }
+    subscription.stop();
+    say(recorder.health(subscription.refused(), true)?, publisher)
+}
+
+fn say(health: Health, publisher: &LinkPublisher) -> anyhow::Result<()> {
+    Ok(publisher.put(health.encode())?)
+}

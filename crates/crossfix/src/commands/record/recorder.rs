@@ -1,0 +1,213 @@
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::BufWriter;
+use std::time::Instant;
+
+use crossfix_message::{CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, glance};
+use crossfix_recording::{Entry, RecordingError, RecordingWriter};
+use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
+
+use super::data_time::{DataTime, Said};
+use crate::network::{self, rivalry};
+use crate::pace::wall_seconds;
+use crate::repeats::Repeats;
+
+/// Messages that are held until there are data that say what time it is: calibrations and health of a
+/// minute of a thousand cameras.
+const MOST_HELD: usize = 100_000;
+
+/// Where a recording goes.
+pub type FileWriter = RecordingWriter<BufWriter<File>>;
+
+/// What the recorder has to do with a message: no clock but that of its arrival, no network.
+pub struct Recorder {
+    writer: FileWriter,
+    site: SiteName,
+    run: RunId,
+    cameras: BTreeSet<CameraName>,
+    times: DataTime,
+    held: Vec<Entry>,
+    reception: Reception,
+    repeats: Repeats,
+    counts: Counts,
+}
+
+/// What was not recorded, or not as it should be.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counts {
+    /// Of cameras that the network's file does not name.
+    foreign: u64,
+    malformed: u64,
+    /// Of a newer major version: recorded all the same.
+    newer: u64,
+}
+
+impl Recorder {
+    /// A recorder of a network's site.
+    pub fn new(writer: FileWriter, network: &NetworkConfig, run: RunId) -> Self {
+        Self {
+            writer,
+            site: network.site.clone(),
+            run,
+            cameras: network.cameras.keys().cloned().collect(),
+            times: DataTime::default(),
+            held: Vec::new(),
+            reception: Reception::default(),
+            repeats: Repeats::default(),
+            counts: Counts::default(),
+        }
+    }
+
+    /// Records a message, if it is one of the site's.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file cannot be written.
+    pub fn take(&mut self, received: Received) -> Result<(), RecordingError> {
+        let Received { key, data, origin, at } = received;
+        // It writes its own health down itself.
+        if key.channel == Channel::RecorderHealth && origin.is_some_and(|origin| origin.run == self.run) {
+            return Ok(());
+        }
+        if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
+            self.counts.foreign += 1;
+            self.repeats.warn("foreign", at, || {
+                format!("`{key}` is of no camera of the network's file: not recorded")
+            });
+            return Ok(());
+        }
+        let sender = origin.map_or_else(|| "an unknown program".to_owned(), |o| format!("run {}", o.run));
+        if let Some(origin) = origin {
+            let missing = self.reception.see(&key, origin, at);
+            if missing > 0 {
+                self.repeats.warn(&format!("missing {key}"), at, || {
+                    format!("{missing} messages on `{key}` from {sender} did not arrive")
+                });
+            }
+        }
+        let seen = match glance(&key.channel, &data) {
+            Ok(Some(seen)) => seen,
+            Ok(None) => return Ok(()),
+            Err(error) => {
+                self.counts.malformed += 1;
+                self.repeats.warn(&format!("malformed {key}"), at, || {
+                    format!("a message on `{key}` from {sender} is not recorded: {error}")
+                });
+                return Ok(());
+            }
+        };
+        let arrival = Timestamp::from_seconds(wall_seconds());
+        let said = if seen.is_readable {
+            self.times.of(&key.channel, seen.time)
+        } else {
+            self.counts.newer += 1;
+            self.repeats.warn(&format!("newer {key}"), at, || {
+                format!("`{key}` from {sender} is of a newer version: recorded, but this build cannot read it")
+            });
+            self.times.now()
+        };
+        self.write(Entry { key, data_time: seen.time, arrival, data }, said)
+    }
+
+    fn write(&mut self, entry: Entry, said: Said) -> Result<(), RecordingError> {
+        match said {
+            Said::At(data_time) => {
+                self.release(data_time)?;
+                self.put(&Entry { data_time, ..entry })
+            }
+            Said::BeforeAnyData if self.held.len() < MOST_HELD => {
+                self.held.push(entry);
+                Ok(())
+            }
+            Said::BeforeAnyData => self.put(&Entry { data_time: entry.arrival, ..entry }),
+        }
+    }
+
+    /// Writes what was said before there were data, at the time of the first.
+    fn release(&mut self, now: Timestamp) -> Result<(), RecordingError> {
+        for held in std::mem::take(&mut self.held) {
+            self.put(&Entry { data_time: now.max(held.data_time), ..held })?;
+        }
+        Ok(())
+    }
+
+    fn put(&mut self, entry: &Entry) -> Result<(), RecordingError> {
+        match self.writer.write(entry) {
+            Err(error @ RecordingError::TooLong { .. }) => {
+                self.counts.malformed += 1;
+                self.repeats.warn("too long", Instant::now(), || error.to_string());
+                Ok(())
+            }
+            written => written,
+        }
+    }
+
+    /// How it does, written down; to be published as well.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file cannot be written.
+    pub fn health(&mut self, refused: Refused, ended: bool) -> Result<Health, RecordingError> {
+        let now = Instant::now();
+        self.repeats.remind(now);
+        let counted = [
+            ("received_dropped", refused.dropped),
+            ("received_foreign_camera", self.counts.foreign),
+            ("received_malformed", self.counts.malformed),
+            ("received_missing", self.reception.missing()),
+            ("received_newer_version", self.counts.newer),
+            ("received_too_long", refused.too_long),
+        ];
+        let mut problems = Vec::new();
+        for (key, runs) in self.reception.rivals(now) {
+            let rivalry = rivalry(key, runs);
+            self.repeats.warn(&format!("rivals {key}"), now, || rivalry.clone());
+            problems.push(rivalry);
+        }
+        let time = match self.times.now() {
+            Said::At(time) => time,
+            Said::BeforeAnyData => Timestamp::EPOCH,
+        };
+        let health = Health {
+            component: "recorder".to_owned(),
+            time_ns: time.nanos(),
+            handled: self.writer.messages(),
+            counters: counted
+                .into_iter()
+                .map(|(name, value)| Counter { name: name.to_owned(), value })
+                .collect(),
+            problems,
+            run: self.run.0,
+            host: network::host(),
+            ended,
+            ..Default::default()
+        };
+        let entry = Entry {
+            key: Key::new(self.site.clone(), Channel::RecorderHealth),
+            data_time: time,
+            arrival: Timestamp::from_seconds(wall_seconds()),
+            data: health.encode(),
+        };
+        let said = self.times.now();
+        self.write(entry, said)?;
+        Ok(health)
+    }
+
+    /// What was recorded until now survives a crash.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file cannot be written.
+    pub fn flush(&mut self) -> Result<(), RecordingError> {
+        self.writer.flush()
+    }
+
+    /// Ends the file with its index; returns how many messages are in it.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file cannot be written.
+    pub fn finish(mut self) -> Result<u64, RecordingError> {
+        // Nothing ever said what time it is in the data: it is that of the wall.
+        for held in std::mem::take(&mut self.held) {
+            self.put(&Entry { data_time: held.arrival, ..held })?;
+        }
+        self.writer.finish()
+    }
+}

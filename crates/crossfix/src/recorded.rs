@@ -1,0 +1,100 @@
+//! Going through recordings, with a word for what they lack.
+
+use std::path::Path;
+
+use anyhow::ensure;
+use crossfix_message::{DecodeError, Payload, decode};
+use crossfix_recording::{Damage, Entry, ReadFailure, RecordingReader};
+use serde::Serialize;
+
+/// What could not be had from a recording.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Lacks {
+    /// Parts of the file that cannot be read.
+    pub damage: Option<Damage>,
+    /// Messages that were asked for and could not be read.
+    pub unreadable: u64,
+    /// Why the first of them could not.
+    pub first_unreadable: Option<String>,
+}
+
+impl Lacks {
+    /// Reads a message, or counts that it cannot be read.
+    pub fn read<M: Payload>(&mut self, data: &[u8]) -> Option<M> {
+        match decode(data) {
+            Ok(message) => Some(message),
+            Err(error) => {
+                self.note(&error);
+                None
+            }
+        }
+    }
+
+    /// Counts a message that cannot be read.
+    pub fn note(&mut self, error: &DecodeError) {
+        self.unreadable += 1;
+        self.first_unreadable.get_or_insert_with(|| error.to_string());
+    }
+
+    /// Says what is lacking, as a warning.
+    pub fn say(&self, path: &Path) {
+        if let Some(damage) = &self.damage {
+            tracing::warn!("{} is damaged {damage}; everything else was read", path.display());
+        }
+        if let Some(first) = &self.first_unreadable {
+            tracing::warn!("{} messages of {} cannot be read: {first}", self.unreadable, path.display());
+        }
+    }
+
+    /// An error that says what was not found, and what may be why.
+    pub fn ensure_found(&self, found: bool, what: &str, path: &Path) -> anyhow::Result<()> {
+        let why = match (&self.first_unreadable, &self.damage) {
+            (Some(first), _) => format!(": {} messages cannot be read ({first})", self.unreadable),
+            (None, Some(damage)) => format!(": it is damaged {damage}"),
+            (None, None) => String::new(),
+        };
+        ensure!(found, "{} holds no {what}{why}", path.display());
+        Ok(())
+    }
+}
+
+/// Hands every message of a recording on, and adds to `lacks` what is damaged.
+pub fn for_each(
+    path: &Path,
+    lacks: &mut Lacks,
+    mut handle: impl FnMut(&mut Lacks, Entry) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let report = RecordingReader::open(path)?
+        .for_each(|entry| handle(lacks, entry).map_err(|error| Handled(error.into())));
+    match report {
+        Ok(report) => {
+            lacks.damage = report.damage;
+            Ok(())
+        }
+        Err(ReadFailure::Recording(error)) => Err(error.into()),
+        Err(ReadFailure::Handler(Handled(error))) => Err(anyhow::Error::from_boxed(error)),
+    }
+}
+
+/// The first message of a recording for which there is an answer.
+pub fn find<T>(path: &Path, mut answer: impl FnMut(Entry) -> Option<T>) -> anyhow::Result<Option<T>> {
+    let mut found = None;
+    let read = RecordingReader::open(path)?.for_each(|entry| {
+        found = answer(entry);
+        if found.is_some() { Err(Found) } else { Ok(()) }
+    });
+    match read {
+        Ok(_) | Err(ReadFailure::Handler(Found)) => Ok(found),
+        Err(ReadFailure::Recording(error)) => Err(error.into()),
+    }
+}
+
+/// That what was looked for is found: the rest need not be read.
+#[derive(Debug, thiserror::Error)]
+#[error("found")]
+struct Found;
+
+/// An error of the handler's.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+struct Handled(Box<dyn std::error::Error + Send + Sync>);

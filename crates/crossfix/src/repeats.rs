@@ -1,0 +1,99 @@
+//! Warnings that would come again and again.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// A warning of one kind is said at once, then this often with how many there were.
+const PERIOD: Duration = Duration::from_secs(60);
+/// Kinds that are told apart: names in them come from outside.
+const MAX_KINDS: usize = 1000;
+
+/// Says the first warning of a kind at once, and then how many more there were, once a minute: whoever can
+/// cause a warning must not be able to fill a disk with it.
+#[derive(Debug, Default)]
+pub struct Repeats {
+    kinds: BTreeMap<String, Kind>,
+}
+
+#[derive(Debug)]
+struct Kind {
+    said: Instant,
+    /// How many since, and the newest of them.
+    more: u64,
+    newest: String,
+}
+
+impl Repeats {
+    /// A warning of a kind. Its text is made only where it is said.
+    pub fn warn(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) {
+        if let Some(line) = self.line(kind, now, text) {
+            tracing::warn!("{line}");
+        }
+    }
+
+    /// Says what is due of warnings that have stopped coming.
+    pub fn remind(&mut self, now: Instant) {
+        for kind in self.kinds.values_mut() {
+            if let Some(line) = kind.due(now) {
+                tracing::warn!("{line}");
+            }
+        }
+    }
+
+    fn line(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) -> Option<String> {
+        let kind = if self.kinds.len() < MAX_KINDS { kind } else { "others" };
+        if let Some(known) = self.kinds.get_mut(kind) {
+            known.more += 1;
+            if known.more == 1 {
+                known.newest = text();
+            }
+            return known.due(now);
+        }
+        let line = text();
+        self.kinds.insert(kind.to_owned(), Kind { said: now, more: 0, newest: String::new() });
+        Some(line)
+    }
+}
+
+impl Kind {
+    fn due(&mut self, now: Instant) -> Option<String> {
+        if self.more == 0 || now.saturating_duration_since(self.said) < PERIOD {
+            return None;
+        }
+        let more = std::mem::take(&mut self.more);
+        self.said = now;
+        Some(format!("{} ({more} times in the last minute)", self.newest))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thousand_warnings_of_a_kind_are_two_lines() {
+        let (mut repeats, begun) = (Repeats::default(), Instant::now());
+        let lines: Vec<String> = (0..1000)
+            .filter_map(|i| repeats.line("gap", begun + PERIOD / 999 * i, || format!("gap {i}")))
+            .collect();
+        assert_eq!(lines, ["gap 0", "gap 1 (999 times in the last minute)"]);
+        assert_eq!(repeats.line("other", begun, || "other".to_owned()).as_deref(), Some("other"));
+    }
+
+    #[test]
+    fn the_last_of_a_flood_is_said_though_nothing_comes_after_it() {
+        let (mut repeats, now) = (Repeats::default(), Instant::now());
+        repeats.line("gap", now, String::new);
+        repeats.line("gap", now, || "gap".to_owned());
+        let kind = repeats.kinds.get_mut("gap").unwrap();
+        assert_eq!(kind.due(now + PERIOD).as_deref(), Some("gap (1 times in the last minute)"));
+        assert_eq!(kind.due(now + 3 * PERIOD), None);
+    }
+
+    #[test]
+    fn kinds_are_bounded() {
+        let (mut repeats, now) = (Repeats::default(), Instant::now());
+        let said = (0..5000).filter_map(|i| repeats.line(&i.to_string(), now, String::new)).count();
+        assert_eq!(said, MAX_KINDS + 1);
+    }
+}
