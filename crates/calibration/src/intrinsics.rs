@@ -18,6 +18,9 @@ pub enum IntrinsicsError {
         /// How many it has.
         found: usize,
     },
+    /// Axes of the image that are not at right angles.
+    #[error("`camera_matrix` has a skew of {0}: only images with square corners are supported")]
+    Skew(f64),
     /// A lens model that we do not have.
     #[error("the distortion model `{0}` is not known: plumb_bob, equidistant or fisheye")]
     Model(String),
@@ -60,6 +63,10 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
         wanted: "9",
         found: file.camera_matrix.data.len(),
     })?;
+    // Some programs write the last bits of a fit.
+    if k[1].abs() > 1e-3 {
+        return Err(IntrinsicsError::Skew(k[1]));
+    }
     let coefficients = &file.distortion_coefficients.data;
     let model = file.distortion_model.as_deref().unwrap_or("plumb_bob");
     let shape =

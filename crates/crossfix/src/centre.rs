@@ -208,7 +208,7 @@ impl Centre {
     }
 
     /// What it says of itself; the shell adds what the transport has counted, in `counted`.
-    pub fn health(&self, counted: &[(&str, u64)]) -> Health {
+    pub fn health(&self, counted: &[(&'static str, u64)]) -> Health {
         let refused = &self.refused;
         let own = [
             ("received_bad_calibration", refused.bad_calibrations),

@@ -19,13 +19,13 @@ pub enum LogFormat {
 #[derive(Debug, Args)]
 pub struct LoggingArgs {
     /// More logs on stderr: -v details, -vv everything.
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    #[arg(short, long, global = true, help_heading = "Logs", action = clap::ArgAction::Count)]
     verbose: u8,
     /// Fewer logs: errors only.
-    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    #[arg(short, long, global = true, help_heading = "Logs", conflicts_with = "verbose")]
     quiet: bool,
     /// Form of the logs on stderr.
-    #[arg(long, global = true, value_enum, default_value_t, value_name = "FORMAT")]
+    #[arg(long, global = true, help_heading = "Logs", value_enum, default_value_t, value_name = "FORMAT")]
     log_format: LogFormat,
 }
 

@@ -74,7 +74,13 @@ pub enum LinkError {
 
 fn zenoh(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> LinkError {
     let what = what.into();
-    move |source| LinkError::Zenoh { what, source }
+    move |source| LinkError::Zenoh { what, source: said(&source) }
+}
+
+/// What Zenoh says, without the place in its own source code where it says it.
+fn said(error: &zenoh::Error) -> Box<dyn Error + Send + Sync> {
+    let text = error.to_string();
+    text.split(" at /").next().unwrap_or(&text).trim().to_owned().into()
 }
 
 /// What people can do about an endpoint that cannot be listened on.
@@ -330,7 +336,7 @@ impl Link {
 /// Why a session did not open.
 fn explain(network: &NetworkConfig, role: &Role, source: zenoh::Error) -> LinkError {
     if network.mode == Mode::Client {
-        return LinkError::NoRouter { routers: network.routers.clone(), source };
+        return LinkError::NoRouter { routers: network.routers.clone(), source: said(&source) };
     }
     let listened = network.endpoints(role).map(|(listen, _)| listen).unwrap_or_default();
     for endpoint in listened {
@@ -338,7 +344,7 @@ fn explain(network: &NetworkConfig, role: &Role, source: zenoh::Error) -> LinkEr
             return LinkError::Listen { endpoint, source };
         }
     }
-    LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source }
+    LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source: said(&source) }
 }
 
 /// Publishes on one key.

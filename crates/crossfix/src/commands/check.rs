@@ -1,15 +1,23 @@
 use std::path::PathBuf;
 
-use crate::config::{self, CameraFile, FusionFile, Site, load_network};
+use anyhow::Context;
+use crossfix_geometry::Camera;
+use crossfix_simulation::Scene;
+use crossfix_vision::TrackerConfig;
+use nalgebra::Vector3;
+
+use crate::config::{self, CameraFile, FusionFile, Kind, Site, load_network};
 use crate::output;
 
 /// Check configuration files before anything starts, and print what they resolve to.
+///
+/// Videos are opened and held against the intrinsics; of a folder, all files must fit together.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  crossfix check -c configs/site\n  crossfix check -c configs/site/north.toml"
 )]
 pub struct Args {
-    /// A site's folder, a camera's file or the fusion centre's file (TOML).
+    /// A site's folder, or one of its files (TOML): a camera's, the fusion centre's, the network's.
     #[arg(short, long, value_name = "PATH")]
     config: PathBuf,
     /// Override a key of a file, e.g. tracker.margin_px=3.
@@ -20,28 +28,60 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.config.is_dir() {
         let site = Site::load(&args.config)?;
-        for (name, path) in &site.cameras {
-            output::line(format!("camera `{name}`: {} is good", path.display()));
+        for (name, checked) in &site.cameras {
+            output::line(format!("camera `{name}`: {} is good; {}", checked.path.display(), view_of(&checked.camera)));
         }
         for path in &site.fusion {
             output::line(format!("fusion centre: {} is good", path.display()));
         }
         return Ok(());
     }
-    let keys: toml::Table = config::load(&args.config, &[])?;
-    let is_camera = keys.contains_key("source") || keys.contains_key("name");
-    let resolved = if is_camera {
-        let file = CameraFile::load(&args.config, &args.sets)?;
-        file.camera(&args.config)?;
-        load_network(&file.network)?;
-        toml::to_string(&file)?
-    } else {
-        let file = FusionFile::load(Some(&args.config), &args.sets)?;
-        if let Some(network) = &file.network {
-            load_network(network)?;
+    let keys: toml::Table = config::load(&args.config, &[], Kind::Fusion)?;
+    let resolved = match Kind::of(&keys) {
+        Some(Kind::Camera) => check_camera(args)?,
+        Some(Kind::Network) => toml::to_string(&load_network(&args.config)?)?,
+        Some(Kind::Scene) => {
+            let scene: Scene = config::load(&args.config, &args.sets, Kind::Scene)?;
+            scene.build().with_context(|| format!("the scene {} has an error", args.config.display()))?;
+            toml::to_string(&scene)?
         }
-        toml::to_string(&file)?
+        Some(Kind::Tracker) => {
+            let tracker: TrackerConfig = config::load(&args.config, &args.sets, Kind::Tracker)?;
+            tracker.validate().with_context(|| format!("{} has an error", args.config.display()))?;
+            toml::to_string(&tracker)?
+        }
+        Some(Kind::Fusion) | None => {
+            let file = FusionFile::load(Some(&args.config), &args.sets)?;
+            if let Some(network) = &file.network {
+                load_network(network).context("key `network`")?;
+            }
+            toml::to_string(&file)?
+        }
     };
     output::line(resolved.trim_end());
     Ok(())
+}
+
+fn check_camera(args: &Args) -> anyhow::Result<String> {
+    let file = CameraFile::load(&args.config, &args.sets)?;
+    let camera = file.camera(&args.config)?;
+    file.check_pictures(&camera).with_context(|| args.config.display().to_string())?;
+    load_network(&file.network).context("key `network`")?;
+    tracing::info!("camera `{}`: {}", file.name, view_of(&camera));
+    Ok(toml::to_string(&file)?)
+}
+
+/// Where a camera stands and looks, as a person sees whether the pose is the one that was meant.
+fn view_of(camera: &Camera) -> String {
+    let place = camera.pose().position();
+    let axis = camera.pose().rotation() * Vector3::z();
+    let azimuth = axis.x.atan2(axis.y).to_degrees().rem_euclid(360.0);
+    let elevation = axis.z.clamp(-1.0, 1.0).asin().to_degrees();
+    let lens = camera.model().intrinsics();
+    let width = 2.0 * (f64::from(lens.size.width) / (2.0 * lens.fx)).atan().to_degrees();
+    format!(
+        "stands at ({:.1}, {:.1}, {:.1}) m, looks to azimuth {azimuth:.0} degrees (north 0, east 90), \
+         {elevation:.0} degrees above the horizon, and sees about {width:.0} degrees across",
+        place.x, place.y, place.z
+    )
 }

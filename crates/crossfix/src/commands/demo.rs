@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use crossfix_calibration::intrinsics_to_yaml;
-use crossfix_message::{CameraName, Channel, Key, TrackFrame, TrackState, decode};
+use crossfix_message::{CameraName, Channel, Key, TrackFrame, TrackNumber, TrackState, decode};
 use crossfix_simulation::{Scene, World};
 use crossfix_transport::{Link, NetworkConfig, Role};
 use crossfix_vision::{DetectorConfig, TrackerConfig};
@@ -89,9 +89,14 @@ impl Component {
         }
     }
 
-    /// Asks it to stop by the end of its stdin, and waits.
-    fn stop(mut self) -> anyhow::Result<()> {
+    /// Asks it to stop by the end of its stdin.
+    fn ask_to_stop(&mut self) {
         drop(self.child.stdin.take());
+    }
+
+    /// Asks it to stop, and waits.
+    fn stop(mut self) -> anyhow::Result<()> {
+        self.ask_to_stop();
         let deadline = Instant::now() + PATIENCE;
         while Instant::now() < deadline {
             if let Some(status) = self.child.try_wait()? {
@@ -136,13 +141,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let world = scene.build()?;
     let network = free_network(&world)?;
     let files = write_files(&args.output, &scene, &world, &network)?;
-    let state = play(args, &files, &network, &shutdown)?;
-    tracing::info!("drawing the picture");
-    save_recording(&files.recording, &files.picture)?;
-    if state == Ending::Interrupted {
-        output::line(format!("stopped early; the recording is readable: {}", files.recording.display()));
+    if play(args, &files, &network, &shutdown)? == Ending::Interrupted {
+        let recording = files.recording.display();
+        output::line(format!("stopped early; the recording is readable: crossfix view {recording}"));
         return Ok(());
     }
+    tracing::info!("drawing the picture");
+    save_recording(&files.recording, &files.picture)?;
     let question = Question { skip_s: 1.0 + SETTLING_S, ..Question::default() };
     let evaluation = evaluate(&files.recording, &question)?;
     if args.json {
@@ -153,7 +158,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     output::line(format!("picture         {}", files.picture.display()));
     output::line(format!("configurations  {}", files.folder.display()));
     output::line(format!(
-        "look at it      rerun {}    (pip install rerun-sdk==0.36.3)",
+        "look at it      rerun --bind 127.0.0.1 {}    (pip install rerun-sdk==0.36.3)",
         files.picture.display()
     ));
     output::line(format!("took            {:.0} s", begun.elapsed().as_secs_f64()));
@@ -174,9 +179,10 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         let arguments: Vec<String> = arguments.iter().map(|a| (*a).to_owned()).collect();
         Component::start(name, &files.folder, &arguments)
     };
-    let recorder =
-        start("recorder", &["record", "-c", &text(&files.network), "-o", &text(&files.recording)])?;
-    let fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
+    let (network_file, recording) = (text(&files.network), text(&files.recording));
+    let mut recorder =
+        start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
+    let mut fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
     let viewer =
         if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };
 
@@ -215,6 +221,10 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         std::thread::sleep(Duration::from_millis(100));
     }
     bar.finish_and_clear();
+    if interrupted {
+        // All at once: who is asked to stop waits for nobody.
+        agents.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);
+    }
     for agent in agents {
         agent.stop()?;
     }
@@ -266,7 +276,8 @@ fn newest(
         .filter(|track| track.state() == TrackState::Confirmed)
         .filter_map(|track| {
             let p = track.position?;
-            Some(format!("#{} ({:.0}, {:.0}, {:.0}) m", track.id, p.x, p.y, p.z))
+            let number = TrackNumber(track.id);
+            Some(format!("#{number} ({:.0}, {:.0}, {:.0}) m", p.x, p.y, p.z))
         })
         .collect();
     heard.then(|| format!("{} tracks  {}", confirmed.len(), confirmed.join("  ")))

@@ -2,11 +2,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 use crossfix_evaluation::{Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory, TrueTarget};
-use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame, decode};
-use crossfix_recording::RecordingReader;
+use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame};
 use serde::Serialize;
 
 use crate::output;
+use crate::recorded::{self, Lacks};
 
 /// Hold the tracks of a recording against the truth in it.
 #[derive(Debug, clap::Args)]
@@ -54,6 +54,8 @@ pub struct Evaluation {
     pub report: Report,
     /// From a bearing to the tracks that follow from it; absent in data without arrival times.
     pub latency: Option<Latency>,
+    /// What could not be read: the figures are of the rest.
+    pub lacks: Lacks,
 }
 
 /// What a recording holds that can be evaluated.
@@ -61,30 +63,36 @@ pub struct Evaluation {
 struct Run {
     truth: Vec<TruthFrame>,
     tracks: TrackHistory,
+    track_frames: u64,
     sightings: Sightings,
     latency: LatencyRecorder,
 }
 
 impl Run {
-    fn read(&mut self, path: &Path) -> anyhow::Result<()> {
-        RecordingReader::open(path)?.for_each(|entry| {
+    fn read(&mut self, path: &Path) -> anyhow::Result<Lacks> {
+        let mut lacks = Lacks::default();
+        recorded::for_each(path, &mut lacks, |lacks, entry| {
             match entry.key.channel {
-                Channel::Truth => self.truth.push(decode(&entry.data)?),
+                Channel::Truth => self.truth.extend(lacks.read::<TruthFrame>(&entry.data)),
                 Channel::Tracks => {
-                    let frame: TrackFrame = decode(&entry.data)?;
-                    self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
-                    self.tracks.add(&frame);
+                    if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
+                        self.track_frames += 1;
+                        self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
+                        self.tracks.add(&frame);
+                    }
                 }
                 Channel::Bearings(_) => {
-                    let frame: BearingFrame = decode(&entry.data)?;
-                    self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
-                    self.sightings.add(&frame);
+                    if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
+                        self.latency.bearing(&frame.camera, frame.sequence, entry.arrival);
+                        self.sightings.add(&frame);
+                    }
                 }
                 _ => {}
             }
-            Ok::<_, crossfix_message::DecodeError>(())
+            Ok(())
         })?;
-        Ok(())
+        lacks.say(path);
+        Ok(lacks)
     }
 }
 
@@ -98,11 +106,14 @@ fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
 /// Evaluates a recording.
 pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluation> {
     let mut run = Run::default();
-    run.read(recording)?;
+    let mut lacks = run.read(recording)?;
+    lacks.ensure_found(run.track_frames > 0, "tracks", recording)?;
     if let Some(path) = &question.truth {
         let mut other = Run::default();
-        other.read(path)?;
+        let theirs = other.read(path)?;
+        theirs.ensure_found(!other.truth.is_empty(), "truth", path)?;
         run.truth = other.truth;
+        lacks.damage = lacks.damage.or(theirs.damage);
     }
     ensure!(
         !run.truth.is_empty(),
@@ -120,7 +131,7 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
     }
     // Imported data arrive when they are made: there is no latency to speak of.
     let latency = run.latency.latency().filter(|latency| latency.p99_ms > 0.0);
-    Ok(Evaluation { report: evaluator.report(), latency })
+    Ok(Evaluation { report: evaluator.report(), latency, lacks })
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -134,7 +145,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// The figures as people read them.
 pub fn render(evaluation: &Evaluation) -> String {
-    let Evaluation { report, latency } = evaluation;
+    let Evaluation { report, latency, .. } = evaluation;
     let head = ["target", "detected", "tracked", "position RMSE [m]", "velocity RMSE [m/s]", "NEES (6)"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     rows.extend(report.targets.iter().map(|target| {

@@ -1,12 +1,12 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use crossfix_evaluation::{Estimate, TrackHistory};
-use crossfix_message::{Channel, Timestamp, TrackFrame, decode};
-use crossfix_recording::RecordingReader;
+use crossfix_message::{Channel, Timestamp, TrackFrame};
 use serde::Deserialize;
 
-use crate::output;
+use crate::output::{self, Draft};
+use crate::recorded::{self, Lacks};
 
 /// Write the confirmed tracks of a recording as a table.
 ///
@@ -33,14 +33,23 @@ struct TimeRow {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut history = TrackHistory::default();
-    RecordingReader::open(&args.recording)?.for_each(|entry| {
-        if entry.key.channel == Channel::Tracks {
-            history.add(&decode::<TrackFrame>(&entry.data)?);
+    let mut lacks = Lacks::default();
+    let mut frames = 0_u64;
+    recorded::for_each(&args.recording, &mut lacks, |lacks, entry| {
+        if entry.key.channel == Channel::Tracks
+            && let Some(frame) = lacks.read::<TrackFrame>(&entry.data)
+        {
+            frames += 1;
+            history.add(&frame);
         }
-        Ok::<_, crossfix_message::DecodeError>(())
+        Ok(())
     })?;
-    let mut writer =
-        csv::Writer::from_path(&args.csv).with_context(|| format!("cannot write {}", args.csv.display()))?;
+    lacks.say(&args.recording);
+    lacks.ensure_found(frames > 0, "tracks", &args.recording)?;
+    let inputs: Vec<&Path> = std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
+    let draft = Draft::new(&args.csv, &inputs)?;
+    let mut writer = csv::Writer::from_path(draft.path())
+        .with_context(|| format!("cannot write {}", args.csv.display()))?;
     writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz"])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
@@ -68,6 +77,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
     }
     writer.flush().with_context(|| format!("cannot write {}", args.csv.display()))?;
+    drop(writer);
+    draft.keep()?;
     output::line(format!("{rows} rows written to {}", args.csv.display()));
     Ok(())
 }

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use crossfix_recording::RecordingWriter;
 
 use crate::import::{drone_tracking, scenario};
-use crate::output;
+use crate::output::{self, Draft};
 
 /// Turn published data sets into recordings.
 #[derive(Debug, clap::Args)]
@@ -59,11 +59,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Source::Scenario { dir, output } => (scenario::read(dir)?, output),
     };
     entries.sort_by_key(|entry| entry.data_time);
-    let mut writer = RecordingWriter::create(path)?;
+    let draft = Draft::new(path, &[])?;
+    let mut writer = RecordingWriter::create(draft.path())?;
+    writer.sign(&crossfix_recording::Source {
+        command: "import".to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        ..Default::default()
+    })?;
     for entry in &entries {
         writer.write(entry)?;
     }
     let messages = writer.finish()?;
+    draft.keep()?;
     output::line(format!("{messages} messages written to {}", path.display()));
     Ok(())
 }

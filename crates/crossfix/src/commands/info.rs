@@ -1,10 +1,11 @@
 use std::path::PathBuf;
 
-use crossfix_recording::RecordingInfo;
+use anyhow::ensure;
+use crossfix_recording::{RecordingInfo, Source};
 
 use crate::output;
 
-/// Say what a recording holds: channels, messages, times, damage.
+/// Say what a recording holds: channels, messages, times; and what it lacks: losses, damage.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  crossfix info recordings/two-uavs.mcap --json")]
 pub struct Args {
@@ -18,8 +19,15 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let info = RecordingInfo::of(&args.recording)?;
     if args.json {
-        return output::json(&info);
+        output::json(&info)?;
+    } else {
+        print(&info);
     }
+    ensure!(!info.channels.is_empty(), "{} holds no message of Crossfix", args.recording.display());
+    Ok(())
+}
+
+fn print(info: &RecordingInfo) {
     let head = ["channel", "messages", "bytes", "first [s]", "last [s]", "schema"].map(str::to_owned);
     let mut rows = vec![head.to_vec()];
     rows.extend(info.channels.iter().map(|channel| {
@@ -36,9 +44,28 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if info.foreign > 0 {
         output::line(format!("{} messages on topics that are not Crossfix's", info.foreign));
     }
+    if let Some(source) = &info.source {
+        let Source { command, version, run, host } = source;
+        let run = if run.is_empty() { String::new() } else { format!(", run {run} on {host}") };
+        output::line(format!("written by crossfix {version} {command}{run}"));
+    }
+    for (component, health) in &info.health {
+        let counted = health.counters.iter().filter(|(name, _)| is_a_loss(name));
+        let counted: Vec<String> = counted.map(|(name, value)| format!("{name} {value}")).collect();
+        if !counted.is_empty() {
+            output::line(format!("`{component}` counted {}", counted.join(", ")));
+        }
+        for problem in &health.problems {
+            output::line(format!("`{component}` said at its last: {problem}"));
+        }
+    }
     match &info.damage {
-        Some(damage) => output::line(format!("torn: {damage}; all of the above is readable")),
+        Some(damage) => output::line(format!("damaged {damage}; all of the above is readable")),
         None => output::line("complete"),
     }
-    Ok(())
+}
+
+/// Whether what a component counts was lost, or not used.
+fn is_a_loss(counter: &str) -> bool {
+    ["received_", "rejected_", "bad_", "unseen_"].iter().any(|kind| counter.starts_with(kind))
 }

@@ -9,7 +9,7 @@ use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key, Payload,
     SiteName, Timestamp,
 };
-use crossfix_recording::{Entry, RecordingWriter};
+use crossfix_recording::{Entry, RecordingWriter, Source};
 use crossfix_simulation::{Scene, SimulatedCamera, World};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -18,7 +18,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::commands::agent::truth_frame;
 use crate::config;
 use crate::import::imported;
-use crate::output;
+use crate::output::{self, Draft};
 
 /// Turn a scene into a recording of bearings with truth, or into video files; or write a scenario.
 #[derive(Debug, clap::Args)]
@@ -59,7 +59,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
-    let scene: Scene = config::load(path, &args.sets)?;
+    let scene: Scene = config::load(path, &args.sets, config::Kind::Scene)?;
     let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
     let noise = args.noise_px;
     ensure!((0.01..100.0).contains(&noise), "--noise-px is {noise}: it must be from 0.01 to 100 px");
@@ -71,7 +71,9 @@ fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
         std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
         for camera in world.cameras() {
             let path = folder.join(format!("{}.y4m", camera.name()));
-            film(camera, &path).with_context(|| format!("cannot write {}", path.display()))?;
+            let draft = Draft::new(&path, &[])?;
+            film(camera, draft.path()).with_context(|| format!("cannot write {}", path.display()))?;
+            draft.keep()?;
             output::line(format!("{} frames written to {}", camera.frames(), path.display()));
         }
     }
@@ -97,11 +99,19 @@ fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Resul
         entries.push(imported(key, Timestamp::from_seconds(t), truth_frame(world, t, 0.0).encode()));
     }
     entries.sort_by_key(|entry| entry.data_time);
-    let mut writer = RecordingWriter::create(path)?;
+    let draft = Draft::new(path, &[])?;
+    let mut writer = RecordingWriter::create(draft.path())?;
+    writer.sign(&Source {
+        command: "simulate".to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        ..Source::default()
+    })?;
     for entry in &entries {
         writer.write(entry)?;
     }
-    Ok(writer.finish()?)
+    let messages = writer.finish()?;
+    draft.keep()?;
+    Ok(messages)
 }
 
 /// What a camera with perfect clock and tracker but noisy pixels would publish of one frame.

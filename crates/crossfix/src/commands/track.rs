@@ -9,7 +9,8 @@ use crossfix_video::{Frame, FrameClock, VideoError};
 use crossfix_view::{FollowedTarget, ImageBox, Sight, TrackingPicture};
 use crossfix_vision::{DetectorConfig, ImageTrack, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
 
-use crate::output;
+use crate::commands::numbers;
+use crate::output::{self, Draft};
 use crate::{config, eye};
 
 /// Follow a target in a video, without a network.
@@ -43,7 +44,7 @@ pub struct Args {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
     /// Frame rate of image folders, frames a second.
-    #[arg(long, default_value_t = 30.0, value_name = "HZ")]
+    #[arg(long, default_value_t = 30.0, value_name = "HZ", value_parser = numbers::rate)]
     rate_hz: f64,
 }
 
@@ -70,7 +71,7 @@ impl FromStr for BoxArg {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut tracker_config: TrackerConfig = match &args.config {
-        Some(path) => config::load(path, &args.sets)?,
+        Some(path) => config::load(path, &args.sets, config::Kind::Tracker)?,
         None => config::parse("", &args.sets)?,
     };
     if args.place.is_none() && tracker_config.detector.is_none() {
@@ -82,15 +83,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     let clock = FrameClock { fallback_rate_hz: args.rate_hz, ..FrameClock::default() };
     let mut source = crossfix_video::open(&args.video, clock)?;
-    let sink: Box<dyn std::io::Write> = match &args.csv {
-        Some(path) => {
-            Box::new(std::fs::File::create(path).with_context(|| format!("cannot write {}", path.display()))?)
-        }
+    let inputs: Vec<&Path> = std::iter::once(&args.video).chain(&args.labels).map(PathBuf::as_path).collect();
+    let draft = |path: &Option<PathBuf>| path.as_deref().map(|path| Draft::new(path, &inputs)).transpose();
+    let (table, drawn) = (draft(&args.csv)?, draft(&args.save)?);
+    let sink: Box<dyn std::io::Write> = match &table {
+        Some(draft) => Box::new(
+            std::fs::File::create(draft.path())
+                .with_context(|| format!("cannot write {}", draft.path().display()))?,
+        ),
         None => Box::new(std::io::stdout().lock()),
     };
     let mut writer = csv::Writer::from_writer(sink);
     writer.write_record(["frame", "x", "y", "w", "h", "ok", "us"])?;
-    let picture = args.save.as_deref().map(|path| Picture::new(path, args.labels.as_deref())).transpose()?;
+    let picture = drawn.as_ref().map(|draft| Picture::new(draft.path(), args.labels.as_deref())).transpose()?;
     let mut frames = 0_u64;
     loop {
         let frame = match source.next_frame() {
@@ -123,9 +128,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     writer.flush().context("cannot write the table")?;
     drop(writer);
-    if let (Some(picture), Some(path)) = (picture, &args.save) {
+    table.map_or(Ok(()), Draft::keep)?;
+    if let (Some(picture), Some(draft), Some(path)) = (picture, drawn, &args.save) {
         picture.picture.finish()?;
-        output::line(format!("picture written to {0}: `rerun {0}` shows it", path.display()));
+        draft.keep()?;
+        output::line(format!("picture written to {0}: `rerun --bind 127.0.0.1 {0}` shows it", path.display()));
     }
     if let Some(path) = &args.csv {
         output::line(format!("{frames} frames tracked, boxes written to {}", path.display()));

@@ -1,16 +1,19 @@
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use crossfix_message::{Key, Timestamp};
-use crossfix_recording::RecordingReader;
-use crossfix_transport::{Link, Role};
-use crossfix_view::{Picture, ViewError};
+use crossfix_message::{CameraName, Key, Timestamp};
+use crossfix_transport::{Received, Reception, Role, Subscription};
+use crossfix_view::Picture;
 
 use crate::config;
-use crate::output;
+use crate::lookout::Lookout;
+use crate::network;
+use crate::output::{self, Draft};
 use crate::pace::wall_seconds;
+use crate::recorded::{self, Lacks};
+use crate::repeats::Repeats;
 use crate::shutdown::Shutdown;
 
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
@@ -37,8 +40,15 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let stream = match (&args.save, args.connect) {
-        (Some(path), _) => crossfix_view::save(path)?,
+    let (inputs, is_live) = match (&args.recording, &args.config) {
+        (Some(recording), _) => (vec![recording.as_path()], false),
+        (None, Some(_)) => (Vec::new(), true),
+        (None, None) => bail!("give a recording, or a network file with -c"),
+    };
+    let draft = args.save.as_deref().map(|path| Draft::new(path, &inputs)).transpose()?;
+    let stream = match (&draft, args.connect) {
+        (Some(draft), _) if is_live => crossfix_view::save_without_end(draft.path())?,
+        (Some(draft), _) => crossfix_view::save(draft.path())?,
         (None, Some(address)) => crossfix_view::connect(address)?,
         (None, None) => crossfix_view::connect(crossfix_view::spawn_viewer()?)?,
     };
@@ -46,11 +56,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     match (&args.recording, &args.config) {
         (Some(recording), _) => draw_recording(picture, recording)?,
         (None, Some(network)) => draw_live(picture, network, args.stop_with_stdin)?,
-        (None, None) => bail!("give a recording, or a network file with -c"),
+        (None, None) => {}
     }
-    if let Some(path) = &args.save {
+    if let (Some(draft), Some(path)) = (draft, &args.save) {
+        draft.keep()?;
         output::line(format!(
-            "picture written to {}; look at it with: rerun {}",
+            "picture written to {}; look at it with: rerun --bind 127.0.0.1 {}",
             path.display(),
             path.display()
         ));
@@ -60,38 +71,112 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// Draws a recording into an .rrd file.
 pub fn save_recording(recording: &Path, rrd: &Path) -> anyhow::Result<()> {
-    draw_recording(Picture::new(crossfix_view::save(rrd)?)?, recording)
+    let draft = Draft::new(rrd, &[recording])?;
+    draw_recording(Picture::new(crossfix_view::save(draft.path())?)?, recording)?;
+    draft.keep()
 }
 
 fn draw_recording(mut picture: Picture, recording: &Path) -> anyhow::Result<()> {
-    let mut unread = 0_u64;
-    let report = RecordingReader::open(recording)?.for_each(|entry| {
-        unread += u64::from(picture.show(&entry.key.channel, entry.arrival, &entry.data)?.is_some());
-        Ok::<_, ViewError>(())
+    let mut lacks = Lacks::default();
+    let mut shown = 0_u64;
+    recorded::for_each(recording, &mut lacks, |lacks, entry| {
+        match picture.show(&entry.key.channel, entry.arrival, &entry.data)? {
+            None => shown += 1,
+            Some(error) => lacks.note(&error),
+        }
+        Ok(())
     })?;
-    if let Some(damage) = report.damage {
-        tracing::warn!("{} is torn: {damage}; everything before is shown", recording.display());
-    }
-    if unread > 0 {
-        tracing::warn!("{unread} messages could not be read and are not shown");
-    }
+    lacks.say(recording);
+    lacks.ensure_found(shown > 0, "message that can be shown", recording)?;
     picture.finish().context("the picture is not complete")
 }
+
+/// How often is looked who is there, and whether the viewer still is.
+const LOOK_PERIOD: Duration = Duration::from_secs(1);
+/// A viewer that takes this long for one message does not keep up.
+const STALL: Duration = Duration::from_secs(2);
+/// How long a viewer has for what was drawn last.
+const LAST_LOOK: Duration = Duration::from_millis(500);
 
 fn draw_live(mut picture: Picture, network: &Path, stop_with_stdin: bool) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_stdin(stop_with_stdin);
     let network = config::load_network(network)?;
-    let link = Link::open(&network, &Role::Observer)?;
+    let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
+        return Ok(());
+    };
+    let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
+    let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     tracing::info!("showing `{}` until Ctrl-C", link.site());
-    while !shutdown.requested() {
-        let Some(received) = subscription.next(Duration::from_millis(50)) else {
-            continue;
-        };
-        let now = Timestamp::from_seconds(wall_seconds());
-        picture.show(&received.key.channel, now, &received.data)?;
+    let mut watch = Watch { cameras, reception: Reception::default(), repeats: Repeats::default() };
+    let mut looked_at = Instant::now();
+    let mut is_watched = true;
+    while is_watched && !shutdown.requested() {
+        if let Some(received) = subscription.next(Duration::from_millis(50)) {
+            watch.show(&mut picture, &received)?;
+        }
+        if looked_at.elapsed() >= LOOK_PERIOD {
+            looked_at = Instant::now();
+            lookout.look(looked_at);
+            watch.look(&subscription, looked_at);
+            is_watched = !picture.has_lost_its_viewer();
+        }
     }
-    drop(subscription);
+    drop((subscription, lookout));
     link.close()?;
-    picture.finish().context("the picture is not complete")
+    if !is_watched {
+        output::line("the viewer was closed");
+        return Ok(());
+    }
+    picture.finish_within(LAST_LOOK).context("the picture is not complete")
+}
+
+/// What a viewer is shown of what comes, and what it misses.
+struct Watch {
+    cameras: Vec<CameraName>,
+    reception: Reception,
+    repeats: Repeats,
+}
+
+impl Watch {
+    fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
+        let Received { key, data, origin, at } = received;
+        if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
+            self.repeats.warn("foreign", *at, || {
+                format!("`{key}` is of no camera of the network's file: not shown")
+            });
+            return Ok(());
+        }
+        if let Some(origin) = *origin {
+            let missing = self.reception.see(key, origin, *at);
+            if missing > 0 {
+                self.repeats.warn(&format!("missing {key}"), *at, || {
+                    format!("{missing} messages on `{key}` did not arrive and are not shown")
+                });
+            }
+        }
+        let begun = Instant::now();
+        let now = Timestamp::from_seconds(wall_seconds());
+        if let Some(error) = picture.show(&key.channel, now, data)? {
+            self.repeats.warn(&format!("unread {key}"), *at, || {
+                format!("a message on `{key}` is not shown: {error}")
+            });
+        }
+        if begun.elapsed() > STALL {
+            self.repeats.warn("stall", *at, || {
+                format!("the viewer did not take the picture for {:.0} s", begun.elapsed().as_secs_f64())
+            });
+        }
+        Ok(())
+    }
+
+    fn look(&mut self, subscription: &Subscription, now: Instant) {
+        self.repeats.remind(now);
+        let dropped = subscription.refused().dropped;
+        if dropped > 0 {
+            self.repeats.warn("dropped", now, || {
+                format!("{dropped} messages came while the viewer was busy and are not shown")
+            });
+        }
+    }
 }

@@ -2,13 +2,19 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, ensure};
 use crossfix_calibration::intrinsics_from_yaml;
-use crossfix_geometry::{Camera, Pose};
+use crossfix_geometry::{Camera, ImageSize, Pixel, PixelCovariance, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
-use crossfix_recording::RecordingReader;
 use crossfix_simulation::{Scene, SceneCamera};
+use crossfix_video::FrameClock;
 use crossfix_vision::{PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
+
+use super::Kind;
+use crate::recorded;
+
+/// The last second of this century: what begins later begins in error.
+const LAST_START_S: f64 = 4_102_444_800.0;
 
 /// One camera: what it is, where it stands, where its pictures come from, how it follows targets.
 /// Paths are relative to the file.
@@ -61,13 +67,13 @@ pub enum SourceConfig {
     Video {
         /// .mp4 (H.264), .y4m, or a folder of PNG or JPEG images.
         path: PathBuf,
-        /// Capture time of the first frame, s since the Unix epoch. Default 0.
+        /// Capture time of the first frame, s since the Unix epoch, 0 to 4102444800. Default 0.
         #[serde(default)]
         start_s: f64,
-        /// Frame rate of image folders, 1/s. Default 30.
+        /// Frame rate of image folders, 1/s, 0.001 to 10000. Default 30.
         #[serde(default = "thirty")]
         rate_hz: f64,
-        /// How much faster than in life it is played; 0 is as fast as it goes. Default 1.
+        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
         #[serde(default = "one")]
         speed: f64,
     },
@@ -83,7 +89,7 @@ pub enum SourceConfig {
     Recording {
         /// The recording (MCAP).
         path: PathBuf,
-        /// How much faster than in life it is played; 0 is as fast as it goes. Default 1.
+        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
         #[serde(default = "one")]
         speed: f64,
     },
@@ -161,7 +167,7 @@ impl Default for PreviewConfig {
 impl CameraFile {
     /// Reads the file and makes its paths absolute or relative to where we are.
     pub fn load(path: &Path, sets: &[String]) -> anyhow::Result<Self> {
-        let mut file: Self = super::load(path, sets)?;
+        let mut file: Self = super::load(path, sets, Kind::Camera)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = folder.join(&file.network);
         file.intrinsics = file.intrinsics.map(|intrinsics| folder.join(intrinsics));
@@ -193,7 +199,9 @@ impl CameraFile {
                 let intrinsics = intrinsics_from_yaml(&text)
                     .with_context(|| format!("the intrinsics file {} has an error", intrinsics.display()))?;
                 let pose = pose.pose().context("section [pose]").with_context(wrong)?;
-                Ok(Camera::new(intrinsics, pose)?)
+                let camera = Camera::new(intrinsics, pose)?;
+                self.check_lens(&camera).with_context(wrong)?;
+                Ok(camera)
             }
             (None, None, SourceConfig::Recording { path, .. }) => {
                 let calibration = recorded_calibration(path, &self.name).with_context(wrong)?;
@@ -228,12 +236,75 @@ impl CameraFile {
             "key `preview.divisor` is {}: it must be from 1 to 64",
             preview.divisor
         );
-        for place in self.boxes() {
+        for place in &self.boxes {
+            let [x, y, width, height] = *place;
             ensure!(
-                place.is_possible(),
-                "key `boxes`: a box must have sides of 1 to 1000 pixels, not {place:?}"
+                PixelBox { x, y, width, height }.is_possible(),
+                "key `boxes`: {place:?} is no box: left and top within 1e6 pixels, sides of 1 to 1000"
             );
         }
+        self.check_pace()
+    }
+
+    /// What a source is played with.
+    fn check_pace(&self) -> anyhow::Result<()> {
+        let (rate_hz, start_s, speed) = match self.source {
+            SourceConfig::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
+            SourceConfig::Recording { speed, .. } => (thirty(), 0.0, speed),
+            SourceConfig::Simulation { .. } => return Ok(()),
+        };
+        ensure!(
+            (0.001..=10_000.0).contains(&rate_hz),
+            "key `source.rate_hz` is {rate_hz}: it must be from 0.001 to 10000 frames a second"
+        );
+        ensure!(
+            (0.0..=LAST_START_S).contains(&start_s),
+            "key `source.start_s` is {start_s}: it must be from 0 to {LAST_START_S} s since the Unix epoch"
+        );
+        ensure!(
+            (0.0..=1000.0).contains(&speed),
+            "key `source.speed` is {speed}: it must be from 0 (as fast as it goes) to 1000"
+        );
+        Ok(())
+    }
+
+    /// Checks what needs the lens: that it shows a direction for every pixel, and that boxes are in its
+    /// image.
+    fn check_lens(&self, camera: &Camera) -> anyhow::Result<()> {
+        let ImageSize { width, height } = camera.model().intrinsics().size;
+        let (right, bottom) = (f64::from(width) - 1.0, f64::from(height) - 1.0);
+        for (x, y) in [(0.0, 0.0), (right, 0.0), (0.0, bottom), (right, bottom), (right / 2.0, 0.0), (0.0, bottom / 2.0)] {
+            camera.model().bearing(Pixel::new(x, y), PixelCovariance::isotropic(1.0)).with_context(|| {
+                format!("the lens shows no direction at pixel ({x}, {y}): are the distortion coefficients in their order?")
+            })?;
+        }
+        for &[x, y, w, h] in &self.boxes {
+            ensure!(
+                x + w > 0.0 && y + h > 0.0 && x < f64::from(width) && y < f64::from(height),
+                "key `boxes`: [{x}, {y}, {w}, {h}] lies outside of the image of {width}x{height} pixels"
+            );
+        }
+        Ok(())
+    }
+
+    /// Opens the pictures and holds them against the lens: what else an agent would find out only when it
+    /// starts.
+    pub fn check_pictures(&self, camera: &Camera) -> anyhow::Result<()> {
+        let SourceConfig::Video { path, .. } = &self.source else {
+            return Ok(());
+        };
+        let wrong = || format!("key `source.path`: {}", path.display());
+        let mut source = crossfix_video::open(path, FrameClock::default()).with_context(wrong)?;
+        let frame = source.next_frame().with_context(wrong)?;
+        let frame = frame.with_context(|| format!("key `source.path`: {} holds no frame", path.display()))?;
+        let ImageSize { width, height } = camera.model().intrinsics().size;
+        ensure!(
+            (frame.width, frame.height) == (width as usize, height as usize),
+            "{} has frames of {}x{} pixels, the intrinsics are for {width}x{height}: calibrate at the size of the video",
+            path.display(),
+            frame.width,
+            frame.height
+        );
         Ok(())
     }
 
@@ -248,12 +319,16 @@ impl CameraFile {
 
     /// The message that describes the camera: the recorded one as it is, where it is replayed with
     /// its own, so that the same bytes give the same tracks.
-    pub fn calibration(&self, camera: &Camera) -> anyhow::Result<CameraCalibration> {
+    pub fn calibration(
+        &self,
+        camera: &Camera,
+        valid_from: Timestamp,
+    ) -> anyhow::Result<CameraCalibration> {
         match &self.source {
             SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
                 recorded_calibration(path, &self.name)
             }
-            _ => Ok(CameraCalibration::new(&self.name, camera, Timestamp::EPOCH)),
+            _ => Ok(CameraCalibration::new(&self.name, camera, valid_from)),
         }
     }
 
@@ -262,11 +337,19 @@ impl CameraFile {
         match &self.source {
             SourceConfig::Video { rate_hz, .. } => Ok(Some(*rate_hz)),
             SourceConfig::Simulation { scene, .. } => {
-                let scene: Scene = super::load(scene, &[])?;
+                let scene: Scene = super::load(scene, &[], Kind::Scene)?;
                 let named = |camera: &&SceneCamera| camera.name == self.name;
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }
             SourceConfig::Recording { .. } => Ok(None),
+        }
+    }
+
+    /// Whether its source is played as fast as it goes.
+    pub fn is_unpaced(&self) -> bool {
+        match self.source {
+            SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => speed == 0.0,
+            SourceConfig::Simulation { .. } => false,
         }
     }
 
@@ -279,14 +362,12 @@ impl CameraFile {
 /// The first calibration of a camera in a recording.
 fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<CameraCalibration> {
     let channel = Channel::Calibration(name.clone());
-    let mut first: Option<CameraCalibration> = None;
-    RecordingReader::open(recording)?.for_each(|entry| {
-        if first.is_none() && entry.key.channel == channel {
-            first = Some(decode(&entry.data)?);
-        }
-        Ok::<_, crossfix_message::DecodeError>(())
+    let found = recorded::find(recording, |entry| {
+        (entry.key.channel == channel).then(|| decode::<CameraCalibration>(&entry.data))
     })?;
-    first.with_context(|| format!("{} has no calibration of camera `{name}`", recording.display()))
+    let found =
+        found.with_context(|| format!("{} has no calibration of camera `{name}`", recording.display()))?;
+    found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
 }
 
 impl PoseConfig {

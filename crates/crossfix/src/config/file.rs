@@ -1,3 +1,4 @@
+use std::fmt;
 use std::path::Path;
 
 use anyhow::{Context, anyhow, bail};
@@ -9,10 +10,58 @@ const SIMILAR: f64 = 0.6;
 /// Reads a TOML file into a configuration; `sets` are `key=value` overrides with dotted keys.
 ///
 /// The error names the file, the line, the key and, for an unknown key, the nearest known one.
-pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String]) -> anyhow::Result<T> {
+/// A file of another kind than is wanted is named as what it is.
+pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> anyhow::Result<T> {
     let text = std::fs::read_to_string(path)
         .with_context(|| format!("cannot read the configuration file {}", path.display()))?;
-    parse(&text, sets).with_context(|| format!("the configuration file {} has an error", path.display()))
+    parse(&text, sets).or_else(|error| {
+        let kind = toml::from_str(&text).ok().and_then(|keys| Kind::of(&keys));
+        match kind.filter(|kind| *kind != wanted) {
+            Some(kind) => bail!("{} is {kind}, and what is wanted here is {wanted}", path.display()),
+            None => Err(error)
+                .with_context(|| format!("the configuration file {} has an error", path.display())),
+        }
+    })
+}
+
+/// What a configuration file is of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    Camera,
+    Fusion,
+    Network,
+    Scene,
+    Tracker,
+}
+
+impl Kind {
+    /// What a file is by its keys; `None` if they say nothing.
+    pub fn of(keys: &toml::Table) -> Option<Self> {
+        let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
+        if has(&["source", "pose", "intrinsics"]) {
+            Some(Self::Camera)
+        } else if has(&["targets"]) {
+            Some(Self::Scene)
+        } else if has(&["site", "routers"]) || keys.get("cameras").is_some_and(toml::Value::is_table) {
+            Some(Self::Network)
+        } else if has(&["event_time", "bearings", "initiation", "tracking", "clocks", "network"]) {
+            Some(Self::Fusion)
+        } else {
+            has(&["algorithm", "reference", "gate", "detector", "margin_px", "paper"]).then_some(Self::Tracker)
+        }
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Camera => "a camera's file",
+            Self::Fusion => "a fusion centre's file",
+            Self::Network => "a network file",
+            Self::Scene => "a scene of the simulator",
+            Self::Tracker => "an image tracker's file",
+        })
+    }
 }
 
 /// Reads TOML text, with overrides.
@@ -76,6 +125,28 @@ mod tests {
         assert!(error.contains("latenes_s"), "{error}");
         assert!(error.contains("line 2"), "{error}");
         assert!(error.contains("did you mean `lateness_s`?"), "{error}");
+    }
+
+    #[test]
+    fn a_file_of_another_kind_is_named_as_what_it_is() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/");
+        let kinds = [
+            ("site/north.toml", Kind::Camera),
+            ("site/fusion.toml", Kind::Fusion),
+            ("site/network.toml", Kind::Network),
+            ("demo/scene.toml", Kind::Scene),
+            ("paper-tracker.toml", Kind::Tracker),
+        ];
+        for (name, kind) in kinds {
+            let path = Path::new(folder).join(name);
+            let keys = toml::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+            assert_eq!(Kind::of(&keys), Some(kind), "{name}");
+            if kind != Kind::Fusion {
+                let error = load::<crate::config::FusionFile>(&path, &[], Kind::Fusion).unwrap_err();
+                let says = format!("is {kind}, and what is wanted here is a fusion centre's file");
+                assert!(error.to_string().contains(&says), "{error}");
+            }
+        }
     }
 
     #[test]

@@ -6,6 +6,6 @@ mod fusion;
 mod site;
 
 pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
-pub use file::{load, parse};
+pub use file::{Kind, load, parse};
 pub use fusion::FusionFile;
 pub use site::{Site, load_cameras, load_network};

@@ -2,14 +2,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
+use crossfix_geometry::Camera;
 use crossfix_message::CameraName;
 use crossfix_transport::NetworkConfig;
 
-use super::{CameraFile, FusionFile};
+use super::{CameraFile, FusionFile, Kind};
 
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
-    let network: NetworkConfig = super::load(path, &[])?;
+    let network: NetworkConfig = super::load(path, &[], Kind::Network)?;
     network.validate().with_context(|| format!("the network file {} has an error", path.display()))?;
     Ok(network)
 }
@@ -32,7 +33,7 @@ fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
 }
 
 fn is_camera(keys: &toml::Table) -> bool {
-    keys.contains_key("source")
+    Kind::of(keys) == Some(Kind::Camera)
 }
 
 /// The camera files of a folder, whether or not the rest of the site is there yet.
@@ -49,37 +50,50 @@ pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>>
 
 /// A folder with the files of a site: what `check` looks at as a whole.
 pub struct Site {
-    pub cameras: BTreeMap<CameraName, PathBuf>,
+    pub cameras: BTreeMap<CameraName, CheckedCamera>,
     pub fusion: Vec<PathBuf>,
+}
+
+/// A camera's file that is good by itself.
+pub struct CheckedCamera {
+    pub path: PathBuf,
+    pub camera: Camera,
+    network: NetworkConfig,
 }
 
 impl Site {
     /// Reads every TOML file of a folder and checks that they fit together.
     pub fn load(folder: &Path) -> anyhow::Result<Self> {
         let mut site = Self { cameras: BTreeMap::new(), fusion: Vec::new() };
+        let mut fusion = Vec::new();
         for (path, keys) in toml_files(folder)? {
-            if is_camera(&keys) {
-                site.add_camera(&path)?;
-            } else if keys.contains_key("fusion") {
-                load_network(&path)?;
-            } else if keys.contains_key("targets") {
-                // A scene of the simulator.
-            } else {
-                let file = FusionFile::load(Some(&path), &[])?;
-                if let Some(network) = &file.network {
-                    load_network(network)?;
-                }
-                site.fusion.push(path);
+            match Kind::of(&keys) {
+                Some(Kind::Camera) => site.add_camera(&path)?,
+                Some(Kind::Network) => drop(load_network(&path)?),
+                // A scene of the simulator, or a tracker's settings.
+                Some(Kind::Scene | Kind::Tracker) => {}
+                Some(Kind::Fusion) | None => fusion.push(path),
             }
         }
         ensure!(!site.cameras.is_empty(), "{} holds no camera file", folder.display());
+        ensure!(
+            !fusion.is_empty(),
+            "{} holds no fusion centre's file: copy configs/site/fusion.toml",
+            folder.display()
+        );
+        for path in fusion {
+            site.add_fusion(path)?;
+        }
+        site.check_cameras()?;
         Ok(site)
     }
 
     fn add_camera(&mut self, path: &Path) -> anyhow::Result<()> {
         let file = CameraFile::load(path, &[])?;
-        file.camera(path)?;
-        let network = load_network(&file.network)?;
+        let camera = file.camera(path)?;
+        file.check_pictures(&camera).with_context(|| path.display().to_string())?;
+        let network = load_network(&file.network)
+            .with_context(|| format!("key `network` of {}", path.display()))?;
         ensure!(
             network.cameras.contains_key(&file.name),
             "{}: camera `{}` has no endpoint: add it to [cameras] of {}",
@@ -87,14 +101,61 @@ impl Site {
             file.name,
             file.network.display()
         );
-        if let Some(other) = self.cameras.insert(file.name.clone(), path.to_owned()) {
+        let checked = CheckedCamera { path: path.to_owned(), camera, network };
+        if let Some(other) = self.cameras.insert(file.name.clone(), checked) {
             bail!(
                 "two cameras are called `{}`: change the key `name` of {} or of {}",
                 file.name,
-                other.display(),
+                other.path.display(),
                 path.display()
             );
         }
         Ok(())
     }
+
+    fn add_fusion(&mut self, path: PathBuf) -> anyhow::Result<()> {
+        let file = FusionFile::load(Some(&path), &[])?;
+        if let Some(network) = &file.network {
+            let network =
+                load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
+            for camera in file.cameras.iter().flatten() {
+                ensure!(
+                    network.cameras.contains_key(camera),
+                    "key `cameras` of {}: the network has no camera `{camera}`{}",
+                    path.display(),
+                    nearest(camera.as_str(), network.cameras.keys().map(CameraName::as_str))
+                );
+            }
+        }
+        self.fusion.push(path);
+        Ok(())
+    }
+
+    /// What the cameras are together.
+    fn check_cameras(&self) -> anyhow::Result<()> {
+        for checked in self.cameras.values() {
+            for camera in checked.network.cameras.keys() {
+                ensure!(
+                    self.cameras.contains_key(camera),
+                    "the network of {} names camera `{camera}`, which has no file here",
+                    checked.path.display()
+                );
+            }
+        }
+        let mut places = self.cameras.values().map(|checked| checked.camera.pose().position());
+        let first = places.next();
+        ensure!(
+            self.cameras.len() < 2 || places.any(|place| Some(place) != first),
+            "all cameras stand at the same place: their sight lines cross nowhere else; see `position_m`"
+        );
+        Ok(())
+    }
+}
+
+/// The known name that is most like a wrong one, as a question.
+fn nearest<'a>(wrong: &str, known: impl Iterator<Item = &'a str>) -> String {
+    let likeness = |name: &&str| strsim::jaro_winkler(wrong, name);
+    known
+        .max_by(|a, b| likeness(a).total_cmp(&likeness(b)))
+        .map_or_else(String::new, |name| format!("; did you mean `{name}`?"))
 }

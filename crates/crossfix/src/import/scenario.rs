@@ -1,7 +1,7 @@
 //! Scenario folders of the format `passive-bearings/1`: time-stamped bearings
 //! of many cameras with clutter and missed detections, with truth.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::{Context, ensure};
@@ -116,7 +116,8 @@ fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
 }
 
 fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec<Entry>> {
-    let epochs: Vec<Timestamp> = scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
+    let epochs: BTreeSet<Timestamp> =
+        scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
     let mut frames: BTreeMap<Timestamp, Vec<TrueState>> = BTreeMap::new();
     for row in read_csv::<TruthRow>(&dir.join("truth.csv"))? {
         let time = Timestamp::from_seconds(row.t);

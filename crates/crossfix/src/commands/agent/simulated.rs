@@ -24,7 +24,7 @@ pub struct SimulatedSource {
 impl SimulatedSource {
     /// A camera's view of a scene that begins `start` seconds after the Unix epoch.
     pub fn open(path: &Path, file: &CameraFile, start: f64) -> anyhow::Result<Self> {
-        let scene: Scene = config::load(path, &[])?;
+        let scene: Scene = config::load(path, &[], config::Kind::Scene)?;
         let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
         let camera = world
             .camera(file.name.as_str())

@@ -160,7 +160,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         let draft = Draft::new(path, &[])?;
         picture::draw(&report, &cameras, draft.path())?;
         draft.keep()?;
-        tracing::info!("picture written to {0}; look at it with: rerun {0}", path.display());
+        tracing::info!("picture written to {0}; look at it with: rerun --bind 127.0.0.1 {0}", path.display());
     }
     Ok(())
 }

@@ -1,10 +1,15 @@
 mod offline;
 mod online;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use crossfix_message::{Channel, Timestamp};
+use anyhow::ensure;
+use crossfix_message::{Channel, Key, Timestamp};
 use crossfix_recording::{Entry, RecordingReader};
+
+use crate::commands::numbers;
+use crate::recorded::{self, Lacks};
 
 /// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
 #[derive(Debug, clap::Args)]
@@ -20,23 +25,25 @@ pub struct Args {
     /// The fusion's configuration (TOML); its defaults without.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     config: Option<PathBuf>,
-    /// Override a key of the configuration, e.g. tracking.acceleration_density=2.
+    /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
     sets: Vec<String>,
-    /// The recording (MCAP) to write: calibrations, truth and the new tracks.
+    /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the old.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     output: Option<PathBuf>,
-    /// Start this long after the first message, seconds of data time.
-    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    /// Start this long after the first bearing, seconds of data time.
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS", value_parser = numbers::not_negative,
+          allow_negative_numbers = true)]
     from: f64,
-    /// End this long after the first message, seconds of data time.
-    #[arg(long, default_value_t = f64::INFINITY, value_name = "SECONDS", hide_default_value = true)]
-    to: f64,
+    /// End this long after the first bearing, seconds of data time.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::positive, allow_negative_numbers = true)]
+    to: Option<f64>,
     /// The network's file (TOML) to publish on; the replay stands in for the site's cameras.
     #[arg(long, value_name = "FILE", conflicts_with = "fuse", required_unless_present = "fuse")]
     network: Option<PathBuf>,
     /// How much faster than in life it is played onto the network; 0 is as fast as it goes.
-    #[arg(long, default_value_t = 1.0, value_name = "FACTOR", conflicts_with = "fuse")]
+    #[arg(long, default_value_t = 1.0, value_name = "FACTOR", conflicts_with = "fuse",
+          value_parser = numbers::speed, allow_negative_numbers = true)]
     speed: f64,
     /// Begin again at the end, until Ctrl-C; times go on.
     #[arg(long = "loop", conflicts_with = "fuse")]
@@ -47,7 +54,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let range = Range::of(&args.recording, args.from, args.to)?;
+    let range = Range::of(args)?;
     match (&args.output, &args.network) {
         (Some(output), _) => offline::fuse(args, output, range),
         (None, Some(network)) => online::publish(args, network, range),
@@ -60,25 +67,65 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 struct Range {
     from: Timestamp,
     to: Timestamp,
+    /// Whether it is the whole recording.
+    is_whole: bool,
 }
 
 impl Range {
-    /// The range between two offsets, in seconds, from the first bearing or track of a recording.
-    fn of(recording: &Path, from_s: f64, to_s: f64) -> anyhow::Result<Self> {
-        let mut start: Option<Timestamp> = None;
-        RecordingReader::open(recording)?.for_each(|entry| {
+    /// The range that was asked for, which counts from the first bearing or track of the recording.
+    fn of(args: &Args) -> anyhow::Result<Self> {
+        let to_s = args.to.unwrap_or(f64::INFINITY);
+        ensure!(args.from < to_s, "--from {} is not before --to {to_s}", args.from);
+        let is_whole = args.from == 0.0 && args.to.is_none();
+        if is_whole && args.fuse {
+            // Where it begins and ends nobody asks.
+            return Ok(Self { from: Timestamp::EPOCH, to: Timestamp::EPOCH, is_whole });
+        }
+        let mut first: Option<Timestamp> = None;
+        let mut last: Option<Timestamp> = None;
+        recorded::for_each(&args.recording, &mut Lacks::default(), |_, entry| {
             if matches!(entry.key.channel, Channel::Bearings(_) | Channel::Tracks) {
-                start = Some(start.map_or(entry.data_time, |s| s.min(entry.data_time)));
+                first = Some(first.map_or(entry.data_time, |first| first.min(entry.data_time)));
+                last = last.max(Some(entry.data_time));
             }
-            Ok::<_, std::convert::Infallible>(())
+            Ok(())
         })?;
-        let start = start.unwrap_or_default();
-        Ok(Self { from: start.plus_seconds(from_s), to: start.plus_seconds(to_s) })
+        let (Some(first), Some(last)) = (first, last) else {
+            anyhow::bail!("{} holds no bearings and no tracks", args.recording.display());
+        };
+        let (from, to) = (first.plus_seconds(args.from), first.plus_seconds(to_s));
+        ensure!(
+            from <= last,
+            "--from {} lies behind the end of {}, which lasts {:.1} s",
+            args.from,
+            args.recording.display(),
+            last.seconds_since(first)
+        );
+        Ok(Self { from, to, is_whole })
     }
 
-    /// Whether an entry is to be played: calibrations always are.
+    /// Whether an entry is to be played.
     fn holds(&self, entry: &Entry) -> bool {
-        matches!(entry.key.channel, Channel::Calibration(_))
-            || (self.from..=self.to).contains(&entry.data_time)
+        self.is_whole || (self.from..=self.to).contains(&entry.data_time)
     }
+}
+
+/// The calibrations that hold at a range's beginning, ordered by key: each camera's last one before it, or
+/// else its first.
+fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
+    let is_calibration = |key: &Key| matches!(key.channel, Channel::Calibration(_));
+    let cameras = RecordingReader::open(recording)?.keys().filter(|key| is_calibration(key)).count();
+    let mut found: BTreeMap<Key, Entry> = BTreeMap::new();
+    recorded::find(recording, |entry| {
+        let is_past = entry.data_time > range.from;
+        if is_calibration(&entry.key)
+            && (!found.contains_key(&entry.key) || !range.is_whole && !is_past)
+        {
+            found.insert(entry.key.clone(), entry);
+        }
+        // A torn file does not say beforehand how many there are.
+        let is_all = cameras > 0 && found.len() == cameras && (range.is_whole || is_past);
+        is_all.then_some(())
+    })?;
+    Ok(found.into_values().collect())
 }

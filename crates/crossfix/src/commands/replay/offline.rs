@@ -3,152 +3,168 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use crossfix_fusion::{Fusion, Output};
-use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Key, Payload, SiteName, Timestamp, decode,
-};
-use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
+use anyhow::bail;
+use crossfix_fusion::Output;
+use crossfix_message::{Channel, Key, Payload, SiteName, Timestamp, TrackNumber};
+use crossfix_recording::{Entry, RecordingWriter, Source};
 
-use super::{Args, Range};
-use crate::commands::rejections::{RejectionLog, report_camera};
+use super::{Args, Range, calibrations};
+use crate::centre::Centre;
 use crate::config::FusionFile;
-use crate::output;
+use crate::output::{self, Draft};
+use crate::recorded::{self, Lacks};
+use crate::shutdown::Shutdown;
+
+/// How often the fusion's health is written down, s of data time.
+const HEALTH_PERIOD_S: f64 = 1.0;
 
 /// What fusing a recording needs and makes.
 struct OfflineFusion {
-    fusion: Fusion,
+    centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
-    rejections: RejectionLog,
     frames: u64,
-    tracks: u64,
+    site: Option<SiteName>,
+    healthy_at: Option<Timestamp>,
     /// Time spent in the fusion itself, and the longest for one frame.
     busy: Duration,
     longest: Duration,
 }
 
-/// Fuses a recording's bearings and writes calibrations, bearings, truth and tracks.
+/// Fuses a recording's bearings and writes all that was recorded, with new tracks.
 pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen();
     let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
+    let draft = Draft::new(output, &[&args.recording])?;
     let mut run = OfflineFusion {
-        fusion: Fusion::new(file.fusion())?,
-        writer: RecordingWriter::create(output)?,
-        rejections: RejectionLog::default(),
+        centre: Centre::new(file.fusion(), None)?,
+        writer: RecordingWriter::create(draft.path())?,
         frames: 0,
-        tracks: 0,
+        site: None,
+        healthy_at: None,
         busy: Duration::ZERO,
         longest: Duration::ZERO,
     };
-    let mut site: Option<SiteName> = None;
-    // Calibrations first: a range may begin after they were said.
-    RecordingReader::open(&args.recording)?.for_each(|entry| {
-        if matches!(entry.key.channel, Channel::Calibration(_)) {
-            let _ = run.fusion.calibrate(&decode(&entry.data)?);
-        }
-        Ok::<_, crossfix_message::DecodeError>(())
+    run.writer.sign(&Source {
+        command: "replay --fuse".to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        ..Source::default()
     })?;
-    let report = RecordingReader::open(&args.recording)?.for_each(|entry| {
-        if range.holds(&entry) {
-            site.get_or_insert_with(|| entry.key.site.clone());
+    for entry in calibrations(&args.recording, range)? {
+        run.centre.take(&entry.key.channel, &entry.data, "");
+        if !range.is_whole {
+            run.writer.write(&Entry { data_time: range.from.max(entry.data_time), ..entry })?;
+        }
+    }
+    let mut lacks = Lacks::default();
+    let (mut first, mut until) = (None, Timestamp::MIN);
+    recorded::for_each(&args.recording, &mut lacks, |_, entry| {
+        if !shutdown.requested() && range.holds(&entry) {
+            first.get_or_insert(entry.data_time);
+            until = until.max(entry.data_time);
             run.take(&entry)?;
         }
-        Ok::<_, FuseError>(())
+        Ok(())
     })?;
-    if let Some(site) = &site {
-        let last = run.fusion.flush();
-        run.write(site, last)?;
-    }
-    let OfflineFusion { writer, frames, tracks, fusion, busy, longest, .. } = run;
-    writer.finish()?;
-    if let Some(damage) = report.damage {
-        tracing::warn!("{} is torn: {damage}; everything before was used", args.recording.display());
-    }
-    for (name, value) in fusion.counters().iter() {
-        tracing::info!("{name} {value}");
-    }
-    output::line(format!(
-        "{frames} bearing frames fused, {tracks} track frames written to {}",
-        output.display()
-    ));
-    if frames > 0 {
-        output::line(format!(
-            "the fusion itself took {:.1} ms: {:.1} us a frame, {:.2} ms at most",
-            busy.as_secs_f64() * 1e3,
-            busy.as_secs_f64() * 1e6 / frames as f64,
-            longest.as_secs_f64() * 1e3
-        ));
+    lacks.say(&args.recording);
+    lacks.ensure_found(run.frames > 0, "bearings in that range", &args.recording)?;
+    run.finish(args, output)?;
+    draft.keep()?;
+    if shutdown.requested() {
+        bail!(
+            "stopped {:.1} s after the beginning: {} ends there",
+            until.seconds_since(first.unwrap_or(until)),
+            output.display()
+        );
     }
     Ok(())
 }
 
-/// Why fusing a recording stops.
-#[derive(Debug, thiserror::Error)]
-enum FuseError {
-    #[error("a message is damaged or of a newer version")]
-    Decode(#[from] crossfix_message::DecodeError),
-    #[error("the new recording cannot be written")]
-    Write(#[from] crossfix_recording::RecordingError),
-}
-
 impl OfflineFusion {
-    fn take(&mut self, entry: &Entry) -> Result<(), FuseError> {
-        let outputs = match &entry.key.channel {
-            Channel::Calibration(_) => {
-                let message: CameraCalibration = decode(&entry.data)?;
-                if let Err(error) = self.fusion.calibrate(&message) {
-                    tracing::warn!("a calibration was not used: {error}");
-                }
-                self.writer.write(entry)?;
-                return Ok(());
-            }
-            Channel::Bearings(_) => {
-                self.frames += 1;
-                self.writer.write(entry)?;
-                let frame: BearingFrame = decode(&entry.data)?;
-                let start = Instant::now();
-                let outputs = self.fusion.ingest(&frame);
-                let took = start.elapsed();
-                self.busy += took;
-                self.longest = self.longest.max(took);
-                outputs
-            }
-            Channel::CameraHealth(camera) => {
-                let health: Health = decode(&entry.data)?;
-                if health.ended { self.fusion.camera_ended(camera) } else { Vec::new() }
-            }
-            Channel::Truth => {
-                self.writer.write(entry)?;
-                return Ok(());
-            }
-            _ => return Ok(()),
-        };
-        self.write(&entry.key.site, outputs)
+    fn take(&mut self, entry: &Entry) -> anyhow::Result<()> {
+        match &entry.key.channel {
+            // What an earlier fusion made of the bearings.
+            Channel::Tracks | Channel::Events | Channel::FusionHealth => return Ok(()),
+            Channel::Bearings(_) => self.frames += 1,
+            _ => {}
+        }
+        self.site.get_or_insert_with(|| entry.key.site.clone());
+        self.writer.write(entry)?;
+        let start = Instant::now();
+        let outputs = self.centre.take(&entry.key.channel, &entry.data, "");
+        let took = start.elapsed();
+        self.busy += took;
+        self.longest = self.longest.max(took);
+        self.write(outputs)
     }
 
-    fn write(&mut self, site: &SiteName, outputs: Vec<Output>) -> Result<(), FuseError> {
+    fn write(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
         for output in outputs {
-            let (channel, time_ns, data) = match output {
+            match output {
                 Output::Tracks(frame) => {
-                    self.tracks += 1;
-                    (Channel::Tracks, frame.time_ns, frame.encode())
+                    let time = Timestamp::from_nanos(frame.time_ns);
+                    self.put(Channel::Tracks, time, frame.encode())?;
+                    self.write_health(time, false)?;
                 }
                 Output::Event(event) => {
                     let time = Timestamp::from_nanos(event.time_ns);
-                    tracing::debug!("{time}: track {} {}", event.track_id, event.kind().as_str_name());
-                    (Channel::Events, event.time_ns, event.encode())
+                    let number = TrackNumber(event.track_id);
+                    tracing::debug!("{time}: track {number} {}", event.kind().as_str_name());
+                    self.put(Channel::Events, time, event.encode())?;
                 }
-                Output::Camera(camera, standing) => {
-                    report_camera(&camera, standing);
-                    continue;
-                }
-                Output::Rejected(rejection) => {
-                    self.rejections.report(&rejection);
-                    continue;
-                }
-            };
-            let time = Timestamp::from_nanos(time_ns);
-            let key = Key::new(site.clone(), channel);
+                Output::Camera(..) | Output::Rejected(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn write_health(&mut self, now: Timestamp, ended: bool) -> anyhow::Result<()> {
+        let is_due = self.healthy_at.is_none_or(|then| now.seconds_since(then).abs() >= HEALTH_PERIOD_S);
+        if !is_due && !ended {
+            return Ok(());
+        }
+        self.healthy_at = Some(now);
+        let mut health = self.centre.health(&[]);
+        health.ended = ended;
+        self.put(Channel::FusionHealth, now, health.encode())
+    }
+
+    fn put(&mut self, channel: Channel, time: Timestamp, data: Vec<u8>) -> anyhow::Result<()> {
+        if let Some(site) = self.site.clone() {
+            let key = Key::new(site, channel);
             self.writer.write(&Entry { key, data_time: time, arrival: time, data })?;
         }
+        Ok(())
+    }
+
+    fn finish(mut self, args: &Args, path: &Path) -> anyhow::Result<()> {
+        let last = self.centre.flush();
+        self.write(last)?;
+        self.write_health(self.centre.now(), true)?;
+        let health = self.centre.health(&[]);
+        for counter in &health.counters {
+            tracing::info!("{} {}", counter.name, counter.value);
+        }
+        let unread = ["received_malformed", "received_newer_version", "received_too_large"];
+        let unread = health.counters.iter().filter(|counter| unread.contains(&counter.name.as_str()));
+        let unread: u64 = unread.map(|counter| counter.value).sum();
+        anyhow::ensure!(
+            unread < self.frames,
+            "none of {} messages of {} can be read: it is damaged, or of a newer version",
+            unread,
+            args.recording.display()
+        );
+        self.writer.finish()?;
+        let (frames, tracks) = (self.frames, self.centre.frames());
+        output::line(format!(
+            "{frames} bearing frames fused, {tracks} track frames written to {}",
+            path.display()
+        ));
+        output::line(format!(
+            "the fusion itself took {:.1} ms: {:.1} us a frame, {:.2} ms at most",
+            self.busy.as_secs_f64() * 1e3,
+            self.busy.as_secs_f64() * 1e6 / frames as f64,
+            self.longest.as_secs_f64() * 1e3
+        ));
         Ok(())
     }
 }

@@ -1,71 +1,206 @@
 //! Onto the network, in the time of the recording or faster.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use crossfix_message::{Channel, Key};
-use crossfix_recording::{ReadFailure, RecordingReader};
-use crossfix_transport::{Link, LinkError, Role};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, CameraName, Channel, Health, Payload, Preview, Timestamp, TrackEvent,
+    TrackFrame, TruthFrame, decode,
+};
+use crossfix_recording::Entry;
+use crossfix_transport::{Delivery, Link, LinkPublisher, Role};
 
 use super::{Args, Range};
 use crate::config;
+use crate::network;
 use crate::output;
-use crate::pace::{Pace, wall_seconds};
+use crate::pace::Pace;
+use crate::recorded::{self, Lacks};
 use crate::shutdown::Shutdown;
 
 /// Time for those who listen to connect before the first message, s.
 const RUN_UP_S: f64 = 2.0;
+/// Time between the last message of a pass and the first of the next, s: a few frames.
+const SEAM_S: f64 = 0.1;
 
 /// Whether the cameras would publish it.
 fn is_cameras(channel: &Channel) -> bool {
-    !matches!(channel, Channel::Tracks | Channel::Events | Channel::FusionHealth)
+    !matches!(channel, Channel::Tracks | Channel::Events | Channel::FusionHealth | Channel::RecorderHealth)
 }
 
 /// Publishes a range of a recording's bytes under the network's site.
 pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let network = config::load_network(network)?;
-    let link = Link::open(&network, &Role::Cameras { and_fusion: args.tracks })?;
+    let Some(link) = network::open(&network, &Role::Cameras { and_fusion: args.tracks }, &shutdown)? else {
+        return Ok(());
+    };
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
-    let mut published = 0_u64;
-    loop {
-        let pace = Pace { start: wall_seconds() + RUN_UP_S, speed: args.speed };
-        // The run-up holds at any speed.
-        if !(Pace { speed: 1.0, ..pace }).wait(0.0, &shutdown) {
-            break;
-        }
-        let report = RecordingReader::open(&args.recording)?.for_each(|entry| {
-            let wanted = range.holds(&entry) && (args.tracks || is_cameras(&entry.key.channel));
-            if !wanted || shutdown.requested() {
-                return Ok(());
-            }
-            let since = entry.data_time.seconds_since(range.from);
-            if pace.wait(since, &shutdown) {
-                // The same bytes, in the site that listens now.
-                link.put(&Key::new(link.site().clone(), entry.key.channel), entry.data)?;
-                published += 1;
-            }
-            Ok::<_, LinkError>(())
-        });
-        match report {
-            Ok(report) => {
-                if let Some(damage) = report.damage {
-                    tracing::warn!(
-                        "{} is torn: {damage}; everything before was played",
-                        args.recording.display()
-                    );
+    let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
+    let mut stage = Stage { link, delivery, publishers: BTreeMap::new(), published: 0 };
+    let mut pass = Pass::default();
+    // The run-up holds at any speed.
+    if Pace::beginning_in(RUN_UP_S, 1.0).wait(0.0, &shutdown) {
+        let pace = Pace::beginning_in(0.0, args.speed);
+        loop {
+            let mut lacks = Lacks::default();
+            recorded::for_each(&args.recording, &mut lacks, |_, entry| {
+                let wanted = range.holds(&entry) && (args.tracks || is_cameras(&entry.key.channel));
+                let since_s = entry.data_time.seconds_since(range.from) + pass.by_s;
+                if wanted && pace.wait(since_s, &shutdown) {
+                    stage.put(pass.shifted(entry))?;
                 }
+                Ok(())
+            })?;
+            lacks.say(&args.recording);
+            if !args.again || shutdown.requested() {
+                break;
             }
-            Err(ReadFailure::Recording(error)) => return Err(error.into()),
-            Err(ReadFailure::Handler(error)) => return Err(error.into()),
-        }
-        if !args.again || shutdown.requested() {
-            break;
+            pass.begin_again(range.from);
         }
     }
+    let Stage { link, publishers, published, .. } = stage;
     // What was put last is on its way.
     std::thread::sleep(Duration::from_millis(200));
+    drop(publishers);
     link.close()?;
     output::line(format!("{published} messages published"));
     Ok(())
+}
+
+/// Where messages are published, each on the key that it was recorded from, in the site that listens now.
+struct Stage {
+    link: Link,
+    delivery: Delivery,
+    publishers: BTreeMap<Channel, LinkPublisher>,
+    published: u64,
+}
+
+impl Stage {
+    fn put(&mut self, entry: Entry) -> anyhow::Result<()> {
+        let channel = entry.key.channel;
+        if !self.publishers.contains_key(&channel) {
+            let is_picture = matches!(channel, Channel::Preview(_));
+            let delivery = if is_picture { Delivery::Picture } else { self.delivery };
+            let publisher = self.link.publisher(channel.clone(), delivery)?;
+            self.publishers.insert(channel.clone(), publisher);
+        }
+        if let Some(publisher) = self.publishers.get(&channel) {
+            publisher.put(entry.data)?;
+            self.published += 1;
+        }
+        Ok(())
+    }
+}
+
+/// One time through the recording: the first gives the recorded bytes, later ones go on in time and number.
+#[derive(Debug, Default)]
+struct Pass {
+    by_s: f64,
+    /// The newest data time of this pass, before it is moved.
+    newest: Option<Timestamp>,
+    /// What is added to each camera's frame numbers, and the number after its highest so far.
+    numbers: BTreeMap<CameraName, (u64, u64)>,
+}
+
+impl Pass {
+    fn begin_again(&mut self, from: Timestamp) {
+        let lasted_s = self.newest.map_or(0.0, |newest| newest.seconds_since(from));
+        self.by_s += lasted_s.max(0.0) + SEAM_S;
+        self.newest = None;
+        for (base, next) in self.numbers.values_mut() {
+            *base = *next;
+        }
+    }
+
+    fn shifted(&mut self, entry: Entry) -> Entry {
+        self.newest = self.newest.max(Some(entry.data_time));
+        let is_first = self.by_s == 0.0;
+        let moved = self.moved(&entry.key.channel, &entry.data);
+        match moved {
+            Some(data) if !is_first => Entry { data, ..entry },
+            _ => entry,
+        }
+    }
+
+    /// The message moved in time; `None` if it cannot be read.
+    fn moved(&mut self, channel: &Channel, data: &[u8]) -> Option<Vec<u8>> {
+        let by_s = self.by_s;
+        let moved = |nanos: &mut i64| *nanos = Timestamp::from_nanos(*nanos).plus_seconds(by_s).nanos();
+        Some(match channel {
+            Channel::Bearings(camera) => {
+                let mut message: BearingFrame = decode(data).ok()?;
+                let (base, next) = self.numbers.entry(camera.clone()).or_default();
+                message.sequence = message.sequence.saturating_add(*base);
+                *next = (*next).max(message.sequence.saturating_add(1));
+                moved(&mut message.capture_time_ns);
+                message.encode_unstamped()
+            }
+            // Since when it holds stays as it is.
+            Channel::Calibration(_) => decode::<CameraCalibration>(data).ok()?.encode_unstamped(),
+            Channel::Preview(_) => {
+                let mut message: Preview = decode(data).ok()?;
+                moved(&mut message.capture_time_ns);
+                message.encode_unstamped()
+            }
+            Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
+                let mut message: Health = decode(data).ok()?;
+                moved(&mut message.time_ns);
+                // It goes on.
+                message.ended = false;
+                message.encode_unstamped()
+            }
+            Channel::Tracks => {
+                let mut message: TrackFrame = decode(data).ok()?;
+                moved(&mut message.time_ns);
+                for track in &mut message.tracks {
+                    moved(&mut track.updated_ns);
+                    track.residuals.iter_mut().for_each(|residual| moved(&mut residual.time_ns));
+                }
+                message.encode_unstamped()
+            }
+            Channel::Events => {
+                let mut message: TrackEvent = decode(data).ok()?;
+                moved(&mut message.time_ns);
+                message.encode_unstamped()
+            }
+            Channel::Truth => {
+                let mut message: TruthFrame = decode(data).ok()?;
+                moved(&mut message.time_ns);
+                message.encode_unstamped()
+            }
+            Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_message::Key;
+
+    use super::*;
+
+    #[test]
+    fn a_second_pass_goes_on_where_the_first_ended() {
+        let key = Key::new("field".parse().unwrap(), Channel::Bearings("north".parse().unwrap()));
+        let entry = |sequence: u64| {
+            let time = Timestamp::from_seconds(100.0 + sequence as f64 * 0.1);
+            let frame =
+                BearingFrame { sequence, capture_time_ns: time.nanos(), ..Default::default() }.stamped();
+            Entry { key: key.clone(), data_time: time, arrival: time, data: frame.encode_unstamped() }
+        };
+        let mut pass = Pass::default();
+        let first: Vec<Entry> = (0..10).map(|k| pass.shifted(entry(k))).collect();
+        assert_eq!(first, (0..10).map(entry).collect::<Vec<_>>(), "the recorded bytes");
+        for round in 1..3 {
+            pass.begin_again(Timestamp::from_seconds(100.0));
+            for k in 0..10 {
+                let frame: BearingFrame = decode(&pass.shifted(entry(k)).data).unwrap();
+                assert_eq!(frame.sequence, 10 * round + k);
+                let at = Timestamp::from_nanos(frame.capture_time_ns).seconds();
+                assert!((at - (100.0 + (10 * round + k) as f64 * 0.1)).abs() < 1e-6, "{at}");
+            }
+        }
+    }
 }
