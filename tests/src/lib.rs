@@ -13,7 +13,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossfix_calibration::intrinsics_to_yaml;
-use crossfix_message::Channel;
+use crossfix_message::{CameraName, Channel};
 use crossfix_recording::{Entry, RecordingReader};
 use crossfix_simulation::{Scene, World};
 use crossfix_transport::{Link, NetworkConfig, Role};
@@ -61,7 +61,7 @@ pub fn real_data() -> Option<PathBuf> {
 /// All messages of a recording on one channel.
 pub fn messages(recording: &Path, wanted: impl Fn(&Channel) -> bool) -> Vec<Entry> {
     let mut entries = Vec::new();
-    RecordingReader::open(recording)
+    let report = RecordingReader::open(recording)
         .unwrap()
         .for_each(|entry| {
             if wanted(&entry.key.channel) {
@@ -70,7 +70,20 @@ pub fn messages(recording: &Path, wanted: impl Fn(&Channel) -> bool) -> Vec<Entr
             Ok::<_, std::convert::Infallible>(())
         })
         .unwrap();
+    assert_eq!(report.damage, None, "{}", recording.display());
     entries
+}
+
+fn start(arguments: &[&str], log: Stdio) -> Process {
+    let child = Command::new(program())
+        .args(arguments)
+        .arg("--stop-with-stdin")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    Process(child)
 }
 
 /// A running part of a site; it is ended when this is dropped.
@@ -93,6 +106,26 @@ impl Process {
             std::thread::sleep(Duration::from_millis(20));
         }
         panic!("the process does not end");
+    }
+
+    /// Sends it SIGTERM, as systemd does, and says how long it took to end, and its exit code.
+    pub fn terminate(mut self) -> (Duration, Option<i32>) {
+        let begun = Instant::now();
+        let pid = self.0.id().to_string();
+        assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
+        loop {
+            if let Some(status) = self.0.try_wait().unwrap() {
+                return (begun.elapsed(), status.code());
+            }
+            assert!(begun.elapsed() < PATIENCE, "the process does not end");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Waits until it ends by itself and returns its exit code.
+    pub fn exit_code(&mut self) -> Option<i32> {
+        let _ = self.wait();
+        self.0.wait().unwrap().code()
     }
 
     /// Ends it at once, as a crash does.
@@ -123,7 +156,7 @@ impl Site {
         scene.duration_s = duration_s;
         let world = scene.build().unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let network = free_network(&world);
+        let network = free_network(world.cameras().iter().map(|camera| camera.name().clone()));
         let site = Self { folder, network, world };
         site.write("network.toml", &toml::to_string(&site.network).unwrap());
         site.write("scene.toml", &toml::to_string(&scene).unwrap());
@@ -173,14 +206,29 @@ impl Site {
 
     /// Starts the program; its logs go to the test's stderr.
     pub fn start(&self, arguments: &[&str]) -> Process {
-        let child = Command::new(program())
-            .args(arguments)
-            .arg("--stop-with-stdin")
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .spawn()
-            .unwrap();
-        Process(child)
+        start(arguments, Stdio::inherit())
+    }
+
+    /// Starts the program; its logs go to a file of the site.
+    pub fn start_logged(&self, arguments: &[&str], log: &str) -> Process {
+        start(arguments, std::fs::File::create(self.path(log)).unwrap().into())
+    }
+
+    /// What a file of the site says.
+    pub fn text(&self, name: &str) -> String {
+        std::fs::read_to_string(self.path(name)).unwrap()
+    }
+
+    /// Waits until a log of the site says something.
+    pub fn wait_for_line(&self, log: &str, words: &str, patience: Duration) -> bool {
+        let deadline = Instant::now() + patience;
+        while Instant::now() < deadline {
+            if self.text(log).contains(words) {
+                return true;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        false
     }
 
     /// Starts the fusion centre.
@@ -211,8 +259,8 @@ impl Site {
     }
 }
 
-/// Endpoints on this machine that nobody uses now.
-fn free_network(world: &World) -> NetworkConfig {
+/// A network of so many cameras at endpoints on this machine that nobody uses now.
+pub fn free_network(cameras: impl IntoIterator<Item = CameraName>) -> NetworkConfig {
     let mut held = Vec::new();
     let mut endpoint = || {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -221,7 +269,7 @@ fn free_network(world: &World) -> NetworkConfig {
         format!("tcp/127.0.0.1:{port}")
     };
     let fusion = endpoint();
-    let cameras = world.cameras().iter().map(|camera| (camera.name().clone(), endpoint())).collect();
+    let cameras = cameras.into_iter().map(|camera| (camera, endpoint())).collect();
     NetworkConfig {
         site: "test".parse().unwrap(),
         mode: crossfix_transport::Mode::Peer,

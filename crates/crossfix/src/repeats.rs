@@ -74,7 +74,7 @@ mod tests {
     fn a_thousand_warnings_of_a_kind_are_two_lines() {
         let (mut repeats, begun) = (Repeats::default(), Instant::now());
         let lines: Vec<String> = (0..1000)
-            .filter_map(|i| repeats.line("gap", begun + PERIOD / 999 * i, || format!("gap {i}")))
+            .filter_map(|i| repeats.line("gap", begun + PERIOD * i / 999, || format!("gap {i}")))
             .collect();
         assert_eq!(lines, ["gap 0", "gap 1 (999 times in the last minute)"]);
         assert_eq!(repeats.line("other", begun, || "other".to_owned()).as_deref(), Some("other"));

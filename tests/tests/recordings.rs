@@ -1,0 +1,262 @@
+//! Nothing that was recorded is destroyed, and what is lacking is said.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, Health, Key, Payload, Preview, Timestamp, TrackFrame, Version,
+    decode,
+};
+use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
+use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
+use crossfix_transport::{Delivery, Link, Role};
+
+fn stderr(arguments: &[&str], code: i32) -> String {
+    let output = crossfix(arguments);
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(code), "crossfix {}: {stderr}", arguments.join(" "));
+    stderr
+}
+
+#[test]
+fn a_recorder_that_is_started_again_goes_on_under_a_new_name() {
+    let site = Site::new(2.0);
+    site.write("today.mcap", "what was recorded before");
+    let recorder = site.start_recorder("today.mcap");
+    let second = site.path("today-2.mcap");
+    let deadline = Instant::now() + PATIENCE;
+    while !Path::new(&second).exists() {
+        assert!(Instant::now() < deadline, "no second recording");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert!(recorder.stop());
+    assert_eq!(site.text("today.mcap"), "what was recorded before");
+    RecordingReader::open(Path::new(&second)).unwrap();
+
+    // Who means it says so.
+    let overwritten = site.start(&[
+        "record",
+        "-c",
+        &site.path("network.toml"),
+        "-o",
+        &site.path("today.mcap"),
+        "--overwrite",
+    ]);
+    std::thread::sleep(Duration::from_secs(1));
+    assert!(overwritten.stop());
+    RecordingReader::open(Path::new(&site.path("today.mcap"))).unwrap();
+}
+
+#[test]
+fn a_recorder_that_cannot_record_touches_no_file() {
+    let site = Site::new(2.0);
+    site.write("today.mcap", "dear");
+    let network = site.text("network.toml").replace("tcp/127.0.0.1", "nonsense/127.0.0.1");
+    site.write("network.toml", &network);
+    let arguments =
+        ["record", "-c", &site.path("network.toml"), "-o", &site.path("today.mcap"), "--overwrite"];
+    stderr(&arguments, 1);
+    assert_eq!(site.text("today.mcap"), "dear");
+}
+
+#[test]
+fn no_command_writes_onto_what_it_reads() {
+    let site = Site::new(2.0);
+    let source = site.path("source.mcap");
+    let before = std::fs::read(&source).unwrap();
+    for arguments in [
+        vec!["replay", &source, "--fuse", "-o", &source],
+        vec!["view", &source, "--save", &source],
+        vec!["export", &source, "--csv", &source],
+        vec!["track", &source, "--csv", &source],
+    ] {
+        let said = stderr(&arguments, 1);
+        assert!(arguments[0] != "replay" || said.contains("is what is read"), "{said}");
+        assert_eq!(std::fs::read(&source).unwrap(), before, "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_failed_fusion_leaves_the_earlier_tracks_and_no_half_file() {
+    let site = Site::new(2.0);
+    site.write("tracks.mcap", "earlier tracks");
+    site.write("empty.mcap", "");
+    let (empty, tracks) = (site.path("empty.mcap"), site.path("tracks.mcap"));
+    let said = stderr(&["replay", &empty, "--fuse", "-o", &tracks], 1);
+    assert!(said.contains("is empty"), "{said}");
+    assert_eq!(site.text("tracks.mcap"), "earlier tracks");
+    assert!(!Path::new(&site.path("tracks.mcap.part")).exists());
+}
+
+#[test]
+fn what_a_file_lacks_is_said_and_an_unanswered_question_fails() {
+    let site = Site::new(20.0);
+    let path = |name: &str| site.path(name);
+    succeed(&["-q", "replay", &path("source.mcap"), "--fuse", "-o", &path("tracks.mcap")]);
+    let whole = std::fs::read(path("tracks.mcap")).unwrap();
+    site.write("empty.mcap", "");
+    std::fs::write(path("torn.mcap"), &whole[..whole.len() / 2]).unwrap();
+    // A file of a newer version: all its messages are there, and none can be read.
+    let mut newer = RecordingWriter::create(Path::new(&path("newer.mcap"))).unwrap();
+    for entry in messages(Path::new(&path("tracks.mcap")), |c| *c == Channel::Tracks) {
+        let mut frame: TrackFrame = decode(&entry.data).unwrap();
+        frame.version = Some(Version { major: 9, minor: 0 });
+        newer.write(&Entry { data: frame.encode_unstamped(), ..entry }).unwrap();
+    }
+    newer.finish().unwrap();
+
+    let (csv, rrd) = (path("out.csv"), path("out.rrd"));
+    for (file, words) in [("empty.mcap", "is empty"), ("newer.mcap", "update this side")] {
+        let file = path(file);
+        for arguments in
+            [vec!["export", &file, "--csv", &csv], vec!["evaluate", &file], vec!["view", &file, "--save", &rrd]]
+        {
+            let said = stderr(&arguments, 1);
+            assert!(said.contains(words), "{arguments:?}: {said}");
+        }
+        assert!(!Path::new(&csv).exists() && !Path::new(&rrd).exists());
+    }
+    stderr(&["info", &path("empty.mcap")], 1);
+    for arguments in [
+        vec!["export", &path("torn.mcap"), "--csv", &csv],
+        vec!["evaluate", &path("torn.mcap"), "--truth", &path("source.mcap")],
+        vec!["view", &path("torn.mcap"), "--save", &rrd],
+    ] {
+        let said = stderr(&arguments, 0);
+        assert!(said.contains("torn.mcap is damaged at byte"), "{arguments:?}: {said}");
+    }
+    let info = succeed(&["info", &path("torn.mcap")]);
+    assert!(info.contains("damaged at byte"), "{info}");
+    assert!(stderr(&["info", &csv], 1).contains("is no MCAP file"));
+}
+
+#[test]
+fn a_range_without_data_is_an_error() {
+    let site = Site::new(4.0);
+    let (source, tracks) = (site.path("source.mcap"), site.path("tracks.mcap"));
+    let replay = |options: &[&str], code: i32| {
+        stderr(&[&["replay", &source, "--fuse", "-o", &tracks], options].concat(), code)
+    };
+    assert!(replay(&["--from", "3", "--to", "2"], 1).contains("is not before"));
+    assert!(replay(&["--from", "1000"], 1).contains("behind the end"));
+    for bad in ["nan", "-1", "1e400"] {
+        assert!(replay(&["--from", bad], 2).contains("invalid value"), "{bad}");
+    }
+    let speed = ["replay", &source, "--network", &site.path("network.toml"), "--speed", "-1"];
+    assert!(stderr(&speed, 2).contains("it must be from 0 to 1000"));
+}
+
+#[test]
+fn a_fused_recording_keeps_previews_health_and_where_calibrations_change() {
+    let site = Site::new(4.0);
+    let source = site.path("source.mcap");
+    // The same flight with pictures and health, and a camera that is moved by a metre after two seconds.
+    let mut writer = RecordingWriter::create(Path::new(&site.path("rich.mcap"))).unwrap();
+    let mut entries = messages(Path::new(&source), |_| true);
+    let name = site.world().cameras()[0].name().clone();
+    let first = entries.iter().find(|entry| entry.key.channel == Channel::Calibration(name.clone())).unwrap();
+    let mut moved: CameraCalibration = decode(&first.data).unwrap();
+    let at = Timestamp::from_seconds(2.0);
+    moved.valid_from_ns = at.nanos();
+    moved.position.as_mut().unwrap().x += 1.0;
+    let key = |channel| Key { channel, ..first.key.clone() };
+    let preview = Preview { camera: name.to_string(), capture_time_ns: at.nanos(), ..Default::default() };
+    let health = Health { component: name.to_string(), time_ns: at.nanos(), ..Default::default() };
+    let more = [
+        (Channel::Calibration(name.clone()), moved.encode()),
+        (Channel::Preview(name.clone()), preview.encode()),
+        (Channel::CameraHealth(name.clone()), health.encode()),
+    ]
+    .map(|(channel, data)| Entry { key: key(channel), data_time: at, arrival: at, data });
+    entries.extend(more.clone());
+    entries.sort_by_key(|entry| entry.data_time);
+    entries.iter().for_each(|entry| writer.write(entry).unwrap());
+    writer.finish().unwrap();
+    succeed(&["-q", "replay", &site.path("rich.mcap"), "--fuse", "-o", &site.path("tracks.mcap")]);
+
+    let kept = messages(Path::new(&site.path("tracks.mcap")), |_| true);
+    for entry in &more {
+        assert_eq!(kept.iter().filter(|other| *other == entry).count(), 1, "{}", entry.key);
+    }
+    assert!(kept.iter().any(|entry| entry.key.channel == Channel::FusionHealth));
+    // Before the camera was moved, the tracks are those of a flight in which it never was.
+    succeed(&["-q", "replay", &source, "--fuse", "-o", &site.path("unmoved.mcap")]);
+    let before = |file: &str| -> Vec<Vec<u8>> {
+        let tracks = messages(Path::new(&site.path(file)), |channel| *channel == Channel::Tracks);
+        tracks.into_iter().filter(|entry| entry.data_time < at).map(|entry| entry.data).collect()
+    };
+    assert!(before("tracks.mcap").len() > 20);
+    assert_eq!(before("tracks.mcap"), before("unmoved.mcap"));
+}
+
+#[test]
+fn the_recorder_says_what_it_did_not_get_and_nothing_lies_in_1970() {
+    let site = Site::new(2.0);
+    let recorder = site.start_recorder("live.mcap");
+    let link = Link::open(site.network(), &Role::Cameras { and_fusion: false }).unwrap();
+    let health_key = Key::new(link.site().clone(), Channel::RecorderHealth).to_string();
+    let health = link.subscribe(&[health_key]).unwrap();
+    link.wait_for(&[Channel::RecorderAlive], PATIENCE, || true).unwrap();
+    std::thread::sleep(Duration::from_millis(500));
+
+    let camera = &site.world().cameras()[0];
+    let name = camera.name().clone();
+    let key = |channel: Channel| Key::new(link.site().clone(), channel);
+    // Said before any data, and valid since long ago.
+    let calibration = CameraCalibration::new(&name, camera.camera(), Timestamp::EPOCH).encode();
+    link.put(&key(Channel::Calibration(name.clone())), calibration).unwrap();
+    link.put(&key(Channel::CameraHealth(name.clone())), Health::default().encode()).unwrap();
+    let bearings = link.publisher(Channel::Bearings(name.clone()), Delivery::Queued).unwrap();
+    let begun = now_seconds();
+    let frame = |sequence: u64| BearingFrame {
+        camera: name.to_string(),
+        sequence,
+        capture_time_ns: Timestamp::from_seconds(begun + 0.1 * sequence as f64).nanos(),
+        ..Default::default()
+    };
+    for sequence in 0..10 {
+        bearings.put(frame(sequence).encode()).unwrap();
+    }
+    let newer = BearingFrame { version: Some(Version { major: 9, minor: 0 }), ..frame(10) };
+    bearings.put(newer.encode_unstamped()).unwrap();
+    link.put(&key(Channel::Bearings(name.clone())), vec![0xff; 40]).unwrap();
+    // As many names as a file has room for, and more: none of them is one of the site's.
+    for number in 0..70_000 {
+        let stranger = format!("stranger-{number}").parse().unwrap();
+        link.put(&key(Channel::Bearings(stranger)), frame(0).encode()).unwrap();
+    }
+    // A second program under the name of the first.
+    let second = Link::open(site.network(), &Role::Cameras { and_fusion: true });
+    assert!(second.is_err(), "its endpoint is taken");
+    let counted = |health: &Health, name: &str| {
+        health.counters.iter().find(|counter| counter.name == name).map_or(0, |counter| counter.value)
+    };
+    let deadline = Instant::now() + PATIENCE;
+    let mut said = Health::default();
+    let last = loop {
+        assert!(Instant::now() < deadline, "the recorder's health does not say it: {said:?}");
+        let Some(received) = health.next(Duration::from_millis(100)) else { continue };
+        let health: Health = decode(&received.data).unwrap();
+        said.clone_from(&health);
+        let foreign = counted(&health, "received_foreign_camera") + counted(&health, "received_dropped");
+        if foreign >= 70_000 {
+            break health;
+        }
+    };
+    assert_eq!(counted(&last, "received_malformed"), 1);
+    assert_eq!(counted(&last, "received_newer_version"), 1);
+    assert!(last.run != 0 && !last.host.is_empty());
+    let (took, code) = recorder.terminate();
+    assert!(took < Duration::from_secs(2) && code == Some(0), "{took:?}");
+
+    let recorded = messages(Path::new(&site.path("live.mcap")), |_| true);
+    let frames = recorded.iter().filter(|entry| matches!(entry.key.channel, Channel::Bearings(_))).count();
+    assert_eq!(frames, 11, "the newer one is kept");
+    let early = recorded.iter().filter(|entry| entry.data_time < Timestamp::from_seconds(begun - 1.0));
+    assert_eq!(early.map(|entry| entry.key.to_string()).collect::<Vec<_>>(), Vec::<String>::new());
+    let info = succeed(&["info", &site.path("live.mcap")]);
+    assert!(info.contains("written by crossfix") && info.contains("record, run "), "{info}");
+    assert!(info.contains("`recorder` counted") && info.contains("received_malformed 1"), "{info}");
+}

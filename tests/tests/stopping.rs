@@ -1,0 +1,146 @@
+//! Whoever is asked to stop does so within two seconds, whatever comes in, and leaves whole files.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crossfix_message::{BearingFrame, CameraCalibration, CameraName, Channel, Payload, Timestamp};
+use crossfix_tests::{PATIENCE, Process, Site, free_network, messages, now_seconds};
+use crossfix_transport::{Delivery, Link, NetworkConfig, Role};
+
+/// What a person, and systemd, are told that it takes.
+const LIMIT: Duration = Duration::from_secs(2);
+
+/// Threads that publish as cameras do until they are dropped.
+struct Traffic {
+    stop: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Traffic {
+    /// Frames of every camera of a network, each so many a second.
+    fn new(network: &NetworkConfig, site: &Site, rate_hz: f64) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let link = Arc::new(Link::open(network, &Role::Cameras { and_fusion: false }).unwrap());
+        let template = site.world().cameras()[0].camera().clone();
+        let publish = |name: &CameraName| {
+            let (stop, link, name, camera) =
+                (Arc::clone(&stop), Arc::clone(&link), name.clone(), template.clone());
+            std::thread::spawn(move || {
+                let alive = link.declare_alive(Channel::Alive(name.clone())).unwrap();
+                let bearings = link.publisher(Channel::Bearings(name.clone()), Delivery::Queued).unwrap();
+                let calibrations =
+                    link.publisher(Channel::Calibration(name.clone()), Delivery::Queued).unwrap();
+                let calibration = CameraCalibration::new(&name, &camera, Timestamp::EPOCH).encode();
+                for sequence in 0.. {
+                    if stop.load(Ordering::Relaxed) {
+                        break;
+                    }
+                    if sequence % 50 == 0 {
+                        calibrations.put(calibration.clone()).unwrap();
+                    }
+                    let time = Timestamp::from_seconds(now_seconds());
+                    let frame = BearingFrame {
+                        camera: name.to_string(),
+                        sequence,
+                        capture_time_ns: time.nanos(),
+                        ..Default::default()
+                    };
+                    bearings.put(frame.encode()).unwrap();
+                    std::thread::sleep(Duration::from_secs_f64(1.0 / rate_hz));
+                }
+                drop(alive);
+            })
+        };
+        let threads = network.cameras.keys().map(publish).collect();
+        Self { stop, threads }
+    }
+}
+
+impl Drop for Traffic {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn wait_until_recorded(path: &str, bytes: u64) {
+    let deadline = Instant::now() + PATIENCE;
+    while Path::new(path).metadata().map_or(0, |file| file.len()) < bytes {
+        assert!(Instant::now() < deadline, "nothing is recorded");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Stops the recorder and the fusion centre in the middle of so many cameras' traffic.
+fn stop_under_traffic(cameras: usize, rate_hz: f64) {
+    let site = Site::new(2.0);
+    let names = (0..cameras).map(|number| format!("camera-{number}").parse().unwrap());
+    let network = free_network(names);
+    site.write("network.toml", &toml::to_string(&network).unwrap());
+    let recorder = site.start_recorder("live.mcap");
+    let fusion = site.start_fusion();
+    let traffic = Traffic::new(&network, &site, rate_hz);
+    wait_until_recorded(&site.path("live.mcap"), 50_000);
+    let stop = |what: &str, process: Process| {
+        let (took, code) = process.terminate();
+        println!("{what}, {cameras} cameras at {rate_hz} Hz: ended after {took:?}");
+        assert!(took < LIMIT, "{what} took {took:?} while {cameras} cameras published");
+        assert_eq!(code, Some(0), "{what}");
+    };
+    stop("record", recorder);
+    stop("fuse", fusion);
+    drop(traffic);
+    // Whole, with its index: `messages` wants no damage.
+    let recorded = messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
+    assert!(recorded.len() > 10 * cameras, "{} frames of {cameras} cameras", recorded.len());
+}
+
+#[test]
+fn record_and_fuse_end_while_three_cameras_publish() {
+    stop_under_traffic(3, 30.0);
+}
+
+#[test]
+fn record_and_fuse_end_while_64_cameras_publish() {
+    stop_under_traffic(64, 10.0);
+}
+
+#[test]
+fn a_fusion_centre_whose_router_is_not_there_says_so_and_ends_when_asked() {
+    let site = Site::new(2.0);
+    let mut network = site.network().clone();
+    network.mode = crossfix_transport::Mode::Client;
+    network.routers = vec![network.fusion.clone()];
+    site.write("network.toml", &toml::to_string(&network).unwrap());
+    let fusion = site.start_logged(&["fuse", "-c", &site.path("fusion.toml")], "fuse.log");
+    let router = network.routers[0].as_str();
+    assert!(site.wait_for_line("fuse.log", router, Duration::from_secs(5)), "{}", site.text("fuse.log"));
+    assert!(site.text("fuse.log").contains("no Zenoh router answers"));
+    let (took, _) = fusion.terminate();
+    assert!(took < LIMIT, "{took:?}");
+}
+
+#[test]
+fn an_interrupted_replay_leaves_a_whole_file_that_ends_early() {
+    let site = Site::new(60.0);
+    let (source, tracks) = (site.path("source.mcap"), site.path("tracks.mcap"));
+    let replay = std::process::Command::new(crossfix_tests::program())
+        .args(["-q", "replay", &source, "--fuse", "-o", &tracks])
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_millis(300));
+    let pid = replay.id().to_string();
+    std::process::Command::new("kill").args(["-INT", &pid]).status().unwrap();
+    let output = replay.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "it did not do what it was asked");
+    let all = messages(Path::new(&source), |c| matches!(c, Channel::Bearings(_))).len();
+    let done = messages(Path::new(&tracks), |c| matches!(c, Channel::Bearings(_))).len();
+    assert!(0 < done && done < all, "{done} of {all}");
+}
