@@ -110,9 +110,11 @@ fn what_a_file_lacks_is_said_and_an_unanswered_question_fails() {
     let (csv, rrd) = (path("out.csv"), path("out.rrd"));
     for (file, words) in [("empty.mcap", "is empty"), ("newer.mcap", "update this side")] {
         let file = path(file);
-        for arguments in
-            [vec!["export", &file, "--csv", &csv], vec!["evaluate", &file], vec!["view", &file, "--save", &rrd]]
-        {
+        for arguments in [
+            vec!["export", &file, "--csv", &csv],
+            vec!["evaluate", &file],
+            vec!["view", &file, "--save", &rrd],
+        ] {
             let said = stderr(&arguments, 1);
             assert!(said.contains(words), "{arguments:?}: {said}");
         }

@@ -29,11 +29,7 @@ struct Other {
 
 impl Lookout {
     /// For those who need cameras.
-    pub fn for_cameras(
-        link: &Link,
-        network: &NetworkConfig,
-        cameras: &[CameraName],
-    ) -> anyhow::Result<Self> {
+    pub fn for_cameras(link: &Link, network: &NetworkConfig, cameras: &[CameraName]) -> anyhow::Result<Self> {
         let others = cameras.iter().map(|camera| Other {
             name: format!("camera `{camera}`"),
             endpoint: network.cameras.get(camera).cloned().unwrap_or_default(),
@@ -93,8 +89,12 @@ impl Lookout {
     }
 
     fn nobody(&self) -> String {
-        let mut named: Vec<String> =
-            self.others.iter().take(NAMED).map(|other| format!("{} at {}", other.name, other.endpoint)).collect();
+        let mut named: Vec<String> = self
+            .others
+            .iter()
+            .take(NAMED)
+            .map(|other| format!("{} at {}", other.name, other.endpoint))
+            .collect();
         if self.others.len() > NAMED {
             named.push(format!("{} more", self.others.len() - NAMED));
         }

@@ -88,7 +88,9 @@ pub fn supervise(command: impl FnOnce() -> anyhow::Result<()> + Send + 'static) 
         }
         let asked = ASKED.get().and_then(|asked| asked.get());
         if asked.is_some_and(|asked| asked.elapsed() > GRACE) {
-            bail!("it was busy and did not end within 2 s: ended without it; files end where they were flushed last");
+            bail!(
+                "it was busy and did not end within 2 s: ended without it; files end where they were flushed last"
+            );
         }
     }
 }

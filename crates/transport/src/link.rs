@@ -363,9 +363,8 @@ impl LinkPublisher {
     pub fn put(&self, data: Vec<u8>) -> Result<(), LinkError> {
         let origin = Origin { run: self.run, sequence: self.published.fetch_add(1, Ordering::Relaxed) };
         let put = self.publisher.put(data).attachment(origin.to_bytes());
-        put.wait().map_err(|source| {
-            zenoh(format!("cannot publish on `{}`", self.publisher.key_expr()))(source)
-        })
+        put.wait()
+            .map_err(|source| zenoh(format!("cannot publish on `{}`", self.publisher.key_expr()))(source))
     }
 
     /// Whether anybody subscribes to it.

@@ -27,7 +27,10 @@ pub enum VideoError {
         path: PathBuf,
     },
     /// The file as a whole cannot be read.
-    #[error("{} cannot be read: {what}", path.display())]
+    #[error(
+        "{} cannot be read: {what} (`ffmpeg -i IN -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes most videos readable)",
+        path.display()
+    )]
     Damaged {
         /// The file.
         path: PathBuf,

@@ -1,17 +1,35 @@
 use std::fs::File;
 use std::io::{BufRead, BufReader, Chain, Cursor, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
 
 /// The longest header line that is read.
 const MAX_HEADER: u64 = 4096;
 
-type Input = Chain<Cursor<Vec<u8>>, BufReader<File>>;
+type Input = Chain<Cursor<Vec<u8>>, Counted>;
+
+/// A file of which is known how much has been read since it was asked last.
+struct Counted {
+    file: BufReader<File>,
+    read: Arc<AtomicU64>,
+}
+
+impl Read for Counted {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let got = self.file.read(buffer)?;
+        self.read.fetch_add(got as u64, Ordering::Relaxed);
+        Ok(got)
+    }
+}
 
 /// A YUV4MPEG2 file; the brightness plane is used, 8 to 16 bits.
 pub struct Y4mSource {
     decoder: y4m::Decoder<Input>,
+    /// Bytes read of the frame that is read now.
+    read: Arc<AtomicU64>,
     path: PathBuf,
     next: u64,
     rate_hz: f64,
@@ -32,6 +50,9 @@ impl Y4mSource {
         let mut header = Vec::new();
         file.by_ref().take(MAX_HEADER).read_until(b'\n', &mut header).map_err(open)?;
         let text = String::from_utf8_lossy(&header).into_owned();
+        if !text.starts_with("YUV4MPEG2") {
+            return Err(damaged("it does not begin with YUV4MPEG2".to_owned()));
+        }
         let side = |letter: char| {
             let token = text.split_whitespace().find_map(|token| token.strip_prefix(letter));
             token.and_then(|digits| digits.parse::<u64>().ok()).unwrap_or(0)
@@ -43,8 +64,10 @@ impl Y4mSource {
         // The library has no mono16, which is laid out as mono12.
         let sixteen = text.contains("Cmono16");
         let header = text.replace("Cmono16", "Cmono12").into_bytes();
+        let read = Arc::new(AtomicU64::new(0));
+        let counted = Counted { file, read: Arc::clone(&read) };
         let limits = y4m::Limits { bytes: 8 * MAX_PIXELS as usize };
-        let decoder = y4m::Decoder::new_with_limits(Cursor::new(header).chain(file), limits)
+        let decoder = y4m::Decoder::new_with_limits(Cursor::new(header).chain(counted), limits)
             .map_err(|error| damaged(error.to_string()))?;
         let rate = decoder.get_framerate();
         let rate_hz = if rate.num > 0 && rate.den > 0 {
@@ -54,7 +77,7 @@ impl Y4mSource {
         };
         let bits = if sixteen { 16 } else { decoder.get_bit_depth() as u32 };
         let path = path.to_owned();
-        Ok(Self { decoder, path, next: 0, rate_hz, shift: 16_u32.saturating_sub(bits), clock })
+        Ok(Self { decoder, read, path, next: 0, rate_hz, shift: 16_u32.saturating_sub(bits), clock })
     }
 }
 
@@ -62,9 +85,16 @@ impl FrameSource for Y4mSource {
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
         let (width, height) = (self.decoder.get_width(), self.decoder.get_height());
         let wide = self.decoder.get_bytes_per_sample() == 2;
+        self.read.store(0, Ordering::Relaxed);
         let frame = match self.decoder.read_frame() {
             Ok(frame) => frame,
-            Err(y4m::Error::EOF) => return Ok(None),
+            Err(y4m::Error::EOF) if self.read.load(Ordering::Relaxed) == 0 => return Ok(None),
+            Err(y4m::Error::EOF) => {
+                let index = self.next;
+                self.next += 1;
+                let what = "the file ends in the middle of it".to_owned();
+                return Err(VideoError::Frame { path: self.path.clone(), index, what });
+            }
             Err(error) => {
                 return Err(VideoError::Damaged { path: self.path.clone(), what: error.to_string() });
             }

@@ -14,7 +14,9 @@ impl Arrivals {
     pub(crate) fn note(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
         let frames = self.0.entry(camera.to_owned()).or_default();
         // A camera that was started again counts from the start: its old frames are another run's.
-        if frames.last_key_value().is_some_and(|(&last, _)| sequence < last.saturating_sub(FRAMES_A_CAMERA as u64 / 2) || sequence == 0) {
+        if frames.last_key_value().is_some_and(|(&last, _)| {
+            sequence < last.saturating_sub(FRAMES_A_CAMERA as u64 / 2) || sequence == 0
+        }) {
             frames.clear();
         }
         frames.insert(sequence, arrival);

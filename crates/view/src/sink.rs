@@ -85,7 +85,8 @@ pub fn save_without_end(path: &Path) -> Result<RecordingStream, ViewError> {
 pub fn connect(address: SocketAddr) -> Result<RecordingStream, ViewError> {
     TcpStream::connect_timeout(&address, Duration::from_millis(500))
         .map_err(|_| ViewError::NobodyListens(address))?;
-    let bounded = ChunkBatcherConfig { max_bytes_in_flight: MOST_IN_FLIGHT, ..ChunkBatcherConfig::LOW_LATENCY };
+    let bounded =
+        ChunkBatcherConfig { max_bytes_in_flight: MOST_IN_FLIGHT, ..ChunkBatcherConfig::LOW_LATENCY };
     Ok(builder().batcher_config(bounded).connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
 }
 

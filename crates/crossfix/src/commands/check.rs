@@ -29,7 +29,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if args.config.is_dir() {
         let site = Site::load(&args.config)?;
         for (name, checked) in &site.cameras {
-            output::line(format!("camera `{name}`: {} is good; {}", checked.path.display(), view_of(&checked.camera)));
+            output::line(format!(
+                "camera `{name}`: {} is good; {}",
+                checked.path.display(),
+                view_of(&checked.camera)
+            ));
         }
         for path in &site.fusion {
             output::line(format!("fusion centre: {} is good", path.display()));

@@ -180,8 +180,7 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         Component::start(name, &files.folder, &arguments)
     };
     let (network_file, recording) = (text(&files.network), text(&files.recording));
-    let mut recorder =
-        start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
+    let mut recorder = start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
     let mut fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
     let viewer =
         if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };

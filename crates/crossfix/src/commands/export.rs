@@ -46,7 +46,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     })?;
     lacks.say(&args.recording);
     lacks.ensure_found(frames > 0, "tracks", &args.recording)?;
-    let inputs: Vec<&Path> = std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
+    let inputs: Vec<&Path> =
+        std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
     let draft = Draft::new(&args.csv, &inputs)?;
     let mut writer = csv::Writer::from_path(draft.path())
         .with_context(|| format!("cannot write {}", args.csv.display()))?;

@@ -119,7 +119,8 @@ impl Station {
                 });
             }
         }
-        let sender = origin.map_or_else(|| " from an unknown program".to_owned(), |o| format!(" from run {}", o.run));
+        let sender =
+            origin.map_or_else(|| " from an unknown program".to_owned(), |o| format!(" from run {}", o.run));
         let outputs = self.centre.take(&key.channel, data, &sender);
         self.publish(outputs)
     }

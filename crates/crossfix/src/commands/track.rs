@@ -95,7 +95,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let mut writer = csv::Writer::from_writer(sink);
     writer.write_record(["frame", "x", "y", "w", "h", "ok", "us"])?;
-    let picture = drawn.as_ref().map(|draft| Picture::new(draft.path(), args.labels.as_deref())).transpose()?;
+    let picture =
+        drawn.as_ref().map(|draft| Picture::new(draft.path(), args.labels.as_deref())).transpose()?;
     let mut frames = 0_u64;
     loop {
         let frame = match source.next_frame() {
@@ -132,7 +133,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if let (Some(picture), Some(draft), Some(path)) = (picture, drawn, &args.save) {
         picture.picture.finish()?;
         draft.keep()?;
-        output::line(format!("picture written to {0}: `rerun --bind 127.0.0.1 {0}` shows it", path.display()));
+        output::line(format!(
+            "picture written to {0}: `rerun --bind 127.0.0.1 {0}` shows it",
+            path.display()
+        ));
     }
     if let Some(path) = &args.csv {
         output::line(format!("{frames} frames tracked, boxes written to {}", path.display()));

@@ -142,9 +142,8 @@ impl Watch {
     fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
         if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
-            self.repeats.warn("foreign", *at, || {
-                format!("`{key}` is of no camera of the network's file: not shown")
-            });
+            self.repeats
+                .warn("foreign", *at, || format!("`{key}` is of no camera of the network's file: not shown"));
             return Ok(());
         }
         if let Some(origin) = *origin {

@@ -273,7 +273,14 @@ impl CameraFile {
     fn check_lens(&self, camera: &Camera) -> anyhow::Result<()> {
         let ImageSize { width, height } = camera.model().intrinsics().size;
         let (right, bottom) = (f64::from(width) - 1.0, f64::from(height) - 1.0);
-        for (x, y) in [(0.0, 0.0), (right, 0.0), (0.0, bottom), (right, bottom), (right / 2.0, 0.0), (0.0, bottom / 2.0)] {
+        for (x, y) in [
+            (0.0, 0.0),
+            (right, 0.0),
+            (0.0, bottom),
+            (right, bottom),
+            (right / 2.0, 0.0),
+            (0.0, bottom / 2.0),
+        ] {
             camera.model().bearing(Pixel::new(x, y), PixelCovariance::isotropic(1.0)).with_context(|| {
                 format!("the lens shows no direction at pixel ({x}, {y}): are the distortion coefficients in their order?")
             })?;
@@ -319,11 +326,7 @@ impl CameraFile {
 
     /// The message that describes the camera: the recorded one as it is, where it is replayed with
     /// its own, so that the same bytes give the same tracks.
-    pub fn calibration(
-        &self,
-        camera: &Camera,
-        valid_from: Timestamp,
-    ) -> anyhow::Result<CameraCalibration> {
+    pub fn calibration(&self, camera: &Camera, valid_from: Timestamp) -> anyhow::Result<CameraCalibration> {
         match &self.source {
             SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
                 recorded_calibration(path, &self.name)

@@ -18,8 +18,9 @@ pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> 
         let kind = toml::from_str(&text).ok().and_then(|keys| Kind::of(&keys));
         match kind.filter(|kind| *kind != wanted) {
             Some(kind) => bail!("{} is {kind}, and what is wanted here is {wanted}", path.display()),
-            None => Err(error)
-                .with_context(|| format!("the configuration file {} has an error", path.display())),
+            None => {
+                Err(error).with_context(|| format!("the configuration file {} has an error", path.display()))
+            }
         }
     })
 }
@@ -47,7 +48,8 @@ impl Kind {
         } else if has(&["event_time", "bearings", "initiation", "tracking", "clocks", "network"]) {
             Some(Self::Fusion)
         } else {
-            has(&["algorithm", "reference", "gate", "detector", "margin_px", "paper"]).then_some(Self::Tracker)
+            has(&["algorithm", "reference", "gate", "detector", "margin_px", "paper"])
+                .then_some(Self::Tracker)
         }
     }
 }

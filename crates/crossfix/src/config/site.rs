@@ -92,8 +92,8 @@ impl Site {
         let file = CameraFile::load(path, &[])?;
         let camera = file.camera(path)?;
         file.check_pictures(&camera).with_context(|| path.display().to_string())?;
-        let network = load_network(&file.network)
-            .with_context(|| format!("key `network` of {}", path.display()))?;
+        let network =
+            load_network(&file.network).with_context(|| format!("key `network` of {}", path.display()))?;
         ensure!(
             network.cameras.contains_key(&file.name),
             "{}: camera `{}` has no endpoint: add it to [cameras] of {}",

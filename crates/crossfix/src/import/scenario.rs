@@ -116,8 +116,7 @@ fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
 }
 
 fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec<Entry>> {
-    let epochs: BTreeSet<Timestamp> =
-        scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
+    let epochs: BTreeSet<Timestamp> = scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
     let mut frames: BTreeMap<Timestamp, Vec<TrueState>> = BTreeMap::new();
     for row in read_csv::<TruthRow>(&dir.join("truth.csv"))? {
         let time = Timestamp::from_seconds(row.t);

@@ -174,8 +174,7 @@ impl Agent {
         match &file.source {
             SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
             SourceConfig::Video { path, rate_hz, speed, .. } => {
-                let clock =
-                    FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
+                let clock = FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
@@ -291,7 +290,8 @@ impl Agent {
                 }
                 // What is lost is the rest of this video; the others see on.
                 Err(error) => {
-                    return Err(error).with_context(|| format!("camera `{}` sees no more", self.identity.name));
+                    return Err(error)
+                        .with_context(|| format!("camera `{}` sees no more", self.identity.name));
                 }
             };
             self.check_size(&frame)?;

@@ -11,8 +11,8 @@ use nalgebra::Point3;
 
 use self::report::Report;
 use crate::commands::numbers::{not_negative, number, positive};
-use crate::output::{self, Draft};
 use crate::config;
+use crate::output::{self, Draft};
 
 /// Frames a second of a camera whose file does not say.
 const DEFAULT_RATE_HZ: f64 = 30.0;

@@ -101,7 +101,9 @@ impl Recorder {
         } else {
             self.counts.newer += 1;
             self.repeats.warn(&format!("newer {key}"), at, || {
-                format!("`{key}` from {sender} is of a newer version: recorded, but this build cannot read it")
+                format!(
+                    "`{key}` from {sender} is of a newer version: recorded, but this build cannot read it"
+                )
             });
             self.times.now()
         };

@@ -118,9 +118,7 @@ fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
     let mut found: BTreeMap<Key, Entry> = BTreeMap::new();
     recorded::find(recording, |entry| {
         let is_past = entry.data_time > range.from;
-        if is_calibration(&entry.key)
-            && (!found.contains_key(&entry.key) || !range.is_whole && !is_past)
-        {
+        if is_calibration(&entry.key) && (!found.contains_key(&entry.key) || !range.is_whole && !is_past) {
             found.insert(entry.key.clone(), entry);
         }
         // A torn file does not say beforehand how many there are.

@@ -1,19 +1,17 @@
+mod index;
+
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use openh264::OpenH264API;
 use openh264::decoder::{DecodedYUV, Decoder, DecoderConfig, Flush};
 use openh264::formats::YUVSource;
-use re_mp4::{Mp4, Sample, StsdBoxContent, TrackKind};
 
+use self::index::Sample;
 use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
-
-/// A compressed frame larger than this is damage.
-const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// An MP4 file with H.264, decoded to its brightness plane.
 pub struct Mp4Source {
@@ -29,6 +27,8 @@ pub struct Mp4Source {
     pending: BinaryHeap<Reverse<i64>>,
     ready: VecDeque<Frame>,
     failed: VecDeque<String>,
+    /// Frames that lie beyond the file's end, as long as that has not been said.
+    missing: usize,
     timescale: f64,
     next: u64,
     clock: FrameClock,
@@ -43,38 +43,24 @@ impl Mp4Source {
         let open = |source| VideoError::Open { path: path.to_owned(), source };
         let damaged = |what: String| VideoError::Damaged { path: path.to_owned(), what };
         let file = File::open(path).map_err(open)?;
-        let size = file.metadata().map_err(open)?.len();
         let mut file = BufReader::new(file);
-        // The parser is not hardened: on a hostile index it panics.
-        let mp4 = catch_unwind(AssertUnwindSafe(|| Mp4::read(&mut file, size)))
-            .map_err(|_| damaged("its index is damaged".to_owned()))?
-            .map_err(|error| damaged(error.to_string()))?;
-        let track = mp4
-            .tracks()
-            .values()
-            .find(|track| track.kind == Some(TrackKind::Video))
-            .ok_or_else(|| damaged("it holds no video".to_owned()))?;
-        let StsdBoxContent::Avc1(avc1) = &track.trak(&mp4).mdia.minf.stbl.stsd.contents else {
-            return Err(damaged("its video is not H.264".to_owned()));
-        };
-        let sets = avc1.avcc.sequence_parameter_sets.iter().chain(&avc1.avcc.picture_parameter_sets);
-        let headers = sets.flat_map(|unit| [&[0, 0, 0, 1][..], &unit.bytes[..]].concat()).collect();
-        let length_bytes = usize::from(avc1.avcc.length_size_minus_one) + 1;
+        let index::Index { samples, timescale, parameters, length_bytes, missing } =
+            index::read(&mut file).map_err(damaged)?;
+        let headers = parameters.iter().flat_map(|unit| [&[0, 0, 0, 1][..], &unit[..]].concat()).collect();
         let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
         let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
-            .map_err(|error| damaged(error.to_string()))?;
-        let samples: VecDeque<Sample> = track.samples.iter().copied().collect();
-        let timescale = samples.front().map_or(1.0, |sample| (sample.timescale as f64).max(1.0));
+            .map_err(|error| damaged(in_words(&error)))?;
         Ok(Self {
             file,
             path: path.to_owned(),
-            samples,
+            samples: samples.into(),
             headers,
             length_bytes,
             decoder,
             pending: BinaryHeap::new(),
             ready: VecDeque::new(),
             failed: VecDeque::new(),
+            missing,
             timescale,
             next: 0,
             clock,
@@ -83,14 +69,11 @@ impl Mp4Source {
 
     /// The compressed frame as an Annex B access unit.
     fn access_unit(&mut self, sample: &Sample) -> Result<Vec<u8>, String> {
-        if sample.size > MAX_SAMPLE_BYTES {
-            return Err(format!("it claims {} bytes", sample.size));
-        }
-        let mut bytes = vec![0; sample.size as usize];
+        let mut bytes = vec![0; sample.size];
         self.file
             .seek(SeekFrom::Start(sample.offset))
             .and_then(|_| self.file.read_exact(&mut bytes))
-            .map_err(|error| error.to_string())?;
+            .map_err(|_| "the file ends before it".to_owned())?;
         let mut unit = if sample.is_sync { self.headers.clone() } else { Vec::new() };
         let mut rest = &bytes[..];
         while !rest.is_empty() {
@@ -113,7 +96,7 @@ impl Mp4Source {
                 return;
             }
         };
-        self.pending.push(Reverse(sample.composition_timestamp));
+        self.pending.push(Reverse(sample.shown_at));
         match self.decoder.decode(&unit) {
             Ok(Some(picture)) => {
                 let time = self.pending.pop();
@@ -122,8 +105,8 @@ impl Mp4Source {
             }
             Ok(None) => {}
             Err(error) => {
-                self.pending.retain(|Reverse(time)| *time != sample.composition_timestamp);
-                self.failed.push_back(error.to_string());
+                self.pending.retain(|Reverse(time)| *time != sample.shown_at);
+                self.failed.push_back(in_words(&error));
             }
         }
     }
@@ -146,9 +129,22 @@ impl Mp4Source {
         });
         match rest {
             Ok(frames) => frames.into_iter().for_each(|frame| self.collect(frame)),
-            Err(error) => self.failed.push_back(error.to_string()),
+            Err(error) => self.failed.push_back(in_words(&error)),
+        }
+        let missing = std::mem::take(&mut self.missing);
+        if missing > 0 {
+            self.failed.push_back(format!("the file ends before it and the {} after it", missing - 1));
         }
     }
+}
+
+/// What the decoder says, in words for people: it counts its errors.
+fn in_words(error: &openh264::Error) -> String {
+    let text = error.to_string();
+    let number: String =
+        text.split("Native:").nth(1).unwrap_or("").chars().take_while(char::is_ascii_digit).collect();
+    let number = if number.is_empty() { String::new() } else { format!(" (OpenH264 {number})") };
+    format!("it is damaged, or builds on one that is{number}")
 }
 
 fn frame_of(

@@ -1,0 +1,264 @@
+//! Where the compressed frames of an MP4 file lie, and when each is shown.
+//!
+//! The boxes are `mp4-atom`'s business. It is given whole boxes out of a buffer, which it cannot leave,
+//! and every loop here goes on to a later byte of the file or ends: a damaged file costs no more time and
+//! memory than its size.
+
+use std::io::{Read, Seek, SeekFrom};
+
+use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak};
+
+/// The longest index that is read, bytes: a day of 60 frames a second.
+const MAX_INDEX_BYTES: u64 = 128 << 20;
+/// The most frames of a file: 19 hours of 60 a second.
+const MAX_SAMPLES: usize = 1 << 22;
+/// A compressed frame larger than this is damage.
+const MAX_SAMPLE_BYTES: u64 = 64 << 20;
+
+/// One compressed frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Sample {
+    /// Where it begins, bytes from the file's beginning.
+    pub(super) offset: u64,
+    /// How long it is, bytes.
+    pub(super) size: usize,
+    /// Whether it can be decoded without those before it.
+    pub(super) is_sync: bool,
+    /// When it is shown, in ticks after the first one is.
+    pub(super) shown_at: i64,
+}
+
+/// What is known of a file's video.
+#[derive(Clone, Debug)]
+pub(super) struct Index {
+    /// In the order of decoding.
+    pub(super) samples: Vec<Sample>,
+    /// Ticks a second.
+    pub(super) timescale: f64,
+    /// The sets of parameters that every picture needs.
+    pub(super) parameters: Vec<Vec<u8>>,
+    /// Bytes of the length before each part of a frame.
+    pub(super) length_bytes: usize,
+    /// Frames that lie beyond the file's end.
+    pub(super) missing: usize,
+}
+
+/// Reads the index of a file's first video.
+///
+/// # Errors
+/// What is wrong with the file, in words.
+pub(super) fn read<R: Read + Seek>(file: &mut R) -> Result<Index, String> {
+    let (moov, moofs) = boxes(file)?;
+    let moov = moov.ok_or("it has no index: it is cut off, or no MP4 file")?;
+    let end = file.seek(SeekFrom::End(0)).map_err(|error| error.to_string())?;
+    let is_video = |trak: &&Trak| trak.mdia.hdlr.handler == FourCC::new(b"vide");
+    let trak = moov.trak.iter().find(is_video).ok_or("it holds no video")?;
+    let table = &trak.mdia.minf.stbl;
+    let avc1 = h264(table)?;
+    let mut samples = Samples { samples: Vec::new(), decoded_at: 0, end, missing: 0 };
+    samples.add_table(table)?;
+    for (at, moof) in &moofs {
+        samples.add_fragment(*at, moof, &moov, trak.tkhd.track_id)?;
+    }
+    let Samples { mut samples, missing, .. } = samples;
+    let first = samples.iter().map(|sample| sample.shown_at).min().unwrap_or(0);
+    samples.iter_mut().for_each(|sample| sample.shown_at = sample.shown_at.saturating_sub(first));
+    let sets = avc1.avcc.sequence_parameter_sets.iter().chain(&avc1.avcc.picture_parameter_sets);
+    Ok(Index {
+        samples,
+        timescale: f64::from(trak.mdia.mdhd.timescale.max(1)),
+        parameters: sets.cloned().collect(),
+        length_bytes: usize::from(avc1.avcc.length_size),
+        missing,
+    })
+}
+
+fn h264(table: &Stbl) -> Result<&Avc1, String> {
+    let found = table.stsd.codecs.iter().find_map(|codec| match codec {
+        Codec::Avc1(avc1) => Some(avc1),
+        _ => None,
+    });
+    found.ok_or_else(|| "its video is not H.264".to_owned())
+}
+
+type Fragments = Vec<(u64, Moof)>;
+
+/// The index, and the fragments with their places. Boxes after a torn one are not looked for.
+fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), String> {
+    let text = |error: std::io::Error| error.to_string();
+    let end = file.seek(SeekFrom::End(0)).map_err(text)?;
+    let (mut moov, mut moofs, mut read_bytes) = (None, Vec::new(), 0);
+    let mut at = 0;
+    while let Some((kind, size)) = head(file, at, end).map_err(text)? {
+        if kind == *b"moov" || kind == *b"moof" {
+            read_bytes += size;
+            if read_bytes > MAX_INDEX_BYTES {
+                return Err(format!("its index has more than {MAX_INDEX_BYTES} bytes"));
+            }
+            let mut bytes = vec![0; usize::try_from(size).map_err(|error| error.to_string())?];
+            file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut bytes)).map_err(text)?;
+            let damaged = |error: mp4_atom::Error| format!("its index is damaged: {error}");
+            if kind == *b"moov" {
+                moov = Some(Moov::decode(&mut bytes.as_slice()).map_err(damaged)?);
+            } else {
+                moofs.push((at, Moof::decode(&mut bytes.as_slice()).map_err(damaged)?));
+            }
+        }
+        at += size;
+    }
+    Ok((moov, moofs))
+}
+
+/// Kind and size of the box at a place; `None` if none lies there whole.
+fn head<R: Read + Seek>(file: &mut R, at: u64, end: u64) -> std::io::Result<Option<([u8; 4], u64)>> {
+    const SHORT: u64 = 8;
+    const LONG: u64 = 16;
+    if end.saturating_sub(at) < SHORT {
+        return Ok(None);
+    }
+    let mut head = [0; SHORT as usize];
+    file.seek(SeekFrom::Start(at))?;
+    file.read_exact(&mut head)?;
+    let [s0, s1, s2, s3, kind @ ..] = head;
+    let (size, least) = match u32::from_be_bytes([s0, s1, s2, s3]) {
+        // To the file's end.
+        0 => (end - at, SHORT),
+        1 if end - at < LONG => return Ok(None),
+        1 => {
+            let mut long = [0; 8];
+            file.read_exact(&mut long)?;
+            (u64::from_be_bytes(long), LONG)
+        }
+        size => (u64::from(size), SHORT),
+    };
+    Ok((size >= least && size <= end - at).then_some((kind, size)))
+}
+
+/// The frames found so far.
+struct Samples {
+    samples: Vec<Sample>,
+    /// When the next one is decoded, ticks.
+    decoded_at: i64,
+    /// The file's length: what lies beyond it is missing.
+    end: u64,
+    missing: usize,
+}
+
+impl Samples {
+    /// Adds a frame; says whether it lies in the file.
+    fn push(
+        &mut self,
+        offset: u64,
+        size: u32,
+        is_sync: bool,
+        shift: i64,
+        lasts: u32,
+    ) -> Result<bool, String> {
+        let number = self.samples.len();
+        let bytes = u64::from(size);
+        if number >= MAX_SAMPLES || bytes > MAX_SAMPLE_BYTES || size == 0 {
+            return Err(format!("its frame {number} claims {bytes} bytes"));
+        }
+        if offset.checked_add(bytes).is_none_or(|ends| ends > self.end) {
+            return Ok(false);
+        }
+        let shown_at = self.decoded_at.saturating_add(shift);
+        self.decoded_at = self.decoded_at.saturating_add(i64::from(lasts));
+        self.samples.push(Sample { offset, size: size as usize, is_sync, shown_at });
+        Ok(true)
+    }
+
+    /// The frames that the index itself lists.
+    fn add_table(&mut self, table: &Stbl) -> Result<(), String> {
+        let (size_of, count): (Box<dyn Fn(usize) -> Option<u32>>, usize) = match &table.stsz.samples {
+            StszSamples::Identical { count, size } => {
+                let (count, size) = (*count as usize, *size);
+                (Box::new(move |index| (index < count).then_some(size)), count)
+            }
+            StszSamples::Different { sizes } => (Box::new(|index| sizes.get(index).copied()), sizes.len()),
+        };
+        let chunks: Vec<u64> = match (&table.stco, &table.co64) {
+            (Some(short), _) => short.entries.iter().map(|&offset| u64::from(offset)).collect(),
+            (None, Some(long)) => long.entries.clone(),
+            (None, None) => Vec::new(),
+        };
+        let times = table.stts.entries.iter();
+        let mut durations = times.flat_map(|e| std::iter::repeat_n(e.sample_delta, e.sample_count as usize));
+        let shifts = table.ctts.iter().flat_map(|ctts| &ctts.entries);
+        let mut shifts = shifts.flat_map(|e| std::iter::repeat_n(e.sample_offset, e.sample_count as usize));
+        let mut runs = table.stsc.entries.iter().peekable();
+        let mut a_chunk = 0;
+        let mut number = 0;
+        for (chunk, &begins) in chunks.iter().enumerate() {
+            while let Some(run) = runs.next_if(|run| run.first_chunk as usize <= chunk + 1) {
+                a_chunk = run.samples_per_chunk;
+            }
+            let mut offset = begins;
+            for _ in 0..a_chunk {
+                let Some(size) = size_of(number) else {
+                    break;
+                };
+                let is_sync = table.stss.is_none();
+                let shift = shifts.next().map_or(0, i64::from);
+                if !self.push(offset, size, is_sync, shift, durations.next().unwrap_or(0))? {
+                    self.missing += count - number;
+                    self.mark_sync(table);
+                    return Ok(());
+                }
+                number += 1;
+                offset = offset.saturating_add(u64::from(size));
+            }
+        }
+        self.mark_sync(table);
+        Ok(())
+    }
+
+    /// Notes which of the listed frames can be decoded by themselves.
+    fn mark_sync(&mut self, table: &Stbl) {
+        for number in table.stss.iter().flat_map(|stss| &stss.entries) {
+            let index = (*number as usize).checked_sub(1);
+            if let Some(sample) = index.and_then(|index| self.samples.get_mut(index)) {
+                sample.is_sync = true;
+            }
+        }
+    }
+
+    /// The frames of a fragment at a place of the file.
+    fn add_fragment(&mut self, at: u64, moof: &Moof, moov: &Moov, track: u32) -> Result<(), String> {
+        /// A frame that others are needed for.
+        const IS_NOT_SYNC: u32 = 1 << 16;
+        let usual = moov.mvex.iter().flat_map(|mvex| &mvex.trex).find(|trex| trex.track_id == track);
+        for part in moof.traf.iter().filter(|part| part.tfhd.track_id == track) {
+            let head = &part.tfhd;
+            let base = head.base_data_offset.unwrap_or(at);
+            if let Some(tfdt) = &part.tfdt {
+                self.decoded_at = i64::try_from(tfdt.base_media_decode_time).unwrap_or(i64::MAX);
+            }
+            let mut offset = base;
+            for run in &part.trun {
+                if let Some(by) = run.data_offset {
+                    offset = base.saturating_add_signed(i64::from(by));
+                }
+                for entry in &run.samples {
+                    let or = |own: Option<u32>, part: Option<u32>, file: Option<u32>| {
+                        own.or(part).or(file).unwrap_or(0)
+                    };
+                    let size = or(entry.size, head.default_sample_size, usual.map(|u| u.default_sample_size));
+                    let flags =
+                        or(entry.flags, head.default_sample_flags, usual.map(|u| u.default_sample_flags));
+                    let lasts = or(
+                        entry.duration,
+                        head.default_sample_duration,
+                        usual.map(|u| u.default_sample_duration),
+                    );
+                    let shift = entry.cts.map_or(0, i64::from);
+                    if !self.push(offset, size, flags & IS_NOT_SYNC == 0, shift, lasts)? {
+                        self.missing += 1;
+                    }
+                    offset = offset.saturating_add(u64::from(size));
+                }
+            }
+        }
+        Ok(())
+    }
+}
