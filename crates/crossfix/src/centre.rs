@@ -19,7 +19,6 @@ pub struct Centre {
     refused: Refusals,
     repeats: Repeats,
     frames: u64,
-    now: Timestamp,
     scene_begins: Timestamp,
 }
 
@@ -85,7 +84,6 @@ impl Centre {
             refused: Refusals::default(),
             repeats: Repeats::default(),
             frames: 0,
-            now: Timestamp::EPOCH,
             scene_begins: Timestamp::EPOCH,
         })
     }
@@ -172,10 +170,7 @@ impl Centre {
     fn follow(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         for output in &outputs {
             match output {
-                Output::Tracks(frame) => {
-                    self.now = Timestamp::from_nanos(frame.time_ns);
-                    self.frames += 1;
-                }
+                Output::Tracks(_) => self.frames += 1,
                 Output::Rejected(rejection) => {
                     let kind = format!("{} {}", rejection.camera, rejection.reason.counter());
                     self.repeats.warn(&kind, Instant::now(), || format!("not used: {rejection}"));
@@ -202,9 +197,9 @@ impl Centre {
         self.frames
     }
 
-    /// Data time of the newest of them.
+    /// What time it is in the data: the epoch before there are any.
     pub fn now(&self) -> Timestamp {
-        self.now
+        self.fusion.now().unwrap_or_default()
     }
 
     /// What it says of itself; the shell adds what the transport has counted, in `counted`.
@@ -226,7 +221,7 @@ impl Centre {
         let problems = left_out.map(|report| format!("camera `{}` is left out", report.camera));
         Health {
             component: "fusion".to_owned(),
-            time_ns: self.now.nanos(),
+            time_ns: self.now().nanos(),
             handled: self.frames,
             counters,
             cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),

@@ -25,6 +25,8 @@ struct Other {
     endpoint: String,
     channel: Channel,
     is_here: bool,
+    /// Whether it was there at the look before, too.
+    was_here: bool,
 }
 
 impl Lookout {
@@ -35,6 +37,7 @@ impl Lookout {
             endpoint: network.cameras.get(camera).cloned().unwrap_or_default(),
             channel: Channel::Alive(camera.clone()),
             is_here: false,
+            was_here: false,
         });
         Self::new(link, others.collect())
     }
@@ -46,6 +49,7 @@ impl Lookout {
             endpoint: network.fusion.clone(),
             channel: Channel::FusionAlive,
             is_here: false,
+            was_here: false,
         };
         Self::new(link, vec![fusion])
     }
@@ -63,6 +67,7 @@ impl Lookout {
                 let what = if is_here { "is there" } else { "is gone" };
                 tracing::info!("{} {what}", other.name);
             }
+            other.was_here = other.is_here;
             other.is_here = is_here;
         }
         if self.others.iter().any(|other| other.is_here) {
@@ -82,9 +87,10 @@ impl Lookout {
         self.presence.is_alive(channel)
     }
 
-    /// The cameras of them that are there, by name.
+    /// The cameras of them that were there at the last two looks, by name: by the second, they hear what
+    /// is said of them.
     pub fn cameras_here(&self) -> Vec<String> {
-        let here = self.others.iter().filter(|other| other.is_here);
+        let here = self.others.iter().filter(|other| other.is_here && other.was_here);
         here.filter_map(|other| other.channel.camera()).map(ToString::to_string).collect()
     }
 

@@ -60,6 +60,7 @@ pub struct Fusion {
     corrected_load: Load,
     counters: Counters,
     sequence: u64,
+    now: Option<Timestamp>,
 }
 
 impl Fusion {
@@ -81,6 +82,7 @@ impl Fusion {
             corrected_load: Load::default(),
             counters: Counters::default(),
             sequence: 0,
+            now: None,
             config,
         })
     }
@@ -153,6 +155,11 @@ impl Fusion {
             noise_factor: self.standings.factor(camera),
             clock: self.clocks.estimate(camera),
         })
+    }
+
+    /// Capture time of the exposure that was handled last; `None` before the first.
+    pub fn now(&self) -> Option<Timestamp> {
+        self.now
     }
 
     /// What has been handled and refused so far.
@@ -255,6 +262,7 @@ impl Fusion {
     /// One exposure, in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
         self.buffer.pass(exposure.time);
+        self.now = Some(exposure.time);
         self.tracker.begin(exposure.time);
         for moved in self.cameras.advance(exposure.time) {
             let pose_covariance = self.cameras.now().get(&moved).and_then(|known| known.pose_covariance);

@@ -3,7 +3,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_fusion::Output;
-use crossfix_message::{Channel, Key, Payload};
+use crossfix_message::{Channel, Key, Payload, Timestamp};
 use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Role, Subscription};
 
 use crate::centre::Centre;
@@ -40,6 +40,8 @@ struct Station {
     health: LinkPublisher,
     reception: Reception,
     lookout: Lookout,
+    /// What time it was in the data at the last report.
+    said_at: Timestamp,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -61,6 +63,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         health: link.publisher(Channel::FusionHealth, Delivery::Queued)?,
         reception: Reception::default(),
         lookout,
+        said_at: Timestamp::EPOCH,
         link,
     };
     let kinds = ["bearings", "calibration", "health"];
@@ -151,6 +154,8 @@ impl Station {
         health.run = self.link.run().0;
         health.host = network::host();
         health.present = self.lookout.cameras_here();
+        health.is_playing = self.centre.now() > self.said_at;
+        self.said_at = self.centre.now();
         for (key, runs) in self.reception.rivals(Instant::now()) {
             let rivalry = rivalry(key, runs);
             self.centre.warn(&format!("rivals {key}"), || rivalry.clone());

@@ -54,20 +54,16 @@ impl Start {
 /// What the fusion centre's health says of what the site plays.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Site {
-    /// Its time goes on: it is at this time, of a scene that began then, if it is one.
+    /// It is at this time, of a scene that began then, if it is one.
     Plays { now: Timestamp, scene_begins: Timestamp },
     /// Its time stands, and all cameras are there.
     IsComplete,
-    /// Its time stands, or it is not known yet whether it does.
+    /// Its time stands, and cameras are missing.
     Waits,
 }
 
-/// Compares one report of the fusion centre with the one before.
-fn judge(before: Option<&Health>, health: &Health, cameras: &[CameraName]) -> Site {
-    let Some(before) = before else {
-        return Site::Waits;
-    };
-    if health.time_ns > before.time_ns && health.time_ns != 0 {
+fn judge(health: &Health, cameras: &[CameraName]) -> Site {
+    if health.is_playing {
         return Site::Plays {
             now: Timestamp::from_nanos(health.time_ns),
             scene_begins: Timestamp::from_nanos(health.scene_begins_ns),
@@ -127,7 +123,6 @@ impl Agent {
         let key = Key::new(self.link.site().clone(), Channel::FusionHealth);
         let reports = self.link.subscribe(&[key.to_string()])?;
         let begun = Instant::now();
-        let mut before: Option<Health> = None;
         tracing::info!(
             "camera `{}` waits for the other cameras, {} s at most",
             self.identity.name,
@@ -141,12 +136,12 @@ impl Agent {
             let Some(health) = reports.next(POLL).and_then(|r| decode::<Health>(&r.data).ok()) else {
                 continue;
             };
-            match judge(before.as_ref(), &health, &cameras) {
+            match judge(&health, &cameras) {
                 Site::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
                 Site::IsComplete => return Ok(Some(Start::now())),
-                Site::Waits => before = Some(health),
+                Site::Waits => {}
             }
         }
         Ok(None)
@@ -170,24 +165,20 @@ impl Agent {
 mod tests {
     use super::*;
 
-    fn health(seconds: f64, present: &[&str]) -> Health {
-        Health {
-            time_ns: Timestamp::from_seconds(seconds).nanos(),
-            present: present.iter().map(|name| (*name).to_owned()).collect(),
-            ..Default::default()
-        }
-    }
-
     #[test]
     fn agents_begin_together_and_one_that_is_late_joins() {
         let cameras = ["a", "b"].map(|name| name.parse().unwrap());
-        let [one, both] = [health(0.0, &["a"]), health(0.0, &["a", "b"])];
-        assert_eq!(judge(None, &both, &cameras), Site::Waits, "it may be playing");
-        assert_eq!(judge(Some(&one), &one, &cameras), Site::Waits);
-        assert_eq!(judge(Some(&one), &both, &cameras), Site::IsComplete);
-        // A file was played before, to its end.
-        assert_eq!(judge(Some(&health(9.0, &["a"])), &health(9.0, &["a", "b"]), &cameras), Site::IsComplete);
-        let plays = judge(Some(&health(3.0, &[])), &health(4.0, &[]), &cameras);
-        assert!(matches!(plays, Site::Plays { now, .. } if now == Timestamp::from_seconds(4.0)));
+        let at = Timestamp::from_seconds(4.0);
+        let health = |is_playing: bool, present: &[&str]| Health {
+            time_ns: at.nanos(),
+            present: present.iter().map(|name| (*name).to_owned()).collect(),
+            is_playing,
+            ..Default::default()
+        };
+        assert_eq!(judge(&health(false, &["a"]), &cameras), Site::Waits);
+        // A file may have been played before, to its end.
+        assert_eq!(judge(&health(false, &["b", "a"]), &cameras), Site::IsComplete);
+        let plays = judge(&health(true, &["b", "a"]), &cameras);
+        assert!(matches!(plays, Site::Plays { now, .. } if now == at));
     }
 }
