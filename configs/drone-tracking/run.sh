@@ -7,13 +7,12 @@ cd "$(dirname "$0")/../.."
 crossfix=${CROSSFIX:-target/release/crossfix}
 here=configs/drone-tracking
 
-"$crossfix" record -c $here/network.toml -o "$output" & recorder=$!
+"$crossfix" record -c $here/network.toml -o "$output" --overwrite & recorder=$!
 "$crossfix" fuse -c $here/fusion.toml & fusion=$!
 trap 'kill $recorder $fusion 2>/dev/null || true' EXIT
-begin=$(($(date +%s) + 4))
 agents=()
 for camera in gopro3 sony5100 sonyG; do
-  "$crossfix" agent -c $here/$camera.toml --wait-for-recorder --start-at $begin & agents+=($!)
+  "$crossfix" agent -c $here/$camera.toml --wait-for-recorder & agents+=($!)
 done
 wait "${agents[@]}"
 kill -TERM $fusion; wait $fusion
