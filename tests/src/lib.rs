@@ -108,6 +108,13 @@ impl Process {
         panic!("the process does not end");
     }
 
+    /// The most memory that it has had, bytes; `None` where the system does not say.
+    pub fn peak_memory(&self) -> Option<u64> {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.0.id())).ok()?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+        line.split_whitespace().next()?.parse::<u64>().ok().map(|kilobytes| kilobytes << 10)
+    }
+
     /// Sends it SIGTERM, as systemd does, and says how long it took to end, and its exit code.
     pub fn terminate(mut self) -> (Duration, Option<i32>) {
         let begun = Instant::now();

@@ -105,6 +105,21 @@ fn an_agent_whose_video_breaks_ends_with_an_error() {
 }
 
 #[test]
+fn an_agent_that_is_behind_its_source_says_so() {
+    let site = Site::new(2.0);
+    let recorder = site.start_recorder("live.mcap");
+    std::thread::sleep(Duration::from_millis(500));
+    // It should have begun five seconds ago.
+    let begin = format!("{:.3}", crossfix_tests::now_seconds() - 5.0);
+    let file = site.path("north.toml");
+    let mut agent =
+        site.start_logged(&["agent", "-c", &file, "--no-wait", "--start-at", &begin], "agent.log");
+    assert!(agent.wait());
+    assert!(recorder.stop());
+    assert!(site.text("agent.log").contains("behind its source"), "{}", site.text("agent.log"));
+}
+
+#[test]
 fn who_waits_says_for_whom_within_five_seconds() {
     let site = Site::new(2.0);
     let logged = |name: &str, arguments: &[&str]| (name.to_owned(), site.start_logged(arguments, name));

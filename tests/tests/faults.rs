@@ -94,6 +94,39 @@ fn hostile_messages_are_counted_and_the_fusion_centre_goes_on() {
 }
 
 #[test]
+fn no_message_of_any_size_costs_much_memory() {
+    let site = Site::new(2.0);
+    let fusion = site.start_fusion();
+    let recorder = site.start_recorder("live.mcap");
+    let link = Link::open(site.network(), &Role::Cameras { and_fusion: false }).unwrap();
+    let ear = site.ear();
+    let health = ear.subscribe(&[Key::new(ear.site().clone(), Channel::FusionHealth).to_string()]).unwrap();
+    link.wait_for(&[Channel::FusionAlive, Channel::RecorderAlive], PATIENCE, || true).unwrap();
+    std::thread::sleep(Duration::from_millis(500));
+    let before = [&fusion, &recorder].map(|process| process.peak_memory());
+    let north = Key::new(link.site().clone(), Channel::Bearings("north".parse().unwrap()));
+    // Empty tracks: two bytes each here, 180 there.
+    for length in [1 << 20, 7 << 20, 12 << 20, 50 << 20, 150 << 20] {
+        link.put(&north, [0x42, 0x00].repeat(length / 2)).unwrap();
+    }
+    let counted = counters(&health, |counted| {
+        ["received_too_large", "received_too_long"].iter().filter_map(|name| counted.get(*name)).sum::<u64>()
+            >= 3
+    });
+    assert!(counted["received_too_large"] >= 2, "{counted:?}");
+    std::thread::sleep(Duration::from_secs(1));
+    for (what, process, before) in [("fuse", &fusion, before[0]), ("record", &recorder, before[1])] {
+        let (Some(before), Some(after)) = (before, process.peak_memory()) else {
+            eprintln!("SKIPPED: this system does not say how much memory a process has");
+            continue;
+        };
+        println!("{what}: {} MiB before, {} MiB at most", before >> 20, after >> 20);
+        assert!(after - before < 64 << 20, "{what}: {before} and {after} bytes");
+    }
+    assert!(fusion.stop() && recorder.stop());
+}
+
+#[test]
 fn a_full_disk_ends_the_recorder_with_a_clear_word() {
     if !std::path::Path::new("/dev/full").exists() {
         eprintln!("SKIPPED: this system has no /dev/full");

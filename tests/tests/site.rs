@@ -1,6 +1,6 @@
 //! Real processes joined by Zenoh over loopback.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot set itself up has failed")]
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -55,23 +55,24 @@ fn agents_wait_for_the_fusion_centre_and_a_new_one_picks_them_up() {
     // The agents are up first.
     let _agents = site.start_agents(now_seconds() + 2.0, &[]);
     std::thread::sleep(Duration::from_secs(1));
-    let confirmed_within = |patience: Duration| {
+    let confirmed_within = |patience: Duration| -> Option<Vec<u64>> {
         let deadline = Instant::now() + patience;
         while Instant::now() < deadline {
             let Some(received) = subscription.next(Duration::from_millis(50)) else { continue };
             let frame: TrackFrame = decode(&received.data).unwrap();
             if frame.tracks.iter().any(|track| track.state() == TrackState::Confirmed) {
-                return true;
+                return Some(frame.tracks.iter().map(|track| track.id).collect());
             }
         }
-        false
+        None
     };
     let first = site.start_fusion();
-    assert!(confirmed_within(PATIENCE), "the first fusion centre has tracks");
+    let before = confirmed_within(PATIENCE).expect("the first fusion centre has tracks");
     first.crash();
     while subscription.next(Duration::from_millis(200)).is_some() {}
     let second = site.start_fusion();
-    assert!(confirmed_within(Duration::from_secs(5)), "the second has tracks within 5 s");
+    let after = confirmed_within(Duration::from_secs(5)).expect("the second has tracks within 5 s");
+    assert!(after.iter().all(|id| !before.contains(id)), "{before:?} and {after:?}: no track is another's");
     assert!(second.stop());
 }
 

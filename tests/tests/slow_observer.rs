@@ -43,7 +43,9 @@ impl Namespaces {
             format!("-n {far} addr add 10.213.0.2/24 dev cf{id}y"),
             format!("-n {site} link set cf{id}x up"),
             format!("-n {far} link set cf{id}y up"),
-            format!("netns exec {site} tc qdisc add dev cf{id}x root tbf rate 40kbit burst 4kb latency 200ms"),
+            format!(
+                "netns exec {site} tc qdisc add dev cf{id}x root tbf rate 40kbit burst 4kb latency 200ms"
+            ),
         ];
         steps.iter().all(|step| ip(step)).then_some(names)
     }
@@ -101,7 +103,8 @@ fn p99_ms(names: &Namespaces, site: &Site, has_slow_one: bool) -> f64 {
     recorder.stop();
     fusion.stop();
     observer.map(Running::stop);
-    let evaluation: serde_json::Value = serde_json::from_str(&succeed(&["evaluate", &near, "--json"])).unwrap();
+    let evaluation: serde_json::Value =
+        serde_json::from_str(&succeed(&["evaluate", &near, "--json"])).unwrap();
     evaluation["latency"]["p99_ms"].as_f64().unwrap()
 }
 
@@ -121,7 +124,9 @@ fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
     site.write("fusion.toml", "network = \"network.toml\"\n");
     let alone = p99_ms(&names, &site, false);
     let beside = p99_ms(&names, &site, true);
-    println!("{played_s} s: bearing to track p99 {alone:.1} ms alone, {beside:.1} ms beside the slow recorder");
+    println!(
+        "{played_s} s: bearing to track p99 {alone:.1} ms alone, {beside:.1} ms beside the slow recorder"
+    );
     // A publisher that waits for the slow one stalls for seconds; this is the machine's own noise.
     assert!(beside < 2.0 * alone + 100.0, "p99 {beside:.1} ms instead of {alone:.1} ms");
 

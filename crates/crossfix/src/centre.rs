@@ -88,13 +88,18 @@ impl Centre {
         })
     }
 
+    /// Whether it listens to a camera.
+    pub fn listens_to(&self, camera: &CameraName) -> bool {
+        self.cameras.as_ref().is_none_or(|cameras| cameras.contains(camera))
+    }
+
     /// Takes a message in and returns what follows from it. `sender` is for the warning, where there is
     /// something to warn of.
     pub fn take(&mut self, channel: &Channel, data: &[u8], sender: &str) -> Vec<Output> {
         let Some(camera) = channel.camera() else {
             return Vec::new();
         };
-        if self.cameras.as_ref().is_some_and(|cameras| !cameras.contains(camera)) {
+        if !self.listens_to(camera) {
             self.refused.foreign += 1;
             self.repeats.warn("foreign", Instant::now(), || {
                 format!("camera `{camera}`{sender} is not configured here: not used")

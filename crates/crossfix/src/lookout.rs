@@ -59,7 +59,7 @@ impl Lookout {
         Ok(Self { presence, site, others, alone_since: None, said: None })
     }
 
-    /// Looks again; to be called a few times a second.
+    /// Looks again; to be called about once a second.
     pub fn look(&mut self, now: Instant) {
         for other in &mut self.others {
             let is_here = self.presence.is_alive(&other.channel);

@@ -17,7 +17,8 @@ pub fn open(network: &NetworkConfig, role: &Role, shutdown: &Shutdown) -> anyhow
     let opened = Link::open_while(network, role, |error| {
         if begun.elapsed() >= PATIENCE && said.is_none_or(|said| said.elapsed() >= PERIOD) {
             said = Some(Instant::now());
-            tracing::warn!("{error}: trying again until one does");
+            let why = std::error::Error::source(error).map_or_else(String::new, |why| format!(" ({why})"));
+            tracing::warn!("{error}{why}: trying again until one does");
         }
         !shutdown.requested()
     });

@@ -50,7 +50,7 @@ impl Draft {
         // What a link names is replaced, and not the link.
         let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         let mut part = path.clone().into_os_string();
-        part.push(".part");
+        part.push(format!(".{}.part", std::process::id()));
         Ok(Self { path, part: (!in_place).then(|| part.into()) })
     }
 
@@ -74,6 +74,29 @@ impl Drop for Draft {
         if let Some(part) = &self.part {
             let _ = std::fs::remove_file(part);
         }
+    }
+}
+
+/// Names that are tried for a file whose own is taken.
+const MOST_NAMES: u32 = 10_000;
+
+/// The name that was asked for, and those that are tried where it is taken: `today-2.mcap`, `today-3.mcap` ..
+pub fn names(asked: &Path) -> impl Iterator<Item = PathBuf> + '_ {
+    let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+    let others =
+        (2..MOST_NAMES).map(move |number| asked.with_file_name(format!("{stem}-{number}{extension}")));
+    std::iter::once(asked.to_owned()).chain(others)
+}
+
+/// Says that a file is written under another name than was asked for.
+pub fn say_other_name(asked: &Path, path: &Path) {
+    if path != asked {
+        tracing::warn!(
+            "{} is there already and stays: writing to {} (--overwrite replaces it)",
+            asked.display(),
+            path.display()
+        );
     }
 }
 

@@ -7,6 +7,8 @@ use crossfix_message::{DecodeError, Payload, decode};
 use crossfix_recording::{Damage, Entry, ReadFailure, RecordingReader};
 use serde::Serialize;
 
+use crate::shutdown::Shutdown;
+
 /// What could not be had from a recording.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Lacks {
@@ -76,6 +78,22 @@ pub fn for_each(
     }
 }
 
+/// Hands messages of a recording on until it is asked to stop: a long file is not read to its end then.
+pub fn for_each_until(
+    path: &Path,
+    lacks: &mut Lacks,
+    shutdown: &Shutdown,
+    mut handle: impl FnMut(&mut Lacks, Entry) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let mut is_stopped = false;
+    let read = for_each(path, lacks, |lacks, entry| {
+        is_stopped = shutdown.requested();
+        anyhow::ensure!(!is_stopped, Found);
+        handle(lacks, entry)
+    });
+    if is_stopped { Ok(()) } else { read }
+}
+
 /// The first message of a recording for which there is an answer.
 pub fn find<T>(path: &Path, mut answer: impl FnMut(Entry) -> Option<T>) -> anyhow::Result<Option<T>> {
     let mut found = None;
@@ -89,7 +107,7 @@ pub fn find<T>(path: &Path, mut answer: impl FnMut(Entry) -> Option<T>) -> anyho
     }
 }
 
-/// That what was looked for is found: the rest need not be read.
+/// That no more is wanted: the rest need not be read.
 #[derive(Debug, thiserror::Error)]
 #[error("found")]
 struct Found;

@@ -18,9 +18,9 @@ pub struct Repeats {
 #[derive(Debug)]
 struct Kind {
     said: Instant,
-    /// How many since, and the newest of them.
+    /// How many since, and the first of them.
     more: u64,
-    newest: String,
+    first: String,
 }
 
 impl Repeats {
@@ -41,16 +41,17 @@ impl Repeats {
     }
 
     fn line(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) -> Option<String> {
-        let kind = if self.kinds.len() < MAX_KINDS { kind } else { "others" };
+        let has_room = self.kinds.len() < MAX_KINDS || self.kinds.contains_key(kind);
+        let kind = if has_room { kind } else { "others" };
         if let Some(known) = self.kinds.get_mut(kind) {
             known.more += 1;
             if known.more == 1 {
-                known.newest = text();
+                known.first = text();
             }
             return known.due(now);
         }
         let line = text();
-        self.kinds.insert(kind.to_owned(), Kind { said: now, more: 0, newest: String::new() });
+        self.kinds.insert(kind.to_owned(), Kind { said: now, more: 0, first: String::new() });
         Some(line)
     }
 }
@@ -62,7 +63,7 @@ impl Kind {
         }
         let more = std::mem::take(&mut self.more);
         self.said = now;
-        Some(format!("{} ({more} times in the last minute)", self.newest))
+        Some(format!("{} ({more} times since this was said last)", self.first))
     }
 }
 
@@ -76,7 +77,7 @@ mod tests {
         let lines: Vec<String> = (0..1000)
             .filter_map(|i| repeats.line("gap", begun + PERIOD * i / 999, || format!("gap {i}")))
             .collect();
-        assert_eq!(lines, ["gap 0", "gap 1 (999 times in the last minute)"]);
+        assert_eq!(lines, ["gap 0", "gap 1 (999 times since this was said last)"]);
         assert_eq!(repeats.line("other", begun, || "other".to_owned()).as_deref(), Some("other"));
     }
 
@@ -86,7 +87,7 @@ mod tests {
         repeats.line("gap", now, String::new);
         repeats.line("gap", now, || "gap".to_owned());
         let kind = repeats.kinds.get_mut("gap").unwrap();
-        assert_eq!(kind.due(now + PERIOD).as_deref(), Some("gap (1 times in the last minute)"));
+        assert_eq!(kind.due(now + PERIOD).as_deref(), Some("gap (1 times since this was said last)"));
         assert_eq!(kind.due(now + 3 * PERIOD), None);
     }
 
@@ -95,5 +96,9 @@ mod tests {
         let (mut repeats, now) = (Repeats::default(), Instant::now());
         let said = (0..5000).filter_map(|i| repeats.line(&i.to_string(), now, String::new)).count();
         assert_eq!(said, MAX_KINDS + 1);
+        assert_eq!(
+            repeats.line("7", now + PERIOD, || "known".to_owned()).as_deref(),
+            Some("known (1 times since this was said last)")
+        );
     }
 }

@@ -1,6 +1,7 @@
 //! Stopping: Ctrl-C, SIGTERM, or, for children of `demo`, the end of stdin.
 
 use std::io::Read;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
@@ -12,6 +13,12 @@ use anyhow::{Context, bail};
 const GRACE: Duration = Duration::from_millis(1800);
 /// How long a command that was asked to stop still takes in what is on its way to it.
 pub const LAST_WORDS: Duration = Duration::from_millis(700);
+/// How long after it was asked to stop it still handles what has come; the rest is counted.
+pub const LAST_WORK: Duration = Duration::from_millis(1100);
+/// How long it takes its leave of peers that do not listen.
+pub const LEAVE: Duration = Duration::from_millis(500);
+/// The same of a command that has come to its end by itself: nothing is to be lost.
+pub const LONG_LEAVE: Duration = Duration::from_secs(10);
 /// How often is looked whether the time is up.
 const POLL: Duration = Duration::from_millis(20);
 /// The commands run on a thread of their own, with the stack of a main thread.
@@ -30,8 +37,10 @@ impl Shutdown {
         let asked = ASKED.get_or_init(|| {
             let asked = Arc::new(OnceLock::new());
             let handled = Arc::clone(&asked);
+            let is_second = AtomicBool::new(false);
             let installed = ctrlc::set_handler(move || {
-                if handled.set(Instant::now()).is_err() {
+                handled.get_or_init(Instant::now);
+                if is_second.swap(true, Ordering::SeqCst) {
                     std::process::exit(130);
                 }
             });
@@ -89,7 +98,7 @@ pub fn supervise(command: impl FnOnce() -> anyhow::Result<()> + Send + 'static) 
         let asked = ASKED.get().and_then(|asked| asked.get());
         if asked.is_some_and(|asked| asked.elapsed() > GRACE) {
             bail!(
-                "it was busy and did not end within 2 s: ended without it; files end where they were flushed last"
+                "it was busy and did not end within 2 s: ended without it; what it was writing is not complete"
             );
         }
     }

@@ -7,8 +7,8 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::ingress::KnownCamera;
 
-/// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; the
-/// bound is for clocks that run wild.
+/// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of a
+/// clock that runs wild, those that lie farthest in the future are forgotten.
 const MAX_UPCOMING: usize = 8;
 
 /// The cameras as they stand at the exposure that is handled, and as they will stand later.

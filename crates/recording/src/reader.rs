@@ -205,9 +205,13 @@ impl<R: Read + Seek> RecordingReader<R> {
         match mcap::parse_record(opcode, body) {
             Ok(Record::Channel(channel)) => self.learn(&channel),
             Ok(Record::Message { header, data }) => {
-                let Some(Some(key)) = self.keys.get(&header.channel_id) else {
-                    self.report.foreign += 1;
-                    return Ok(Ok(()));
+                let key = match self.keys.get(&header.channel_id) {
+                    Some(Some(key)) => key,
+                    Some(None) => {
+                        self.report.foreign += 1;
+                        return Ok(Ok(()));
+                    }
+                    None => return Ok(Err("a message is of a channel that was lost".to_owned())),
                 };
                 let time = |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
                 let entry = Entry {
@@ -286,7 +290,10 @@ impl<R: Read + Seek> RecordingReader<R> {
             let Some((opcode, length)) = self.head(self.at)? else {
                 break;
             };
-            let body = self.body(self.at, length)?;
+            if length > MAX_RECORD_BYTES {
+                break;
+            }
+            let body = if opcode == op::CHANNEL { self.body(self.at, length)? } else { Vec::new() };
             if opcode == op::CHANNEL
                 && let Ok(Record::Channel(channel)) = mcap::parse_record(opcode, &body)
             {
@@ -300,27 +307,19 @@ impl<R: Read + Seek> RecordingReader<R> {
 
     /// The next whole record; damage before it is noted.
     fn next_record(&mut self) -> Result<Option<Framing>, RecordingError> {
-        loop {
-            if self.is_complete || self.at >= self.size {
-                return Ok(None);
-            }
-            match self.head(self.at)? {
-                Some((opcode, length)) if length <= MAX_RECORD_BYTES => {
-                    let next = self.at + HEAD_BYTES as u64 + length;
-                    return Ok(Some(Framing { opcode, body: self.body(self.at, length)?, next }));
-                }
-                Some((_, length)) => {
-                    self.note(self.at, length, "a record is too long to be true");
-                    self.sure_until = self.at + 1;
-                    self.at += HEAD_BYTES as u64 + length;
-                }
-                // The record before may have claimed the beginning of the one that is missing.
-                None => {
-                    self.lose("no record begins where one must", self.sure_until)?;
-                    return self.chunk_here();
-                }
-            }
+        if self.is_complete || self.at >= self.size {
+            return Ok(None);
         }
+        match self.head(self.at)? {
+            Some((opcode, length)) if length <= MAX_RECORD_BYTES => {
+                let next = self.at + HEAD_BYTES as u64 + length;
+                return Ok(Some(Framing { opcode, body: self.body(self.at, length)?, next }));
+            }
+            Some(_) => self.lose("a record is too long to be true", self.at + 1)?,
+            // The record before may have claimed the beginning of the one that is missing.
+            None => self.lose("no record begins where one must", self.sure_until)?,
+        }
+        self.chunk_here()
     }
 
     /// The chunk that was found by its shape, whatever its kind says.

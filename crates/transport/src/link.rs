@@ -24,11 +24,10 @@ const PICTURE_BATCHES: u32 = 4;
 /// receiver behind 5 kB a second would be told of tracks a quarter of an hour old before it loses one.
 const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three seconds.
-const OPEN_TIMEOUT_MS: u32 = 10_000;
+/// Whoever waits for a router that does not answer at all has a word of it within five.
+const OPEN_TIMEOUT_MS: u32 = 4000;
 /// A peer that has not been heard for this long is gone, ms.
 const LEASE_MS: u32 = 3000;
-/// How long a session takes its leave of peers that do not listen.
-const CLOSE_PATIENCE: Duration = Duration::from_millis(500);
 /// How often a router that does not answer is tried.
 const RETRY_PERIOD: Duration = Duration::from_millis(500);
 
@@ -164,7 +163,7 @@ impl Link {
     /// answers.
     pub fn open(network: &NetworkConfig, role: &Role) -> Result<Self, LinkError> {
         let config = config(network, role)?;
-        let session = zenoh::open(config).wait().map_err(|source| explain(network, role, source))?;
+        let session = zenoh::open(config).wait().map_err(|source| explain(network, role, &source))?;
         // The first half of what Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
@@ -315,15 +314,15 @@ impl Link {
         Ok(())
     }
 
-    /// Sends what still waits and says goodbye; gives up on peers that do not listen.
+    /// Sends what still waits and says goodbye; gives up after a while on peers that do not listen.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`] if Zenoh cannot close it.
-    pub fn close(self) -> Result<(), LinkError> {
+    pub fn close(self, patience: Duration) -> Result<(), LinkError> {
         let (done, closed) = channel();
         // Its own patience is ten seconds, and not kept.
         std::thread::spawn(move || done.send(self.session.close().wait()));
-        match closed.recv_timeout(CLOSE_PATIENCE) {
+        match closed.recv_timeout(patience) {
             Ok(result) => result.map_err(zenoh("the Zenoh session did not close")),
             Err(_) => {
                 tracing::debug!("a peer did not take what was sent to it last");
@@ -334,9 +333,9 @@ impl Link {
 }
 
 /// Why a session did not open.
-fn explain(network: &NetworkConfig, role: &Role, source: zenoh::Error) -> LinkError {
+fn explain(network: &NetworkConfig, role: &Role, source: &zenoh::Error) -> LinkError {
     if network.mode == Mode::Client {
-        return LinkError::NoRouter { routers: network.routers.clone(), source: said(&source) };
+        return LinkError::NoRouter { routers: network.routers.clone(), source: said(source) };
     }
     let listened = network.endpoints(role).map(|(listen, _)| listen).unwrap_or_default();
     for endpoint in listened {
@@ -344,7 +343,7 @@ fn explain(network: &NetworkConfig, role: &Role, source: zenoh::Error) -> LinkEr
             return LinkError::Listen { endpoint, source };
         }
     }
-    LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source: said(&source) }
+    LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source: said(source) }
 }
 
 /// Publishes on one key.

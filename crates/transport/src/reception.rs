@@ -60,7 +60,8 @@ impl Reception {
         if known.is_some_and(|index| index < senders.runs.len()) {
             senders.took_turns = Some(now);
         }
-        senders.runs.push((origin.run, origin.sequence.saturating_add(1)));
+        let next = origin.sequence.saturating_add(1);
+        senders.runs.push((origin.run, expected.map_or(next, |expected| expected.max(next))));
         if senders.runs.len() > RUNS_A_KEY {
             senders.runs.remove(0);
         }
@@ -110,9 +111,16 @@ mod tests {
     }
 
     #[test]
+    fn one_that_was_overtaken_is_not_counted_twice() {
+        let (mut reception, key) = (Reception::default(), key());
+        let mut see = |sequence| reception.see(&key, Origin { run: RunId(1), sequence }, Instant::now());
+        assert_eq!([5, 3, 6].map(&mut see), [0, 0, 0]);
+    }
+
+    #[test]
     fn a_number_from_nowhere_is_no_loss() {
         let (mut reception, key) = (Reception::default(), key());
-        for sequence in [0, u64::MAX, 5, u64::MAX] {
+        for sequence in [0, u64::MAX, 5, u64::MAX, 0, 1_000, 0, 1_000] {
             reception.see(&key, Origin { run: RunId(1), sequence }, Instant::now());
         }
         assert_eq!(reception.missing(), 0);

@@ -114,6 +114,13 @@ impl Subscription {
         self.subscribers.clear();
     }
 
+    /// Counts what still waits as dropped: there is no time for it.
+    pub fn give_up(&self) {
+        while self.next(Duration::ZERO).is_some() {
+            self.counts.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
     /// What was not handed on so far.
     pub fn refused(&self) -> Refused {
         Refused {

@@ -145,6 +145,21 @@ fn an_mp4_file_that_is_cut_off_says_how_many_frames_are_missing() {
 }
 
 #[test]
+fn a_fragment_that_claims_four_thousand_million_frames_is_read_in_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mp4");
+    let mut bytes = MP4[1].to_vec();
+    let trun = bytes.windows(4).position(|word| word == b"trun").unwrap();
+    // No fields of their own, so that twenty bytes claim them all.
+    bytes[trun + 5..trun + 8].copy_from_slice(&[0, 0, 1]);
+    bytes[trun + 8..trun + 12].copy_from_slice(&[0xff; 4]);
+    fs::write(&path, &bytes).unwrap();
+    if let Ok(mut source) = open(&path, FrameClock::default()) {
+        let _ = source.next_frame();
+    }
+}
+
+#[test]
 fn a_thousand_damaged_mp4_files_end_with_frames_or_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.mp4");

@@ -172,7 +172,7 @@ impl Picture {
 
     fn bearings(&mut self, frame: &BearingFrame, arrival: Timestamp) -> Result<(), ViewError> {
         self.arrivals.note(&frame.camera, frame.sequence, arrival);
-        self.clear_ghosts(arrival)?;
+        self.clear_ghosts(arrival, Timestamp::from_nanos(frame.capture_time_ns))?;
         let time = self.at(frame.capture_time_ns);
         let Some(view) = self.cameras.get(&frame.camera) else {
             return Ok(());
@@ -222,11 +222,28 @@ impl Picture {
         Ok(())
     }
 
-    /// Takes away the tracks of which nobody speaks any more.
-    fn clear_ghosts(&mut self, now: Timestamp) -> Result<(), ViewError> {
-        let silent = self.drawn.iter().filter(|(_, drawn)| now.seconds_since(drawn.heard) > GHOST_S);
-        let silent: Vec<u64> = silent.map(|(&id, _)| id).collect();
-        silent.into_iter().try_for_each(|id| self.clear(id))
+    /// Takes away the tracks of which nobody speaks any more while bearings still come. They must be old
+    /// by their arrival, as one camera's clock may be wrong, and in the data, as a recording's tracks may
+    /// have been made long after its bearings.
+    fn clear_ghosts(&mut self, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
+        self.clear_if(|drawn| {
+            arrival.seconds_since(drawn.heard) > GHOST_S && time.seconds_since(drawn.time) > GHOST_S
+        })
+    }
+
+    /// Takes away the tracks of which nobody has spoken for a while, in a live picture to which nothing
+    /// comes any more; `now` is the clock that the arrivals were read from.
+    ///
+    /// # Errors
+    /// [`ViewError`] if the stream does not take it.
+    pub fn clear_silent(&mut self, now: Timestamp) -> Result<(), ViewError> {
+        self.clear_if(|drawn| now.seconds_since(drawn.heard) > GHOST_S)
+    }
+
+    fn clear_if(&mut self, is_gone: impl Fn(&DrawnTrack) -> bool) -> Result<(), ViewError> {
+        let gone: Vec<u64> =
+            self.drawn.iter().filter(|(_, drawn)| is_gone(drawn)).map(|(&id, _)| id).collect();
+        gone.into_iter().try_for_each(|id| self.clear(id))
     }
 
     fn clear(&mut self, id: u64) -> Result<(), ViewError> {
@@ -279,5 +296,66 @@ impl Picture {
             .with_colors([Color::from_rgb(255, 255, 255)])
             .with_radii([Radius::new_ui_points(2.5)]);
         Ok(self.stream.log("world/truth", &truth)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_message::{BearingFrame, Payload, Track, Vector3};
+    use rerun::RecordingStreamBuilder;
+
+    use super::*;
+
+    fn picture() -> Picture {
+        Picture::new(RecordingStreamBuilder::new("test").memory().unwrap().0).unwrap()
+    }
+
+    fn tell(picture: &mut Picture, channel: &Channel, arrival_s: f64, data: &[u8]) {
+        assert!(picture.show(channel, Timestamp::from_seconds(arrival_s), data).unwrap().is_none());
+    }
+
+    fn track(time_s: f64) -> Vec<u8> {
+        let place = Some(Vector3 { x: 1.0, y: 2.0, z: 3.0 });
+        let track = Track {
+            id: 1,
+            state: TrackState::Confirmed.into(),
+            position: place,
+            velocity: place,
+            ..Default::default()
+        };
+        let time_ns = Timestamp::from_seconds(time_s).nanos();
+        TrackFrame { time_ns, tracks: vec![track], ..Default::default() }.encode()
+    }
+
+    fn bearings(time_s: f64) -> Vec<u8> {
+        let capture_time_ns = Timestamp::from_seconds(time_s).nanos();
+        BearingFrame { camera: "north".into(), capture_time_ns, ..Default::default() }.encode()
+    }
+
+    #[test]
+    fn tracks_of_a_fusion_centre_that_is_gone_are_not_drawn_for_ever() {
+        let mut picture = picture();
+        let north = Channel::Bearings("north".parse().unwrap());
+        tell(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
+        tell(&mut picture, &north, 102.0, &bearings(12.0));
+        assert_eq!(picture.drawn.len(), 1, "it may only be late");
+        tell(&mut picture, &north, 104.0, &bearings(14.0));
+        assert!(picture.drawn.is_empty() && picture.trails.is_empty());
+        // And where nothing comes at all.
+        tell(&mut picture, &Channel::Tracks, 105.0, &track(15.0));
+        picture.clear_silent(Timestamp::from_seconds(109.0)).unwrap();
+        assert!(picture.drawn.is_empty());
+    }
+
+    #[test]
+    fn neither_a_clock_from_the_future_nor_tracks_made_later_are_ghosts() {
+        let mut picture = picture();
+        let north = Channel::Bearings("north".parse().unwrap());
+        tell(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
+        tell(&mut picture, &north, 100.1, &bearings(1e6));
+        assert_eq!(picture.drawn.len(), 1, "a camera's clock is wrong");
+        // Fused long after it was recorded.
+        tell(&mut picture, &north, 1.79e9, &bearings(10.1));
+        assert_eq!(picture.drawn.len(), 1);
     }
 }

@@ -17,7 +17,7 @@ use crate::commands::view::save_recording;
 use crate::config::{self, CameraFile, ClockConfig, FusionFile, PoseConfig, SourceConfig};
 use crate::output;
 use crate::pace::wall_seconds;
-use crate::shutdown::Shutdown;
+use crate::shutdown::{LEAVE, Shutdown};
 
 /// The scene that the demo plays, as in `configs/demo`.
 const SCENE: &str = include_str!("../../../../configs/demo/scene.toml");
@@ -235,7 +235,7 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
         tracing::warn!("no live view: {error}");
     }
     drop(subscription);
-    link.close()?;
+    link.close(LEAVE)?;
     Ok(if interrupted { Ending::Interrupted } else { Ending::Complete })
 }
 

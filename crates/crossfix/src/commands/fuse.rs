@@ -11,7 +11,7 @@ use crate::config::{self, FusionFile};
 use crate::lookout::Lookout;
 use crate::network::{self, rivalry};
 use crate::output;
-use crate::shutdown::{LAST_WORDS, Shutdown};
+use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(20);
@@ -55,7 +55,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Fusion, &shutdown)? else {
         return Ok(());
     };
-    let lookout = Lookout::for_cameras(&link, &network, &cameras)?;
+    let everybody: Vec<_> = network.cameras.keys().cloned().collect();
+    let lookout = Lookout::for_cameras(&link, &network, &everybody)?;
     let mut station = Station {
         centre: Centre::new(file.fusion(), Some(cameras))?,
         tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
@@ -77,7 +78,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let frames = station.centre.frames();
     let Station { link, tracks, events, health, lookout, .. } = station;
     drop((alive, subscription, tracks, events, health, lookout));
-    link.close()?;
+    link.close(LEAVE)?;
     output::line(format!("fusion centre: {frames} track frames published"));
     Ok(())
 }
@@ -107,6 +108,12 @@ impl Station {
             self.take(&received)?;
         }
         subscription.stop();
+        while !shutdown.overdue(LAST_WORK)
+            && let Some(received) = subscription.next(Duration::ZERO)
+        {
+            self.take(&received)?;
+        }
+        subscription.give_up();
         let last = self.centre.flush();
         self.publish(last)?;
         self.say_health(subscription, true)
@@ -114,7 +121,9 @@ impl Station {
 
     fn take(&mut self, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
-        if let Some(origin) = *origin {
+        // Names come from outside: those that are not configured are not kept count of.
+        let is_ours = key.channel.camera().is_some_and(|camera| self.centre.listens_to(camera));
+        if let Some(origin) = origin.filter(|_| is_ours) {
             let missing = self.reception.see(key, origin, *at);
             if missing > 0 {
                 self.centre.warn(&format!("missing {key}"), || {

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use crossfix_message::{CameraName, Key, Timestamp};
 use crossfix_transport::{Received, Reception, Role, Subscription};
-use crossfix_view::Picture;
+use crossfix_view::{Picture, RecordingStream};
 
 use crate::config;
 use crate::lookout::Lookout;
@@ -14,7 +14,7 @@ use crate::output::{self, Draft};
 use crate::pace::wall_seconds;
 use crate::recorded::{self, Lacks};
 use crate::repeats::Repeats;
-use crate::shutdown::Shutdown;
+use crate::shutdown::{LEAVE, Shutdown};
 
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
 #[derive(Debug, clap::Args)]
@@ -28,7 +28,8 @@ pub struct Args {
     /// The network's file (TOML): show the site live.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Write the picture to a file (.rrd) instead of a viewer.
+    /// Write the picture to a file (.rrd) instead of a viewer. A live one that is there already stays, and
+    /// the new one is written beside it.
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     /// A viewer that runs already, e.g. 127.0.0.1:9876; one is started without.
@@ -40,33 +41,31 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let (inputs, is_live) = match (&args.recording, &args.config) {
-        (Some(recording), _) => (vec![recording.as_path()], false),
-        (None, Some(_)) => (Vec::new(), true),
-        (None, None) => bail!("give a recording, or a network file with -c"),
-    };
-    let draft = args.save.as_deref().map(|path| Draft::new(path, &inputs)).transpose()?;
-    let stream = match (&draft, args.connect) {
-        (Some(draft), _) if is_live => crossfix_view::save_without_end(draft.path())?,
-        (Some(draft), _) => crossfix_view::save(draft.path())?,
-        (None, Some(address)) => crossfix_view::connect(address)?,
-        (None, None) => crossfix_view::connect(crossfix_view::spawn_viewer()?)?,
-    };
-    let picture = Picture::new(stream)?;
     match (&args.recording, &args.config) {
-        (Some(recording), _) => draw_recording(picture, recording)?,
-        (None, Some(network)) => draw_live(picture, network, args.stop_with_stdin)?,
-        (None, None) => {}
+        (Some(recording), _) => match &args.save {
+            Some(rrd) => {
+                save_recording(recording, rrd)?;
+                say_saved(rrd);
+                Ok(())
+            }
+            None => draw_recording(Picture::new(viewer(args)?)?, recording),
+        },
+        (None, Some(network)) => draw_live(args, network),
+        (None, None) => bail!("give a recording, or a network file with -c"),
     }
-    if let (Some(draft), Some(path)) = (draft, &args.save) {
-        draft.keep()?;
-        output::line(format!(
-            "picture written to {}; look at it with: rerun --bind 127.0.0.1 {}",
-            path.display(),
-            path.display()
-        ));
-    }
-    Ok(())
+}
+
+fn viewer(args: &Args) -> anyhow::Result<RecordingStream> {
+    let address = match args.connect {
+        Some(address) => address,
+        None => crossfix_view::spawn_viewer()?,
+    };
+    Ok(crossfix_view::connect(address)?)
+}
+
+fn say_saved(rrd: &Path) {
+    let rrd = rrd.display();
+    output::line(format!("picture written to {rrd}; look at it with: rerun --bind 127.0.0.1 {rrd}"));
 }
 
 /// Draws a recording into an .rrd file.
@@ -96,14 +95,24 @@ const LOOK_PERIOD: Duration = Duration::from_secs(1);
 /// A viewer that takes this long for one message does not keep up.
 const STALL: Duration = Duration::from_secs(2);
 /// How long a viewer has for what was drawn last.
-const LAST_LOOK: Duration = Duration::from_millis(500);
+const LAST_LOOK: Duration = Duration::from_secs(1);
 
-fn draw_live(mut picture: Picture, network: &Path, stop_with_stdin: bool) -> anyhow::Result<()> {
-    let shutdown = Shutdown::listen().with_stdin(stop_with_stdin);
+fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(network)?;
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
+    // A live picture is like a live recording: what was drawn stays, whatever becomes of the rest.
+    let rrd = args.save.as_deref().and_then(|asked| output::names(asked).find(|path| !path.exists()));
+    let stream = match (&rrd, &args.save) {
+        (Some(rrd), Some(asked)) => {
+            output::say_other_name(asked, rrd);
+            crossfix_view::save_without_end(rrd)?
+        }
+        _ => viewer(args)?,
+    };
+    let mut picture = Picture::new(stream)?;
     let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
@@ -119,16 +128,19 @@ fn draw_live(mut picture: Picture, network: &Path, stop_with_stdin: bool) -> any
             looked_at = Instant::now();
             lookout.look(looked_at);
             watch.look(&subscription, looked_at);
+            picture.clear_silent(Timestamp::from_seconds(wall_seconds()))?;
             is_watched = !picture.has_lost_its_viewer();
         }
     }
     drop((subscription, lookout));
-    link.close()?;
+    link.close(LEAVE)?;
     if !is_watched {
         output::line("the viewer was closed");
         return Ok(());
     }
-    picture.finish_within(LAST_LOOK).context("the picture is not complete")
+    picture.finish_within(LAST_LOOK).context("the picture is not complete")?;
+    rrd.iter().for_each(|rrd| say_saved(rrd));
+    Ok(())
 }
 
 /// What a viewer is shown of what comes, and what it misses.

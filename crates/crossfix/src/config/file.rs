@@ -39,7 +39,7 @@ impl Kind {
     /// What a file is by its keys; `None` if they say nothing.
     pub fn of(keys: &toml::Table) -> Option<Self> {
         let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
-        if has(&["source", "pose", "intrinsics"]) {
+        if has(&["name", "source", "pose", "intrinsics"]) {
             Some(Self::Camera)
         } else if has(&["targets"]) {
             Some(Self::Scene)

@@ -201,7 +201,7 @@ impl Samples {
                 let is_sync = table.stss.is_none();
                 let shift = shifts.next().map_or(0, i64::from);
                 if !self.push(offset, size, is_sync, shift, durations.next().unwrap_or(0))? {
-                    self.missing += count - number;
+                    self.missing = self.missing.saturating_add(count - number);
                     self.mark_sync(table);
                     return Ok(());
                 }
@@ -239,7 +239,7 @@ impl Samples {
                 if let Some(by) = run.data_offset {
                     offset = base.saturating_add_signed(i64::from(by));
                 }
-                for entry in &run.samples {
+                for (done, entry) in run.samples.iter().enumerate() {
                     let or = |own: Option<u32>, part: Option<u32>, file: Option<u32>| {
                         own.or(part).or(file).unwrap_or(0)
                     };
@@ -253,7 +253,9 @@ impl Samples {
                     );
                     let shift = entry.cts.map_or(0, i64::from);
                     if !self.push(offset, size, flags & IS_NOT_SYNC == 0, shift, lasts)? {
-                        self.missing += 1;
+                        // What is left of the run lies beyond the end too, however many it claims.
+                        self.missing = self.missing.saturating_add(run.samples.len() - done);
+                        return Ok(());
                     }
                     offset = offset.saturating_add(u64::from(size));
                 }

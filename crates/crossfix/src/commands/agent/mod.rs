@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use crossfix_message::{BearingFrame, Channel, Counter, Health, Payload, Timestamp};
-use crossfix_transport::{Delivery, Link, LinkPublisher, NetworkConfig, Role};
+use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
 
@@ -19,7 +19,7 @@ use crate::network;
 use crate::output;
 use crate::recorded::{self, Lacks};
 use crate::repeats::Repeats;
-use crate::shutdown::Shutdown;
+use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
 pub use self::simulated::truth_frame;
 
@@ -28,7 +28,7 @@ const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 /// How often the agent says how it does.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 /// An agent that is this far behind its source is too slow for it: the fusion centre waits half a second.
-const BEHIND: Duration = Duration::from_millis(500);
+pub const BEHIND: Duration = Duration::from_millis(500);
 
 /// Run one camera host: find and follow targets, publish their bearings.
 #[derive(Debug, clap::Args)]
@@ -60,6 +60,8 @@ struct Agent {
     identity: CameraIdentity,
     calibration: Vec<u8>,
     link: Link,
+    /// That it hears what is said to it; from the moment on at which it does.
+    alive: Option<AliveToken>,
     bearings: LinkPublisher,
     calibrations: LinkPublisher,
     health: LinkPublisher,
@@ -86,7 +88,6 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
     };
-    let _alive = link.declare_alive(Channel::Alive(file.name.clone()))?;
     let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
         return agent.finish(Ok(()));
@@ -129,6 +130,7 @@ impl Agent {
             previews: link.publisher(Channel::Preview(name), Delivery::Picture)?,
             identity,
             calibration: Vec::new(),
+            alive: None,
             link,
             calibrated_at: None,
             healthy_at: None,
@@ -152,6 +154,7 @@ impl Agent {
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
         let start = if args.no_wait {
+            self.appear()?;
             Some(Start::now())
         } else {
             self.wait(args.wait_for_recorder, file, network, begins, args.start_at.is_some())?
@@ -167,6 +170,12 @@ impl Agent {
             self.now = valid_from;
         }
         Ok(start)
+    }
+
+    /// Says that it is there.
+    fn appear(&mut self) -> anyhow::Result<()> {
+        self.alive = Some(self.link.declare_alive(Channel::Alive(self.identity.name.clone()))?);
+        Ok(())
     }
 
     /// Follows what the source shows until its end.
@@ -186,7 +195,8 @@ impl Agent {
                     None
                 };
                 let shutdown = self.shutdown.clone();
-                let truth = truth.map(|truth| std::thread::spawn(move || truth.run(&shutdown)));
+                let from_s = start.joined_s;
+                let truth = truth.map(|truth| std::thread::spawn(move || truth.run(from_s, &shutdown)));
                 // Its frames carry wall times from the start on.
                 let begins = Timestamp::from_seconds(start.wall_s);
                 let seen = self.watch(file, &mut source, begins, start, 1.0);
@@ -206,6 +216,7 @@ impl Agent {
             self.calibrated_at = Some(Instant::now());
         }
         if due(self.healthy_at, HEALTH_PERIOD) {
+            self.repeats.remind(Instant::now());
             self.say_health(false)?;
             self.healthy_at = Some(Instant::now());
         }
@@ -304,7 +315,8 @@ impl Agent {
                 continue;
             };
             let tracks = tracker.step(&image, capture.time);
-            if since_s < start.joined_s {
+            if !start.is_caught_up(since_s, pace.behind(since_s)) {
+                self.keep_up()?;
                 continue;
             }
             self.note_behind(pace.behind(since_s));
@@ -344,9 +356,13 @@ impl Agent {
         let pace = start.pace(speed);
         let key = Channel::Bearings(self.identity.name.clone());
         let mut lacks = Lacks::default();
-        recorded::for_each(path, &mut lacks, |lacks, entry| {
+        let shutdown = self.shutdown.clone();
+        recorded::for_each_until(path, &mut lacks, &shutdown, |lacks, entry| {
             let since_s = entry.data_time.seconds_since(begins);
-            if entry.key.channel != key || since_s < start.joined_s || !pace.wait(since_s, &self.shutdown) {
+            if entry.key.channel != key
+                || !start.is_caught_up(since_s, pace.behind(since_s))
+                || !pace.wait(since_s, &self.shutdown)
+            {
                 return Ok(());
             }
             self.note_behind(pace.behind(since_s));
@@ -368,9 +384,10 @@ impl Agent {
         self.say_health(true)?;
         let name = self.identity.name.clone();
         let (frames, bad) = (self.frames, self.bad_frames);
-        let Self { bearings, calibrations, health, previews, link, .. } = self;
-        drop((bearings, calibrations, health, previews));
-        link.close()?;
+        let leave = if self.shutdown.requested() { LEAVE } else { LONG_LEAVE };
+        let Self { alive, bearings, calibrations, health, previews, link, .. } = self;
+        drop((alive, bearings, calibrations, health, previews));
+        link.close(leave)?;
         output::line(format!("camera `{name}`: {frames} frames published, {bad} bad frames"));
         seen?;
         ensure!(bad <= frames, "camera `{name}`: {bad} of {} frames could not be decoded", frames + bad);

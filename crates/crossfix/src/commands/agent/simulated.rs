@@ -66,11 +66,14 @@ impl TruthPublisher {
         Ok(Self { publisher: link.publisher(Channel::Truth, Delivery::Queued)?, world, start })
     }
 
-    /// Publishes until the scene ends.
-    pub fn run(self, shutdown: &Shutdown) {
+    /// Publishes from so many seconds after the scene's beginning until its end.
+    pub fn run(self, from_s: f64, shutdown: &Shutdown) {
         let pace = Pace::beginning_at(self.start, 1.0);
         for step in 0..(self.world.duration_s() * Self::RATE_HZ) as u32 {
             let t = f64::from(step) / Self::RATE_HZ;
+            if t < from_s {
+                continue;
+            }
             if !pace.wait(t, shutdown) {
                 return;
             }

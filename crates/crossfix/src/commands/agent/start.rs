@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use crossfix_message::{CameraName, Channel, Health, Key, Timestamp, decode};
 use crossfix_transport::NetworkConfig;
 
-use super::Agent;
+use super::{Agent, BEHIND};
 use crate::config::{CameraFile, SourceConfig};
 use crate::lookout::Lookout;
 use crate::pace::{Pace, wall_seconds};
@@ -36,9 +36,22 @@ impl Start {
         Self { wall_s: wall_seconds(), joined_s: 0.0, is_at_wall_time: false }
     }
 
+    /// At the beginning, at the next whole second of the wall's clock but one: agents that decide so at
+    /// the same moment begin a scene at the same time, if their hosts' clocks agree.
+    fn together() -> Self {
+        Self::at_wall_time((wall_seconds() + 0.5).ceil())
+    }
+
     /// At the beginning, at a time of the wall's clock.
     pub fn at_wall_time(wall_s: f64) -> Self {
         Self { wall_s, joined_s: 0.0, is_at_wall_time: true }
+    }
+
+    /// Whether what lies so far in the data is to be published: an agent that joins others is silent until
+    /// it has caught up with them.
+    pub fn is_caught_up(&self, data_s: f64, behind: Duration) -> bool {
+        let has_joined = self.joined_s > 0.0;
+        !has_joined || data_s >= self.joined_s && (self.is_at_wall_time || behind < BEHIND)
     }
 
     /// The pace of data that run so many times as fast as life.
@@ -86,27 +99,27 @@ impl Agent {
     ) -> anyhow::Result<Option<Start>> {
         let mut lookout = Lookout::for_fusion(&self.link, network)?;
         let begun = Instant::now();
+        // A token comes with its peer's other declarations, but the subscription may come after it.
+        let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
             lookout.look(Instant::now());
             let [fusion, recording] =
                 [Channel::FusionAlive, Channel::RecorderAlive].map(|channel| lookout.is_here(&channel));
-            if fusion && (recording || !recorder) {
+            if fusion && (recording || !recorder) && has_ears(self)? {
                 break;
             }
             if !fusion && recording && begun.elapsed() >= FUSION_PATIENCE {
                 tracing::warn!("no fusion centre is there: beginning all the same, the recorder hears it");
+                self.appear()?;
                 return Ok(Some(Start::now()));
             }
-            std::thread::sleep(POLL);
-        }
-        // A token comes with its peer's other declarations, but the subscription may come after it.
-        while !self.shutdown.requested() && !self.bearings.has_subscribers()? {
             std::thread::sleep(POLL);
         }
         if self.shutdown.requested() {
             return Ok(None);
         }
         if has_start || file.is_unpaced() {
+            self.appear()?;
             return Ok(Some(Start::now()));
         }
         self.wait_for_cameras(file, network, begins)
@@ -122,6 +135,7 @@ impl Agent {
         let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
         let key = Key::new(self.link.site().clone(), Channel::FusionHealth);
         let reports = self.link.subscribe(&[key.to_string()])?;
+        self.appear()?;
         let begun = Instant::now();
         tracing::info!(
             "camera `{}` waits for the other cameras, {} s at most",
@@ -140,7 +154,7 @@ impl Agent {
                 Site::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
-                Site::IsComplete => return Ok(Some(Start::now())),
+                Site::IsComplete => return Ok(Some(Start::together())),
                 Site::Waits => {}
             }
         }

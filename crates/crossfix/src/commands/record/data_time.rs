@@ -2,8 +2,9 @@ use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Channel, Timestamp};
 
-/// What time it is in the data: the newest capture time of each camera, and of the site. Some messages do
-/// not say when they were said but since when they hold; in a recording they lie where they were said.
+/// What time it is in the data: the capture time heard last of each camera, and of the site. Not the
+/// greatest: one frame from the future must not move all that is said after it. Some messages do not say
+/// when they were said but since when they hold; in a recording they lie where they were said.
 #[derive(Debug, Default)]
 pub struct DataTime {
     cameras: BTreeMap<CameraName, Timestamp>,
@@ -33,16 +34,15 @@ impl DataTime {
                 self.now()
             }
             Channel::Bearings(camera) => {
-                let newest = self.cameras.entry(camera.clone()).or_insert(time);
-                *newest = time.max(*newest);
-                self.site = self.site.max(Some(time));
+                self.cameras.insert(camera.clone(), time);
+                self.site = Some(time);
                 Said::At(time)
             }
             _ => Said::At(time),
         }
     }
 
-    /// The site's newest time.
+    /// The site's time.
     pub fn now(&self) -> Said {
         self.site.map_or(Said::BeforeAnyData, Said::At)
     }

@@ -14,13 +14,11 @@ use crate::config;
 use crate::lookout::Lookout;
 use crate::network;
 use crate::output;
-use crate::shutdown::{LAST_WORDS, Shutdown};
+use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
 /// What was flushed survives a crash of the machine's programs; health is said as often.
 const PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(50);
-/// Names that are tried for a recording whose own is taken.
-const MOST_NAMES: u32 = 10_000;
 
 /// Record everything that a site publishes.
 #[derive(Debug, clap::Args)]
@@ -67,7 +65,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         .context("recording has stopped; the rest of the site goes on");
     drop((subscription, alive, health, lookout));
     let finished = recorded.and_then(|()| Ok(recorder.finish()?));
-    link.close()?;
+    link.close(LEAVE)?;
     output::line(format!("{} messages recorded to {}", finished?, path.display()));
     Ok(())
 }
@@ -79,26 +77,17 @@ fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)
     if overwrite || (asked.exists() && !asked.is_file()) {
         return Ok((RecordingWriter::create(asked)?, asked.to_owned()));
     }
-    let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-    let others = (2..MOST_NAMES).map(|number| asked.with_file_name(format!("{stem}-{number}{extension}")));
-    for path in std::iter::once(asked.to_owned()).chain(others) {
+    for path in output::names(asked) {
         match RecordingWriter::create_new(&path) {
             Err(RecordingError::Exists { .. }) => {}
             Err(error) => return Err(error.into()),
             Ok(writer) => {
-                if path != asked {
-                    tracing::warn!(
-                        "{} is there already and stays: recording to {} (--overwrite replaces it)",
-                        asked.display(),
-                        path.display()
-                    );
-                }
+                output::say_other_name(asked, &path);
                 return Ok((writer, path));
             }
         }
     }
-    anyhow::bail!("{} is there, and so are {MOST_NAMES} more of it", asked.display())
+    anyhow::bail!("{} is there, and so is every other name of it that was tried", asked.display())
 }
 
 /// Records until it is asked to stop, and for a moment what is still on its way.
@@ -117,7 +106,7 @@ fn work(
         if said_at.elapsed() >= PERIOD {
             said_at = Instant::now();
             lookout.look(said_at);
-            say(recorder.health(subscription.refused(), false)?, publisher)?;
+            say(&recorder.health(subscription.refused(), false)?, publisher)?;
             recorder.flush()?;
         }
     }
@@ -127,9 +116,15 @@ fn work(
         recorder.take(received)?;
     }
     subscription.stop();
-    say(recorder.health(subscription.refused(), true)?, publisher)
+    while !shutdown.overdue(LAST_WORK)
+        && let Some(received) = subscription.next(Duration::ZERO)
+    {
+        recorder.take(received)?;
+    }
+    subscription.give_up();
+    say(&recorder.health(subscription.refused(), true)?, publisher)
 }
 
-fn say(health: Health, publisher: &LinkPublisher) -> anyhow::Result<()> {
+fn say(health: &Health, publisher: &LinkPublisher) -> anyhow::Result<()> {
     Ok(publisher.put(health.encode())?)
 }

@@ -12,9 +12,9 @@ use crate::network::{self, rivalry};
 use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 
-/// Messages that are held until there are data that say what time it is: calibrations and health of a
-/// minute of a thousand cameras.
-const MOST_HELD: usize = 100_000;
+/// Bytes of messages that are held until there are data that say what time it is: what a site of a
+/// hundred cameras says of itself in minutes. More is written down with the time of its arrival.
+const MOST_HELD_BYTES: usize = 8 << 20;
 
 /// Where a recording goes.
 pub type FileWriter = RecordingWriter<BufWriter<File>>;
@@ -27,6 +27,7 @@ pub struct Recorder {
     cameras: BTreeSet<CameraName>,
     times: DataTime,
     held: Vec<Entry>,
+    held_bytes: usize,
     reception: Reception,
     repeats: Repeats,
     counts: Counts,
@@ -52,6 +53,7 @@ impl Recorder {
             cameras: network.cameras.keys().cloned().collect(),
             times: DataTime::default(),
             held: Vec::new(),
+            held_bytes: 0,
             reception: Reception::default(),
             repeats: Repeats::default(),
             counts: Counts::default(),
@@ -116,7 +118,8 @@ impl Recorder {
                 self.release(data_time)?;
                 self.put(&Entry { data_time, ..entry })
             }
-            Said::BeforeAnyData if self.held.len() < MOST_HELD => {
+            Said::BeforeAnyData if self.held_bytes < MOST_HELD_BYTES => {
+                self.held_bytes += entry.data.len();
                 self.held.push(entry);
                 Ok(())
             }
@@ -126,6 +129,7 @@ impl Recorder {
 
     /// Writes what was said before there were data, at the time of the first.
     fn release(&mut self, now: Timestamp) -> Result<(), RecordingError> {
+        self.held_bytes = 0;
         for held in std::mem::take(&mut self.held) {
             self.put(&Entry { data_time: now.max(held.data_time), ..held })?;
         }

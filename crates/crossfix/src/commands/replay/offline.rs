@@ -57,8 +57,8 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     }
     let mut lacks = Lacks::default();
     let (mut first, mut until) = (None, Timestamp::MIN);
-    recorded::for_each(&args.recording, &mut lacks, |_, entry| {
-        if !shutdown.requested() && range.holds(&entry) {
+    recorded::for_each_until(&args.recording, &mut lacks, &shutdown, |_, entry| {
+        if range.holds(&entry) {
             first.get_or_insert(entry.data_time);
             until = until.max(entry.data_time);
             run.take(&entry)?;

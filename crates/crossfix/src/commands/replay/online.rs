@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use anyhow::ensure;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraName, Channel, Health, Payload, Preview, Timestamp, TrackEvent,
-    TrackFrame, TruthFrame, decode,
+    BearingFrame, CameraName, Channel, Health, Payload, Preview, Timestamp, TrackEvent, TrackFrame,
+    TruthFrame, decode,
 };
 use crossfix_recording::Entry;
-use crossfix_transport::{Delivery, Link, LinkPublisher, Role};
+use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 
 use super::{Args, Range};
 use crate::config;
@@ -17,7 +18,7 @@ use crate::network;
 use crate::output;
 use crate::pace::Pace;
 use crate::recorded::{self, Lacks};
-use crate::shutdown::Shutdown;
+use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
 /// Time for those who listen to connect before the first message, s.
 const RUN_UP_S: f64 = 2.0;
@@ -38,14 +39,16 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
     };
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
-    let mut stage = Stage { link, delivery, publishers: BTreeMap::new(), published: 0 };
-    let mut pass = Pass::default();
+    let mut stage = Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
+    stage.appear(&network, args.tracks)?;
+    let mut pass = Pass { goes_on: args.again, ..Pass::default() };
     // The run-up holds at any speed.
     if Pace::beginning_in(RUN_UP_S, 1.0).wait(0.0, &shutdown) {
         let pace = Pace::beginning_in(0.0, args.speed);
         loop {
             let mut lacks = Lacks::default();
-            recorded::for_each(&args.recording, &mut lacks, |_, entry| {
+            let before = stage.published;
+            recorded::for_each_until(&args.recording, &mut lacks, &shutdown, |_, entry| {
                 let wanted = range.holds(&entry) && (args.tracks || is_cameras(&entry.key.channel));
                 let since_s = entry.data_time.seconds_since(range.from) + pass.by_s;
                 if wanted && pace.wait(since_s, &shutdown) {
@@ -57,14 +60,15 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
             if !args.again || shutdown.requested() {
                 break;
             }
+            ensure!(stage.published > before, "nothing in that range can be played again and again");
             pass.begin_again(range.from);
         }
     }
-    let Stage { link, publishers, published, .. } = stage;
+    let Stage { link, publishers, alive, published, .. } = stage;
     // What was put last is on its way.
     std::thread::sleep(Duration::from_millis(200));
-    drop(publishers);
-    link.close()?;
+    drop((publishers, alive));
+    link.close(if shutdown.requested() { LEAVE } else { LONG_LEAVE })?;
     output::line(format!("{published} messages published"));
     Ok(())
 }
@@ -74,10 +78,20 @@ struct Stage {
     link: Link,
     delivery: Delivery,
     publishers: BTreeMap<Channel, LinkPublisher>,
+    /// That those whom it stands in for are there.
+    alive: Vec<AliveToken>,
     published: u64,
 }
 
 impl Stage {
+    fn appear(&mut self, network: &NetworkConfig, and_fusion: bool) -> anyhow::Result<()> {
+        let cameras = network.cameras.keys().map(|camera| Channel::Alive(camera.clone()));
+        for channel in cameras.chain(and_fusion.then_some(Channel::FusionAlive)) {
+            self.alive.push(self.link.declare_alive(channel)?);
+        }
+        Ok(())
+    }
+
     fn put(&mut self, entry: Entry) -> anyhow::Result<()> {
         let channel = entry.key.channel;
         if !self.publishers.contains_key(&channel) {
@@ -98,6 +112,8 @@ impl Stage {
 #[derive(Debug, Default)]
 struct Pass {
     by_s: f64,
+    /// Whether there will be another: then no source comes to its end.
+    goes_on: bool,
     /// The newest data time of this pass, before it is moved.
     newest: Option<Timestamp>,
     /// What is added to each camera's frame numbers, and the number after its highest so far.
@@ -116,10 +132,10 @@ impl Pass {
 
     fn shifted(&mut self, entry: Entry) -> Entry {
         self.newest = self.newest.max(Some(entry.data_time));
-        let is_first = self.by_s == 0.0;
+        let is_recorded = self.by_s == 0.0 && !self.goes_on;
         let moved = self.moved(&entry.key.channel, &entry.data);
         match moved {
-            Some(data) if !is_first => Entry { data, ..entry },
+            Some(data) if !is_recorded => Entry { data, ..entry },
             _ => entry,
         }
     }
@@ -138,7 +154,7 @@ impl Pass {
                 message.encode_unstamped()
             }
             // Since when it holds stays as it is.
-            Channel::Calibration(_) => decode::<CameraCalibration>(data).ok()?.encode_unstamped(),
+            Channel::Calibration(_) => return None,
             Channel::Preview(_) => {
                 let mut message: Preview = decode(data).ok()?;
                 moved(&mut message.capture_time_ns);
