@@ -102,7 +102,9 @@ fn p99_ms(names: &Namespaces, site: &Site, has_slow_one: bool) -> f64 {
     std::thread::sleep(Duration::from_millis(500));
     recorder.stop();
     fusion.stop();
-    observer.map(Running::stop);
+    if let Some(observer) = observer {
+        observer.stop();
+    }
     let evaluation: serde_json::Value =
         serde_json::from_str(&succeed(&["evaluate", &near, "--json"])).unwrap();
     evaluation["latency"]["p99_ms"].as_f64().unwrap()

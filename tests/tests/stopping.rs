@@ -1,6 +1,6 @@
 //! Whoever is asked to stop does so within two seconds, whatever comes in, and leaves whole files.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test that cannot set itself up has failed")]
 
 use std::path::Path;
 use std::sync::Arc;
