@@ -5,7 +5,7 @@ use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_f
 
 use crate::{BearingTrack, CameraHealth, CameraResidual, Counter, Track, TrueState};
 
-/// The longest message that is sent, received or recorded, bytes. The largest true ones are previews
+/// The longest message that is taken in or recorded, bytes. The largest true ones are previews
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB).
 pub const MAX_MESSAGE_BYTES: usize = 8 << 20;
 

@@ -17,8 +17,8 @@
 //! ([`Origin`]), so that the receiver counts what it lost and notices a second
 //! publisher ([`Reception`]). Only what is played as fast as it goes waits for
 //! the slowest ([`Delivery::Every`]). A published message that nobody
-//! subscribes to is gone: file sources wait with [`Link::wait_for`] until
-//! those who must hear them are alive.
+//! subscribes to is gone: who plays a file watches ([`Link::presence`]) until
+//! those who must hear it are there.
 
 mod config;
 mod link;

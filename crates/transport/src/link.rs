@@ -279,7 +279,7 @@ impl Link {
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
-    pub fn is_alive(&self, channel: &Channel) -> Result<bool, LinkError> {
+    fn is_alive(&self, channel: &Channel) -> Result<bool, LinkError> {
         let key = Key::new(self.site.clone(), channel.clone()).to_string();
         let replies = self
             .session

@@ -61,11 +61,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     entries.sort_by_key(|entry| entry.data_time);
     let draft = Draft::new(path, &[])?;
     let mut writer = RecordingWriter::create(draft.path())?;
-    writer.sign(&crossfix_recording::Source {
-        command: "import".to_owned(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        ..Default::default()
-    })?;
+    writer.sign(&crossfix_recording::Source::of("import"))?;
     for entry in &entries {
         writer.write(entry)?;
     }

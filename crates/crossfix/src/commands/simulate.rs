@@ -101,11 +101,7 @@ fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Resul
     entries.sort_by_key(|entry| entry.data_time);
     let draft = Draft::new(path, &[])?;
     let mut writer = RecordingWriter::create(draft.path())?;
-    writer.sign(&Source {
-        command: "simulate".to_owned(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        ..Source::default()
-    })?;
+    writer.sign(&Source::of("simulate"))?;
     for entry in &entries {
         writer.write(entry)?;
     }

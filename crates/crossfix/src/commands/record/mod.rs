@@ -51,12 +51,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     let health = link.publisher(Channel::RecorderHealth, Delivery::Queued)?;
     let (mut writer, path) = create(&args.output, args.overwrite)?;
-    writer.sign(&Source {
-        command: "record".to_owned(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        run: link.run().to_string(),
-        host: network::host(),
-    })?;
+    writer.sign(&Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") })?;
     let mut recorder = Recorder::new(writer, &network, link.run());
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());

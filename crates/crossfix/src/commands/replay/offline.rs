@@ -44,11 +44,7 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
         busy: Duration::ZERO,
         longest: Duration::ZERO,
     };
-    run.writer.sign(&Source {
-        command: "replay --fuse".to_owned(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        ..Source::default()
-    })?;
+    run.writer.sign(&Source::of("replay --fuse"))?;
     for entry in calibrations(&args.recording, range)? {
         run.centre.take(&entry.key.channel, &entry.data, "");
         if !range.is_whole {
