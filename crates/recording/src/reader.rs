@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use crossfix_message::{Key, Timestamp};
 use mcap::MAGIC;
-use mcap::records::{Channel, Record, op};
+use mcap::records::{Record, op};
 use thiserror::Error;
 
 use crate::chunk::{self, Framing, HEAD_BYTES, MAX_RECORD_BYTES};
-use crate::source::Texts;
+use crate::source::{self, Texts};
 use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 
 /// Damaged records may claim what is not theirs, so that what lies in them is read again: this many
@@ -199,11 +199,15 @@ impl<R: Read + Seek> RecordingReader<R> {
         body: &[u8],
         handle: &mut impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<Result<(), String>, ReadFailure<E>> {
-        if !matches!(opcode, op::CHANNEL | op::MESSAGE) {
+        if opcode == op::CHANNEL {
+            let channel = source::channel(body);
+            channel.iter().for_each(|channel| self.learn(channel));
+            return Ok(channel.map(drop).ok_or_else(|| "a channel record is damaged".to_owned()));
+        }
+        if opcode != op::MESSAGE {
             return Ok(Ok(()));
         }
         match mcap::parse_record(opcode, body) {
-            Ok(Record::Channel(channel)) => self.learn(&channel),
             Ok(Record::Message { header, data }) => {
                 let key = match self.keys.get(&header.channel_id) {
                     Some(Some(key)) => key,
@@ -253,8 +257,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         }
     }
 
-    fn learn(&mut self, channel: &Channel) {
-        self.keys.insert(channel.id, channel.topic.parse().ok());
+    fn learn(&mut self, (id, topic): &(u16, String)) {
+        self.keys.insert(*id, topic.parse().ok());
     }
 
     fn learn_texts(&mut self, texts: &Texts) {
@@ -295,7 +299,7 @@ impl<R: Read + Seek> RecordingReader<R> {
             }
             let body = if opcode == op::CHANNEL { self.body(self.at, length)? } else { Vec::new() };
             if opcode == op::CHANNEL
-                && let Ok(Record::Channel(channel)) = mcap::parse_record(opcode, &body)
+                && let Some(channel) = source::channel(&body)
             {
                 self.learn(&channel);
             }

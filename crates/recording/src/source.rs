@@ -72,6 +72,14 @@ fn bytes<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
     Some(bytes)
 }
 
+/// Id and topic of a channel record, read in the same way.
+pub(crate) fn channel(body: &[u8]) -> Option<(u16, String)> {
+    let (id, rest) = body.split_first_chunk::<2>()?;
+    // Then the schema's id.
+    let mut rest = rest.get(2..)?;
+    Some((u16::from_le_bytes(*id), text(&mut rest)?))
+}
+
 fn text(rest: &mut &[u8]) -> Option<String> {
     String::from_utf8(bytes(rest)?.to_vec()).ok()
 }
