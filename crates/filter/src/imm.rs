@@ -12,41 +12,47 @@ pub struct MotionModel {
     pub density: f64,
     /// Share of the time that targets fly like this, before anything is known of one.
     pub share: f64,
+    /// The habit that it belongs to, by number: a target changes between the models of its habit often, and
+    /// its habit seldom.
+    pub habit: u8,
 }
 
 /// The ways in which targets fly, and how often they change from one to another.
 ///
-/// The mode is a Markov process in continuous time that is drawn anew from the shares at
-/// `switching_rate`, so that the transition over an interval is the same however it is cut.
+/// The mode is a Markov process in continuous time: at `switching_rate` it is drawn anew from the shares of
+/// the models of its habit, and at `habit_rate` from those of all models. So the transition over an interval
+/// is the same however it is cut, and a target that has turned once is expected to turn again soon, while one
+/// that has flown straight for long is not.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionModels {
     models: Vec<MotionModel>,
     switching_rate: f64,
+    habit_rate: f64,
 }
 
 /// Weights of the models, in their order; what lies beyond the last model is 0.
 pub type ModelWeights = [f64; MAX_MODELS];
 
 impl MotionModels {
-    /// One to [`MAX_MODELS`] models, with the switching rate in 1/s. The shares are scaled to a sum of 1.
+    /// One to [`MAX_MODELS`] models, with the rates of switching within a habit and of changing it in 1/s. The shares are scaled to a sum of 1.
     ///
-    /// `None` if a density is negative, a share or the rate is not positive (a lone model needs no
+    /// `None` if a density is negative, a share or a rate is not positive (a lone model needs no
     /// rate), or a number is not finite.
-    pub fn new(models: &[MotionModel], switching_rate: f64) -> Option<Self> {
+    pub fn new(models: &[MotionModel], switching_rate: f64, habit_rate: f64) -> Option<Self> {
         let total: f64 = models.iter().map(|m| m.share).sum();
         let possible = |m: &MotionModel| m.density >= 0.0 && m.density.is_finite() && m.share > 0.0;
-        let rate_is_one = switching_rate.is_finite() && (switching_rate > 0.0 || models.len() == 1);
+        let is_rate = |rate: f64| rate.is_finite() && (rate > 0.0 || models.len() == 1);
         let good = (1..=MAX_MODELS).contains(&models.len()) && models.iter().all(possible);
-        if !(good && rate_is_one && total.is_finite()) {
+        if !(good && is_rate(switching_rate) && is_rate(habit_rate) && total.is_finite()) {
             return None;
         }
-        let scaled = |m: &MotionModel| MotionModel { density: m.density, share: m.share / total };
-        Some(Self { models: models.iter().map(scaled).collect(), switching_rate })
+        let scaled = |m: &MotionModel| MotionModel { share: m.share / total, ..*m };
+        Some(Self { models: models.iter().map(scaled).collect(), switching_rate, habit_rate })
     }
 
     /// A single model: a plain Kalman filter.
     pub fn single(density: f64) -> Option<Self> {
-        Self::new(&[MotionModel { density, share: 1.0 }], 0.0)
+        Self::new(&[MotionModel { density, share: 1.0, habit: 0 }], 0.0, 0.0)
     }
 
     /// The models.
@@ -54,9 +60,12 @@ impl MotionModels {
         &self.models
     }
 
-    /// How often the mode is drawn anew, 1/s.
-    pub fn switching_rate(&self) -> f64 {
-        self.switching_rate
+    /// The same with every model as lively as the liveliest.
+    #[must_use]
+    pub fn widened(&self) -> Self {
+        let widest = self.widest();
+        let models = self.models.iter().map(|m| MotionModel { density: widest, ..*m }).collect();
+        Self { models, ..*self }
     }
 
     /// The largest density of acceleration among the models, m^2/s^3.
@@ -64,9 +73,23 @@ impl MotionModels {
         self.models.iter().map(|m| m.density).fold(0.0, f64::max)
     }
 
-    /// Probability that the mode is not drawn anew within an interval of seconds.
-    fn staying(&self, interval: f64) -> f64 {
-        (-self.switching_rate * interval.abs()).exp()
+    /// Probability of model `to` an interval of seconds after model `from`.
+    fn transitions(&self, interval: f64) -> [ModelWeights; MAX_MODELS] {
+        let same_habit = (-self.habit_rate * interval.abs()).exp();
+        let same_mode = (-self.switching_rate * interval.abs()).exp();
+        let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
+        for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
+            let alike = self.models.iter().filter(|model| model.habit == from.habit);
+            let habit_share: f64 = alike.map(|model| model.share).sum();
+            for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
+                *probability = (1.0 - same_habit) * to.share;
+                if from.habit == to.habit {
+                    let kept = if i == j { same_mode } else { 0.0 };
+                    *probability += same_habit * (kept + (1.0 - same_mode) * to.share / habit_share);
+                }
+            }
+        }
+        transitions
     }
 }
 
@@ -81,9 +104,9 @@ impl MotionModels {
 /// ```
 /// use crossfix_filter::{Imm, KinematicState, MotionModel, MotionModels};
 /// use nalgebra::{Matrix3, Matrix6, Point3, Vector6};
-/// let quiet = MotionModel { density: 0.001, share: 0.8 };
-/// let lively = MotionModel { density: 10.0, share: 0.2 };
-/// let models = MotionModels::new(&[quiet, lively], 0.1).ok_or("models")?;
+/// let quiet = MotionModel { density: 0.001, share: 0.8, habit: 0 };
+/// let lively = MotionModel { density: 10.0, share: 0.2, habit: 0 };
+/// let models = MotionModels::new(&[quiet, lively], 0.1, 0.1).ok_or("models")?;
 /// let start = KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() };
 /// let mut imm = Imm::new(start, &models);
 /// let noise = Matrix3::identity() * 0.01;
@@ -128,10 +151,15 @@ impl Imm {
 
     /// Each model's probability `interval` seconds on.
     pub fn predicted_probabilities(&self, interval: f64, models: &MotionModels) -> ModelWeights {
-        let stay = models.staying(interval);
+        self.probabilities_after(&models.transitions(interval))
+    }
+
+    fn probabilities_after(&self, transitions: &[ModelWeights; MAX_MODELS]) -> ModelWeights {
         let mut predicted = [0.0; MAX_MODELS];
-        for ((p, now), model) in predicted.iter_mut().zip(self.probabilities()).zip(models.models()) {
-            *p = stay * now + (1.0 - stay) * model.share;
+        for (row, now) in transitions.iter().zip(self.probabilities()) {
+            for (p, transition) in predicted.iter_mut().zip(row) {
+                *p += transition * now;
+            }
         }
         predicted
     }
@@ -157,11 +185,12 @@ impl Imm {
         models: &MotionModels,
         mut update: impl FnMut(&KinematicState) -> Option<(KinematicState, f64)>,
     ) -> Option<f64> {
-        let weights = self.predicted_probabilities(interval, models);
+        let transitions = models.transitions(interval);
+        let weights = self.probabilities_after(&transitions);
         let mut states: [Option<KinematicState>; MAX_MODELS] = Default::default();
         let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
         for (j, (next, model)) in states.iter_mut().zip(models.models()).enumerate() {
-            let mut predicted = self.mixed(j, interval, models);
+            let mut predicted = self.mixed(j, &transitions);
             predicted.time_update(interval, model.density);
             let updated = update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
             *next = Some(match updated {
@@ -194,19 +223,54 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
+    /// Adds to every model's covariance, or takes from it, for what is learnt of errors that all models
+    /// share. What would leave a model less than nothing is not taken from it.
+    pub fn add_covariance(&mut self, change: &Matrix6<f64>) {
+        for state in &mut self.states {
+            let next = state.covariance + change;
+            if next.cholesky().is_some() {
+                state.covariance = next;
+            }
+        }
+        self.combined = combined(&self.states, &self.probabilities);
+    }
+
+    /// Makes every model's covariance more than a part of it that all share: what is short of it grows by a
+    /// quarter of the part until it is.
+    pub fn exceed(&mut self, part: &Matrix6<f64>) {
+        let mut grown = false;
+        for state in &mut self.states {
+            for _ in 0..5 {
+                if (state.covariance - part).cholesky().is_some() {
+                    break;
+                }
+                state.covariance += part / 4.0;
+                grown = true;
+            }
+        }
+        if grown {
+            self.combined = combined(&self.states, &self.probabilities);
+        }
+    }
+
+    /// Moves every model's mean: for what is learnt of an error that all models share.
+    pub fn shift(&mut self, change: &Vector6<f64>) {
+        for state in &mut self.states {
+            state.mean += change;
+        }
+        self.combined = combined(&self.states, &self.probabilities);
+    }
+
     /// What model `j` starts its step from: the states weighted by the probability of each having
     /// been the mode, given that `j` is the mode now.
-    fn mixed(&self, j: usize, interval: f64, models: &MotionModels) -> KinematicState {
+    fn mixed(&self, j: usize, transitions: &[ModelWeights; MAX_MODELS]) -> KinematicState {
         if self.states.len() == 1 {
             return self.states[0].clone();
         }
-        let stay = models.staying(interval);
-        let share = models.models()[j].share;
         let mut weights = [0.0; MAX_MODELS];
         let mut total = 0.0;
-        for (i, (weight, probability)) in weights.iter_mut().zip(self.probabilities()).enumerate() {
-            let kept = if i == j { stay } else { 0.0 };
-            *weight = (kept + (1.0 - stay) * share) * probability;
+        for ((weight, row), probability) in weights.iter_mut().zip(transitions).zip(self.probabilities()) {
+            *weight = row[j] * probability;
             total += *weight;
         }
         if total <= 0.0 {
@@ -238,8 +302,8 @@ mod tests {
     use super::*;
 
     fn models() -> MotionModels {
-        let model = |density, share| MotionModel { density, share };
-        MotionModels::new(&[model(0.0, 0.7), model(1.0, 0.2), model(20.0, 0.1)], 0.2).unwrap()
+        let model = |density, share, habit| MotionModel { density, share, habit };
+        MotionModels::new(&[model(0.0, 0.7, 0), model(1.0, 0.2, 1), model(20.0, 0.1, 1)], 0.2, 0.05).unwrap()
     }
 
     fn running() -> Imm {
@@ -261,7 +325,7 @@ mod tests {
             .models()
             .iter()
             .enumerate()
-            .map(|(j, model)| imm.mixed(j, dt, &models).predicted(dt, model.density))
+            .map(|(j, model)| imm.mixed(j, &models.transitions(dt)).predicted(dt, model.density))
             .collect();
         let (slow, fast) = (combined(&states, &weights), imm.predicted(dt, &models));
         assert!((slow.mean - fast.mean).norm() < 1e-9);
@@ -302,12 +366,13 @@ mod tests {
 
     #[test]
     fn models_that_cannot_be_are_refused() {
-        let model = |density, share| MotionModel { density, share };
-        assert!(MotionModels::new(&[], 1.0).is_none());
-        assert!(MotionModels::new(&[model(-1.0, 1.0)], 1.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 0.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, f64::NAN)], 1.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, 1.0); 5], 1.0).is_none());
+        let model = |density, share| MotionModel { density, share, habit: 0 };
+        assert!(MotionModels::new(&[], 1.0, 1.0).is_none());
+        assert!(MotionModels::new(&[model(-1.0, 1.0)], 1.0, 1.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 0.0, 1.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 1.0, 0.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, f64::NAN)], 1.0, 1.0).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 5], 1.0, 1.0).is_none());
         assert!(MotionModels::single(1.0).is_some());
     }
 }

@@ -23,17 +23,19 @@ pub(crate) struct KnownCameras {
 }
 
 impl KnownCameras {
-    /// Takes a calibration in. A camera's first one holds for all that it captured before it, too.
-    pub(crate) fn insert(&mut self, name: CameraName, valid_from: Timestamp, known: KnownCamera) {
+    /// Takes a calibration in; says whether it is the camera's first one, which holds for all that it captured
+    /// before it, too.
+    pub(crate) fn insert(&mut self, name: CameraName, valid_from: Timestamp, known: KnownCamera) -> bool {
         if let Entry::Vacant(place) = self.now.entry(name.clone()) {
             place.insert(known);
-            return;
+            return true;
         }
         let upcoming = self.upcoming.entry(name).or_default();
         upcoming.insert(valid_from, known);
         if upcoming.len() > MAX_UPCOMING {
             upcoming.pop_last();
         }
+        false
     }
 
     /// A camera as it stood at a capture time.
@@ -81,7 +83,11 @@ mod tests {
             distortion: Distortion::None,
         };
         let pose = Pose::looking_at(Point3::new(x, 0.0, 0.0), Point3::new(0.0, 100.0, 10.0)).unwrap();
-        KnownCamera { camera: Camera::new(intrinsics, pose).unwrap(), pose_covariance: None }
+        KnownCamera {
+            camera: Camera::new(intrinsics, pose).unwrap(),
+            pose_covariance: None,
+            is_declared: false,
+        }
     }
 
     #[test]

@@ -160,9 +160,9 @@ impl Default for Initiation {
             period_s: 0.05,
             periods: 4,
             fixes: 2,
-            pair_s: 1.0,
-            velocity_prior_sd_mps: 15.0,
-            max_range_m: 2000.0,
+            pair_s: 0.3,
+            velocity_prior_sd_mps: 50.0,
+            max_range_m: 20_000.0,
             spatial_gate_probability: 0.999,
             pair_gate_m2: 16.0,
             temporal_gate_m: None,
@@ -195,6 +195,10 @@ pub struct FlightModel {
     pub acceleration_density: f64,
     /// Share of the time that targets fly like this.
     pub share: f64,
+    /// The habit that it belongs to: a target changes between the models of one habit at
+    /// `switching_rate_per_s` and its habit at `habit_rate_per_s`. 0 to 255. Default 0.
+    #[serde(default)]
+    pub habit: u8,
 }
 
 /// How tracks are kept up.
@@ -206,8 +210,10 @@ pub struct Tracking {
     /// The ways of flying of `models`. Default: straight (1e-6, 0.998 of the time), drifting (0.3, 0.001) and
     /// manoeuvring (5, 0.001).
     pub models: Vec<FlightModel>,
-    /// How often a target changes its way of flying, 1/s. 1e-9 to 100. Default 0.01.
+    /// How often a target changes its way of flying within its habit, 1/s. 1e-9 to 100. Default 0.5.
     pub switching_rate_per_s: f64,
+    /// How often a target changes its habit, 1/s. 1e-9 to 100. Default 0.02.
+    pub habit_rate_per_s: f64,
     /// Power spectral density of the white acceleration where there is one model, m^2/s^3. 1e-12 to
     /// 1000000. Default 3, for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for what flies
     /// straight.
@@ -240,11 +246,17 @@ pub struct Tracking {
 
 impl Default for Tracking {
     fn default() -> Self {
-        let model = |acceleration_density, share| FlightModel { acceleration_density, share };
+        let model = |acceleration_density, share, habit| FlightModel { acceleration_density, share, habit };
         Self {
             manoeuvres: Manoeuvres::default(),
-            models: vec![model(1e-6, 0.998), model(0.3, 0.001), model(5.0, 0.001)],
-            switching_rate_per_s: 0.01,
+            models: vec![
+                model(1e-6, 0.98, 0),
+                model(0.3, 0.012, 1),
+                model(5.0, 0.007, 1),
+                model(60.0, 0.001, 1),
+            ],
+            switching_rate_per_s: 0.3,
+            habit_rate_per_s: 0.02,
             acceleration_density: 3.0,
             residual_window: 8,
             residual_scale: 0.81,

@@ -5,15 +5,19 @@ use crossfix_message::{
     TrackEvent, TrackFrame, TrackState,
 };
 
+use nalgebra::{Matrix6, Vector6};
+
 use crate::calibrations::KnownCameras;
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
+use crate::noise::WhiteNoise;
+use crate::pose_scale::PoseScales;
+use crate::rooted::View;
 use crate::spatial::Quantity;
-use crate::standing::CameraStanding;
-use crate::standing::Standings;
+use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{Happening, Tracker};
 use crate::{ConfigError, Counters, FusionConfig};
@@ -44,6 +48,53 @@ pub struct CameraReport {
     pub clock: Option<ClockEstimate>,
 }
 
+/// A camera whose noise is so many times (variance) what it reports is doubted.
+const DOUBTED_NOISE: f64 = 2.0;
+/// A clock whose variance (logarithm) and offset (in its deviations) change by less than this changes no track.
+const NOTICED_CLOCK: f64 = 0.1;
+
+/// What is learnt of a camera from its own bearings.
+#[derive(Clone, Debug)]
+struct CameraRecord {
+    noise: WhiteNoise,
+    view: View,
+    /// The deviation and the offset of its clock that the tracks know of, s.
+    time_sd_s: f64,
+    offset_s: f64,
+}
+
+impl CameraRecord {
+    fn new(config: &FusionConfig, exposure: &Exposure) -> Self {
+        let view = View::new(config.tracking.coasting_after_s);
+        let (time_sd_s, offset_s) = (exposure.uncertainty.time_sd_s, exposure.correction_s);
+        Self { noise: WhiteNoise::default(), view, time_sd_s, offset_s }
+    }
+
+    /// By how much, in its deviations so far, the clock is found to be ahead of what was known, and how its
+    /// variance has changed; `None` if that is little.
+    fn clock_change(&mut self, exposure: &Exposure) -> Option<(f64, f64)> {
+        let (sd_s, offset_s) = (exposure.uncertainty.time_sd_s, exposure.correction_s);
+        let ratio = (sd_s / self.time_sd_s).powi(2);
+        let ahead = (offset_s - self.offset_s) / self.time_sd_s;
+        let known = self.time_sd_s > 0.0 && sd_s > 0.0;
+        if known && ratio.ln().abs() < NOTICED_CLOCK && ahead.abs() < NOTICED_CLOCK {
+            return None;
+        }
+        (self.time_sd_s, self.offset_s) = (sd_s, offset_s);
+        known.then_some((ahead, ratio))
+    }
+
+    /// Puts into an exposure what is known of its camera, and takes what it shows in.
+    fn tell(&mut self, exposure: &mut Exposure) {
+        exposure.uncertainty.factor = self.noise.factor();
+        let lines = exposure.sightings.iter().map(|sighting| &sighting.line);
+        let rooted = self.view.see(exposure.time, lines);
+        for (sighting, rooted) in exposure.sightings.iter_mut().zip(rooted) {
+            sighting.rooted = rooted;
+        }
+    }
+}
+
 /// The fusion centre as a state machine: frames in, tracks out; no clock, no thread, no socket.
 #[derive(Debug)]
 pub struct Fusion {
@@ -54,6 +105,12 @@ pub struct Fusion {
     initiator: Initiator,
     clocks: ClockEstimator,
     standings: Standings,
+    /// The same where two others see a target.
+    misfits: Standings,
+    /// How the frames' times fit.
+    punctuality: Standings,
+    records: BTreeMap<CameraName, CameraRecord>,
+    pose_scales: PoseScales,
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
     corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
@@ -78,6 +135,10 @@ impl Fusion {
             initiator: Initiator::new(&config),
             clocks: ClockEstimator::new(config.clocks.clone()),
             standings: Standings::default(),
+            misfits: Standings::default(),
+            punctuality: Standings::default(),
+            records: BTreeMap::new(),
+            pose_scales: PoseScales::default(),
             corrected: BTreeMap::new(),
             corrected_load: Load::default(),
             counters: Counters::default(),
@@ -95,8 +156,12 @@ impl Fusion {
     pub fn calibrate(&mut self, message: &CameraCalibration) -> Result<(), CalibrationError> {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
-        let known = KnownCamera { camera: calibration.camera, pose_covariance: calibration.pose_covariance };
-        self.cameras.insert(calibration.name, calibration.valid_from, known);
+        let is_declared = calibration.pose_covariance.is_some();
+        let pose_covariance = Some(calibration.pose_covariance.unwrap_or_else(careful_survey));
+        let known = KnownCamera { camera: calibration.camera, pose_covariance, is_declared };
+        if self.cameras.insert(calibration.name.clone(), calibration.valid_from, known) {
+            self.pose_scales.calibrate(&calibration.name, is_declared);
+        }
         Ok(())
     }
 
@@ -111,7 +176,11 @@ impl Fusion {
                 }
                 // As far as is known by now: it is settled when the exposure's turn comes.
                 exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
+                let (camera, time) = (exposure.camera.clone(), exposure.time);
                 let arrival = self.buffer.insert(exposure);
+                let refused =
+                    matches!(arrival, Err(RejectionReason::Late { .. } | RejectionReason::Future { .. }));
+                self.note_time(&camera, time, !refused, &mut outputs);
                 if let Some(time) = self.buffer.take_restart() {
                     self.restart(time, &mut outputs);
                 }
@@ -151,8 +220,8 @@ impl Fusion {
     pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
         self.cameras.now().keys().map(|camera| CameraReport {
             camera: camera.clone(),
-            standing: self.standings.of(camera),
-            noise_factor: self.standings.factor(camera),
+            standing: self.standing(camera),
+            noise_factor: self.noise_factor(camera),
             clock: self.clocks.estimate(camera),
         })
     }
@@ -267,29 +336,50 @@ impl Fusion {
         for moved in self.cameras.advance(exposure.time) {
             let pose_covariance = self.cameras.now().get(&moved).and_then(|known| known.pose_covariance);
             self.clocks.calibrate(&moved, pose_covariance);
+            let is_declared = self.cameras.now().get(&moved).is_some_and(|known| known.is_declared);
+            self.pose_scales.calibrate(&moved, is_declared);
+            self.records.remove(&moved);
         }
         let Some(known) = self.cameras.at(&exposure.camera, exposure.time) else {
             return;
         };
         self.counters.count("exposures");
         let mut exposure = exposure.clone();
-        exposure.uncertainty.factor = self.standings.factor(&exposure.camera);
-        let excluded = self.standings.of(&exposure.camera) == CameraStanding::Excluded;
+        exposure.uncertainty.pose_scale = self.pose_scales.of(&exposure.camera);
+        exposure.clutter_per_sr = self.tracker.clutter_per_sr(&exposure.camera, known);
+        if !self.records.contains_key(&exposure.camera) {
+            self.records.insert(exposure.camera.clone(), CameraRecord::new(&self.config, &exposure));
+        }
+        if let Some(record) = self.records.get_mut(&exposure.camera) {
+            record.tell(&mut exposure);
+            if let Some((ahead, ratio)) = record.clock_change(&exposure) {
+                self.tracker.set_clock(&exposure.camera, ahead, ratio);
+            }
+        }
+        let excluded = self.is_excluded(&exposure.camera);
         let mut happenings = Vec::new();
-        let (evidence, used) = if excluded {
+        let (fittings, used) = if excluded {
             self.counters.count("exposures_of_excluded_cameras");
             self.tracker.compare(&exposure, known)
         } else {
             let step = self.tracker.step(&exposure, known);
+            if let Some(record) = self.records.get_mut(&exposure.camera) {
+                step.third_differences.iter().for_each(|squared| record.noise.see(*squared));
+            }
             happenings = step.happenings;
             let rest = Exposure { sightings: step.free, ..exposure.clone() };
             for start in self.initiator.add(rest, &step.claims, self.cameras.now(), self.tracker.motion()) {
                 happenings.extend(self.tracker.adopt(start));
             }
-            (step.evidence, step.used)
+            (step.fittings, step.used)
         };
+        for samples in self.tracker.draws() {
+            for (camera, ratio) in self.pose_scales.learn(&samples) {
+                self.tracker.rescale_pose(&camera, ratio);
+            }
+        }
         self.compare_clocks(&exposure, &used);
-        self.judge(&exposure, &evidence, &used, outputs);
+        self.judge(&exposure.camera, exposure.time, &fittings, outputs);
         self.say(&exposure, happenings, outputs);
     }
 
@@ -309,27 +399,59 @@ impl Fusion {
     /// Learns from an exposure how far its camera can be believed.
     fn judge(
         &mut self,
-        exposure: &Exposure,
-        evidence: &[Option<f64>],
-        used: &[(usize, TrackId)],
+        camera: &CameraName,
+        time: Timestamp,
+        fittings: &Fittings,
         outputs: &mut Vec<Output>,
     ) {
-        // One that is turned away sees the targets elsewhere. Where all its bearings are known targets',
-        // those that it misses are hidden from it; and one that sees nothing says nothing.
-        let strangers = exposure.sightings.len() > used.len();
-        let telling: Vec<Option<f64>> =
-            evidence.iter().copied().filter(|nis| nis.is_some() || strangers).collect();
-        self.standings.learn(&exposure.camera, &telling);
-        if let Some(standing) = self.standings.review(&exposure.camera) {
+        self.standings.learn(camera, time, &fittings.of_three);
+        self.misfits.learn(camera, time, &fittings.of_two);
+        if self.misfits.review(camera) == Some(CameraStanding::Excluded) {
+            // Beside the targets that two others see: they accuse nobody, but its clock may be wrong.
+            self.clocks.suspect(camera);
+        }
+        if let Some(standing) = self.standings.review(camera) {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
             if standing == CameraStanding::Excluded {
                 // It may be its clock that is wrong: bearings compared and not used can tell.
-                self.clocks.suspect(&exposure.camera);
+                self.clocks.suspect(camera);
             }
-            outputs.push(Output::Camera(exposure.camera.clone(), standing));
+            outputs.push(Output::Camera(camera.clone(), standing));
+        }
+    }
+
+    fn noise_factor(&self, camera: &CameraName) -> f64 {
+        self.records.get(camera).map_or(1.0, |record| record.noise.factor())
+    }
+
+    fn is_excluded(&self, camera: &CameraName) -> bool {
+        self.standings.is_excluded(camera) || self.punctuality.is_excluded(camera)
+    }
+
+    /// Takes in whether a frame of a camera came in time; one whose frames are refused says nothing.
+    fn note_time(&mut self, camera: &CameraName, time: Timestamp, accepted: bool, outputs: &mut Vec<Output>) {
+        let fitting = if accepted { Fitting::Fits } else { Fitting::Refused };
+        self.punctuality.learn(camera, time, &[fitting]);
+        if let Some(standing) = self.punctuality.review(camera) {
+            self.counters.count(match standing {
+                CameraStanding::Excluded => "cameras_out_of_time",
+                _ => "cameras_in_time_again",
+            });
+            outputs.push(Output::Camera(camera.clone(), standing));
+        }
+    }
+
+    /// How far a camera is believed.
+    fn standing(&self, camera: &CameraName) -> CameraStanding {
+        if self.is_excluded(camera) {
+            CameraStanding::Excluded
+        } else if self.pose_scales.is_doubted(camera) || self.noise_factor(camera) > DOUBTED_NOISE {
+            CameraStanding::Doubted
+        } else {
+            CameraStanding::Good
         }
     }
 
@@ -371,6 +493,15 @@ impl Fusion {
     }
 }
 
+/// Covariance of a pose of which nobody has said how sure it is: what a careful survey reaches, 1 mrad and
+/// 5 cm an axis. A camera of which half as much were assumed would be believed before the others are.
+fn careful_survey() -> Matrix6<f64> {
+    const ROTATION_SD_RAD: f64 = 1e-3;
+    const POSITION_SD_M: f64 = 0.05;
+    let [rotation, position] = [ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2)];
+    Matrix6::from_diagonal(&Vector6::new(rotation, rotation, rotation, position, position, position))
+}
+
 fn event(happening: Happening, time: Timestamp) -> TrackEvent {
     TrackEvent {
         time_ns: time.nanos(),
@@ -385,11 +516,12 @@ fn event(happening: Happening, time: Timestamp) -> TrackEvent {
 impl Fusion {
     /// A track as of `time`.
     fn track_message(&self, track: &Track, time: Timestamp) -> crossfix_message::Track {
-        let now = track.honest(time, self.tracker.motion());
+        let now = track.predicted(time, self.tracker.motion());
         let state = match track.status {
             TrackStatus::Tentative => TrackState::Tentative,
             TrackStatus::Confirmed => TrackState::Confirmed,
             TrackStatus::Coasting => TrackState::Coasting,
+            TrackStatus::OneCamera => TrackState::OneCamera,
             TrackStatus::Lost => TrackState::Lost,
         };
         let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {

@@ -6,6 +6,7 @@ use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
 use nalgebra::{Matrix2, Matrix6, Point3};
 
+use crate::rooted::Rooted;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
@@ -26,6 +27,8 @@ pub struct Sighting {
     pub image_track: u64,
     /// Where it is seen.
     pub line: SightLine,
+    /// Whether it is of something that stands in the camera's view for good.
+    pub(crate) rooted: Rooted,
 }
 
 /// All that one camera measured at one time.
@@ -39,6 +42,8 @@ pub struct Exposure {
     pub time: Timestamp,
     /// What is uncertain of the camera as a whole.
     pub(crate) uncertainty: CameraUncertainty,
+    /// Density of the camera's false bearings, 1/sr.
+    pub(crate) clutter_per_sr: f64,
     /// What has been taken off the reported time for the clock's offset, s.
     pub(crate) correction_s: f64,
     /// The targets, in the frame's order.
@@ -75,6 +80,8 @@ pub(crate) struct KnownCamera {
     pub(crate) camera: Camera,
     /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
     pub(crate) pose_covariance: Option<Matrix6<f64>>,
+    /// Whether somebody has said how sure the pose is.
+    pub(crate) is_declared: bool,
 }
 
 impl KnownCamera {
@@ -178,14 +185,14 @@ fn sighting(track: &BearingTrack, camera: &Camera, config: &Bearings) -> Result<
         }
     };
     let bearing = Bearing::new(vector.into(), covariance)?;
-    Ok(Sighting { image_track: track.track_id, line: camera.sight_line(&bearing) })
+    Ok(Sighting { image_track: track.track_id, line: camera.sight_line(&bearing), rooted: Rooted::Unknown })
 }
 
 /// Reads a frame: what was measured, and what of it had to be left out.
 pub(crate) fn read(
     frame: &BearingFrame,
     name: &CameraName,
-    KnownCamera { camera, pose_covariance: pose }: &KnownCamera,
+    KnownCamera { camera, pose_covariance: pose, .. }: &KnownCamera,
     config: &Bearings,
     counters: &mut Counters,
 ) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
@@ -218,7 +225,12 @@ pub(crate) fn read(
         camera: name.clone(),
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
-        uncertainty: CameraUncertainty { time_sd_s: sd, factor: 1.0, pose: *pose },
+        uncertainty: CameraUncertainty {
+            pose: *pose,
+            axes: *camera.pose().rotation(),
+            ..CameraUncertainty::of_time(sd)
+        },
+        clutter_per_sr: 1.0,
         correction_s: 0.0,
         sightings,
     };

@@ -36,10 +36,13 @@ impl Motion {
         let single = MotionModels::single(config.acceleration_density);
         let (models, detector) = match config.manoeuvres {
             Manoeuvres::Models => {
-                let model =
-                    |m: &crate::FlightModel| MotionModel { density: m.acceleration_density, share: m.share };
+                let model = |m: &crate::FlightModel| MotionModel {
+                    density: m.acceleration_density,
+                    share: m.share,
+                    habit: m.habit,
+                };
                 let models: Vec<MotionModel> = config.models.iter().map(model).collect();
-                (MotionModels::new(&models, config.switching_rate_per_s), None)
+                (MotionModels::new(&models, config.switching_rate_per_s, config.habit_rate_per_s), None)
             }
             Manoeuvres::None => (single, None),
             Manoeuvres::SmoothedResidual => {
@@ -57,9 +60,7 @@ impl Motion {
             value: config.models.len() as f64,
             must: "one to four models with densities of 0 and more and positive shares".to_owned(),
         })?;
-        let wide: Vec<MotionModel> =
-            models.models().iter().map(|m| MotionModel { density: models.widest(), ..*m }).collect();
-        let unheld = MotionModels::new(&wide, models.switching_rate()).unwrap_or_else(|| models.clone());
+        let unheld = models.widened();
         Ok(Self { models, unheld, holding_s: config.coasting_after_s, detector })
     }
 

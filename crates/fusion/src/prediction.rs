@@ -4,15 +4,15 @@
 use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
-use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Matrix3, Matrix3x2, Point3, Unit, Vector2};
+use crossfix_geometry::{BearingModel, SightLine};
+use nalgebra::{Matrix2, Matrix3x2, Matrix6x3, Point3, Vector2};
 
-use crate::uncertainty::{CameraUncertainty, View};
+use crate::uncertainty::CameraUncertainty;
 
 /// Where a camera should see a target, and how surely.
 #[derive(Clone, Debug)]
 pub(crate) struct BearingPrediction {
-    view: View,
+    model: BearingModel,
     factor: f64,
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
@@ -43,25 +43,26 @@ impl BearingPrediction {
         models: &MotionModels,
         origin: Point3<f64>,
         uncertainty: &CameraUncertainty,
+        ties: &Matrix6x3<f64>,
     ) -> Option<Self> {
         // Process noise is the same along all axes: what it adds to a direction is a multiple of
         // the identity, and only what the models share has to be projected.
         let state: KinematicState = imm.combined().predicted(interval, 0.0);
-        let offset = state.position() - origin;
-        let range = offset.norm();
-        let direction = Unit::try_new(offset, 1e-6)?;
-        let basis = tangent_basis(&direction);
-        let across = basis / range;
-        let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
-        let common = uncertainty.common(&view);
-        let steady = across.transpose() * state.position_covariance() * across + common;
+        let model = BearingModel::new(origin, state.position())?;
+        let by = model.by_position();
+        let shifts = uncertainty.shifts(&model, state.velocity());
+        let common =
+            shifts * shifts.transpose() + uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
+        let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
+        let steady = by * state.position_covariance() * by.transpose() + cross + cross.transpose() + common;
+        let range = model.range;
         let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
         let mut added = [0.0; MAX_MODELS];
         for (variance, model) in added.iter_mut().zip(models.models()) {
             *variance = model.density * spread;
         }
         Some(Self {
-            view,
+            model,
             factor: uncertainty.factor,
             steady,
             common,
@@ -71,41 +72,27 @@ impl BearingPrediction {
         })
     }
 
-    /// The same where the target's position is uncertain by more than the track itself knows, m^2: for
-    /// what the cameras' clocks shift all their bearings by.
-    pub(crate) fn widened(mut self, more: &Matrix3<f64>) -> Self {
-        let across = self.view.basis / self.view.range;
-        let seen = across.transpose() * more * across;
-        self.steady += seen;
-        self.common += seen;
-        self
-    }
-
     /// Where a camera at `origin` should see a target of a state, as of the state's time; the target
     /// may have moved by `moved` (m, standard deviation an axis) between that time and the exposure.
     pub(crate) fn of_state(state: &KinematicState, origin: Point3<f64>, moved: f64) -> Option<Self> {
-        let offset = state.position() - origin;
-        let range = offset.norm();
-        let direction = Unit::try_new(offset, 1e-6)?;
-        let basis = tangent_basis(&direction);
-        let across = basis / range;
-        let steady = across.transpose() * state.position_covariance() * across
-            + Matrix2::identity() * (moved / range).powi(2);
+        let model = BearingModel::new(origin, state.position())?;
+        let by = model.by_position();
+        let steady = by * state.position_covariance() * by.transpose()
+            + Matrix2::identity() * (moved / model.range).powi(2);
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
-        let view = View { direction, basis, range, rate: across.transpose() * state.velocity() };
         let (common, added) = (Matrix2::zeros(), [0.0; MAX_MODELS]);
-        Some(Self { view, factor: 1.0, steady, common, added, weights, widest: 0.0 })
+        Some(Self { model, factor: 1.0, steady, common, added, weights, widest: 0.0 })
     }
 
     /// Range of the target, m.
     pub(crate) fn range(&self) -> f64 {
-        self.view.range
+        self.model.range
     }
 
     /// The tangents at the predicted direction, in which its covariances are expressed, world.
     pub(crate) fn basis(&self) -> &Matrix3x2<f64> {
-        &self.view.basis
+        &self.model.basis
     }
 
     /// Covariance of the predicted direction without what pose and clock of the camera add, and that,
@@ -117,17 +104,15 @@ impl BearingPrediction {
 
     /// Covariance of a bearing, rad^2.
     pub(crate) fn noise_of(&self, line: &SightLine) -> Matrix2<f64> {
-        let turn = self.view.basis.transpose() * line.basis;
-        turn * line.covariance * turn.transpose() * self.factor
+        self.model.covariance_of(line) * self.factor
     }
 
     /// How a bearing fits; `None` if it lies outside the gate.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
-        let innovation = self.view.basis.transpose() * line.direction.into_inner();
+        let innovation = self.model.offset(line)?;
         // No axis of the covariance is longer than its trace: most bearings need no more than this.
         let longest = self.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
-        let behind = self.view.direction.dot(&line.direction) <= 0.0;
-        if behind || innovation.norm_squared() > gate.threshold() * longest {
+        if innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
         let spread = self.steady + self.noise_of(line);
@@ -171,16 +156,23 @@ mod tests {
 
     #[test]
     fn a_true_bearing_fits_and_the_liveliest_model_opens_the_gate() {
-        let model = |density, share| MotionModel { density, share };
-        let models = MotionModels::new(&[model(0.0, 0.9), model(5.0, 0.1)], 0.1).unwrap();
+        let model = |density, share| MotionModel { density, share, habit: 0 };
+        let models = MotionModels::new(&[model(0.0, 0.9), model(5.0, 0.1)], 0.1, 0.1).unwrap();
         let state = KinematicState {
             mean: Vector6::new(0.0, 0.0, 50.0, 10.0, 0.0, 0.0),
             covariance: Matrix6::identity() * 0.01,
         };
         let imm = Imm::new(state, &models);
         let camera = Point3::new(5.0, -100.0, 0.0);
-        let prediction =
-            BearingPrediction::new(&imm, 1.0, &models, camera, &CameraUncertainty::of_time(0.0)).unwrap();
+        let prediction = BearingPrediction::new(
+            &imm,
+            1.0,
+            &models,
+            camera,
+            &CameraUncertainty::of_time(0.0),
+            &Matrix6x3::zeros(),
+        )
+        .unwrap();
         let gate = Gate::with_probability(0.9999);
         let fit = |x: f64| prediction.fit(&line_at(camera, Point3::new(x, 0.0, 50.0), 1.0).line, gate);
         let near = |x: f64| fit(x).unwrap();

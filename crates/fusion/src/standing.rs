@@ -1,127 +1,116 @@
-//! How far each camera can be believed: its bearings against the tracks that the others hold.
+//! How far each camera can be believed.
+//!
+//! How large a camera's errors are is found from all lines together ([`crate::pose_scale`]), and such a camera
+//! counts less; here is what that cannot find: a camera whose lines miss the targets by so much that no track
+//! takes them, and one whose frames come at impossible times. A target that a camera does not report accuses
+//! nobody: something may stand in between. Only a line beside a target that three other cameras see does.
 
 use std::collections::BTreeMap;
 
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Timestamp};
 
-/// Exposures that the running means look back on.
-const MEMORY: f64 = 50.0;
-/// Evidence that a verdict needs.
-const LEAST_EVIDENCE: u32 = 30;
-/// Residuals this many times what the camera reports (squared) are no accident: its noise counts more.
-const DOUBT: f64 = 1.5;
-/// Residuals beyond this many times (squared) say that pose or clock are wrong: it is left out.
-const EXCLUSION: f64 = 16.0;
-/// A camera that hits the others' tracks less often than this is looking elsewhere: it is left out.
-const LEAST_HITS: f64 = 0.2;
-/// A camera left out comes back when it hits the tracks at least so often, ...
-const RETURN_HITS: f64 = 0.6;
-/// ... with residuals below this many times what it reports (squared).
-const RETURN_RATIO: f64 = 4.0;
+/// What is remembered of a camera, s: long enough for a bird beside a target to pass, short enough for a
+/// camera that has been put right to come back.
+const MEMORY_S: f64 = 5.0;
+/// Evidence that a verdict needs, s.
+const LEAST_EVIDENCE_S: f64 = 3.0;
+/// A camera that misses the targets, or whose frames are refused, in this share of the time is left out.
+const EXCLUSION: f64 = 0.7;
+/// It comes back when it does so in less than this.
+const RETURN: f64 = 0.3;
+/// Frames further apart than this count no longer than it, s.
+const LONGEST_STEP_S: f64 = 1.0;
 
 /// How far a camera is believed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CameraStanding {
-    /// Its residuals are what it reports.
+    /// Its bearings are as good as it says.
     Good,
-    /// Its residuals are larger: its bearings count less.
+    /// Its bearings miss the targets by more than is declared of its pose: they count less.
     Doubted,
-    /// Its bearings do not fit the tracks that the others hold: pose or clock must be wrong. They
-    /// are compared and not used, until they fit again.
+    /// Its bearings pass beside the targets that the others see, or its frames are refused: pose or clock must
+    /// be wrong. They are compared and not used, until they fit again.
     Excluded,
 }
 
-#[derive(Clone, Debug)]
+/// How a camera's exposure fits the targets that three other cameras see.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Fitting {
+    /// It has a bearing of such a target.
+    Fits,
+    /// It has one beside it, and none of it.
+    Beside,
+    /// Its frame was refused for its time.
+    Refused,
+}
+
+/// How an exposure fits all the sure targets that others see.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Fittings {
+    /// Those that two others see: enough to suspect a clock.
+    pub(crate) of_two: Vec<Fitting>,
+    /// Those that three others see: enough to accuse a camera.
+    pub(crate) of_three: Vec<Fitting>,
+}
+
+impl Fittings {
+    /// Notes how a target that so many other cameras see is fitted; `None` says nothing.
+    pub(crate) fn add(&mut self, others: usize, fitting: Option<Fitting>) {
+        if others >= 2 {
+            self.of_two.extend(fitting);
+        }
+        if others >= 3 {
+            self.of_three.extend(fitting);
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
 struct Record {
-    /// Running mean of the squared residuals over what is reported; 1 is honest.
-    ratio: f64,
-    /// Running share of expected bearings that came.
-    hits: f64,
-    evidence: u32,
+    /// Share of the time in which it has been wrong.
+    wrong: f64,
+    /// Evidence so far, s.
+    evidence_s: f64,
+    last: Timestamp,
     excluded: bool,
 }
 
-/// The standing of every camera.
+/// The standing of every camera, by one kind of evidence.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Standings {
     records: BTreeMap<CameraName, Record>,
 }
 
-impl Record {
-    fn new() -> Self {
-        Self { ratio: 1.0, hits: 1.0, evidence: 0, excluded: false }
-    }
-
-    /// What all tracks of one exposure say is one piece of evidence: they share its pose and time.
-    fn learn(&mut self, ratios: &[Option<f64>]) {
-        if ratios.is_empty() {
+impl Standings {
+    /// Takes in how an exposure fits, by its camera's own clock. All targets of one exposure are one piece of
+    /// evidence: they share its pose and time.
+    pub(crate) fn learn(&mut self, camera: &CameraName, time: Timestamp, fittings: &[Fitting]) {
+        if fittings.is_empty() {
             return;
         }
-        self.evidence = self.evidence.saturating_add(1);
-        let rate = 1.0 / MEMORY;
-        let (came, sum) = ratios.iter().flatten().fold((0.0, 0.0), |(n, sum), ratio| (n + 1.0, sum + ratio));
-        self.hits += rate * (came / ratios.len() as f64 - self.hits);
-        if came > 0.0 {
-            self.ratio += rate * (sum / came - self.ratio);
-        }
-    }
-}
-
-impl Standings {
-    /// For each track that others hold and an exposure should show: the bearing's squared distance by
-    /// the reported noise (two degrees of freedom), or `None` if none was near.
-    pub(crate) fn learn(&mut self, camera: &CameraName, reported_nis: &[Option<f64>]) {
-        if !self.records.contains_key(camera) {
-            self.records.insert(camera.clone(), Record::new());
-        }
-        if let Some(record) = self.records.get_mut(camera) {
-            let ratios: Vec<Option<f64>> = reported_nis.iter().map(|nis| nis.map(|nis| nis / 2.0)).collect();
-            record.learn(&ratios);
-        }
+        let new = Record { wrong: 0.0, evidence_s: 0.0, last: time, excluded: false };
+        let record = self.records.entry(camera.clone()).or_insert(new);
+        let step_s = time.seconds_since(record.last).abs().min(LONGEST_STEP_S);
+        record.last = time;
+        record.evidence_s = (record.evidence_s + step_s).min(MEMORY_S);
+        let wrong = fittings.iter().filter(|fitting| **fitting != Fitting::Fits).count();
+        let share = wrong as f64 / fittings.len() as f64;
+        record.wrong += (share - record.wrong) * (step_s / record.evidence_s.max(step_s)).min(1.0);
     }
 
-    /// What the camera's reported covariances are to be multiplied with.
-    ///
-    /// What all cameras have in common is no camera's fault: a manoeuvre, or a motion model too calm.
-    pub(crate) fn factor(&self, camera: &CameraName) -> f64 {
-        let Some(record) = self.records.get(camera).filter(|r| r.evidence >= LEAST_EVIDENCE) else {
-            return 1.0;
-        };
-        let mut ratios: Vec<f64> = self.records.values().filter(|r| !r.excluded).map(|r| r.ratio).collect();
-        ratios.sort_unstable_by(f64::total_cmp);
-        let common = ratios.get(ratios.len().saturating_sub(1) / 2).copied().unwrap_or(1.0).max(1.0);
-        let own = record.ratio / common;
-        if own < DOUBT { 1.0 } else { own }
-    }
-
-    /// The standing of a camera.
-    pub(crate) fn of(&self, camera: &CameraName) -> CameraStanding {
-        match self.records.get(camera) {
-            Some(record) if record.excluded => CameraStanding::Excluded,
-            Some(_) if self.factor(camera) > 1.0 => CameraStanding::Doubted,
-            _ => CameraStanding::Good,
-        }
+    /// Whether a camera is left out.
+    pub(crate) fn is_excluded(&self, camera: &CameraName) -> bool {
+        self.records.get(camera).is_some_and(|record| record.excluded)
     }
 
     /// Leaves a camera out or lets it back in; returns the new standing if that has changed.
     pub(crate) fn review(&mut self, camera: &CameraName) -> Option<CameraStanding> {
-        let factor = self.factor(camera);
-        let others = self.records.iter().filter(|(name, r)| *name != camera && !r.excluded).count();
-        let record = self.records.get_mut(camera).filter(|r| r.evidence >= LEAST_EVIDENCE)?;
-        if record.excluded {
-            let fits = record.hits >= RETURN_HITS && record.ratio < RETURN_RATIO;
-            if !fits {
-                return None;
-            }
-            *record = Record { ratio: record.ratio, hits: record.hits, evidence: 0, excluded: false };
-            return Some(CameraStanding::Good);
-        }
-        if others >= 2 && (factor > EXCLUSION || record.hits < LEAST_HITS) {
-            // It comes back by new evidence only.
-            *record = Record { ratio: EXCLUSION, hits: 0.0, evidence: 0, excluded: true };
-            return Some(CameraStanding::Excluded);
-        }
-        None
+        let record = self.records.get_mut(camera).filter(|r| r.evidence_s >= LEAST_EVIDENCE_S)?;
+        let excluded = if record.excluded { record.wrong > RETURN } else { record.wrong > EXCLUSION };
+        let changed = excluded != record.excluded;
+        record.excluded = excluded;
+        let standing = if excluded { CameraStanding::Excluded } else { CameraStanding::Good };
+        changed.then_some(standing)
     }
 }
 
@@ -133,66 +122,47 @@ mod tests {
         text.parse().unwrap()
     }
 
-    fn after(bad: Option<f64>) -> Standings {
-        let mut standings = Standings::default();
-        for _ in 0..200 {
-            standings.learn(&name("a"), &[Some(2.0)]);
-            standings.learn(&name("b"), &[Some(2.2)]);
-            standings.learn(&name("c"), &[bad]);
-            standings.review(&name("c"));
-        }
-        standings
-    }
-
-    #[test]
-    fn honest_cameras_are_taken_at_their_word() {
-        let standings = after(Some(1.8));
-        assert!(["a", "b", "c"].iter().all(|c| standings.factor(&name(c)) == 1.0));
-    }
-
-    #[test]
-    fn a_worse_camera_counts_less_and_a_wrong_one_not_at_all() {
-        let standings = after(Some(12.0));
-        assert_eq!(standings.of(&name("c")), CameraStanding::Doubted);
-        assert!((5.0..6.1).contains(&standings.factor(&name("c"))));
-        assert_eq!(after(Some(80.0)).of(&name("c")), CameraStanding::Excluded);
-        assert_eq!(after(None).of(&name("c")), CameraStanding::Excluded);
-    }
-
-    #[test]
-    fn one_exposure_is_one_piece_of_evidence_however_many_tracks_it_misses() {
-        let mut standings = after(Some(2.0));
-        standings.learn(&name("b"), &[None; 100]);
-        assert_eq!(standings.review(&name("b")), None);
-        assert_eq!(standings.of(&name("b")), CameraStanding::Good);
-    }
-
-    #[test]
-    fn it_comes_back_by_evidence() {
-        let mut standings = after(None);
-        let mut changes = Vec::new();
-        for _ in 0..200 {
-            standings.learn(&name("c"), &[Some(2.0)]);
-            changes.extend(standings.review(&name("c")));
-        }
-        assert_eq!(changes, [CameraStanding::Good]);
-        assert_eq!(standings.of(&name("a")), CameraStanding::Good);
-    }
-
-    #[test]
-    fn what_all_have_in_common_is_nobodys_fault_and_of_two_none_is_left_out() {
-        let mut standings = Standings::default();
-        for _ in 0..200 {
-            for camera in ["a", "b", "c"] {
-                standings.learn(&name(camera), &[Some(20.0)]);
+    /// The verdicts on a camera that gives the same evidence `rate` times a second.
+    fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraStanding> {
+        let (mut standings, camera) = (Standings::default(), name("a"));
+        let mut verdicts = Vec::new();
+        let mut time = Timestamp::EPOCH;
+        for fitting in fittings {
+            for _ in 0..(8.0 * rate) as usize {
+                time = time.plus_seconds(rate.recip());
+                standings.learn(&camera, time, fitting);
+                verdicts.extend(standings.review(&camera));
             }
         }
-        assert!((standings.factor(&name("b")) - 1.0).abs() < 1e-12);
-        let mut two = Standings::default();
-        for _ in 0..200 {
-            two.learn(&name("a"), &[Some(2.0)]);
-            two.learn(&name("b"), &[None]);
-            assert_eq!(two.review(&name("b")), None);
+        verdicts
+    }
+
+    #[test]
+    fn a_camera_whose_lines_pass_beside_the_targets_is_left_out_and_comes_back_when_they_fit() {
+        use Fitting::{Beside, Fits};
+        for rate in [2.0, 25.0, 240.0] {
+            assert_eq!(verdicts(&[&[Fits], &[Fits]], rate), []);
+            assert_eq!(
+                verdicts(&[&[Fits], &[Beside], &[Fits]], rate),
+                [CameraStanding::Excluded, CameraStanding::Good],
+                "{rate} Hz"
+            );
         }
+    }
+
+    #[test]
+    fn a_target_that_is_not_reported_accuses_nobody() {
+        assert_eq!(verdicts(&[&[], &[], &[]], 25.0), []);
+    }
+
+    #[test]
+    fn a_camera_whose_frames_are_refused_is_left_out() {
+        assert_eq!(verdicts(&[&[Fitting::Refused]], 30.0), [CameraStanding::Excluded]);
+    }
+
+    #[test]
+    fn one_target_of_three_that_is_missed_is_no_crime() {
+        use Fitting::{Beside, Fits};
+        assert_eq!(verdicts(&[&[Fits, Beside, Fits]], 25.0), []);
     }
 }

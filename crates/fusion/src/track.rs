@@ -1,29 +1,31 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crossfix_filter::{Imm, KinematicState};
-use crossfix_geometry::SightLine;
+use crossfix_filter::{Gate, Imm, KinematicState};
+use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Solver, Timestamp, TrackNumber};
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Matrix6x3, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Matrix6x3, Point3, Unit, Vector2};
 
 use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
-use crate::prediction::BearingPrediction;
+use crate::noise::LastThree;
+use crate::pose_scale::Sample;
+use crate::prediction::{BearingPrediction, Fit};
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
-use crate::uncertainty::{CameraUncertainty, View};
-use crate::watch::independent_share;
+use crate::uncertainty::CameraUncertainty;
+use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
+use crate::watch::Visibility;
 
-/// Two cameras alone must place a target at least this well (m, root of the sum over the axes):
-/// nearly parallel lines of two targets cross too.
-pub(crate) const MAX_PAIR_SD_M: f64 = 3.0;
-/// Rounds of the iterated update; the linearisation mostly holds from the first.
-const MAX_ITERATIONS: usize = 5;
-/// The linearisation has settled when what a round leaves out, the square of the angle of its step, is
-/// less than this share of the bearing's noise.
-const SETTLED: f64 = 0.01;
-/// Clocks less sure than this shift tracks by more than their bearings' noise, s.
-const UNSURE_CLOCK_S: f64 = 2e-3;
-/// What a track can be told apart by is looked at this often, s: eigenvalues cost more than an update.
+/// Two cameras alone must place a target at least this well (root of the sum over the axes, as a share of the
+/// range): nearly parallel lines of two targets cross too.
+const MAX_PAIR_SHARE: f64 = 0.03;
+/// Bearings further apart than this share of the time for which one holds a track tell no noise from jerks.
+const CLOSE_BEARINGS: f64 = 0.1;
+/// What the bearings tell apart is looked at this often, s: eigenvalues cost more than an update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
+/// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a mast is seen.
+const DRAW_S: f64 = 0.3;
+/// The information of bearings counts for this long, s.
+const INFORMATION_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
 const POSITION_SCALE_M: f64 = 20.0;
 
@@ -47,6 +49,8 @@ pub enum TrackStatus {
     Confirmed,
     /// Sure, but not seen of late.
     Coasting,
+    /// Sure, but one camera alone follows it: a direction with an unknown range.
+    OneCamera,
     /// Given up.
     Lost,
 }
@@ -60,19 +64,48 @@ pub struct MeasurementResidual {
     pub angle: f64,
     /// Squared Mahalanobis distance, two degrees of freedom.
     pub nis: f64,
-    contribution: Contribution,
 }
 
-/// What a bearing says of the position, and what is common to it and to its camera's others.
+/// What ties a track to the shared errors of a camera that has seen it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Contribution {
-    jacobian: Matrix2x3<f64>,
-    /// The bearing's own noise, rad^2.
-    own: Matrix2<f64>,
-    /// Pose and clock of its camera, rad^2.
-    common: Matrix2<f64>,
-    /// Standard deviation of its camera's clock, s.
-    time_sd_s: f64,
+struct Ties {
+    /// Covariance of position and velocity with the errors, each in its own deviations.
+    covariance: Matrix6x3<f64>,
+    /// Whether the camera can see the target, when it was exposed last.
+    visibility: Visibility,
+    last_three: LastThree,
+    drawn: Option<Drawn>,
+}
+
+/// What a camera has seen of the target since the last draw: see [`crate::pose_scale`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Drawn {
+    offsets: Vector2<f64>,
+    count: f64,
+    by_position: Matrix2x3<f64>,
+    /// Covariance of each bearing's noise, rad^2.
+    noise: Matrix2<f64>,
+    pose: Matrix2<f64>,
+}
+
+impl Ties {
+    fn new(time: Timestamp) -> Self {
+        Self {
+            covariance: Matrix6x3::zeros(),
+            visibility: Visibility::new(time),
+            last_three: LastThree::default(),
+            drawn: None,
+        }
+    }
+
+    /// The same `interval` seconds on: the position goes on with the velocity.
+    fn predicted(&self, interval: f64) -> Matrix6x3<f64> {
+        let mut covariance = self.covariance;
+        let velocity = covariance.fixed_rows::<3>(3).into_owned();
+        let mut position = covariance.fixed_rows_mut::<3>(0);
+        position += velocity * interval;
+        covariance
+    }
 }
 
 /// A bearing that a track has taken in.
@@ -80,8 +113,8 @@ struct Contribution {
 pub(crate) struct Taken {
     /// Whether a detector has seen the target begin to manoeuvre.
     pub(crate) manoeuvre: bool,
-    /// Squared Mahalanobis distance by the noise that the camera itself has reported.
-    pub(crate) reported_nis: f64,
+    /// Squared third difference of the camera's last four bearings, by the noise reported.
+    pub(crate) third_difference: Option<f64>,
 }
 
 /// A target in space, kept up from single bearings of single cameras.
@@ -99,142 +132,134 @@ pub struct Track {
     pub residuals: BTreeMap<CameraName, MeasurementResidual>,
     /// What made the newest update.
     pub solver: Solver,
-    /// What the state's covariance says is known; renewed about once a second.
+    /// What the bearings of late tell apart; renewed about once a second.
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
-    /// When evidence for or against it came last.
-    judged: Option<Timestamp>,
-    /// What unsure clocks may shift the position by, m^2; `None` where all are sure.
-    shift: Option<Matrix3<f64>>,
+    /// Where the camera stands that gave the newest bearing.
+    follower: Option<Point3<f64>>,
+    /// When the last draw was.
+    drawn: Timestamp,
     /// When its state went out, and as what.
     pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
+    /// What ties it to the shared errors of each camera that has seen it.
+    ties: BTreeMap<CameraName, Ties>,
+    /// Fisher information of the bearings of late, for position and velocity.
+    information: Matrix6<f64>,
     detector: Option<Detector>,
 }
 
-/// A bearing against a state: `h(x)`, its derivative by the position, and the noise.
-struct Linearised {
-    /// Direction to the state's position as an offset from the sight line, rad.
-    offset: Vector2<f64>,
-    jacobian: Matrix2x3<f64>,
-    noise: Matrix2<f64>,
-    view: View,
+/// What a camera should see of a track.
+// Made and used in one exposure: never stored, so the size of the larger variant costs nothing.
+#[allow(clippy::large_enum_variant)]
+#[derive(Clone, Debug)]
+pub(crate) enum Expectation {
+    /// The range is known: one direction with its covariance.
+    Near(BearingPrediction),
+    /// It is not: a stripe along another camera's sight line. Each bearing is tried by an update.
+    Along {
+        /// The track's state at the exposure's time.
+        state: KinematicState,
+        /// Where the camera stands that follows the target.
+        seen_from: Point3<f64>,
+        /// The camera that looks now, ...
+        camera: CameraUncertainty,
+        /// ... and what ties the track to its errors.
+        ties: Matrix6x3<f64>,
+    },
 }
 
-impl Linearised {
-    /// `None` if the position lies behind the camera.
-    fn at(state: &KinematicState, line: &SightLine, camera: &CameraUncertainty) -> Option<Self> {
-        let position = state.position();
-        let offset = line.tangent_offset(position)?;
-        let away = position - line.origin;
-        let range = away.norm();
-        let direction = away / range;
-        let across = (Matrix3::identity() - direction * direction.transpose()) / range;
-        let jacobian = line.basis.transpose() * across;
-        let view =
-            View { direction: line.direction, basis: line.basis, range, rate: jacobian * state.velocity() };
-        Some(Self { offset, jacobian, noise: camera.noise(&line.covariance, &view), view })
+impl Expectation {
+    /// How a bearing fits; `None` if it lies outside the gate.
+    pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
+        match self {
+            Self::Near(prediction) => prediction.fit(line, gate),
+            Self::Along { state, seen_from, camera, ties } => {
+                let Updated { nis, log_likelihood, .. } =
+                    updated(state, Some(*seen_from), &Measured { line, camera, ties })?;
+                gate.holds(nis).then_some(Fit { gate_distance: nis, log_density: log_likelihood })
+            }
+        }
     }
 }
 
-impl Linearised {
-    /// Squared Mahalanobis distance of the offset.
-    fn distance(&self, spread: Matrix2<f64>) -> Option<f64> {
+/// A bearing against a state, rad: offset and covariance of what is expected.
+struct Innovation {
+    offset: Vector2<f64>,
+    model: BearingModel,
+    /// Of the state and of what it shares with the camera's errors.
+    known: Matrix2<f64>,
+    shared: Matrix2<f64>,
+}
+
+impl Innovation {
+    /// Squared Mahalanobis distance where the reported covariance counts so many times.
+    fn nis(&self, line: &SightLine, factor: f64) -> Option<f64> {
+        let spread = self.known + self.shared + self.model.covariance_of(line) * factor;
         Some(self.offset.dot(&spread.cholesky()?.solve(&self.offset)))
     }
-
-    /// The note of this bearing in the track.
-    fn residual(
-        &self,
-        time: Timestamp,
-        nis: f64,
-        line: &SightLine,
-        camera: &CameraUncertainty,
-    ) -> MeasurementResidual {
-        let contribution = Contribution {
-            jacobian: self.jacobian,
-            own: line.covariance * camera.factor,
-            common: camera.common(&self.view),
-            time_sd_s: camera.time_sd_s,
-        };
-        MeasurementResidual { time, angle: self.offset.norm(), nis, contribution }
-    }
-}
-
-/// The state after a bearing of its time, with the logarithm of the bearing's likelihood: an
-/// iterated extended Kalman update (Gauss-Newton on the posterior density). `None` if the position
-/// lies behind the camera or the numbers fail.
-pub(crate) fn updated(
-    prior: &KinematicState,
-    line: &SightLine,
-    camera: &CameraUncertainty,
-) -> Option<(KinematicState, f64)> {
-    let mut mean = prior.mean;
-    let mut log_likelihood = None;
-    let ties: Matrix6x3<f64> = prior.covariance.fixed_columns::<3>(0).into_owned();
-    let mut covariance = prior.covariance;
-    for _ in 0..MAX_ITERATIONS {
-        let here = KinematicState { mean, covariance: prior.covariance };
-        let Linearised { offset, jacobian, noise, view } = Linearised::at(&here, line, camera)?;
-        let across = ties * jacobian.transpose();
-        let spread = jacobian * across.fixed_rows::<3>(0) + noise;
-        let determinant = spread.determinant();
-        let inverse = spread.try_inverse()?;
-        if determinant.is_nan() || determinant <= 0.0 {
-            return None;
-        }
-        if log_likelihood.is_none() {
-            let normaliser = (4.0 * std::f64::consts::PI.powi(2) * determinant).ln();
-            log_likelihood = Some(-(offset.dot(&(inverse * offset)) + normaliser) / 2.0);
-        }
-        let gain = across * inverse;
-        let already = (prior.mean - mean).fixed_rows::<3>(0).into_owned();
-        let next = prior.mean + gain * (-offset - jacobian * already);
-        let moved = (next - mean).fixed_rows::<3>(0).norm();
-        mean = next;
-        covariance = prior.covariance - gain * across.transpose();
-        if (moved / view.range).powi(2) < SETTLED * (noise.trace() / 2.0).sqrt() {
-            break;
-        }
-    }
-    let covariance = (covariance + covariance.transpose()) / 2.0;
-    let positive = covariance.diagonal().iter().all(|variance| *variance > 0.0);
-    positive.then_some((KinematicState { mean, covariance }, log_likelihood?))
 }
 
 impl Track {
-    /// A tentative track at a fix of these lines.
+    /// A tentative track at a fix of these lines, each with what is uncertain of its camera; the lines'
+    /// covariances hold that already.
     pub(crate) fn start<'a>(
         fix: &Fix,
-        lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine)>,
+        lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine, CameraUncertainty)>,
         motion: &Motion,
     ) -> Self {
-        let residual = |(camera, TimedLine { line, time, time_sd_s, .. }): (&CameraName, &TimedLine)| {
-            let here = fix.state.predicted(time.seconds_since(fix.time), 0.0);
-            let uncertainty = CameraUncertainty::of_time(*time_sd_s);
-            let seen = Linearised::at(&here, line, &uncertainty)?;
-            let nis = seen.offset.dot(&seen.noise.cholesky()?.solve(&seen.offset));
-            Some((camera.clone(), seen.residual(*time, nis, line, &uncertainty)))
-        };
         let mut track = Self {
             id: TrackId(0),
             status: TrackStatus::Tentative,
             updated: fix.time,
             score: 0.0,
-            residuals: lines.into_iter().filter_map(residual).collect(),
+            residuals: BTreeMap::new(),
             solver: fix.solver,
             observability: fix.observability,
             observed: fix.time,
             held: true,
-            judged: None,
-            shift: None,
+            follower: None,
+            drawn: fix.time,
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
+            ties: BTreeMap::new(),
+            information: Matrix6::zeros(),
             detector: motion.detector(),
         };
-        track.shift = track.clock_shift(motion);
+        for (camera, timed, uncertainty) in lines {
+            track.note_start(fix, camera, timed, &uncertainty);
+        }
         track
+    }
+
+    /// Notes a line of the fix that the track starts with.
+    fn note_start(
+        &mut self,
+        fix: &Fix,
+        camera: &CameraName,
+        TimedLine { line, time, time_sd_s, origin_sd_m }: &TimedLine,
+        uncertainty: &CameraUncertainty,
+    ) -> Option<()> {
+        let dt = time.seconds_since(fix.time);
+        let here = fix.state.predicted(dt, 0.0);
+        let model = BearingModel::new(line.origin, here.position())?;
+        let offset = model.offset(line)?;
+        let shifts = uncertainty.shifts(&model, here.velocity());
+        let moved = (here.velocity().norm() * time_sd_s).powi(2) + origin_sd_m.powi(2);
+        let noise = model.covariance_of(line) + Matrix2::identity() * (moved / model.range.powi(2));
+        let inverse = noise.try_inverse()?;
+        let nis = offset.dot(&(inverse * offset));
+        self.residuals.insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
+        let mut by = Matrix2x6::zeros();
+        by.fixed_view_mut::<2, 3>(0, 0).copy_from(&model.by_position());
+        by.fixed_view_mut::<2, 3>(0, 3).copy_from(&(model.by_position() * dt));
+        // The least-squares solution errs by -P H' R^-1 times the error of the line.
+        let covariance = -(fix.state.covariance * by.transpose() * inverse * shifts);
+        let visibility = Visibility::seen(*time);
+        self.ties.insert(camera.clone(), Ties { covariance, visibility, ..Ties::new(*time) });
+        self.information += by.transpose() * inverse * by;
+        Some(())
     }
 
     /// Position and velocity at [`Self::updated`].
@@ -247,13 +272,27 @@ impl Track {
         self.state().covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
     }
 
+    /// Whether the bearings' own noise leaves the place in no doubt; what poses and clocks shift the whole
+    /// track by is left out.
+    pub(crate) fn is_placed(&self) -> bool {
+        let shared: f64 = self.ties.values().map(|t| t.covariance.fixed_rows::<3>(0).norm_squared()).sum();
+        let sd = (self.position_sd().powi(2) - shared).max(0.0).sqrt();
+        sd <= MAX_PAIR_SHARE * self.range()
+    }
+
+    /// Range from the camera that gave the newest bearing, m.
+    fn range(&self) -> f64 {
+        let place = self.state().position();
+        self.follower.map_or(f64::INFINITY, |follower| (place - follower).norm())
+    }
+
     /// Position and velocity expected at another time.
     pub(crate) fn predicted(&self, time: Timestamp, motion: &Motion) -> KinematicState {
         self.imm.predicted(time.seconds_since(self.updated), motion.models(self.held))
     }
 
     /// Where the target is expected at another time: the mean alone.
-    pub(crate) fn position_at(&self, time: Timestamp) -> nalgebra::Point3<f64> {
+    pub(crate) fn position_at(&self, time: Timestamp) -> Point3<f64> {
         let state = self.imm.combined();
         state.position() + state.velocity() * time.seconds_since(self.updated)
     }
@@ -263,71 +302,109 @@ impl Track {
         self.imm.probabilities()
     }
 
-    /// Whether two other cameras than this one have lately seen the target.
-    pub(crate) fn is_held_without(&self, camera: &CameraName, motion: &Motion) -> bool {
+    /// How many other cameras than this one have lately seen the target.
+    pub(crate) fn others_than(&self, camera: &CameraName, motion: &Motion) -> usize {
         let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        self.residuals.iter().filter(|(name, r)| *name != camera && lately(r)).count() >= 2
+        self.residuals.iter().filter(|(name, r)| *name != camera && lately(r)).count()
+    }
+
+    /// Whether a camera has lately given the track a bearing.
+    fn is_followed_by(&self, camera: &CameraName, motion: &Motion) -> bool {
+        let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
+        self.residuals.get(camera).is_some_and(lately)
     }
 
     /// Whether the track is too uncertain for a camera that has not been following it: any line that
     /// crosses another camera's sight line would pass for its target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &Motion) -> bool {
-        let follows = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        !self.held && !self.residuals.get(camera).is_some_and(follows) && self.position_sd() > MAX_PAIR_SD_M
+        !self.held
+            && !self.is_followed_by(camera, motion)
+            && self.position_sd() > MAX_PAIR_SHARE * self.range()
+    }
+
+    fn ties_of(&self, camera: &CameraName, interval: f64) -> Matrix6x3<f64> {
+        self.ties.get(camera).map_or_else(Matrix6x3::zeros, |ties| ties.predicted(interval))
+    }
+
+    /// Whether the range is unknown as one camera alone has lately followed the target.
+    pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &Motion) -> bool {
+        let vague = |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
+        !self.held && self.follower.is_some_and(vague)
     }
 
     /// What a camera at `origin` should see at a time.
-    pub(crate) fn bearing_prediction(
+    pub(crate) fn expectation(
         &self,
         time: Timestamp,
-        origin: nalgebra::Point3<f64>,
-        camera: &CameraUncertainty,
+        (camera, origin): (&CameraName, Point3<f64>),
+        uncertainty: &CameraUncertainty,
         motion: &Motion,
-    ) -> Option<BearingPrediction> {
-        let prediction = BearingPrediction::new(
-            &self.imm,
-            time.seconds_since(self.updated),
-            motion.models(self.held),
-            origin,
-            camera,
-        )?;
-        Some(self.shift.iter().fold(prediction, |prediction, shift| prediction.widened(shift)))
+    ) -> Option<Expectation> {
+        let interval = time.seconds_since(self.updated);
+        let ties = self.ties_of(camera, interval);
+        let follower = self.follower.filter(|follower| !self.held && *follower != origin);
+        if let Some(seen_from) = follower {
+            let state = self.predicted(time, motion);
+            if log_range_sd(&state, seen_from) > VAGUE_LOG_RANGE_SD {
+                return Some(Expectation::Along { state, seen_from, camera: *uncertainty, ties });
+            }
+        }
+        let models = motion.models(self.held);
+        BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &ties).map(Expectation::Near)
     }
 
-    /// A bearing against what is expected at its time, with the covariance of that, rad^2.
+    /// A bearing against what is expected at its time.
     fn innovation(
         &self,
         time: Timestamp,
+        camera: &CameraName,
         line: &SightLine,
         uncertainty: &CameraUncertainty,
         motion: &Motion,
-    ) -> Option<(Linearised, Matrix2<f64>)> {
+    ) -> Option<Innovation> {
         let before = self.predicted(time, motion);
-        let seen = Linearised::at(&before, line, uncertainty)?;
-        let known = before.position_covariance() + self.shift.unwrap_or_else(Matrix3::zeros);
-        let known = seen.jacobian * known * seen.jacobian.transpose();
-        Some((seen, known))
+        let model = BearingModel::new(line.origin, before.position())?;
+        let offset = model.offset(line)?;
+        let by = model.by_position();
+        let shifts = uncertainty.shifts(&model, before.velocity());
+        let ties = self.ties_of(camera, time.seconds_since(self.updated));
+        let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
+        let known = by * before.position_covariance() * by.transpose() + cross + cross.transpose();
+        Some(Innovation { offset, model, known, shared: shifts * shifts.transpose() })
     }
 
-    /// Squared Mahalanobis distance of a bearing by the noise that its camera reports.
-    pub(crate) fn reported_nis(
-        &self,
+    /// Probability that a camera can see the target at a time, by what it has seen so far.
+    pub(crate) fn visible_to(&self, camera: &CameraName, time: Timestamp, motion: &Motion) -> f64 {
+        let visibility = |ties: &Ties| ties.visibility.at(time, motion.holding_s);
+        self.ties.get(camera).map_or(Visibility::UNKNOWN, visibility)
+    }
+
+    /// Whether another camera has seen the target since this one looked for it last. Where nobody has, what
+    /// hides it hides it from all, and one camera's miss says no more than another's.
+    pub(crate) fn is_seen_since_look_of(&self, camera: &CameraName) -> bool {
+        self.ties.get(camera).is_none_or(|ties| self.updated > ties.visibility.last_look())
+    }
+
+    /// Takes note of whether a camera that should see the target has reported it.
+    pub(crate) fn look(
+        &mut self,
+        camera: &CameraName,
         time: Timestamp,
-        line: &SightLine,
-        uncertainty: &CameraUncertainty,
+        seen: bool,
+        detection: f64,
         motion: &Motion,
-    ) -> Option<f64> {
-        let (seen, known) = self.innovation(time, line, uncertainty, motion)?;
-        seen.distance(known + line.covariance + uncertainty.common(&seen.view))
+    ) {
+        if !self.ties.contains_key(camera) {
+            self.ties.insert(camera.clone(), Ties::new(time));
+        }
+        if let Some(ties) = self.ties.get_mut(camera) {
+            ties.visibility.look(time, seen, detection, motion.holding_s);
+        }
     }
 
-    /// Takes evidence (a log-likelihood ratio) for or against the track in. Of a sure track it counts
-    /// for the time since the evidence before; its score is at most `most`.
-    pub(crate) fn judge(&mut self, now: Timestamp, change: f64, most: f64) {
-        let share = self.judged.map_or(1.0, |before| independent_share(now.seconds_since(before)));
-        self.judged = Some(now);
-        let share = if self.is_confirmed() { share } else { 1.0 };
-        self.score = (self.score + change * share).min(most);
+    /// Takes evidence (a log-likelihood ratio) for or against the track in; its score is at most `most`.
+    pub(crate) fn judge(&mut self, change: f64, most: f64) {
+        self.score = (self.score + change).min(most);
     }
 
     /// Takes a bearing in, and tells whether the target has begun to manoeuvre. `None` if the numbers
@@ -340,83 +417,177 @@ impl Track {
         motion: &Motion,
     ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
-        let (seen, known) = self.innovation(time, line, uncertainty, motion)?;
-        let nis = seen.distance(known + seen.noise)?;
-        let reported_nis = seen.distance(known + line.covariance + uncertainty.common(&seen.view))?;
+        let innovation = self.innovation(time, camera, line, uncertainty, motion)?;
         let manoeuvre = self.detector.as_mut().is_some_and(|detector| match detector {
             Detector::Residual(detector) => {
-                let in_deviations = line.basis * -seen.offset / line.standard_deviation();
+                let in_deviations = innovation.model.basis * innovation.offset / line.standard_deviation();
                 detector.see(in_deviations)
             }
-            Detector::Innovation(detector) => detector.see(nis, 2),
+            Detector::Innovation(detector) => {
+                innovation.nis(line, uncertainty.factor).is_some_and(|nis| detector.see(nis, 2))
+            }
         });
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
         }
-        self.imm.update(interval, motion.models(self.held), |state| updated(state, line, uncertainty))?;
+        let seen_from = self.follower.filter(|_| !self.held);
+        let ties = self.ties_of(camera, interval);
+        let measured = Measured { line, camera: uncertainty, ties: &ties };
+        let mut results: Vec<Option<Updated>> = Vec::with_capacity(crossfix_filter::MAX_MODELS);
+        self.imm.update(interval, motion.models(self.held), |state| {
+            let result = updated(state, seen_from, &measured);
+            let likely = result.as_ref().map(|after| (after.state.clone(), after.log_likelihood));
+            results.push(result);
+            likely
+        })?;
+        let nis = self.carry(camera, interval, &results);
+        self.gather_information(interval, line, uncertainty);
         self.updated = time;
+        self.follower = Some(line.origin);
         self.solver = Solver::Kalman;
-        let residual = seen.residual(time, nis, line, uncertainty);
+        let residual = MeasurementResidual { time, angle: innovation.offset.norm(), nis };
         if let Some(newest) = self.residuals.get_mut(camera) {
             *newest = residual;
         } else {
             self.residuals.insert(camera.clone(), residual);
         }
         self.held = self.cameras_lately(motion.holding_s) >= 2;
-        if self.shift.is_some() || uncertainty.time_sd_s >= UNSURE_CLOCK_S {
-            self.shift = self.clock_shift(motion);
-        }
-        Some(Taken { manoeuvre, reported_nis })
+        self.gather(camera, &innovation, line, uncertainty);
+        let third_difference = self.third_difference(camera, line, motion);
+        Some(Taken { manoeuvre, third_difference })
     }
 
-    /// Position and velocity expected at a time, with all that is uncertain: what the cameras' poses
-    /// and clocks shift all bearings by is not averaged away by more of them.
-    pub(crate) fn honest(&self, time: Timestamp, motion: &Motion) -> KinematicState {
-        let mut state = self.predicted(time, motion);
-        let recent = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        let parts: Vec<&Contribution> =
-            self.residuals.values().filter(recent).map(|r| &r.contribution).collect();
-        if parts.iter().all(|part| part.common.amax() <= 0.0) {
-            return state;
+    /// Keeps a bearing for the next draw.
+    fn gather(
+        &mut self,
+        camera: &CameraName,
+        innovation: &Innovation,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+    ) {
+        let own = innovation.model.covariance_of(line);
+        if let Some(ties) = self.ties.get_mut(camera) {
+            let before = ties.drawn.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
+            ties.drawn = Some(Drawn {
+                offsets: before.0 + innovation.offset,
+                count: before.1 + 1.0,
+                by_position: innovation.model.by_position(),
+                noise: own * uncertainty.factor,
+                pose: uncertainty.declared_pose(&innovation.model),
+            });
         }
-        // The position that one bearing of each camera gives, and how each camera's shift moves it.
-        let weighed = |part: &&Contribution| Some(part.jacobian.transpose() * part.own.try_inverse()?);
-        let weights: Vec<Matrix3x2<f64>> = parts.iter().filter_map(weighed).collect();
-        let information: Matrix3<f64> =
-            weights.iter().zip(&parts).map(|(weight, part)| weight * part.jacobian).sum();
-        if let Some(spread) = information.try_inverse().filter(|_| weights.len() == parts.len()) {
-            let mut shifted = Matrix3::zeros();
-            for (weight, part) in weights.iter().zip(&parts) {
-                let moves = spread * weight;
-                shifted += moves * part.common * moves.transpose();
-            }
-            // Covariances that no camera has make weights that are no numbers.
-            if shifted.iter().all(|v| v.is_finite()) {
-                let mut position = state.covariance.fixed_view_mut::<3, 3>(0, 0);
-                position += shifted;
-            }
-        }
-        state
     }
 
-    /// What the clocks that are not sure may shift the position by, m^2. The filter takes such a shift
-    /// for noise of each bearing and averages it away; a camera that joins would find the target
-    /// outside its gate.
-    fn clock_shift(&self, motion: &Motion) -> Option<Matrix3<f64>> {
-        let recent = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        let parts = || self.residuals.values().filter(recent).map(|r| &r.contribution);
-        if parts().all(|part| part.time_sd_s < UNSURE_CLOCK_S) {
-            return None;
+    /// What the cameras have seen of the target since the last draw, if it is time for the next.
+    pub(crate) fn draw(&mut self) -> Vec<Sample> {
+        if self.updated.seconds_since(self.drawn) < DRAW_S {
+            return Vec::new();
         }
-        let mut information = Matrix3::zeros();
-        let mut shifted = Matrix3::zeros();
-        for Contribution { jacobian, own, common, .. } in parts() {
-            let weight = jacobian.transpose() * (own + common).try_inverse()?;
-            information += weight * jacobian;
-            shifted += weight * common * weight.transpose();
+        self.drawn = self.updated;
+        // Cameras see it at other times within a draw: a velocity that is not known moves it in between.
+        let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
+        let drawn = self.ties.iter_mut().filter_map(|(camera, ties)| Some((camera, ties.drawn.take()?)));
+        let sample = |(camera, drawn): (&CameraName, Drawn)| {
+            let moved = drawn.by_position * (speed * DRAW_S / 10.0);
+            Sample {
+                camera: camera.clone(),
+                offset: drawn.offsets / drawn.count,
+                by_position: drawn.by_position,
+                noise: drawn.noise / drawn.count + moved * moved.transpose(),
+                pose: drawn.pose,
+            }
+        };
+        drawn.map(sample).collect()
+    }
+
+    /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances): what they
+    /// have done to the track is as well.
+    pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
+        let Some(ties) = self.ties.get_mut(camera) else {
+            return;
+        };
+        let mut shared = ties.covariance.fixed_columns_mut::<2>(0);
+        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
+        shared *= ratio.sqrt();
+        self.imm.add_covariance(&change);
+    }
+
+    /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was taken off its
+    /// times, and its variance to be `ratio` times what it was: the track lies by as much beside where it was
+    /// thought to be.
+    pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
+        let Some(ties) = self.ties.get_mut(camera) else {
+            return;
+        };
+        let mut shared = ties.covariance.fixed_columns_mut::<1>(2);
+        let moved = shared.clone_owned() * ahead;
+        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
+        shared *= ratio.sqrt();
+        self.imm.shift(&moved);
+        self.imm.add_covariance(&change);
+    }
+
+    fn third_difference(&mut self, camera: &CameraName, line: &SightLine, motion: &Motion) -> Option<f64> {
+        let (now, state) = (self.updated, self.imm.combined());
+        let (place, velocity) = (state.position(), state.velocity());
+        let expected =
+            |time: Timestamp| Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6);
+        let last_three = &mut self.ties.get_mut(camera)?.last_three;
+        last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
+    }
+
+    /// Carries the ties to all cameras' errors through an update, by the mean over the models; returns the
+    /// mean squared distance of the bearing.
+    fn carry(&mut self, camera: &CameraName, interval: f64, results: &[Option<Updated>]) -> f64 {
+        let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), Matrix6x3::zeros());
+        for (result, weight) in results.iter().zip(self.imm.probabilities()) {
+            if let Some(after) = result {
+                nis += after.nis * weight;
+                carried += after.carried * *weight;
+                gained += after.gained * *weight;
+            }
         }
-        let spread = information.try_inverse()?;
-        Some(spread * shifted * spread).filter(|shift| shift.iter().all(|value| value.is_finite()))
+        if !self.ties.contains_key(camera) {
+            self.ties.insert(camera.clone(), Ties::new(self.updated));
+        }
+        for (name, ties) in &mut self.ties {
+            ties.covariance = carried * ties.predicted(interval);
+            if name == camera {
+                ties.covariance -= gained;
+            }
+        }
+        self.keep_ties_possible();
+        nis
+    }
+
+    /// The ties are carried by the mean over the models: where one model alone is surer than they allow, it is
+    /// not believed.
+    fn keep_ties_possible(&mut self) {
+        let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
+        let shared: Matrix6<f64> = squares.sum();
+        if shared.amax() > 0.0 {
+            self.imm.exceed(&shared);
+        }
+    }
+
+    /// Adds what a bearing says of position and velocity to what those of the last second have said.
+    fn gather_information(&mut self, interval: f64, line: &SightLine, uncertainty: &CameraUncertainty) {
+        let old = &self.information;
+        let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
+        let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
+        let tied = ties - places * interval;
+        let moved = speeds - (ties + ties.transpose()) * interval + places * interval.powi(2);
+        let mut next = Matrix6::zeros();
+        next.fixed_view_mut::<3, 3>(0, 0).copy_from(&places);
+        next.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
+        next.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
+        next.fixed_view_mut::<3, 3>(3, 3).copy_from(&moved);
+        next *= (-interval.abs() / INFORMATION_S).exp();
+        if let Some(told) = told_of_position(self.state().position(), line, uncertainty) {
+            let mut position = next.fixed_view_mut::<3, 3>(0, 0);
+            position += told;
+        }
+        self.information = if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
     }
 
     /// Cameras that have given a bearing within the last seconds before [`Self::updated`].
@@ -431,26 +602,41 @@ impl Track {
         self.held
     }
 
-    /// Looks at what the covariance tells apart if that was a second ago.
+    /// Looks at what the bearings tell apart if that was a second ago.
     pub(crate) fn observe_again(&mut self) {
         if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
             self.observe();
         }
     }
 
-    /// Looks at what the covariance tells apart.
+    /// Looks at what the bearings tell apart.
     pub(crate) fn observe(&mut self) {
         self.observed = self.updated;
-        if let Some(information) = self.state().covariance.try_inverse() {
-            self.observability =
-                Observability::of_information(&information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
-        }
+        self.observability =
+            Observability::of_information(&self.information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
     }
 
     /// Whether it was confirmed once and is not lost.
     pub fn is_confirmed(&self) -> bool {
-        matches!(self.status, TrackStatus::Confirmed | TrackStatus::Coasting)
+        matches!(self.status, TrackStatus::Confirmed | TrackStatus::Coasting | TrackStatus::OneCamera)
     }
+}
+
+/// Standard deviation of the logarithm of a state's range from a place.
+fn log_range_sd(state: &KinematicState, origin: Point3<f64>) -> f64 {
+    let away = state.position() - origin;
+    (away.dot(&(state.position_covariance() * away))).max(0.0).sqrt() / away.norm_squared()
+}
+
+/// Fisher information of a bearing for the position.
+fn told_of_position(
+    place: Point3<f64>,
+    line: &SightLine,
+    uncertainty: &CameraUncertainty,
+) -> Option<Matrix3<f64>> {
+    let model = BearingModel::new(line.origin, place)?;
+    let by = model.by_position();
+    Some(by.transpose() * (model.covariance_of(line) * uncertainty.factor).try_inverse()? * by)
 }
 
 #[cfg(test)]

@@ -5,14 +5,17 @@ use std::collections::BTreeMap;
 
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind, track_id};
+use nalgebra::Point3;
 
 use crate::assignment::{Candidate, assign};
 use crate::ingress::KnownCamera;
 use crate::initiation::Start;
 use crate::motion::Motion;
+use crate::pose_scale::Sample;
 use crate::prediction::Fit;
+use crate::reacquisition::{FOUND_AGAIN_MARGIN, Look, Reacquisition};
+use crate::standing::{Fitting, Fittings};
 use crate::track::{Track, TrackId, TrackStatus};
-use crate::uncertainty::CameraUncertainty;
 use crate::watch::Watch;
 use crate::{Exposure, Sighting, Tracking};
 
@@ -27,9 +30,11 @@ const REACH: f64 = 1.5;
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// A score beyond this counts no more: a track that has long been good can still be doubted.
 const MAX_SCORE: f64 = 40.0;
-/// A camera brings a track back that it has lost sight of if the line is so many times (logarithm)
-/// more likely the target's than one of the strangers that the camera reports anyway.
-const FOUND_AGAIN_MARGIN: f64 = 8.0;
+/// A camera that is turned by no more than this shows a target beside where the others have it, rad.
+const BESIDE_RAD: f64 = 0.1;
+/// The smallest target that is found, px: what lies closer together is one. With half of it the two ends of a
+/// target make two tracks.
+const SMALLEST_TARGET_PX: f64 = 6.0;
 
 /// A track that one camera alone was following is found again within this distance (squared
 /// Mahalanobis, P = 0.999 999).
@@ -63,6 +68,17 @@ pub(crate) struct Tracker {
     /// Of the next track in this run.
     next_number: u64,
     watches: BTreeMap<CameraName, Watch>,
+    reacquisition: Reacquisition,
+    /// Where each camera stands, and how small a target it shows (rad).
+    eyes: BTreeMap<CameraName, (Point3<f64>, f64)>,
+}
+
+/// What is noted while an exposure's bearings are given to the tracks.
+#[derive(Debug, Default)]
+struct Noted {
+    happenings: Vec<Happening>,
+    fittings: Fittings,
+    third_differences: Vec<f64>,
 }
 
 /// What an exposure has done.
@@ -74,9 +90,10 @@ pub(crate) struct Step {
     pub(crate) claims: Vec<(usize, TrackId)>,
     /// Which sighting (by index) each track has taken in.
     pub(crate) used: Vec<(usize, TrackId)>,
-    /// For every sure track that two other cameras hold and this one should see: the squared
-    /// distance of its bearing by the reported noise, or `None` if none came.
-    pub(crate) evidence: Vec<Option<f64>>,
+    /// How the exposure fits the sure targets that other cameras see.
+    pub(crate) fittings: Fittings,
+    /// Squared third differences of the camera's bearings of tracks, by the noise that it reports.
+    pub(crate) third_differences: Vec<f64>,
     pub(crate) happenings: Vec<Happening>,
 }
 
@@ -92,6 +109,8 @@ impl Tracker {
             began: None,
             next_number: 1,
             watches: BTreeMap::new(),
+            reacquisition: Reacquisition::default(),
+            eyes: BTreeMap::new(),
         }
     }
 
@@ -128,32 +147,34 @@ impl Tracker {
         self.tracks.get(&id)
     }
 
-    /// Compares an exposure with the sure tracks that other cameras hold, and updates none: what
-    /// [`Step::evidence`] and [`Step::used`] would be.
+    /// Compares an exposure of a camera that is left out with the sure tracks that others see, and
+    /// updates none: what [`Step::fittings`] and [`Step::used`] would be.
     pub(crate) fn compare(
         &self,
         exposure: &Exposure,
         known: &KnownCamera,
-    ) -> (Vec<Option<f64>>, Vec<(usize, TrackId)>) {
+    ) -> (Fittings, Vec<(usize, TrackId)>) {
         let seen = self.tracks.values().filter(|track| {
             track.is_confirmed()
-                && track.is_held_without(&exposure.camera, &self.motion)
+                && track.others_than(&exposure.camera, &self.motion) >= 2
                 && known.expects(track.position_at(exposure.time), self.max_range_m)
         });
-        // By what the camera reports, however much it is doubted.
-        let reported = CameraUncertainty { factor: 1.0, ..exposure.uncertainty };
+        let origin = known.camera.pose().position();
         let nearest = |track: &Track| {
-            let origin = known.camera.pose().position();
-            let prediction = track.bearing_prediction(exposure.time, origin, &reported, &self.motion)?;
+            let camera = (&exposure.camera, origin);
+            let expected = track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
             let fits = exposure.sightings.iter().enumerate();
-            let fits = fits.filter_map(|(i, s)| Some((prediction.fit(&s.line, self.gate)?.gate_distance, i)));
-            let (_, nearest) = fits.min_by(|a, b| a.0.total_cmp(&b.0))?;
-            let line = &exposure.sightings[nearest].line;
-            Some((nearest, track.reported_nis(exposure.time, line, &reported, &self.motion)?))
+            let fits = fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
+            fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
         };
-        let nearest: Vec<(TrackId, Option<(usize, f64)>)> = seen.map(|t| (t.id, nearest(t))).collect();
-        let used = nearest.iter().filter_map(|(id, fit)| Some(((*fit)?.0, *id))).collect();
-        (nearest.into_iter().map(|(_, fit)| fit.map(|(_, nis)| nis)).collect(), used)
+        let (mut fittings, mut used) = (Fittings::default(), Vec::new());
+        for track in seen {
+            let nearest = nearest(track);
+            let others = track.others_than(&exposure.camera, &self.motion);
+            fittings.add(others, fitting(track, exposure, known, nearest.is_some()));
+            used.extend(nearest.map(|nearest| (nearest, track.id)));
+        }
+        (fittings, used)
     }
 
     /// How targets move.
@@ -179,14 +200,17 @@ impl Tracker {
     /// Takes in one exposure: what of it belongs to tracks updates them.
     pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
+        let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
+        self.eyes.insert(exposure.camera.clone(), (known.camera.pose().position(), smallest));
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
-        let mut happenings = Vec::new();
-        let mut evidence = Vec::new();
-        // A sure track chooses before an unsure one: a ghost must not take a target's bearings.
-        for sure in [true, false] {
-            happenings.extend(self.associate(exposure, known, &mut owners, sure, &mut evidence));
+        let mut noted = Noted::default();
+        for ids in self.in_order_of_choice() {
+            self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
+        let Noted { mut happenings, fittings, third_differences } = noted;
+        self.reacquire(exposure, known, &mut owners);
         let used = owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
+        let strangers = owners.iter().filter(|owner| owner.is_none()).count();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
             // What one camera alone follows is offered as if it were nobody's: if the others see the
@@ -197,39 +221,82 @@ impl Tracker {
                 free.push(sighting.clone());
             }
         }
-        let (time, strangers) = (exposure.time, free.len());
+        let time = exposure.time;
         let watch = self.watches.get_mut(&exposure.camera);
         if let Some(watch) = watch {
-            watch.see(time, strangers);
+            watch.see(time, strangers, self.motion.holding_s);
         } else {
             self.watches.insert(exposure.camera.clone(), Watch::first(time, strangers));
         }
         happenings.extend(self.review(exposure.time));
         happenings.extend(self.merge(exposure.time));
-        Step { free, claims, used, evidence, happenings }
+        Step { free, claims, used, fittings, third_differences, happenings }
     }
 
-    /// Gives bearings that are still open to the sure tracks or the others, and judges these by it.
+    /// What the cameras have seen of sure targets, by target, where it is time to compare them.
+    pub(crate) fn draws(&mut self) -> Vec<Vec<Sample>> {
+        let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
+        sure.map(Track::draw).filter(|samples| samples.len() >= 2).collect()
+    }
+
+    /// A camera's pose errors have been found to be larger or smaller (ratio of the variances).
+    pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
+        self.tracks.values_mut().for_each(|track| track.rescale_pose(camera, ratio));
+    }
+
+    /// A camera's clock is known otherwise: see [`Track::set_clock`].
+    pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
+        self.tracks.values_mut().for_each(|track| track.set_clock(camera, ahead, ratio));
+    }
+
+    /// Takes up what a second camera sees of the tracks that one alone follows.
+    fn reacquire(&mut self, exposure: &Exposure, known: &KnownCamera, owners: &mut [Option<TrackId>]) {
+        let look = Look {
+            exposure,
+            known,
+            motion: &self.motion,
+            config: &self.config,
+            gate: self.gate,
+            max_range_m: self.max_range_m,
+            owners,
+        };
+        for (track, sighting) in self.reacquisition.advance(&self.tracks, &look) {
+            if let Some(owner) = sighting.and_then(|index| owners.get_mut(index)) {
+                *owner = Some(track.id);
+            }
+            self.tracks.insert(track.id, track);
+        }
+    }
+
+    /// Which tracks choose first: those that several cameras hold in their place, then those that one alone
+    /// follows, then those that are not sure. A ghost must not take a target's bearings.
+    fn in_order_of_choice(&self) -> [Vec<TrackId>; 3] {
+        let mut order = [const { Vec::new() }; 3];
+        for track in self.tracks.values() {
+            let place = if !track.is_confirmed() { 2 } else { usize::from(!track.is_held()) };
+            order[place].push(track.id);
+        }
+        order
+    }
+
+    /// Gives bearings that are still open to some tracks, and judges these by it.
     fn associate(
         &mut self,
         exposure: &Exposure,
         known: &KnownCamera,
+        ids: &[TrackId],
         owners: &mut [Option<TrackId>],
-        sure: bool,
-        evidence: &mut Vec<Option<f64>>,
-    ) -> Vec<Happening> {
-        let ids: Vec<TrackId> =
-            self.tracks.values().filter(|t| t.is_confirmed() == sure).map(|t| t.id).collect();
-        let miss = self.miss();
-        let candidates = self.candidates(exposure, known, owners, &ids);
+        noted: &mut Noted,
+    ) {
+        let candidates = self.candidates(exposure, known, owners, ids);
         let gains: BTreeMap<(usize, usize), f64> =
             candidates.iter().map(|c| ((c.row, c.column), c.gain)).collect();
         let partner: BTreeMap<usize, usize> = assign(&candidates).into_iter().collect();
-        let mut happenings = Vec::new();
         for (row, id) in ids.iter().enumerate() {
             let Some(track) = self.tracks.get_mut(id) else {
                 continue;
             };
+            let sure = track.is_confirmed();
             let column = partner.get(&row).copied();
             let taken = column.and_then(|column| {
                 let sighting = &exposure.sightings[column];
@@ -240,32 +307,38 @@ impl Tracker {
             });
             let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
             let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
-            let held = track.is_held_without(&exposure.camera, &self.motion);
-            if sure && (taken.is_some() || sees) && held {
-                evidence.push(taken.map(|taken| taken.reported_nis));
+            if sure && (taken.is_some() || sees) {
+                let others = track.others_than(&exposure.camera, &self.motion);
+                noted.fittings.add(others, fitting(track, exposure, known, taken.is_some()));
             }
+            noted.third_differences.extend(taken.filter(|_| sure).and_then(|taken| taken.third_difference));
             let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
+            let detection = self.config.detection_probability;
+            let missed = missed(track.visible_to(&exposure.camera, exposure.time, &self.motion), detection);
+            let seen_since = !sure || track.is_seen_since_look_of(&exposure.camera);
+            let silent = sure && silent;
             let change = match gain {
                 // What one camera alone follows may be anything along its sight line.
-                Some(_) if sure && !held => Some(0.0),
-                Some(gain) => Some(gain + miss),
-                // Outside its field of view a camera has missed nothing, and of what nobody sees time
-                // decides.
-                None => (sees && !(sure && silent)).then_some(miss),
+                Some(_) if sure && !track.is_held() => 0.0,
+                Some(gain) => gain + missed,
+                // What hides the target from all is no evidence against it: of what nobody sees time decides.
+                None if sees && !silent && seen_since => missed,
+                None => 0.0,
             };
-            if let Some(change) = change {
-                track.judge(exposure.time, change, MAX_SCORE);
+            track.judge(change, MAX_SCORE);
+            // Outside its field of view a camera has missed nothing.
+            if gain.is_some() || sees {
+                track.look(&exposure.camera, exposure.time, gain.is_some(), detection, &self.motion);
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
-                happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
+                noted.happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
             }
         }
-        happenings
     }
 
-    /// Log-likelihood ratio of a camera's missing a target.
-    fn miss(&self) -> f64 {
-        (1.0 - self.config.detection_probability).ln()
+    /// Density of a camera's false bearings, 1/sr: as many as it reports beside the targets.
+    pub(crate) fn clutter_per_sr(&self, camera: &CameraName, known: &KnownCamera) -> f64 {
+        self.watches.get(camera).map_or(self.config.clutter_per_sr, |watch| watch.strangers_per_sr(known))
     }
 
     /// What the open bearings in the gates of these tracks are worth to them.
@@ -276,26 +349,32 @@ impl Tracker {
         owners: &[Option<TrackId>],
         ids: &[TrackId],
     ) -> Vec<Candidate> {
-        let watch = self.watches.get(&exposure.camera);
         // What a line must be worth to bring a track back that the camera has lost sight of.
-        let stranger = watch.map_or(0.0, |watch| watch.strangers_per_sr(known).ln()) + FOUND_AGAIN_MARGIN;
+        let stranger = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
         let origin = known.camera.pose().position();
-        let (mut candidates, miss) = (Vec::new(), self.miss());
+        let mut candidates = Vec::new();
         for (row, track) in ids.iter().enumerate().filter_map(|(row, id)| Some((row, self.tracks.get(id)?))) {
             if (track.position_at(exposure.time) - origin).norm() > REACH * self.max_range_m {
                 continue;
             }
-            let prediction =
-                track.bearing_prediction(exposure.time, origin, &exposure.uncertainty, &self.motion);
+            let prediction = track.expectation(
+                exposure.time,
+                (&exposure.camera, origin),
+                &exposure.uncertainty,
+                &self.motion,
+            );
             let Some(prediction) = prediction else {
                 continue;
             };
+            let detection = self.config.detection_probability;
+            let visible = track.visible_to(&exposure.camera, exposure.time, &self.motion);
             let lost_sight = track.is_lost_sight_of_by(&exposure.camera, &self.motion);
             let open = exposure.sightings.iter().enumerate().filter(|(i, _)| owners[*i].is_none());
             for (column, sighting) in open {
                 let fit = prediction.fit(&sighting.line, self.gate);
                 if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
-                    let gain = log_likelihood_ratio(&fit, &self.config) - miss;
+                    let gain = log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr)
+                        - missed(visible, detection);
                     candidates.push(Candidate { row, column, gain });
                 }
             }
@@ -308,8 +387,9 @@ impl Tracker {
         let mut happenings = Vec::new();
         for track in self.tracks.values_mut() {
             let silent_s = now.seconds_since(track.updated);
+            let unseen = silent_s > self.config.coasting_after_s;
             let hopeless = silent_s > self.config.lost_after_s
-                || position_sd(track, now, &self.motion) > self.config.max_position_sd_m;
+                || (unseen && position_sd(track, now, &self.motion) > self.config.max_position_sd_m);
             match track.status {
                 TrackStatus::Lost => {}
                 _ if hopeless || track.score < DROP_SCORE => {
@@ -320,8 +400,10 @@ impl Tracker {
                     track.status = TrackStatus::Confirmed;
                     happenings.push(Happening::new(TrackEventKind::Confirmed, track.id));
                 }
-                TrackStatus::Confirmed | TrackStatus::Coasting => {
-                    track.status = if silent_s > self.config.coasting_after_s {
+                TrackStatus::Confirmed | TrackStatus::Coasting | TrackStatus::OneCamera => {
+                    track.status = if track.is_a_direction(now, &self.motion) {
+                        TrackStatus::OneCamera
+                    } else if unseen {
                         TrackStatus::Coasting
                     } else {
                         TrackStatus::Confirmed
@@ -374,6 +456,9 @@ impl Tracker {
             self.tracks.insert(track.id, track);
             return Vec::new();
         }
+        if self.tracks.values().any(|old| old.is_confirmed() && self.is_one_image(old, &track)) {
+            return Vec::new();
+        }
         let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();
         if !wrong.is_empty() && cameras < 3 {
             return Vec::new();
@@ -396,9 +481,38 @@ impl Tracker {
     }
 }
 
-/// Log-likelihood ratio of a bearing being a target's against being clutter.
-pub(crate) fn log_likelihood_ratio(fit: &Fit, config: &Tracking) -> f64 {
-    config.detection_probability.ln() + fit.log_density - config.clutter_per_sr.ln()
+/// How an exposure fits a track that other cameras see; `None` if it says nothing.
+fn fitting(track: &Track, exposure: &Exposure, known: &KnownCamera, seen: bool) -> Option<Fitting> {
+    let expected = track.position_at(exposure.time) - known.camera.pose().position();
+    let is_beside = |sighting: &Sighting| sighting.line.direction.angle(&expected) < BESIDE_RAD;
+    if seen {
+        Some(Fitting::Fits)
+    } else {
+        exposure.sightings.iter().any(is_beside).then_some(Fitting::Beside)
+    }
+}
+
+impl Tracker {
+    /// Whether two tracks lie so close together for every camera that sees the new one that they are parts of
+    /// one target: a detector may report its two ends.
+    fn is_one_image(&self, old: &Track, new: &Track) -> bool {
+        let [there, here] = [old.position_at(new.updated), new.position_at(new.updated)];
+        let mut eyes = new.residuals.keys().map(|camera| self.eyes.get(camera));
+        eyes.all(|eye| {
+            eye.is_some_and(|(origin, smallest)| (there - origin).angle(&(here - origin)) < *smallest)
+        })
+    }
+}
+
+/// Log-likelihood ratio of a bearing being a target's that is seen with a probability against being one of
+/// so many false ones, 1/sr.
+pub(crate) fn log_likelihood_ratio(fit: &Fit, detection: f64, clutter_per_sr: f64) -> f64 {
+    detection.ln() + fit.log_density - clutter_per_sr.ln()
+}
+
+/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a probability.
+pub(crate) fn missed(visible: f64, detection: f64) -> f64 {
+    (1.0 - visible * detection).ln()
 }
 
 /// Root of the sum of the position's variances, m: not less than the standard deviation along any axis.

@@ -1,6 +1,7 @@
 //! What is uncertain of a camera as a whole, beside the noise of each bearing.
 
-use nalgebra::{Matrix2, Matrix2x6, Matrix3x2, Matrix6, Unit, Vector2, Vector3};
+use crossfix_geometry::{BearingModel, tangent_basis};
+use nalgebra::{Matrix2, Matrix2x3, Matrix6, Rotation3, Unit, Vector2, Vector3};
 
 /// What all bearings of an exposure have in common: the uncertainty of its time and of the
 /// camera's pose, and how much worse than it says the camera has been found to be.
@@ -10,71 +11,147 @@ pub(crate) struct CameraUncertainty {
     pub(crate) time_sd_s: f64,
     /// The reported covariances count this many times.
     pub(crate) factor: f64,
-    /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
+    /// Covariance of the pose in the world's axes as declared: rotation (rad), then position (m), ...
     pub(crate) pose: Option<Matrix6<f64>>,
-}
-
-/// A target as a camera sees it.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct View {
-    /// Direction to it, world.
-    pub(crate) direction: Unit<Vector3<f64>>,
-    /// Tangents in which covariances are expressed, world.
-    pub(crate) basis: Matrix3x2<f64>,
-    /// Its range, m.
-    pub(crate) range: f64,
-    /// Speed of the direction on the tangents, rad/s.
-    pub(crate) rate: Vector2<f64>,
+    /// ... and how many times that is what the camera's lines have shown.
+    pub(crate) pose_scale: f64,
+    /// Whether the clock's error is taken for noise of each bearing: where the velocity is not known yet, what
+    /// it shifts the bearings by is not either.
+    pub(crate) clock_is_noise: bool,
+    /// World from camera: the shared errors keep to the camera's axes.
+    pub(crate) axes: Rotation3<f64>,
 }
 
 impl CameraUncertainty {
     /// A camera of exact pose and clock, with the time's standard deviation.
     pub(crate) fn of_time(time_sd_s: f64) -> Self {
-        Self { time_sd_s, factor: 1.0, pose: None }
+        Self {
+            time_sd_s,
+            factor: 1.0,
+            pose: None,
+            pose_scale: 1.0,
+            clock_is_noise: false,
+            axes: Rotation3::identity(),
+        }
     }
 
-    /// Covariance of what pose and clock shift all bearings of the camera by, rad^2: a target that
-    /// moves across the sight line is elsewhere a moment later, and so is one seen from elsewhere.
-    pub(crate) fn common(&self, view: &View) -> Matrix2<f64> {
-        let clock = view.rate * view.rate.transpose() * self.time_sd_s.powi(2);
-        let Some(pose) = self.pose else {
-            return clock;
-        };
-        // A rotation d turns the direction u by d x u; a step c of the camera turns it by -c / range.
-        let turned = view.basis.transpose() * view.direction.cross_matrix();
-        let mut jacobian = Matrix2x6::zeros();
-        jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&-turned);
-        jacobian.fixed_view_mut::<2, 3>(0, 3).copy_from(&(-view.basis.transpose() / view.range));
-        clock + jacobian * pose * jacobian.transpose()
+    /// How the camera's shared errors (two of its pose, one of its clock) shift a
+    /// bearing, rad, each in units of its own deviation: what pose and clock are off by hits every bearing of the camera alike, and more bearings do not average it
+    /// away. `own` is the covariance that the bearing reports.
+    pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Matrix2x3<f64> {
+        let mut shifts = Matrix2x3::zeros();
+        let pose = self.declared_pose(model) * self.pose_scale.sqrt();
+        shifts.fixed_view_mut::<2, 2>(0, 0).copy_from(&pose);
+        if self.time_sd_s > 0.0 && !self.clock_is_noise {
+            shifts.set_column(2, &(model.by_time(velocity) * self.time_sd_s));
+        }
+        shifts
     }
 
-    /// Covariance of a bearing whose own is `own`, rad^2.
-    pub(crate) fn noise(&self, own: &Matrix2<f64>, view: &View) -> Matrix2<f64> {
-        own * self.factor + self.common(view)
+    /// Covariance of what in a bearing is noise, rad^2; `own` is the covariance that it reports.
+    pub(crate) fn noise(
+        &self,
+        model: &BearingModel,
+        velocity: Vector3<f64>,
+        own: &Matrix2<f64>,
+    ) -> Matrix2<f64> {
+        let clock =
+            if self.clock_is_noise { model.by_time(velocity) * self.time_sd_s } else { Vector2::zeros() };
+        own * self.factor + clock * clock.transpose()
     }
+
+    /// What the pose shifts a bearing by as declared: the root of its covariance, rad.
+    pub(crate) fn declared_pose(&self, model: &BearingModel) -> Matrix2<f64> {
+        let by = model.by_pose();
+        self.pose.map_or_else(Matrix2::zeros, |pose| self.root(model, &(by * pose * by.transpose())))
+    }
+
+    /// The root of a covariance on the model's tangents whose columns keep to the camera's axes as the
+    /// direction changes.
+    fn root(&self, model: &BearingModel, covariance: &Matrix2<f64>) -> Matrix2<f64> {
+        let direction = Unit::new_unchecked(self.axes.inverse() * model.direction.into_inner());
+        let turn = model.basis.transpose() * (self.axes.matrix() * tangent_basis(&direction));
+        turn * root(&(turn.transpose() * covariance * turn))
+    }
+
+    /// Covariance of what the shared errors shift a bearing by, rad^2.
+    pub(crate) fn shared(&self, model: &BearingModel, velocity: Vector3<f64>) -> Matrix2<f64> {
+        let shifts = self.shifts(model, velocity);
+        shifts * shifts.transpose()
+    }
+}
+
+/// The lower triangular root of a covariance; of one that is singular, what there is of it.
+fn root(covariance: &Matrix2<f64>) -> Matrix2<f64> {
+    let first = covariance.m11.max(0.0).sqrt();
+    let across = if first > 0.0 { covariance.m12 / first } else { 0.0 };
+    Matrix2::new(first, 0.0, across, (covariance.m22 - across * across).max(0.0).sqrt())
 }
 
 #[cfg(test)]
 mod tests {
-    use crossfix_geometry::tangent_basis;
+    use nalgebra::{Point3, Vector6};
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
 
     #[test]
     fn rotation_position_and_clock_add_what_they_shift() {
-        let direction = Unit::new_normalize(Vector3::new(0.3, 0.8, 0.2));
-        let view =
-            View { direction, basis: tangent_basis(&direction), range: 50.0, rate: Vector2::new(0.2, 0.0) };
+        let direction = Vector3::new(0.3, 0.8, 0.2).normalize();
+        let model = BearingModel::new(Point3::origin(), Point3::from(direction * 50.0)).unwrap();
         let mut pose = Matrix6::zeros();
         for axis in 0..3 {
             pose[(axis, axis)] = 1e-6;
             pose[(axis + 3, axis + 3)] = 0.01;
         }
-        let camera = CameraUncertainty { time_sd_s: 0.01, factor: 4.0, pose: Some(pose) };
-        let noise = camera.noise(&(Matrix2::identity() * 1e-6), &view);
-        // 4 x 1e-6 of its own, 1e-6 of the rotation, (0.1 m / 50 m)^2, and (0.2 rad/s x 0.01 s)^2 on x.
-        assert!((noise.m22 - (4e-6 + 1e-6 + 4e-6)).abs() < 1e-12);
-        assert!((noise.m11 - noise.m22 - 4e-6).abs() < 1e-12);
-        assert!(noise.m12.abs() < 1e-12);
+        let camera = CameraUncertainty {
+            time_sd_s: 0.01,
+            factor: 4.0,
+            pose: Some(pose),
+            clock_is_noise: false,
+            pose_scale: 1.0,
+            axes: Rotation3::identity(),
+        };
+        // 10 m/s along the first tangent: 0.2 rad/s.
+        let velocity = model.basis.column(0) * 10.0;
+        let shared = camera.shared(&model, velocity);
+        // 1e-6 of the rotation, (0.1 m / 50 m)^2, and (0.2 rad/s x 0.01 s)^2 on the first tangent.
+        assert!((shared.m22 - (1e-6 + 4e-6)).abs() < 1e-12);
+        assert!((shared.m11 - shared.m22 - 4e-6).abs() < 1e-12);
+        assert!(shared.m12.abs() < 1e-12);
+    }
+
+    /// A calibration from landmarks ties rotation to position: a camera thought to stand too far left is
+    /// turned too far right. Drawn from such a covariance, bearings scatter as `shared` says.
+    #[test]
+    fn a_correlated_pose_shifts_bearings_as_a_thousand_drawn_poses_do() {
+        const RUNS: usize = 4000;
+        let (origin, place) = (Point3::new(5.0, 0.0, 2.0), Point3::new(10.0, 60.0, 12.0));
+        let model = BearingModel::new(origin, place).unwrap();
+        // Landmarks 40 m away: a position error c is made up for by a rotation about the vertical.
+        let mut factor = Matrix6::<f64>::identity() * 2e-4;
+        factor[(3, 3)] = 0.2;
+        factor[(2, 3)] = 0.2 / 40.0;
+        let pose = factor * factor.transpose();
+        let camera = CameraUncertainty { pose: Some(pose), ..CameraUncertainty::of_time(0.0) };
+        let expected = camera.shared(&model, Vector3::zeros());
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        let mut sum = Matrix2::zeros();
+        for _ in 0..RUNS {
+            let drawn = Vector6::from_fn(|_, _| StandardNormal.sample(&mut random));
+            let error = factor * drawn;
+            let turned = Rotation3::new(error.fixed_rows::<3>(0).into_owned());
+            let seen = turned.inverse() * (place - origin - error.fixed_rows::<3>(3)).normalize();
+            let offset = model.basis.transpose() * seen;
+            sum += offset * offset.transpose();
+        }
+        let found = sum / RUNS as f64;
+        // A variance of n draws is known to sqrt(2 / n) of itself.
+        let tolerance = 4.0 * (2.0 / RUNS as f64).sqrt() * expected.trace();
+        assert!((found - expected).norm() < tolerance, "{found} {expected}");
+        // With the wrong sign of the position it would be several times as large.
+        assert!(expected.trace().sqrt() < 0.6 * (0.2 / 40.0), "{}", expected.trace().sqrt());
     }
 }

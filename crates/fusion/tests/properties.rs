@@ -87,6 +87,7 @@ fn scaled_config(s: f64, u: f64) -> FusionConfig {
     let initiation = &mut config.initiation;
     initiation.birth_density_per_m3 /= s.powi(3);
     initiation.period_s *= u;
+    initiation.pair_s *= u;
     initiation.velocity_prior_sd_mps *= s / u;
     initiation.max_range_m *= s;
     let tracking = &mut config.tracking;
@@ -94,6 +95,7 @@ fn scaled_config(s: f64, u: f64) -> FusionConfig {
         model.acceleration_density *= s.powi(2) / u.powi(3);
     }
     tracking.switching_rate_per_s /= u;
+    tracking.habit_rate_per_s /= u;
     tracking.coasting_after_s *= u;
     tracking.lost_after_s *= u;
     tracking.max_position_sd_m *= s;
@@ -160,8 +162,8 @@ proptest! {
     }
 
     /// The state of the clocks is against the camera that was heard first, whatever it is called; but
-    /// sums over all cameras go by their names. A window's information (in m^2 and s^2) has a condition
-    /// of some 1e9: rounding of 1e-16 is up to 1e-7 of a standard deviation.
+    /// sums over all cameras go by their names, and so do those over what ties a track to their errors. A window's information (in m^2 and s^2) has a condition
+    /// of some 1e9: rounding of 1e-16 is up to some 1e-7 of a standard deviation.
     #[test]
     fn nor_does_it_where_clocks_are_unsure(
         names in Just(["a", "m", "z"]).prop_shuffle(),

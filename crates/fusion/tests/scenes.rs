@@ -212,21 +212,26 @@ fn drawn(density: f64, seconds: f64, seed: u64) -> Path {
 }
 
 /// Mean NEES at the end of ten seconds of flights drawn from the filter's own model, and the mean
-/// variance of a position, m^2.
+/// variance of a position, m^2. One flight in twenty may hang in the air before two cameras as a tree stands
+/// there: that is not found.
 fn honesty(eyes: &[Eye]) -> (f64, f64) {
     const RUNS: u32 = 200;
     const DENSITY: f64 = 0.3;
     let mut config = FusionConfig::default();
     config.tracking.manoeuvres = Manoeuvres::None;
     config.tracking.acceleration_density = DENSITY;
-    let (mut nees, mut variance) = (0.0, 0.0);
+    let (mut nees, mut variance, mut found) = (0.0, 0.0, 0.0);
     for seed in 0..u64::from(RUNS) {
         let scene = Scene { eyes: eyes.to_vec(), ..good_day(vec![drawn(DENSITY, 10.1, seed)], 10.0) };
         let mut flight = Flight::with(config.clone(), scene, 1000 + seed, |_| true);
-        nees += flight.until(10.0).nees(0);
-        variance += flight.track(0).unwrap().state().position_covariance().trace() / 3.0;
+        if let Some(track) = flight.until(10.0).track(0) {
+            variance += track.state().position_covariance().trace() / 3.0;
+            nees += flight.nees(0);
+            found += 1.0;
+        }
     }
-    (nees / f64::from(RUNS), variance / f64::from(RUNS))
+    assert!(found >= 0.95 * f64::from(RUNS), "{found}");
+    (nees / found, variance / found)
 }
 
 #[test]

@@ -29,6 +29,7 @@ mod camera;
 mod error;
 mod fisheye;
 mod geodetic;
+mod model;
 mod pose;
 mod scanning;
 
@@ -36,5 +37,6 @@ pub use bearing::{Bearing, SightLine, tangent_basis};
 pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};
+pub use model::BearingModel;
 pub use pose::Pose;
 pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};

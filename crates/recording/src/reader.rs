@@ -241,6 +241,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         handle: &mut impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<Result<(), String>, ReadFailure<E>> {
         match opcode {
+            // What is written in chunks has no message beside them: it is another record, damaged.
+            op::MESSAGE if self.sure_until > 0 => Ok(Err("a message lies between chunks".to_owned())),
             op::CHANNEL | op::MESSAGE => self.take_inner(opcode, body, handle),
             op::METADATA => {
                 let texts = Texts::read(body);

@@ -93,6 +93,8 @@ fn one_wrong_bit_anywhere_costs_one_chunk_at_most_and_is_said() {
         let (entries, report) = read(&bytes).unwrap();
         let lost = chunks.iter().position(|chunk| chunk.contains(&at));
         let left = lost.map_or(0..0, |chunk| 10 * chunk as u64..10 * (chunk as u64 + 1));
+        let torn = entries.iter().filter(|e| decode::<BearingFrame>(&e.data).is_err()).count();
+        assert_eq!(torn, 0, "byte {at} of {}, chunks {chunks:?}: {report:?}", whole.len());
         let got = sequences(&entries);
         assert!(got == but(left.clone()) || got == but(0..0), "byte {at}: {got:?}");
         // A chunk's times, which nobody needs to read it, have no checksum.

@@ -247,7 +247,9 @@ impl SimulatedSite {
 
     /// What a fusion centre has to know of every camera.
     pub fn calibrations(&self) -> Vec<CameraCalibration> {
-        let message = |c: &SiteCamera| CameraCalibration::new(&c.name, &c.camera, Timestamp::EPOCH);
+        let message = |c: &SiteCamera| {
+            CameraCalibration::new(&c.name, &c.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
+        };
         self.cameras.iter().map(message).collect()
     }
 

@@ -10,7 +10,8 @@ use crate::recorded::{self, Lacks};
 
 /// Write the confirmed tracks of a recording as a table.
 ///
-/// Columns t,track_id,x,y,z,vx,vy,vz: seconds since the Unix epoch, metres, metres a second. With
+/// Columns t,track_id,x,y,z,vx,vy,vz,sd_m: seconds since the Unix epoch, metres, metres a second, and the root
+/// of the sum of the position's variances, metres. With
 /// --times, the state of each track at those times from its last frame at or before them,
 /// extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
@@ -51,12 +52,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let draft = Draft::new(&args.csv, &inputs)?;
     let mut writer = csv::Writer::from_path(draft.path())
         .with_context(|| format!("cannot write {}", args.csv.display()))?;
-    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz"])?;
+    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "sd_m"])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
         for Estimate { id, state } in estimates {
             let mut record = vec![format!("{time:.9}"), id.to_string()];
             record.extend(state.mean.iter().map(|value| format!("{value:.6}")));
+            record.push(format!("{:.6}", state.position_covariance().trace().sqrt()));
             writer.write_record(&record)?;
             rows += 1;
         }

@@ -84,7 +84,8 @@ fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Resul
     let site: SiteName = "simulation".parse()?;
     let mut entries = Vec::new();
     for (index, camera) in world.cameras().iter().enumerate() {
-        let calibration = CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH);
+        let calibration =
+            CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH).with_pose_sd(0.0, 0.0);
         let key = Key::new(site.clone(), Channel::Calibration(camera.name().clone()));
         entries.push(imported(key, Timestamp::EPOCH, calibration.encode()));
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

@@ -77,7 +77,9 @@ fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry
         cy: 1499.5,
         distortion: Distortion::None,
     };
-    let message = CameraCalibration::new(&name, &Camera::new(intrinsics, pose)?, Timestamp::EPOCH);
+    // The format's poses are the truth.
+    let message = CameraCalibration::new(&name, &Camera::new(intrinsics, pose)?, Timestamp::EPOCH)
+        .with_pose_sd(0.0, 0.0);
     Ok(imported(Key::new(site.clone(), Channel::Calibration(name)), Timestamp::EPOCH, message.encode()))
 }
 

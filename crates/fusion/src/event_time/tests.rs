@@ -8,6 +8,7 @@ fn exposure(camera: &str, time_s: f64) -> Exposure {
         sequence: 0,
         time: Timestamp::from_seconds(time_s),
         uncertainty: crate::uncertainty::CameraUncertainty::of_time(0.0),
+        clutter_per_sr: 1.0,
         correction_s: 0.0,
         sightings: vec![],
     }
@@ -301,7 +302,7 @@ fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
         basis: nalgebra::Matrix3x2::identity(),
         covariance: nalgebra::Matrix2::identity(),
     };
-    let sighting = crate::Sighting { image_track: 1, line };
+    let sighting = crate::Sighting { image_track: 1, line, rooted: crate::rooted::Rooted::Unknown };
     Exposure { sightings: vec![sighting; sightings], ..exposure(camera, time_s) }
 }
 

@@ -5,6 +5,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Unit, Vector3};
 
 use crate::prediction::{BearingPrediction, log_density};
+use crate::spatial::TYPICAL_SPEED;
 use crate::watch::independent_share;
 
 /// Logarithm of the probability that a camera is blind for a target that it should see.
@@ -125,7 +126,7 @@ impl Coincidence {
     pub(super) fn see(
         &mut self,
         camera: &CameraName,
-        (line, time): (&SightLine, Timestamp),
+        (line, time, time_sd_s): (&SightLine, Timestamp, f64),
         prediction: &BearingPrediction,
         (density, speed): (f64, f64),
         first_ratio: f64,
@@ -138,7 +139,10 @@ impl Coincidence {
         };
         sight.predict(time, density / range.powi(2));
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
-        self.vague |= sight.shift_variance.is_some_and(|v| v > VAGUE * line.covariance.trace() / 2.0);
+        // What an unsure clock shifts a bearing by is not known before the velocity is.
+        let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
+        let shift = sight.shift_variance.map_or(clock, |variance| variance.max(clock));
+        self.vague |= shift > VAGUE * line.covariance.trace() / 2.0;
         sight.update(line);
     }
 

@@ -60,7 +60,12 @@ impl Grouped {
 fn start(group: &Group, motion: &Motion) -> Option<Track> {
     let (fix, later) = starting_point(group)?;
     let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
-    let named = group.fixes.first()?.lines.iter().map(|((camera, ..), line)| (camera, line));
+    let named = group
+        .fixes
+        .first()?
+        .lines
+        .iter()
+        .map(|((camera, ..), line)| (camera, line, CameraUncertainty::of_time(0.0)));
     let mut track = Track::start(&vague, named, motion);
     for ((camera, ..), timed) in later {
         track.measurement_update(

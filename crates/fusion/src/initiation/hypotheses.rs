@@ -13,8 +13,8 @@ use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::{Fix, Observability, VelocityKnowledge};
 use crate::temporal::LineId;
-use crate::track::{MAX_PAIR_SD_M, Track, TrackId, TrackStatus};
-use crate::tracker::{log_likelihood_ratio, same_target};
+use crate::track::{Expectation, Track, TrackId, TrackStatus};
+use crate::tracker::{log_likelihood_ratio, missed, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
@@ -140,7 +140,7 @@ impl Hypotheses {
         self.hypotheses
             .retain(|h| h.cameras().len() >= 2 && h.coincidence.log_ratio().is_none_or(|r| r > LEAST_SCORE));
         let seeds = self.finder.find(exposures, cameras);
-        self.begin(seeds, motion);
+        self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
         now.map_or_else(Vec::new, |now| self.confirm(now, motion))
@@ -149,23 +149,24 @@ impl Hypotheses {
     /// Lets every hypothesis go on with each bearing in its gate, and without any.
     fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &Motion) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
-        // The lines have the camera's factor in their covariances already.
-        let uncertainty = CameraUncertainty { factor: 1.0, ..exposure.uncertainty };
-        let miss = (1.0 - self.tracking.detection_probability).ln();
+        let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
+        let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for mut hypothesis in self.hypotheses.drain(..) {
             let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
-            let prediction = hypothesis.track.bearing_prediction(
+            let prediction = hypothesis.track.expectation(
                 exposure.time,
-                known.camera.pose().position(),
+                (&exposure.camera, known.camera.pose().position()),
                 &uncertainty,
                 motion,
             );
+            let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
+            let miss = missed(visible, detection);
             let ratio = |(i, (_, line)): (usize, &NamedLine)| {
                 let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
-                Some((log_likelihood_ratio(&fit, &self.tracking), i))
+                Some((log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr), i))
             };
             let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
             near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
@@ -176,10 +177,11 @@ impl Hypotheses {
                 let time = (exposure.time, &uncertainty);
                 if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
                     child.track.score += ratio;
-                    if let Some(prediction) = &prediction {
+                    child.track.look(&exposure.camera, exposure.time, true, detection, motion);
+                    if let Some(Expectation::Near(prediction)) = &prediction {
                         child.coincidence.see(
                             &exposure.camera,
-                            (&line.line, exposure.time),
+                            (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
                             prediction,
                             (density, self.speed),
                             ratio,
@@ -191,7 +193,8 @@ impl Hypotheses {
             }
             if expected {
                 hypothesis.track.score += miss;
-                hypothesis.coincidence.miss(&exposure.camera, miss, interval_s);
+                hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
+                hypothesis.coincidence.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
             }
             next.push(hypothesis);
         }
@@ -217,7 +220,13 @@ impl Hypotheses {
     }
 
     /// Begins a hypothesis with every seed.
-    fn begin(&mut self, seeds: Vec<Seed>, motion: &Motion) {
+    fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &Motion) {
+        let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
+            .iter()
+            .map(|exposure| {
+                (&exposure.camera, CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty })
+            })
+            .collect();
         for seed in seeds {
             let Some(time) = seed.time() else {
                 continue;
@@ -227,7 +236,10 @@ impl Hypotheses {
             // Eigenvalues cost more than all the rest: they are for those that are confirmed.
             let observability = Observability::unexamined(6);
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
-            let named = seed.lines.iter().map(|((camera, ..), line)| (camera, line));
+            let named = seed
+                .lines
+                .iter()
+                .filter_map(|((camera, ..), line)| Some((camera, line, *uncertainty.get(camera)?)));
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
             let lines = seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
@@ -272,7 +284,7 @@ impl Hypotheses {
                 let hypothesis = &self.hypotheses[i];
                 // Lines of two targets that two cameras see one each may cross for a while.
                 let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
-                    && hypothesis.track.position_sd() <= MAX_PAIR_SD_M;
+                    && hypothesis.track.is_placed();
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
                 let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= COINCIDENCE_MARGIN);
                 let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;

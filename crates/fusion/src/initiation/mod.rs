@@ -13,16 +13,15 @@ mod selection;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crossfix_geometry::SightLine;
+use crossfix_geometry::BearingModel;
 use crossfix_message::CameraName;
-use nalgebra::Vector2;
+use nalgebra::Vector3;
 
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::spatial::TimedLine;
 use crate::temporal::LineId;
 use crate::track::{Track, TrackId};
-use crate::uncertainty::View;
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 
 use grouped::Grouped;
@@ -98,9 +97,8 @@ impl Initiator {
 fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
-        let line = SightLine { covariance: line.covariance * exposure.uncertainty.factor, ..*line };
         let time_sd_s = exposure.uncertainty.time_sd_s;
-        (id, TimedLine { line, time: exposure.time, time_sd_s, origin_sd_m: 0.0 })
+        (id, TimedLine { line: *line, time: exposure.time, time_sd_s, origin_sd_m: 0.0 })
     })
 }
 
@@ -111,13 +109,9 @@ fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ 
     let origin_sd_m = pose.map_or(0.0, |pose| (pose.fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());
     lines_of(exposure).map(move |(id, mut timed)| {
         let line = &mut timed.line;
-        let at_infinity = View {
-            direction: line.direction,
-            basis: line.basis,
-            range: f64::INFINITY,
-            rate: Vector2::zeros(),
-        };
-        line.covariance += exposure.uncertainty.common(&at_infinity);
+        let at_infinity = BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
+        line.covariance *= exposure.uncertainty.factor;
+        line.covariance += exposure.uncertainty.shared(&at_infinity, Vector3::zeros());
         (id, TimedLine { origin_sd_m, ..timed })
     })
 }

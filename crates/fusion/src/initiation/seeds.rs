@@ -9,7 +9,8 @@ use crossfix_message::{CameraName, Timestamp};
 use super::{NamedLine, lines_with_pose};
 use crate::ingress::KnownCamera;
 use crate::prediction::BearingPrediction;
-use crate::spatial::{MapSolution, TimedLine, chi_square, map};
+use crate::rooted::Rooted;
+use crate::spatial::{MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::temporal::LineId;
 use crate::{Exposure, FusionConfig, Initiation};
 
@@ -53,7 +54,6 @@ impl Seed {
 pub(super) struct SeedFinder {
     initiation: Initiation,
     detection_probability: f64,
-    clutter_per_sr: f64,
     line_gate: Gate,
     /// The largest sum of squares of n true lines, by n, with the gate's probability.
     set_gates: Vec<f64>,
@@ -80,7 +80,6 @@ impl SeedFinder {
         Self {
             initiation,
             detection_probability: config.tracking.detection_probability,
-            clutter_per_sr: config.tracking.clutter_per_sr,
             line_gate,
             set_gates,
             least_cameras,
@@ -106,6 +105,12 @@ impl SeedFinder {
                     tried += 1;
                     let enough = tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
                     if settled[a][i] || settled[b][j] || enough {
+                        continue;
+                    }
+                    let both = |rooted| {
+                        [(a, i), (b, j)].iter().all(|&(k, l)| exposures[k].sightings[l].rooted == rooted)
+                    };
+                    if both(Rooted::Yes) && exposures.len() == 2 {
                         continue;
                     }
                     if !self.pass_closely(&lines[a][i].1, &lines[b][j].1) {
@@ -240,7 +245,8 @@ impl SeedFinder {
         }
         let apart = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
         let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
-        let between = second.time.seconds_since(first.time).abs() + first.time_sd_s + second.time_sd_s;
+        let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);
+        let between = second.time.seconds_since(first.time).abs() + unsure;
         let motion = self.initiation.velocity_prior_sd_mps * between;
         apart <= SIGMAS * (noise + motion)
     }
@@ -264,7 +270,7 @@ impl SeedFinder {
         if !known.expects(state.position(), self.initiation.max_range_m) {
             return Vec::new();
         }
-        let moved = self.initiation.velocity_prior_sd_mps * first.time_sd_s;
+        let moved = self.initiation.velocity_prior_sd_mps * TYPICAL_SPEED * first.time_sd_s;
         let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
             return Vec::new();
         };
@@ -278,7 +284,7 @@ impl SeedFinder {
 
     /// The seed of a set, if it is possible at all.
     fn seed(&self, growing: &Growing<'_>, places: &[(usize, usize)], solution: MapSolution) -> Option<Seed> {
-        if places.len() < self.least_cameras {
+        if places.len() < self.least_cameras || is_rooted(growing, places) {
             return None;
         }
         let mut lines: Vec<NamedLine> = places.iter().map(|&(k, l)| growing.lines[k][l].clone()).collect();
@@ -296,13 +302,14 @@ impl SeedFinder {
                     .get(&exposure.camera)
                     .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
         });
-        let score = self.log_evidence(&lines, &solution)?
+        let false_alarms: f64 = places.iter().map(|&(k, _)| growing.exposures[k].clutter_per_sr.ln()).sum();
+        let score = self.log_evidence(&lines, &solution)? - false_alarms
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
         (score > self.least_score).then_some(Seed { lines, solution, score })
     }
 
-    /// Log-likelihood ratio of the lines being a new target's against their being clutter: the
-    /// density of new targets times the integral over all positions and velocities.
+    /// Logarithm of the density of the lines as a new target's: the density of new targets times the
+    /// integral over all positions and velocities.
     fn log_evidence(&self, lines: &[NamedLine], solution: &MapSolution) -> Option<f64> {
         let factor = solution.state.covariance.cholesky()?;
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
@@ -314,10 +321,18 @@ impl SeedFinder {
         for (_, timed) in lines {
             let noise = timed.noise_at((position - timed.line.origin).norm(), speed);
             let density = (2.0 * PI).ln() + noise.determinant().ln() / 2.0;
-            evidence += (self.detection_probability / self.clutter_per_sr).ln() - density;
+            evidence += self.detection_probability.ln() - density;
         }
         evidence.is_finite().then_some(evidence)
     }
+}
+
+/// Whether lines are of things that stand in their cameras' views for good. Of a camera that has only begun to
+/// look nobody can say: then three must agree.
+fn is_rooted(growing: &Growing<'_>, places: &[(usize, usize)]) -> bool {
+    let rooted = || places.iter().map(|&(k, l)| growing.exposures[k].sightings[l].rooted);
+    rooted().all(|rooted| rooted == Rooted::Yes)
+        || (places.len() == 2 && rooted().any(|rooted| rooted == Rooted::Unknown))
 }
 
 fn ids(seed: &Seed) -> Vec<LineId> {

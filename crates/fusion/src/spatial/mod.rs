@@ -58,10 +58,10 @@ impl TimedLine {
         Self { line, time, time_sd_s: 0.0, origin_sd_m: 0.0 }
     }
 
-    /// Covariance of the direction to a target at `range` that moves at `speed` (m/s an axis): the
-    /// line's own, and what the uncertainty of its time and origin adds.
-    pub(crate) fn noise_at(&self, range: f64, speed: f64) -> Matrix2<f64> {
-        let variance = (speed * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
+    /// Covariance of the direction to a target at `range` whose velocity has a prior of `velocity_sd` (m/s an
+    /// axis): the line's own, and what the uncertainty of its time and origin adds.
+    pub(crate) fn noise_at(&self, range: f64, velocity_sd: f64) -> Matrix2<f64> {
+        let variance = (velocity_sd * TYPICAL_SPEED * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
         self.line.covariance + Matrix2::identity() * (variance / range.powi(2))
     }
 }
@@ -105,6 +105,10 @@ pub enum VelocityKnowledge {
     /// The solver does not solve for it.
     Unknown,
 }
+
+/// How fast most targets are, as a share of the velocity prior, which is wide enough for the fastest: what an
+/// unsure clock moves a line by. With the whole of it the lines of unsure clocks would meet anywhere.
+pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 
 /// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s an axis.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;

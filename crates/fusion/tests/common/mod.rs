@@ -79,7 +79,7 @@ pub fn fusion_of(config: FusionConfig, eyes: &[Eye]) -> Fusion {
 
 /// The message that makes a camera known.
 pub fn calibration(eye: &Eye) -> CameraCalibration {
-    CameraCalibration::new(&eye.name, &eye.camera, Timestamp::EPOCH)
+    CameraCalibration::new(&eye.name, &eye.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
 }
 
 /// The confirmed track within three metres of a path at its own time, the nearest if there are more.

@@ -19,7 +19,7 @@ use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, t
 
 /// Mean NEES of position and velocity where the covariance is honest: what 4000 runs leave to chance.
 const HONEST: Limit = Limit::Near { value: 6.0, tolerance: 0.15 };
-/// Standard deviation of the batch solution's prior on the velocity, m/s: the fusion's default.
+/// Standard deviation of the prior on the velocity, m/s, of the batch solution and of the fusion.
 const PRIOR_SD: f64 = 15.0;
 /// An error of so many of its own standard deviations, or of so many metres, has diverged.
 const DIVERGED_SDS: f64 = 10.0;
@@ -107,9 +107,12 @@ impl Outcome {
 /// The messages of a flight through the whole fusion with its default configuration; the last track
 /// frame's confirmed track, the nearest one if there are several.
 fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
-    let mut fusion = Fusion::new(FusionConfig::default()).ok()?;
+    let mut config = FusionConfig::default();
+    config.initiation.velocity_prior_sd_mps = PRIOR_SD;
+    let mut fusion = Fusion::new(config).ok()?;
     for (name, camera) in cameras {
-        fusion.calibrate(&CameraCalibration::new(name, camera, Timestamp::EPOCH)).ok()?;
+        let exact = CameraCalibration::new(name, camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0);
+        fusion.calibrate(&exact).ok()?;
     }
     let mut outputs = Vec::new();
     for seen in &flight.seen {

@@ -196,12 +196,12 @@ fn densities() -> impl Iterator<Item = f64> {
 
 /// All methods, tuned for a noise.
 fn methods(deviation: f64, seed: u64) -> Vec<Method> {
-    let model = |density, share| MotionModel { density, share };
+    let model = |density, share| MotionModel { density, share, habit: 0 };
     let mut mixtures = Vec::new();
     for quiet in densities() {
         for lively in densities().filter(|lively| *lively >= 10.0 * quiet) {
             // A leg in ten to twenty frames ends.
-            let models = MotionModels::new(&[model(quiet, 0.9), model(lively, 0.1)], 1.0);
+            let models = MotionModels::new(&[model(quiet, 0.9), model(lively, 0.1)], 1.0, 1.0);
             mixtures.extend(models.map(Method::Imm));
         }
     }

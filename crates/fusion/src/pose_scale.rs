@@ -1,0 +1,144 @@
+//! How good the cameras' poses are, against what is declared of them, by how well their sight lines meet.
+//!
+//! Each camera's bearings of a target are off by what its pose is off by; where the target is nobody knows
+//! beforehand. What is left of the lines when the best place is taken out tells how large the cameras' errors
+//! are, and whose: their variances are found by minorising and maximising their likelihood (REML of variance
+//! components), a step a draw. Where nobody has declared a pose's deviation, a careful survey's is where it begins. A clock
+//! that is off by more than its camera says looks like a pose that is.
+
+use std::collections::BTreeMap;
+
+use crossfix_message::CameraName;
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+/// The share of a draw in the running means, once there are enough. A draw lasts a third of a second: they
+/// remember some two seconds of one target. With half of it a site would be a minute in learning what it is
+/// worth.
+const DRAW_SHARE: f64 = 0.15;
+/// The power of the ratio by which a step goes: the square root is the algorithm's for one batch, and its root
+/// as the means follow late.
+const STEP: f64 = 0.25;
+/// Cameras of one site have been surveyed alike: each step takes their factors (logarithms) closer to the
+/// median by this share. Without it two of four cameras would be taken to be perfect, and the others for worse
+/// than they are: the lines tell of fewer errors than there are.
+const ALIKE: f64 = 0.05;
+/// Fewer cameras cannot tell whose error it is: two lines that miss each other accuse nobody.
+const LEAST_ACCUSERS: usize = 3;
+/// No pose is known better than this share (variance) of a careful survey: a hundredth of a milliradian.
+const LEAST: f64 = 1e-4;
+/// No pose is worse than this many times (variance) what is said of it and still a pose.
+const MOST: f64 = 1e6;
+/// Nor is one that is declared.
+const DECLARED_MOST: f64 = 4.0;
+/// A camera whose errors are this many times (variance) what is declared of them is doubted.
+const DOUBTED: f64 = 9.0;
+/// Estimates that move by less than this (logarithm) change no track.
+const NOTICED: f64 = 0.1;
+
+/// What a camera has seen of a target within a draw.
+#[derive(Clone, Debug)]
+pub(crate) struct Sample {
+    pub(crate) camera: CameraName,
+    /// Mean offset of its bearings from the track, rad.
+    pub(crate) offset: Vector2<f64>,
+    /// How the offset changes with the place, rad/m.
+    pub(crate) by_position: Matrix2x3<f64>,
+    /// Covariance of the mean offset for noise alone, rad^2.
+    pub(crate) noise: Matrix2<f64>,
+    /// What the pose shifts it by as declared: the root of its covariance, rad.
+    pub(crate) pose: Matrix2<f64>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Scale {
+    value: f64,
+    /// What the tracks know of it.
+    told: f64,
+    /// Not less: a declared pose is not made better than it says.
+    least: f64,
+    greatest: f64,
+    draws: f64,
+    /// Running means of what the camera's errors are, and of what they should be.
+    found: f64,
+    expected: f64,
+}
+
+/// What each camera's pose covariance is to be multiplied with.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct PoseScales {
+    scales: BTreeMap<CameraName, Scale>,
+}
+
+impl PoseScales {
+    /// Makes a camera known, or known anew where it has been moved.
+    pub(crate) fn calibrate(&mut self, camera: &CameraName, is_declared: bool) {
+        let (least, greatest) = if is_declared { (1.0, DECLARED_MOST) } else { (LEAST, MOST) };
+        self.scales.insert(
+            camera.clone(),
+            Scale { value: 1.0, told: 1.0, least, greatest, draws: 0.0, found: 0.0, expected: 0.0 },
+        );
+    }
+
+    /// The factor on a camera's pose covariance.
+    pub(crate) fn of(&self, camera: &CameraName) -> f64 {
+        self.scales.get(camera).map_or(1.0, |scale| scale.told)
+    }
+
+    /// Whether a camera's lines miss the others' by far more than is declared of it.
+    pub(crate) fn is_doubted(&self, camera: &CameraName) -> bool {
+        self.of(camera) > DOUBTED
+    }
+
+    /// Takes a draw in; returns the cameras whose factor has changed, each with the ratio.
+    pub(crate) fn learn(&mut self, samples: &[Sample]) -> Vec<(CameraName, f64)> {
+        let Some(found) = self.found_and_expected(samples) else {
+            return Vec::new();
+        };
+        let mut logarithms: Vec<f64> =
+            samples.iter().filter_map(|sample| Some(self.scales.get(&sample.camera)?.value.ln())).collect();
+        logarithms.sort_unstable_by(f64::total_cmp);
+        let typical = logarithms.get(logarithms.len() / 2).copied().unwrap_or(0.0);
+        let mut changed = Vec::new();
+        for (sample, (found, expected)) in samples.iter().zip(found) {
+            let scale = self.scales.get_mut(&sample.camera);
+            if let Some(scale) = scale.filter(|_| found.is_finite() && expected > 0.0) {
+                scale.draws += 1.0;
+                let share = scale.draws.recip().max(DRAW_SHARE);
+                scale.found += (found - scale.found) * share;
+                scale.expected += (expected - scale.expected) * share;
+                let step = (scale.found / scale.expected).powf(STEP);
+                let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { f64::INFINITY };
+                let like_others = (ALIKE * (typical - scale.value.ln())).exp();
+                scale.value = (scale.value * like_others * step.min(most)).clamp(scale.least, scale.greatest);
+                let ratio = scale.value / scale.told;
+                if ratio.ln().abs() > NOTICED {
+                    scale.told = scale.value;
+                    changed.push((sample.camera.clone(), ratio));
+                }
+            }
+        }
+        changed
+    }
+
+    /// By each camera's factor: what of a draw its pose error explains, and what it should explain.
+    fn found_and_expected(&self, samples: &[Sample]) -> Option<Vec<(f64, f64)>> {
+        let scale = |sample: &Sample| self.scales.get(&sample.camera).map_or(1.0, |scale| scale.value);
+        let weight = |s: &Sample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
+        let weights: Vec<Matrix2<f64>> = samples.iter().map(weight).collect::<Option<_>>()?;
+        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
+        for (sample, weight) in samples.iter().zip(&weights) {
+            let weighed = sample.by_position.transpose() * weight;
+            information += weighed * sample.by_position;
+            pull += weighed * sample.offset;
+        }
+        let spread = information.try_inverse()?;
+        let place = spread * pull;
+        let of_camera = |(sample, weight): (&Sample, &Matrix2<f64>)| {
+            let Sample { offset, by_position, pose, .. } = sample;
+            let error = pose.transpose() * weight * (offset - by_position * place);
+            let told = weight - weight * by_position * spread * by_position.transpose() * weight;
+            (error.norm_squared() * scale(sample), (pose.transpose() * told * pose).trace() * scale(sample))
+        };
+        Some(samples.iter().zip(&weights).map(of_camera).collect())
+    }
+}

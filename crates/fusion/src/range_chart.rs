@@ -1,0 +1,179 @@
+//! The coordinates in which one camera's bearings leave the range alone.
+//!
+//! Seen from a camera that stands still, a target at twice the distance and twice the speed gives the same
+//! bearings for ever. In Cartesian coordinates that direction of the state turns with every update, and a
+//! linearised filter takes the difference for knowledge: within seconds it is sure of a range that no
+//! bearing holds. In the direction, the logarithm of the range, and the velocity as a share of the range, it
+//! is one axis that never turns, a bearing is a linear measurement of the two others, and an uncertain range
+//! is nearly Gaussian.
+
+use crossfix_filter::KinematicState;
+use nalgebra::{Matrix3, Matrix3x2, Matrix6, Point3, Unit, Vector3, Vector6};
+
+/// Coordinates of a target's state about one state.
+// Made and used in one update: never stored, so the size of the larger variant costs nothing.
+#[allow(clippy::large_enum_variant)]
+#[derive(Clone, Debug)]
+pub(crate) enum Chart {
+    /// Position and velocity: where several cameras hold the target in its place.
+    Cartesian(KinematicState),
+    /// Where one camera alone follows it.
+    ByRange(RangeChart),
+}
+
+/// Direction (two tangents, rad), logarithm of the range, and velocity by range (1/s, world's axes), as
+/// differences from those of one state, seen from one place.
+#[derive(Clone, Debug)]
+pub(crate) struct RangeChart {
+    origin: Point3<f64>,
+    direction: Unit<Vector3<f64>>,
+    tangents: Matrix3x2<f64>,
+    range: f64,
+    /// Velocity by range, 1/s.
+    share: Vector3<f64>,
+}
+
+/// A point of the chart in the world.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ChartPoint {
+    pub(crate) place: Point3<f64>,
+    pub(crate) velocity: Vector3<f64>,
+    /// How the place changes with the first three coordinates.
+    pub(crate) place_by: Matrix3<f64>,
+    /// How position and velocity change with the coordinates.
+    pub(crate) state_by: Matrix6<f64>,
+}
+
+impl Chart {
+    /// Of a state that several cameras hold.
+    pub(crate) fn cartesian(state: &KinematicState) -> Self {
+        Self::Cartesian(state.clone())
+    }
+
+    /// About a state, as seen from `origin`; `None` if the state lies there.
+    pub(crate) fn by_range(origin: Point3<f64>, state: &KinematicState) -> Option<Self> {
+        RangeChart::new(origin, state).map(Self::ByRange)
+    }
+
+    /// How the coordinates change with position and velocity at the chart's own state.
+    pub(crate) fn by_state(&self) -> Matrix6<f64> {
+        match self {
+            Self::Cartesian(_) => Matrix6::identity(),
+            Self::ByRange(chart) => chart.by_state(),
+        }
+    }
+
+    /// The point of some coordinates.
+    pub(crate) fn point(&self, coordinates: &Vector6<f64>) -> ChartPoint {
+        match self {
+            Self::Cartesian(state) => ChartPoint {
+                place: state.position() + coordinates.fixed_rows::<3>(0),
+                velocity: state.velocity() + coordinates.fixed_rows::<3>(3),
+                place_by: Matrix3::identity(),
+                state_by: Matrix6::identity(),
+            },
+            Self::ByRange(chart) => chart.point(coordinates),
+        }
+    }
+
+    /// The coordinate along the sight line at which this passes nearest to a line; `None` if that lies behind
+    /// either camera, or there is no such coordinate.
+    pub(crate) fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
+        match self {
+            Self::Cartesian(_) => None,
+            Self::ByRange(chart) => chart.nearest_to(line),
+        }
+    }
+}
+
+impl RangeChart {
+    fn new(origin: Point3<f64>, state: &KinematicState) -> Option<Self> {
+        let (direction, range) = Unit::try_new_and_get(state.position() - origin, 1e-6)?;
+        let tangents = crossfix_geometry::tangent_basis(&direction);
+        Some(Self { origin, direction, tangents, range, share: state.velocity() / range })
+    }
+
+    fn by_state(&self) -> Matrix6<f64> {
+        let mut by = Matrix6::zeros();
+        let along = self.direction.transpose() / self.range;
+        by.fixed_view_mut::<2, 3>(0, 0).copy_from(&(self.tangents.transpose() / self.range));
+        by.fixed_view_mut::<1, 3>(2, 0).copy_from(&along);
+        by.fixed_view_mut::<3, 3>(3, 0).copy_from(&(-self.share * along));
+        by.fixed_view_mut::<3, 3>(3, 3).fill_with_identity();
+        by.fixed_view_mut::<3, 3>(3, 3).scale_mut(1.0 / self.range);
+        by
+    }
+
+    fn point(&self, coordinates: &Vector6<f64>) -> ChartPoint {
+        let aside = self.direction.into_inner() + self.tangents * coordinates.fixed_rows::<2>(0);
+        let (direction, length) = Unit::new_and_get(aside);
+        let range = self.range * coordinates[2].exp();
+        let across =
+            (self.tangents - direction.into_inner() * (direction.transpose() * self.tangents)) / length;
+        let mut place_by = Matrix3::zeros();
+        place_by.fixed_view_mut::<3, 2>(0, 0).copy_from(&(across * range));
+        place_by.set_column(2, &(direction.into_inner() * range));
+        let velocity = (self.share + coordinates.fixed_rows::<3>(3)) * range;
+        let mut state_by = Matrix6::zeros();
+        state_by.fixed_view_mut::<3, 3>(0, 0).copy_from(&place_by);
+        state_by.fixed_view_mut::<3, 1>(3, 2).copy_from(&velocity);
+        state_by.fixed_view_mut::<3, 3>(3, 3).fill_with_identity();
+        state_by.fixed_view_mut::<3, 3>(3, 3).scale_mut(range);
+        ChartPoint { place: self.origin + direction.into_inner() * range, velocity, place_by, state_by }
+    }
+
+    /// The logarithm of the range against the chart's own.
+    fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
+        let (u, v) = (&self.direction, &line.direction);
+        let base = line.origin - self.origin;
+        let cosine = u.dot(v);
+        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
+        let here = (u.dot(&base) - cosine * v.dot(&base)) / sine_squared;
+        let there = (cosine * u.dot(&base) - v.dot(&base)) / sine_squared;
+        (here > 0.0 && there > 0.0).then(|| (here / self.range).ln())
+    }
+}
+
+impl ChartPoint {
+    /// Position and velocity.
+    pub(crate) fn mean(&self) -> Vector6<f64> {
+        let mut mean = Vector6::zeros();
+        mean.fixed_rows_mut::<3>(0).copy_from(&self.place.coords);
+        mean.fixed_rows_mut::<3>(3).copy_from(&self.velocity);
+        mean
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state() -> KinematicState {
+        KinematicState {
+            mean: Vector6::new(30.0, 80.0, 40.0, 6.0, -3.0, 1.0),
+            covariance: Matrix6::identity(),
+        }
+    }
+
+    #[test]
+    fn the_derivatives_are_each_others_inverse_and_the_finite_differences() {
+        let chart = RangeChart::new(Point3::new(1.0, 2.0, 3.0), &state()).unwrap();
+        let here = chart.point(&Vector6::zeros());
+        assert!((here.mean() - state().mean).norm() < 1e-9);
+        assert!((chart.by_state() * here.state_by - Matrix6::identity()).norm() < 1e-12);
+        for axis in 0..6 {
+            let step = Vector6::ith(axis, 1e-6);
+            let slope = (chart.point(&step).mean() - chart.point(&-step).mean()) / 2e-6;
+            assert!((slope - here.state_by.column(axis)).norm() < 1e-5, "axis {axis}");
+        }
+    }
+
+    #[test]
+    fn what_scales_place_and_velocity_is_the_range_axis_alone() {
+        let origin = Point3::new(1.0, 2.0, 3.0);
+        let chart = RangeChart::new(origin, &state()).unwrap();
+        let doubled = chart.point(&Vector6::ith(2, 2.0_f64.ln()));
+        assert!((doubled.place - origin - (state().position() - origin) * 2.0).norm() < 1e-9);
+        assert!((doubled.velocity - state().velocity() * 2.0).norm() < 1e-9);
+    }
+}

@@ -1,0 +1,145 @@
+//! Tracks that one camera alone follows, seen by a second one again: every bearing that crosses the sight
+//! line may be the target's, so each is followed as a leaf of its own until one is sure.
+
+use std::collections::BTreeMap;
+
+use crossfix_filter::Gate;
+
+use crate::ingress::KnownCamera;
+use crate::motion::Motion;
+use crate::track::{Track, TrackId};
+use crate::tracker::{log_likelihood_ratio, missed};
+use crate::{Exposure, Tracking};
+
+/// A leaf is the track when the bearings are so many times (logarithm) likelier the target's than strangers:
+/// a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on a stranger.
+pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
+/// A leaf less likely than this (logarithm) is given up.
+const GIVEN_UP: f64 = -3.0;
+/// Leaves of one track that are followed at a time, the best ones: strangers cannot fill the memory.
+const MAX_LEAVES: usize = 4;
+
+/// A track with bearings of a second camera taken in, and how much likelier (logarithm) it is that these are
+/// the target's.
+#[derive(Clone, Debug)]
+struct Leaf {
+    track: Track,
+    log_ratio: f64,
+}
+
+/// The leaves of all tracks that one camera alone follows.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Reacquisition {
+    leaves: BTreeMap<TrackId, Vec<Leaf>>,
+}
+
+/// What an exposure is compared with.
+pub(crate) struct Look<'a> {
+    pub(crate) exposure: &'a Exposure,
+    pub(crate) known: &'a KnownCamera,
+    pub(crate) motion: &'a Motion,
+    pub(crate) config: &'a Tracking,
+    pub(crate) gate: Gate,
+    pub(crate) max_range_m: f64,
+    /// Which sightings belong to which tracks.
+    pub(crate) owners: &'a [Option<TrackId>],
+}
+
+impl Look<'_> {
+    /// The sightings (by index) that may be a track's, with their log-likelihood ratios against strangers,
+    /// the best first.
+    fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
+        let Self { exposure, known, motion, config, .. } = self;
+        let seen_from = (&exposure.camera, known.camera.pose().position());
+        let Some(expected) = track.expectation(exposure.time, seen_from, &exposure.uncertainty, motion)
+        else {
+            return Vec::new();
+        };
+        let detection =
+            track.visible_to(&exposure.camera, exposure.time, motion) * config.detection_probability;
+        let open = exposure.sightings.iter().enumerate();
+        let open = open.filter(|(i, _)| self.owners[*i].is_none_or(|id| id == owner));
+        let fit = |(i, sighting): (usize, &crate::Sighting)| {
+            let fit = expected.fit(&sighting.line, self.gate)?;
+            Some((log_likelihood_ratio(&fit, detection, exposure.clutter_per_sr), i))
+        };
+        let mut fits: Vec<(f64, usize)> = open.filter_map(fit).collect();
+        fits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        fits
+    }
+
+    fn expects(&self, track: &Track) -> bool {
+        self.known.expects(track.position_at(self.exposure.time), self.max_range_m)
+    }
+
+    /// A track with a sighting taken in.
+    fn taken(&self, track: &Track, index: usize) -> Option<Track> {
+        let Exposure { camera, time, uncertainty, sightings, .. } = self.exposure;
+        let mut track = track.clone();
+        track.measurement_update(camera, &sightings[index].line, (*time, uncertainty), self.motion)?;
+        track.look(camera, *time, true, self.config.detection_probability, self.motion);
+        Some(track)
+    }
+
+    /// A leaf after the exposure.
+    fn advanced(&self, mut leaf: Leaf, owner: TrackId) -> Option<(Leaf, Option<usize>)> {
+        let Exposure { camera, time, .. } = self.exposure;
+        let best = self.fits(&leaf.track, owner).first().copied();
+        if let Some((ratio, index)) = best
+            && let Some(track) = self.taken(&leaf.track, index)
+        {
+            // What the track itself has taken says nothing for or against its leaves.
+            let gained = if self.owners[index].is_some() { 0.0 } else { ratio };
+            return Some((Leaf { track, log_ratio: leaf.log_ratio + gained }, Some(index)));
+        }
+        if self.expects(&leaf.track) {
+            let detection = self.config.detection_probability;
+            leaf.log_ratio += missed(leaf.track.visible_to(camera, *time, self.motion), detection);
+            leaf.track.look(camera, *time, false, detection, self.motion);
+        }
+        (leaf.log_ratio > GIVEN_UP).then_some((leaf, None))
+    }
+
+    /// The leaves that begin with the exposure's bearings.
+    fn begun(&self, track: &Track) -> Vec<(Leaf, Option<usize>)> {
+        if !track.is_lost_sight_of_by(&self.exposure.camera, self.motion) {
+            return Vec::new();
+        }
+        let fits = self.fits(track, track.id).into_iter().filter(|(_, i)| self.owners[*i].is_none());
+        fits.take(MAX_LEAVES)
+            .filter_map(|(log_ratio, i)| Some((Leaf { track: self.taken(track, i)?, log_ratio }, Some(i))))
+            .collect()
+    }
+}
+
+impl Reacquisition {
+    /// Goes on with the leaves of the tracks that one camera alone follows; returns those that are found
+    /// again, with the sighting (by index) that has settled it.
+    pub(crate) fn advance(
+        &mut self,
+        tracks: &BTreeMap<TrackId, Track>,
+        look: &Look<'_>,
+    ) -> Vec<(Track, Option<usize>)> {
+        self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_held()));
+        let mut found = Vec::new();
+        let alone = tracks.values().filter(|track| track.is_confirmed() && !track.is_held());
+        for track in alone {
+            let before = self.leaves.remove(&track.id).unwrap_or_default();
+            let mut next: Vec<_> =
+                before.into_iter().filter_map(|leaf| look.advanced(leaf, track.id)).collect();
+            next.extend(look.begun(track));
+            next.sort_by(|a, b| b.0.log_ratio.total_cmp(&a.0.log_ratio));
+            next.truncate(MAX_LEAVES);
+            match next.first() {
+                Some((best, index)) if best.log_ratio >= FOUND_AGAIN_MARGIN => {
+                    found.push((best.track.clone(), *index));
+                }
+                Some(_) => {
+                    self.leaves.insert(track.id, next.into_iter().map(|(leaf, _)| leaf).collect());
+                }
+                None => {}
+            }
+        }
+        found
+    }
+}

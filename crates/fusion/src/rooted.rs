@@ -1,0 +1,99 @@
+//! What stands in a camera's view for good: trees, horizons, lights, cloud edges. Detectors report them again
+//! and again in the same place, and the lines of two cameras to two of them cross as a target's do.
+
+use crossfix_geometry::SightLine;
+use crossfix_message::Timestamp;
+use nalgebra::{Unit, Vector3};
+
+/// How far something rooted sways about its middle, rad: a tree of 2 m in the wind at 150 m.
+const REACH_RAD: f64 = 0.015;
+/// The middle follows what it sways about with a time constant of so many times that after which something is
+/// rooted: a few periods of a tree.
+const MIDDLE: f64 = 2.0;
+/// Something rooted is reported in at least this share of the exposures.
+const LEAST_SHARE: f64 = 0.3;
+/// What has not been reported for so many times that time is forgotten.
+const FORGOTTEN: f64 = 7.0;
+/// What is reported within this share of that time of a camera's first exposure may have been there before.
+const BEGINNING: f64 = 0.2;
+/// Places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
+const MAX_PLACES: usize = 1_000;
+
+/// Whether a bearing is of something that stands in its camera's view for good.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Rooted {
+    /// It was there when the camera began to look, not long ago.
+    #[default]
+    Unknown,
+    /// It has come or moved.
+    No,
+    /// It has been there for long.
+    Yes,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    middle: Unit<Vector3<f64>>,
+    first: Timestamp,
+    last: Timestamp,
+    reports: f64,
+    /// [`View::exposures`] before the first.
+    before: f64,
+}
+
+/// The places in a camera's view from which it has reported something lately.
+#[derive(Clone, Debug)]
+pub(crate) struct View {
+    /// What has stayed within reach of one direction for this long is rooted, s: a target that flies leaves it
+    /// sooner, and one that hovers has been seen to come.
+    rooted_s: f64,
+    places: Vec<Place>,
+    began: Option<Timestamp>,
+    exposures: f64,
+}
+
+impl View {
+    /// Of a camera that has not looked yet.
+    pub(crate) fn new(rooted_s: f64) -> Self {
+        Self { rooted_s, places: Vec::new(), began: None, exposures: 0.0 }
+    }
+
+    /// Takes an exposure's lines in; says of each whether it is rooted.
+    pub(crate) fn see<'a>(
+        &mut self,
+        time: Timestamp,
+        lines: impl Iterator<Item = &'a SightLine>,
+    ) -> Vec<Rooted> {
+        let began = *self.began.get_or_insert(time);
+        self.places.retain(|place| time.seconds_since(place.last) <= FORGOTTEN * self.rooted_s);
+        let before = self.exposures;
+        self.exposures += 1.0;
+        lines.map(|line| self.report(time, began, before, line)).collect()
+    }
+
+    fn report(&mut self, time: Timestamp, began: Timestamp, before: f64, line: &SightLine) -> Rooted {
+        let rooted_s = self.rooted_s;
+        // What is there when a camera begins to look may have been there for long.
+        let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
+        let distance = |place: &Place| (place.middle.into_inner() - line.direction.into_inner()).norm();
+        let near = self.places.iter_mut().map(|place| (distance(place), place));
+        let nearest = near.filter(|(away, _)| *away <= REACH_RAD).min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((_, place)) = nearest else {
+            if self.places.len() >= MAX_PLACES {
+                self.places.remove(0);
+            }
+            self.places.push(Place { middle: line.direction, first: time, last: time, reports: 1.0, before });
+            return if may_be_old(time) { Rooted::Unknown } else { Rooted::No };
+        };
+        let share = (time.seconds_since(place.last).max(0.0) / (MIDDLE * rooted_s)).min(1.0);
+        let moved = (line.direction.into_inner() - place.middle.into_inner()) * share;
+        place.middle = Unit::new_normalize(place.middle.into_inner() + moved);
+        place.last = place.last.max(time);
+        place.reports += 1.0;
+        let exposures = before + 1.0 - place.before;
+        if time.seconds_since(place.first) < rooted_s {
+            return if may_be_old(place.first) { Rooted::Unknown } else { Rooted::No };
+        }
+        if place.reports >= LEAST_SHARE * exposures { Rooted::Yes } else { Rooted::No }
+    }
+}

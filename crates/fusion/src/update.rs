@@ -1,0 +1,109 @@
+//! One bearing into one state: an iterated extended Kalman update in the coordinates of [`RangeChart`], with
+//! the camera's shared errors considered (Schmidt) and not estimated.
+
+use std::f64::consts::PI;
+
+use crossfix_filter::KinematicState;
+use crossfix_geometry::{BearingModel, SightLine};
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Matrix6x2, Matrix6x3, Point3, Vector2, Vector6};
+
+use crate::range_chart::Chart;
+use crate::uncertainty::CameraUncertainty;
+
+/// Rounds of the iterated update: from a range known to a factor of three it takes four or five.
+const MAX_ROUNDS: usize = 10;
+/// The linearisation has settled when what a round leaves out, the square of the angle of its step, is
+/// less than this share of the bearing's noise.
+const SETTLED: f64 = 0.01;
+/// A range known worse than this (standard deviation of its logarithm) is looked for along the sight line
+/// first: from its middle the iteration may not find the crossing.
+pub(crate) const VAGUE_LOG_RANGE_SD: f64 = 0.1;
+
+/// A bearing with what its camera is uncertain of.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Measured<'a> {
+    pub(crate) line: &'a SightLine,
+    pub(crate) camera: &'a CameraUncertainty,
+    /// Covariance of the state with the camera's shared errors, each of these in its own deviations.
+    pub(crate) ties: &'a Matrix6x3<f64>,
+}
+
+/// A state after a bearing.
+#[derive(Clone, Debug)]
+pub(crate) struct Updated {
+    pub(crate) state: KinematicState,
+    /// Squared Mahalanobis distance of the bearing, two degrees of freedom.
+    pub(crate) nis: f64,
+    /// Logarithm of the bearing's likelihood, 1/sr.
+    pub(crate) log_likelihood: f64,
+    /// What the update does to the state's covariance with any error: `carried * ties`, ...
+    pub(crate) carried: Matrix6<f64>,
+    /// ... less, of the camera's own errors, `gain * shifts`.
+    pub(crate) gained: Matrix6x3<f64>,
+}
+
+/// The state after a bearing of its time; `seen_from` is where the camera stands that follows the target alone,
+/// so that the range is uncertain from there. `None` if the numbers fail.
+pub(crate) fn updated(
+    prior: &KinematicState,
+    seen_from: Option<Point3<f64>>,
+    measured: &Measured<'_>,
+) -> Option<Updated> {
+    let Measured { line, camera, ties } = *measured;
+    let chart = match seen_from {
+        Some(origin) => Chart::by_range(origin, prior)?,
+        None => Chart::cartesian(prior),
+    };
+    let by_state = chart.by_state();
+    let covariance = by_state * prior.covariance * by_state.transpose();
+    let ties = by_state * ties;
+    let is_own = seen_from == Some(line.origin);
+    let mut coordinates = Vector6::zeros();
+    if !is_own && seen_from.is_some() && covariance.m33 > VAGUE_LOG_RANGE_SD.powi(2) {
+        coordinates[2] = chart.nearest_to(line)?;
+    }
+    for round in 1.. {
+        let point = chart.point(&coordinates);
+        let model = BearingModel::new(line.origin, point.place)?;
+        let offset = model.offset(line)?;
+        let shifts = camera.shifts(&model, point.velocity);
+        let mut by = Matrix2x6::zeros();
+        by.fixed_view_mut::<2, 3>(0, 0).copy_from(&(model.by_position() * point.place_by));
+        let tied: Matrix6x2<f64> = ties * shifts.transpose();
+        let across: Matrix6x2<f64> = covariance * by.transpose() + tied;
+        let cross: Matrix2<f64> = by * tied;
+        let noise =
+            camera.noise(&model, point.velocity, &model.covariance_of(line)) + shifts * shifts.transpose();
+        let spread = by * (across - tied) + cross + cross.transpose() + noise;
+        let determinant = spread.determinant();
+        let inverse = spread.try_inverse()?;
+        if !(determinant > 0.0 && spread.m11 > 0.0) {
+            return None;
+        }
+        let innovation: Vector2<f64> = offset + by * coordinates;
+        let gain = across * inverse;
+        let next = gain * innovation;
+        let moved = (point.place_by * (next - coordinates).fixed_rows::<3>(0)).norm() / model.range;
+        coordinates = next;
+        let settled = moved.powi(2) < SETTLED * (noise.trace() / 2.0).sqrt();
+        if !(is_own || settled || round == MAX_ROUNDS) {
+            continue;
+        }
+        let nis = innovation.dot(&(inverse * innovation));
+        let point = chart.point(&coordinates);
+        let state_by = point.state_by;
+        let posterior = covariance - gain * across.transpose();
+        let covariance = state_by * posterior * state_by.transpose();
+        let state =
+            KinematicState { mean: point.mean(), covariance: (covariance + covariance.transpose()) / 2.0 };
+        let positive = state.covariance.diagonal().iter().all(|variance| *variance > 0.0);
+        return (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
+            state,
+            nis,
+            log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
+            carried: state_by * (Matrix6::identity() - gain * by) * by_state,
+            gained: state_by * gain * shifts,
+        });
+    }
+    None
+}

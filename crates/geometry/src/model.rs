@@ -1,0 +1,125 @@
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix3x2, Point3, Unit, Vector2, Vector3};
+
+use crate::{SightLine, tangent_basis};
+
+/// The bearing model: how a camera at `origin` sees a place, and how that changes with the place, with the
+/// camera's pose and with its clock.
+///
+/// A bearing is compared as an offset on the tangent plane at the expected direction, measured less
+/// expected. The Jacobians say how that offset changes with a true value that the expectation does not know:
+/// `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is the true place less the
+/// expected one (m, world), `de` the true pose less the stated one (a small rotation vector about the
+/// world's axes, rad, then the position, m) and `dt` the stated capture time less the true one (s).
+///
+/// ```
+/// use crossfix_geometry::BearingModel;
+/// use nalgebra::{Point3, Vector3};
+/// let model = BearingModel::new(Point3::origin(), Point3::new(0.0, 100.0, 0.0)).ok_or("at the camera")?;
+/// // A metre across, seen from 100 m, is a hundredth of a radian; a metre along the line is nothing.
+/// assert!(((model.by_position() * Vector3::x()).norm() - 0.01).abs() < 1e-12);
+/// assert!((model.by_position() * Vector3::y()).norm() < 1e-12);
+/// # Ok::<(), &str>(())
+/// ```
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BearingModel {
+    /// Expected direction, world.
+    pub direction: Unit<Vector3<f64>>,
+    /// The tangents (columns, world) on which offsets are expressed.
+    pub basis: Matrix3x2<f64>,
+    /// Distance of the place, m.
+    pub range: f64,
+}
+
+impl BearingModel {
+    /// Of a camera at `origin` and a place, m, world; `None` if both are one.
+    pub fn new(origin: Point3<f64>, place: Point3<f64>) -> Option<Self> {
+        let (direction, range) = Unit::try_new_and_get(place - origin, 1e-6)?;
+        Some(Self { direction, basis: tangent_basis(&direction), range })
+    }
+
+    /// The same for a known direction and range.
+    pub fn along(direction: Unit<Vector3<f64>>, range: f64) -> Self {
+        Self { direction, basis: tangent_basis(&direction), range }
+    }
+
+    /// A measured line less the expected direction, rad; `None` if it points to the other side.
+    pub fn offset(&self, line: &SightLine) -> Option<Vector2<f64>> {
+        (self.direction.dot(&line.direction) > 0.0)
+            .then(|| self.basis.transpose() * line.direction.into_inner())
+    }
+
+    /// A line's own covariance on these tangents, rad^2.
+    pub fn covariance_of(&self, line: &SightLine) -> Matrix2<f64> {
+        let turn = self.basis.transpose() * line.basis;
+        turn * line.covariance * turn.transpose()
+    }
+
+    /// Change with the place, rad/m.
+    pub fn by_position(&self) -> Matrix2x3<f64> {
+        self.basis.transpose() / self.range
+    }
+
+    /// Change with the pose: rad/rad, then rad/m. A camera that is turned by `d` more than it says measures
+    /// in its stated axes the direction turned back by `d`; one that stands farther by `c` sees the place
+    /// moved by `-c`.
+    pub fn by_pose(&self) -> Matrix2x6<f64> {
+        let tangents = self.basis.transpose();
+        let cross: Matrix3<f64> = self.direction.cross_matrix();
+        let mut jacobian = Matrix2x6::zeros();
+        jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(&(tangents * cross));
+        jacobian.fixed_view_mut::<2, 3>(0, 3).copy_from(&(-tangents / self.range));
+        jacobian
+    }
+
+    /// Change with the clock, rad/s: one that is ahead shows the target of `velocity` (m/s) where it was.
+    pub fn by_time(&self, velocity: Vector3<f64>) -> Vector2<f64> {
+        -(self.by_position() * velocity)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix2, Rotation3, Vector6};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// What a camera measures, placed in the world by the pose and the time that it states.
+    fn measured(
+        origin: Point3<f64>,
+        (place, velocity): (Point3<f64>, Vector3<f64>),
+        (pose_error, ahead_s): (Vector6<f64>, f64),
+    ) -> SightLine {
+        let turned = Rotation3::new(pose_error.fixed_rows::<3>(0).into_owned());
+        let true_origin = origin + pose_error.fixed_rows::<3>(3);
+        let seen_at = place - velocity * ahead_s;
+        let direction = Unit::new_normalize(turned.inverse() * (seen_at - true_origin));
+        let basis = tangent_basis(&direction);
+        SightLine { origin, direction, basis, covariance: Matrix2::identity() }
+    }
+
+    proptest! {
+        #[test]
+        fn the_jacobians_are_the_finite_differences(
+            place in prop::array::uniform3(-100.0..100.0f64),
+            velocity in prop::array::uniform3(-30.0..30.0f64),
+            error in prop::array::uniform6(-1.0..1.0f64),
+            moved in prop::array::uniform3(-1.0..1.0f64),
+            ahead in -1.0..1.0f64,
+        ) {
+            let (origin, place) = (Point3::new(1.0, -2.0, 3.0), Point3::from(place));
+            prop_assume!((place - origin).norm() > 5.0);
+            let step = 1e-6;
+            let velocity = Vector3::from(velocity);
+            let (moved, error) = (Vector3::from(moved) * step, Vector6::from(error) * step);
+            let ahead = ahead * step;
+            let model = BearingModel::new(origin, place).unwrap();
+            let line = measured(origin, (place + moved, velocity), (error, ahead));
+            let offset = model.offset(&line).unwrap();
+            let expected = model.by_position() * moved
+                + model.by_pose() * error
+                + model.by_time(velocity) * ahead;
+            prop_assert!((offset - expected).norm() < 1e-4 * step * 10.0, "{offset} {expected}");
+        }
+    }
+}
