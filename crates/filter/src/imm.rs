@@ -235,18 +235,22 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Makes every model's covariance more than a part of it that all share: what is short of it grows by a
-    /// quarter of the part until it is.
+    /// Makes no model's covariance less than a part of it that all share: what is short of it grows by the
+    /// smallest share of the part that does. The growth is continuous, so that rounding decides nothing.
     pub fn exceed(&mut self, part: &Matrix6<f64>) {
         let mut grown = false;
         for state in &mut self.states {
-            for _ in 0..5 {
-                if (state.covariance - part).cholesky().is_some() {
-                    break;
-                }
-                state.covariance += part / 4.0;
-                grown = true;
+            if (state.covariance - part).cholesky().is_some() {
+                continue;
             }
+            // P + a Q >= Q where (1 - a) m <= 1, m being the largest eigenvalue of L^-1 Q L^-T with P = L L'.
+            let largest = state.covariance.cholesky().and_then(|factor| {
+                let half = factor.l().solve_lower_triangular(part)?;
+                let whole = factor.l().solve_lower_triangular(&half.transpose())?;
+                Some(whole.symmetric_eigenvalues().max())
+            });
+            state.covariance += part * largest.map_or(1.0, |m| (1.0 - m.recip()).clamp(0.0, 1.0));
+            grown = true;
         }
         if grown {
             self.combined = combined(&self.states, &self.probabilities);

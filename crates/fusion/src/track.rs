@@ -564,7 +564,10 @@ impl Track {
     /// not believed.
     fn keep_ties_possible(&mut self) {
         let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
-        let shared: Matrix6<f64> = squares.sum();
+        // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
+        let mut squares: Vec<Matrix6<f64>> = squares.collect();
+        squares.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
+        let shared: Matrix6<f64> = squares.iter().sum();
         if shared.amax() > 0.0 {
             self.imm.exceed(&shared);
         }

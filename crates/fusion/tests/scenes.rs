@@ -211,33 +211,34 @@ fn drawn(density: f64, seconds: f64, seed: u64) -> Path {
     })
 }
 
-/// Mean NEES at the end of ten seconds of flights drawn from the filter's own model, and the mean
-/// variance of a position, m^2. One flight in twenty may hang in the air before two cameras as a tree stands
-/// there: that is not found.
-fn honesty(eyes: &[Eye]) -> (f64, f64) {
+/// Of 200 flights drawn from the filter's own model how many are found within ten seconds, their mean NEES and
+/// the mean variance of a position, m^2.
+fn honesty(eyes: &[Eye]) -> (u32, f64, f64) {
     const RUNS: u32 = 200;
     const DENSITY: f64 = 0.3;
     let mut config = FusionConfig::default();
     config.tracking.manoeuvres = Manoeuvres::None;
     config.tracking.acceleration_density = DENSITY;
-    let (mut nees, mut variance, mut found) = (0.0, 0.0, 0.0);
+    let (mut found, mut nees, mut variance) = (0, 0.0, 0.0);
     for seed in 0..u64::from(RUNS) {
         let scene = Scene { eyes: eyes.to_vec(), ..good_day(vec![drawn(DENSITY, 10.1, seed)], 10.0) };
         let mut flight = Flight::with(config.clone(), scene, 1000 + seed, |_| true);
         if let Some(track) = flight.until(10.0).track(0) {
             variance += track.state().position_covariance().trace() / 3.0;
             nees += flight.nees(0);
-            found += 1.0;
+            found += 1;
         }
     }
-    assert!(found >= 0.95 * f64::from(RUNS), "{found}");
-    (nees / found, variance / found)
+    (found, nees / f64::from(found), variance / f64::from(found))
 }
 
 #[test]
 fn two_cameras_know_less_than_three_and_both_say_so_honestly() {
-    let (three, three_variance) = honesty(&site());
-    let (two, two_variance) = honesty(&site()[..2]);
+    let (of_three, three, three_variance) = honesty(&site());
+    let (of_two, two, two_variance) = honesty(&site()[..2]);
+    assert_eq!(of_three, 200);
+    // What hangs before two cameras from the beginning as a tree stands there is not taken for a target.
+    assert!(of_two >= 197, "{of_two}");
     // Chi-square of six degrees of freedom: the mean of 200 has a standard deviation of 0.245.
     for nees in [three, two] {
         assert!((nees - 6.0).abs() < 3.0 * (12.0_f64 / 200.0).sqrt(), "{nees}");
