@@ -6,14 +6,24 @@ use nalgebra::{Matrix6, Vector6};
 
 use crate::Estimate;
 
+/// A camera has a part in a track if it has given it a bearing within this before the answer, s.
+const LATELY_S: f64 = 1.0;
+
 /// What a run's `TrackFrame`s said when: the causal answer to "where was each track at time t".
 ///
 /// A frame holds the tracks that an exposure has changed; the others go on as they were said last.
 #[derive(Clone, Debug, Default)]
 pub struct TrackHistory {
-    /// What was said of each track: its state, or that it is not (or no longer) sure.
-    tracks: BTreeMap<u64, BTreeMap<Timestamp, Option<KinematicState>>>,
+    /// What was said of each track.
+    tracks: BTreeMap<u64, BTreeMap<Timestamp, Said>>,
     times: BTreeSet<Timestamp>,
+}
+
+#[derive(Clone, Debug)]
+struct Said {
+    status: TrackState,
+    cameras: usize,
+    state: Option<KinematicState>,
 }
 
 /// A track's state, if the message holds one that makes sense.
@@ -26,13 +36,16 @@ fn state(track: &Track) -> Option<KinematicState> {
 }
 
 impl TrackHistory {
-    /// Takes a frame in, in any order; tentative and lost tracks are none.
+    /// Takes a frame in, in any order.
     pub fn add(&mut self, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
         self.times.insert(time);
         for track in &frame.tracks {
-            let sure = matches!(track.state(), TrackState::Confirmed | TrackState::Coasting);
-            let said = if sure { state(track) } else { None };
+            let lately = |r: &&crossfix_message::CameraResidual| {
+                time.seconds_since(Timestamp::from_nanos(r.time_ns)) <= LATELY_S
+            };
+            let cameras = track.residuals.iter().filter(lately).count();
+            let said = Said { status: track.state(), cameras, state: state(track) };
             self.tracks.entry(track.id).or_default().insert(time, said);
         }
     }
@@ -40,16 +53,24 @@ impl TrackHistory {
     /// The confirmed tracks at `time`, ordered by id: as last said at or before it, extrapolated with
     /// their velocities. Their covariances grow with the velocity's alone.
     pub fn at(&self, time: Timestamp) -> Vec<Estimate> {
-        let said = self.tracks.iter().filter_map(|(&id, said)| {
-            let (&then, state) = said.range(..=time).next_back()?;
-            let state = state.as_ref()?.predicted(time.seconds_since(then), 0.0);
-            Some(Estimate { id, state })
-        });
-        said.collect()
+        let mut estimates = self.all_at(time);
+        estimates.retain(|said| matches!(said.status, TrackState::Confirmed | TrackState::Coasting));
+        estimates
     }
 
-    /// Every frame's time with the confirmed tracks at it, in order of time.
-    pub fn frames(&self) -> impl Iterator<Item = (Timestamp, Vec<Estimate>)> + '_ {
-        self.times.iter().map(|&time| (time, self.at(time)))
+    /// The same with the tracks that are not sure, and those that one camera alone follows: a direction whose
+    /// range is a guess.
+    pub fn all_at(&self, time: Timestamp) -> Vec<Estimate> {
+        let said = self.tracks.iter().filter_map(|(&id, said)| {
+            let (&then, said) = said.range(..=time).next_back()?;
+            let state = said.state.as_ref()?.predicted(time.seconds_since(then), 0.0);
+            Some(Estimate { id, status: said.status, cameras: said.cameras, state })
+        });
+        said.filter(|said| said.status != TrackState::Lost).collect()
+    }
+
+    /// Every frame's time, in order.
+    pub fn times(&self) -> impl Iterator<Item = Timestamp> + '_ {
+        self.times.iter().copied()
     }
 }

@@ -4,14 +4,15 @@
 //!
 //! ```
 //! use crossfix_evaluation::{Estimate, Evaluator, TrueTarget};
-//! use crossfix_message::Timestamp;
+//! use crossfix_message::{Timestamp, TrackState};
 //! use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 //! use crossfix_filter::KinematicState;
 //!
 //! let mut evaluator = Evaluator::new(5.0);
 //! let truth = [TrueTarget { id: 1, position: Point3::new(0.0, 0.0, 50.0), velocity: Vector3::zeros() }];
 //! let state = KinematicState { mean: Vector6::new(0.3, 0.0, 50.4, 0.0, 0.0, 0.0), covariance: Matrix6::identity() };
-//! evaluator.add(&truth, &[Estimate { id: 7, state }]);
+//! let said = Estimate { id: 7, status: TrackState::Confirmed, cameras: 3, state };
+//! evaluator.add(Timestamp::EPOCH, &truth, &[said]);
 //! let report = evaluator.report();
 //! assert!((report.position_rmse_m.unwrap() - 0.5).abs() < 1e-12);
 //! assert_eq!(report.completeness, 1.0);
@@ -23,9 +24,11 @@ mod latency;
 mod metrics;
 mod papers;
 mod sightings;
+mod stretches;
 
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
-pub use metrics::{Estimate, Evaluator, Report, TargetReport, TrueTarget};
+pub use metrics::{Estimate, Evaluator, Nees, Report, TargetReport, TrueTarget};
 pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker};
 pub use sightings::Sightings;
+pub use stretches::Delays;

@@ -1,12 +1,19 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_filter::KinematicState;
+use crossfix_message::{Timestamp, TrackState};
 use nalgebra::{Point3, Vector3, Vector6};
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 use serde::Serialize;
 
+use crate::stretches::{Delays, Stretches, quantile};
+
 /// Costs are quantised for the assignment: a millionth of the cut-off.
 const COST_SCALE: f64 = 1e6;
+/// An answer farther than this from every target is far off for most uses, m.
+const FAR_OFF_M: f64 = 1.0;
+/// An answer farther off than this many of its own deviations has said that it was surer than it was.
+const SIGMAS: f64 = 4.0;
 
 /// Where a target really is.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,8 +31,39 @@ pub struct TrueTarget {
 pub struct Estimate {
     /// The track's number.
     pub id: u64,
+    /// What the track said that it was.
+    pub status: TrackState,
+    /// How many cameras had given it a bearing within the second before.
+    pub cameras: usize,
     /// Its state.
     pub state: KinematicState,
+}
+
+impl Estimate {
+    /// Root of the sum of the position's variances, m.
+    pub fn position_sd_m(&self) -> f64 {
+        self.state.position_covariance().trace().max(0.0).sqrt()
+    }
+}
+
+/// How large errors are against what the tracks said of them: errors squared by the stated covariance. The mean
+/// of honest ones is the number of their degrees of freedom; one instant of great confidence and great error
+/// spoils it, which the median does not show.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Nees {
+    /// Mean over the instants.
+    pub mean: Option<f64>,
+    /// Median over the instants: honest is 5.35 of six degrees of freedom, 2.37 of three.
+    pub median: Option<f64>,
+}
+
+impl Nees {
+    fn of(values: &[f64]) -> Self {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let mean = (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+        Self { mean, median: quantile(&sorted, 0.5) }
+    }
 }
 
 /// One target's figures.
@@ -41,8 +79,12 @@ pub struct TargetReport {
     pub position_rmse_m: Option<f64>,
     /// Root mean squared velocity error, m/s.
     pub velocity_rmse_mps: Option<f64>,
-    /// Mean normalised estimation error squared; 6 is honest.
-    pub mean_nees: Option<f64>,
+    /// Normalised estimation error squared of position and velocity; 6 is honest.
+    pub nees: Nees,
+    /// Of the position alone; 3 is honest.
+    pub position_nees: Nees,
+    /// Of the velocity alone; 3 is honest.
+    pub velocity_nees: Nees,
     /// How often another track took it over.
     pub id_switches: u64,
 }
@@ -58,8 +100,23 @@ pub struct Report {
     pub position_rmse_m: Option<f64>,
     /// Root mean squared velocity error of the pairs, m/s.
     pub velocity_rmse_mps: Option<f64>,
-    /// Mean normalised estimation error squared; 6 is honest.
-    pub mean_nees: Option<f64>,
+    /// Normalised estimation error squared of position and velocity of the pairs; 6 is honest.
+    pub nees: Nees,
+    /// Of the position alone; 3 is honest.
+    pub position_nees: Nees,
+    /// Of the velocity alone; 3 is honest.
+    pub velocity_nees: Nees,
+    /// What the tracks said at all instants together: one answer a track and instant.
+    pub answers: u64,
+    /// Answers that lay farther than the cut-off from every target.
+    pub false_answers: u64,
+    /// Share of the answers that lay more than 1 m from the nearest target, however far.
+    pub share_off_by_1_m: Option<f64>,
+    /// Share of the answers that lay farther from the nearest target than four times what they said themselves
+    /// (the root of the sum of the position's variances).
+    pub share_beyond_4_sd: Option<f64>,
+    /// How long the targets waited for an answer.
+    pub delays: Delays,
     /// Share of target instants with a track.
     pub completeness: f64,
     /// Mean number of tracks without a target.
@@ -76,11 +133,12 @@ pub struct Report {
     pub targets: Vec<TargetReport>,
 }
 
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Sums {
     position: f64,
     velocity: f64,
-    nees: f64,
+    /// Of both, of the position and of the velocity, an entry a pair.
+    nees: [Vec<f64>; 3],
     pairs: u64,
 }
 
@@ -92,16 +150,23 @@ impl Sums {
         self.velocity += velocity.norm_squared();
         let error = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
         // A covariance that cannot be inverted is not honest at any error.
-        self.nees += state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
+        let both = state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
+        let part = |from: usize, error: &Vector3<f64>| {
+            let spread = state.covariance.fixed_view::<3, 3>(from, from).into_owned().cholesky();
+            spread.map_or(f64::INFINITY, |c| error.dot(&c.solve(error)))
+        };
+        for (list, value) in self.nees.iter_mut().zip([both, part(0, &position), part(3, &velocity)]) {
+            list.push(value);
+        }
         self.pairs += 1;
     }
 
-    fn mean(&self, sum: f64) -> Option<f64> {
-        (self.pairs > 0).then(|| sum / self.pairs as f64)
+    fn root_mean(&self, sum: f64) -> Option<f64> {
+        (self.pairs > 0).then(|| (sum / self.pairs as f64).sqrt())
     }
 
-    fn root_mean(&self, sum: f64) -> Option<f64> {
-        self.mean(sum).map(f64::sqrt)
+    fn nees(&self) -> [Nees; 3] {
+        self.nees.each_ref().map(|values| Nees::of(values))
     }
 }
 
@@ -113,6 +178,35 @@ struct Target {
     switches: u64,
 }
 
+/// How far from the nearest target the answers lay, at instants with any target.
+#[derive(Clone, Copy, Debug, Default)]
+struct Answers {
+    all: u64,
+    judged: u64,
+    false_ones: u64,
+    off_by_1_m: u64,
+    beyond_4_sd: u64,
+}
+
+impl Answers {
+    fn add(&mut self, truth: &[TrueTarget], estimate: &Estimate, cutoff: f64) {
+        self.all += 1;
+        let away = |target: &TrueTarget| (estimate.state.position() - target.position).norm();
+        let Some(nearest) = truth.iter().map(away).min_by(f64::total_cmp) else {
+            self.false_ones += 1;
+            return;
+        };
+        self.judged += 1;
+        self.false_ones += u64::from(nearest >= cutoff);
+        self.off_by_1_m += u64::from(nearest > FAR_OFF_M);
+        self.beyond_4_sd += u64::from(nearest > SIGMAS * estimate.position_sd_m());
+    }
+
+    fn share(&self, count: u64) -> Option<f64> {
+        (self.judged > 0).then(|| count as f64 / self.judged as f64)
+    }
+}
+
 /// Holds tracks against truth, instant by instant.
 #[derive(Clone, Debug)]
 pub struct Evaluator {
@@ -121,6 +215,8 @@ pub struct Evaluator {
     targets: BTreeMap<u64, Target>,
     all: Sums,
     false_instants: u64,
+    answers: Answers,
+    stretches: Stretches,
     tracks: BTreeSet<u64>,
     true_tracks: BTreeSet<u64>,
     ospa: f64,
@@ -136,6 +232,8 @@ impl Evaluator {
             targets: BTreeMap::new(),
             all: Sums::default(),
             false_instants: 0,
+            answers: Answers::default(),
+            stretches: Stretches::default(),
             tracks: BTreeSet::new(),
             true_tracks: BTreeSet::new(),
             ospa: 0.0,
@@ -143,15 +241,17 @@ impl Evaluator {
         }
     }
 
-    /// Compares one instant.
-    pub fn add(&mut self, truth: &[TrueTarget], estimates: &[Estimate]) {
+    /// Compares one instant; instants come in order of time.
+    pub fn add(&mut self, time: Timestamp, truth: &[TrueTarget], estimates: &[Estimate]) {
         self.instants += 1;
+        estimates.iter().for_each(|estimate| self.answers.add(truth, estimate, self.cutoff));
         self.tracks.extend(estimates.iter().map(|estimate| estimate.id));
         let mut squares = 0.0;
         let pairs = self.pair(truth, estimates);
         for (target, partner) in truth.iter().zip(&pairs) {
             let entry = self.targets.entry(target.id).or_default();
             entry.instants += 1;
+            self.stretches.add(target.id, time, partner.is_some());
             let Some(estimate) = partner.map(|index| &estimates[index]) else {
                 continue;
             };
@@ -200,12 +300,20 @@ impl Evaluator {
     pub fn report(&self) -> Report {
         let target_instants: u64 = self.targets.values().map(|target| target.instants).sum();
         let instants = self.instants.max(1) as f64;
+        let [nees, position_nees, velocity_nees] = self.all.nees();
         Report {
             instants: self.instants,
             cutoff_m: self.cutoff,
             position_rmse_m: self.all.root_mean(self.all.position),
             velocity_rmse_mps: self.all.root_mean(self.all.velocity),
-            mean_nees: self.all.mean(self.all.nees),
+            nees,
+            position_nees,
+            velocity_nees,
+            answers: self.answers.all,
+            false_answers: self.answers.false_ones,
+            share_off_by_1_m: self.answers.share(self.answers.off_by_1_m),
+            share_beyond_4_sd: self.answers.share(self.answers.beyond_4_sd),
+            delays: self.stretches.delays(),
             completeness: if target_instants > 0 {
                 self.all.pairs as f64 / target_instants as f64
             } else {
@@ -223,13 +331,16 @@ impl Evaluator {
 
 fn target_report(id: u64, target: &Target) -> TargetReport {
     let sums = &target.sums;
+    let [nees, position_nees, velocity_nees] = sums.nees();
     TargetReport {
         target: id,
         detected: sums.pairs > 0,
         share_tracked: sums.pairs as f64 / target.instants.max(1) as f64,
         position_rmse_m: sums.root_mean(sums.position),
         velocity_rmse_mps: sums.root_mean(sums.velocity),
-        mean_nees: sums.mean(sums.nees),
+        nees,
+        position_nees,
+        velocity_nees,
         id_switches: target.switches,
     }
 }
@@ -246,17 +357,23 @@ mod tests {
 
     fn estimate(id: u64, x: f64) -> Estimate {
         let mean = Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0);
-        Estimate { id, state: KinematicState { mean, covariance: Matrix6::identity() } }
+        let state = KinematicState { mean, covariance: Matrix6::identity() };
+        Estimate { id, status: TrackState::Confirmed, cameras: 3, state }
     }
 
     #[test]
     fn known_answers_by_hand() {
         let mut evaluator = Evaluator::new(5.0);
         // One pair 1 m apart, one miss, one false track.
-        evaluator.add(&[target(1, 0.0), target(2, 100.0)], &[estimate(7, 1.0), estimate(8, 50.0)]);
+        let now = Timestamp::EPOCH;
+        evaluator.add(now, &[target(1, 0.0), target(2, 100.0)], &[estimate(7, 1.0), estimate(8, 50.0)]);
         let report = evaluator.report();
         assert_eq!(report.position_rmse_m, Some(1.0));
-        assert_eq!(report.mean_nees, Some(1.0));
+        assert_eq!(report.nees, Nees { mean: Some(1.0), median: Some(1.0) });
+        assert_eq!((report.position_nees.mean, report.velocity_nees.mean), (Some(1.0), Some(0.0)));
+        // Two answers: one a metre off, within its 1.7 m; one 50 m from any target.
+        assert_eq!((report.answers, report.false_answers), (2, 1));
+        assert_eq!((report.share_off_by_1_m, report.share_beyond_4_sd), (Some(0.5), Some(0.5)));
         assert_eq!(report.completeness, 0.5);
         assert_eq!(report.false_tracks, 1);
         assert_eq!(report.false_tracks_per_instant, 1.0);
@@ -267,9 +384,11 @@ mod tests {
     #[test]
     fn a_track_that_takes_over_is_a_switch_and_not_a_false_track() {
         let mut evaluator = Evaluator::new(5.0);
-        evaluator.add(&[target(1, 0.0)], &[estimate(7, 0.0)]);
-        evaluator.add(&[target(1, 0.0)], &[]);
-        evaluator.add(&[target(1, 0.0)], &[estimate(9, 0.0)]);
+        for (seconds, estimates) in
+            [(0.0, vec![estimate(7, 0.0)]), (0.5, vec![]), (1.0, vec![estimate(9, 0.0)])]
+        {
+            evaluator.add(Timestamp::EPOCH.plus_seconds(seconds), &[target(1, 0.0)], &estimates);
+        }
         let report = evaluator.report();
         assert_eq!((report.id_switches, report.false_tracks), (1, 0));
         assert!((report.targets[0].share_tracked - 2.0 / 3.0).abs() < 1e-12);

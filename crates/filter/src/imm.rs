@@ -5,6 +5,15 @@ use crate::KinematicState;
 /// More models than this say nothing that fewer do not.
 pub const MAX_MODELS: usize = 4;
 
+/// What is believed of a target's restlessness before it has been seen is worth so much calm flight, s: the rates
+/// at which targets leave their calm differ from one to the next by orders of magnitude, so a first manoeuvre
+/// says much. With half of it a target that has turned once is taken to turn again within ten seconds.
+const RESTLESSNESS_PRIOR_S: f64 = 20.0;
+/// A target has left its calm when calm is less likely than this, ...
+const UPSET: f64 = 0.5;
+/// ... and has come to it again when it is likelier than this.
+const CALM: f64 = 0.9;
+
 /// One way of flying: constant velocity driven by white acceleration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionModel {
@@ -21,20 +30,23 @@ pub struct MotionModel {
 ///
 /// The mode is a Markov process in continuous time: at `switching_rate` it is drawn anew from the shares of
 /// the models of its habit, and at `habit_rate` from those of all models. So the transition over an interval
-/// is the same however it is cut, and a target that has turned once is expected to turn again soon, while one
-/// that has flown straight for long is not.
+/// is the same however it is cut. The rate at which a target leaves the calmest habit is its own and is learnt
+/// (see [`Imm`]).
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionModels {
     models: Vec<MotionModel>,
     switching_rate: f64,
     habit_rate: f64,
+    /// The habit of the quietest model.
+    calm: u8,
 }
 
 /// Weights of the models, in their order; what lies beyond the last model is 0.
 pub type ModelWeights = [f64; MAX_MODELS];
 
 impl MotionModels {
-    /// One to [`MAX_MODELS`] models, with the rates of switching within a habit and of changing it in 1/s. The shares are scaled to a sum of 1.
+    /// One to [`MAX_MODELS`] models, with the rates of switching within a habit and of changing it in 1/s. The
+    /// shares are scaled to a sum of 1.
     ///
     /// `None` if a density is negative, a share or a rate is not positive (a lone model needs no
     /// rate), or a number is not finite.
@@ -47,7 +59,8 @@ impl MotionModels {
             return None;
         }
         let scaled = |m: &MotionModel| MotionModel { share: m.share / total, ..*m };
-        Some(Self { models: models.iter().map(scaled).collect(), switching_rate, habit_rate })
+        let calm = models.iter().min_by(|a, b| a.density.total_cmp(&b.density))?.habit;
+        Some(Self { models: models.iter().map(scaled).collect(), switching_rate, habit_rate, calm })
     }
 
     /// A single model: a plain Kalman filter.
@@ -73,12 +86,17 @@ impl MotionModels {
         self.models.iter().map(|m| m.density).fold(0.0, f64::max)
     }
 
-    /// Probability of model `to` an interval of seconds after model `from`.
-    fn transitions(&self, interval: f64) -> [ModelWeights; MAX_MODELS] {
-        let same_habit = (-self.habit_rate * interval.abs()).exp();
+    /// Probability of each model (columns) an interval of seconds after each (rows), for a target of some
+    /// restlessness.
+    fn transitions(&self, interval: f64, restlessness: &Restlessness) -> [ModelWeights; MAX_MODELS] {
+        let lively = 1.0 - self.calm_share();
+        let leaving = restlessness.rate(self.habit_rate * lively);
+        let leaving_calm = if lively > 0.0 { leaving / lively } else { 0.0 };
         let same_mode = (-self.switching_rate * interval.abs()).exp();
         let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
         for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
+            let rate = if from.habit == self.calm { leaving_calm } else { self.habit_rate };
+            let same_habit = (-rate * interval.abs()).exp();
             let alike = self.models.iter().filter(|model| model.habit == from.habit);
             let habit_share: f64 = alike.map(|model| model.share).sum();
             for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
@@ -91,11 +109,54 @@ impl MotionModels {
         }
         transitions
     }
+
+    /// Share of the time that targets are calm.
+    fn calm_share(&self) -> f64 {
+        self.calm_probability(&self.models.iter().map(|model| model.share).collect::<Vec<_>>())
+    }
+
+    fn calm_probability(&self, probabilities: &[f64]) -> f64 {
+        let calm = self.models.iter().zip(probabilities).filter(|(model, _)| model.habit == self.calm);
+        calm.map(|(_, probability)| probability).sum()
+    }
+}
+
+/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each time it does and
+/// each second that it does not sharpen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Restlessness {
+    is_calm: bool,
+    /// How often it has been seen to leave its calm, ...
+    upsets: f64,
+    /// ... and for how long it has been calm, s.
+    calm_s: f64,
+}
+
+impl Restlessness {
+    const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
+
+    /// The rate, 1/s; `usual` is that of all targets.
+    fn rate(&self, usual: f64) -> f64 {
+        (usual * RESTLESSNESS_PRIOR_S + self.upsets) / (RESTLESSNESS_PRIOR_S + self.calm_s)
+    }
+
+    /// The target has been calm with this probability for an interval of seconds.
+    fn see(&mut self, calm: f64, interval: f64) {
+        self.calm_s += calm * interval.abs();
+        if self.is_calm && calm < UPSET {
+            self.upsets += 1.0;
+            self.is_calm = false;
+        }
+        self.is_calm |= calm > CALM;
+    }
 }
 
 /// Interacting multiple models (IMM): a bank of Kalman filters that differ in their process noise,
 /// weighted by how well each predicts (003, equations 10-17, with the errata; there for the
 /// brightness of a pixel, here for position and velocity).
+///
+/// How often a target leaves its calm is learnt of each: one that has flown straight for minutes is expected to go
+/// on, and one that turns every few seconds to turn again before its bearings can show it.
 ///
 /// All models share the transition of constant velocity. So the moments of the prediction follow
 /// from those of the combined state in closed form, and a gate needs no mixing: see
@@ -127,6 +188,7 @@ pub struct Imm {
     states: Vec<KinematicState>,
     probabilities: ModelWeights,
     combined: KinematicState,
+    restlessness: Restlessness,
 }
 
 impl Imm {
@@ -136,7 +198,8 @@ impl Imm {
         for (probability, model) in probabilities.iter_mut().zip(models.models()) {
             *probability = model.share;
         }
-        Self { states: vec![state.clone(); models.models().len()], probabilities, combined: state }
+        let states = vec![state.clone(); models.models().len()];
+        Self { states, probabilities, combined: state, restlessness: Restlessness::UNKNOWN }
     }
 
     /// Mean and covariance over all models.
@@ -151,7 +214,7 @@ impl Imm {
 
     /// Each model's probability `interval` seconds on.
     pub fn predicted_probabilities(&self, interval: f64, models: &MotionModels) -> ModelWeights {
-        self.probabilities_after(&models.transitions(interval))
+        self.probabilities_after(&models.transitions(interval, &self.restlessness))
     }
 
     fn probabilities_after(&self, transitions: &[ModelWeights; MAX_MODELS]) -> ModelWeights {
@@ -185,7 +248,7 @@ impl Imm {
         models: &MotionModels,
         mut update: impl FnMut(&KinematicState) -> Option<(KinematicState, f64)>,
     ) -> Option<f64> {
-        let transitions = models.transitions(interval);
+        let transitions = models.transitions(interval, &self.restlessness);
         let weights = self.probabilities_after(&transitions);
         let mut states: [Option<KinematicState>; MAX_MODELS] = Default::default();
         let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
@@ -211,6 +274,7 @@ impl Imm {
             *state = next;
         }
         self.combined = combined(&self.states, &self.probabilities);
+        self.restlessness.see(models.calm_probability(self.probabilities()), interval);
         Some(largest + sum.ln())
     }
 
@@ -329,7 +393,7 @@ mod tests {
             .models()
             .iter()
             .enumerate()
-            .map(|(j, model)| imm.mixed(j, &models.transitions(dt)).predicted(dt, model.density))
+            .map(|(j, model)| imm.mixed(j, &models.transitions(dt, &imm.restlessness)).predicted(dt, model.density))
             .collect();
         let (slow, fast) = (combined(&states, &weights), imm.predicted(dt, &models));
         assert!((slow.mean - fast.mean).norm() < 1e-9);

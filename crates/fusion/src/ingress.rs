@@ -7,7 +7,7 @@ use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, 
 use nalgebra::{Matrix2, Matrix6, Point3};
 
 use crate::rooted::Rooted;
-use crate::uncertainty::CameraUncertainty;
+use crate::uncertainty::{CameraUncertainty, PoseUncertainty};
 use crate::{Bearings, Counters, Weighting};
 
 /// Bearings of one frame that are read: more is no picture, and memory is bounded.
@@ -226,7 +226,7 @@ pub(crate) fn read(
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty {
-            pose: *pose,
+            pose: pose.map(PoseUncertainty::new),
             axes: *camera.pose().rotation(),
             ..CameraUncertainty::of_time(sd)
         },

@@ -8,7 +8,9 @@
 //! is nearly Gaussian.
 
 use crossfix_filter::KinematicState;
-use nalgebra::{Matrix3, Matrix3x2, Matrix6, Point3, Unit, Vector3, Vector6};
+use nalgebra::{
+    Matrix2x3, Matrix3, Matrix3x2, Matrix6, Matrix6x2, Matrix6x3, Point3, Unit, Vector3, Vector6,
+};
 
 /// Coordinates of a target's state about one state.
 // Made and used in one update: never stored, so the size of the larger variant costs nothing.
@@ -55,11 +57,41 @@ impl Chart {
         RangeChart::new(origin, state).map(Self::ByRange)
     }
 
-    /// How the coordinates change with position and velocity at the chart's own state.
-    pub(crate) fn by_state(&self) -> Matrix6<f64> {
+    /// A covariance of position and velocity, and theirs with some errors, in the chart's coordinates.
+    pub(crate) fn expressed(
+        &self,
+        covariance: &Matrix6<f64>,
+        ties: &Matrix6x3<f64>,
+    ) -> (Matrix6<f64>, Matrix6x3<f64>) {
         match self {
-            Self::Cartesian(_) => Matrix6::identity(),
-            Self::ByRange(chart) => chart.by_state(),
+            Self::Cartesian(_) => (*covariance, *ties),
+            Self::ByRange(chart) => {
+                let by = chart.by_state();
+                (by * covariance * by.transpose(), by * ties)
+            }
+        }
+    }
+
+    /// Back from the chart at a point of it, after an update by a measurement of the place (`by`, on the first
+    /// three coordinates) with a gain: the covariance, what becomes of the state's covariance with any error,
+    /// and the gain, all of position and velocity.
+    pub(crate) fn from(
+        &self,
+        point: &ChartPoint,
+        covariance: Matrix6<f64>,
+        by: &Matrix2x3<f64>,
+        gain: Matrix6x2<f64>,
+    ) -> (Matrix6<f64>, Matrix6<f64>, Matrix6x2<f64>) {
+        let mut left = Matrix6::identity();
+        let mut of_place = left.fixed_columns_mut::<3>(0);
+        of_place -= gain * by;
+        match self {
+            Self::Cartesian(_) => (covariance, left, gain),
+            Self::ByRange(chart) => {
+                let state_by = point.state_by;
+                let covariance = state_by * covariance * state_by.transpose();
+                (covariance, state_by * left * chart.by_state(), state_by * gain)
+            }
         }
     }
 

@@ -75,9 +75,10 @@ impl View {
         let rooted_s = self.rooted_s;
         // What is there when a camera begins to look may have been there for long.
         let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
-        let distance = |place: &Place| (place.middle.into_inner() - line.direction.into_inner()).norm();
+        let distance =
+            |place: &Place| (place.middle.into_inner() - line.direction.into_inner()).norm_squared();
         let near = self.places.iter_mut().map(|place| (distance(place), place));
-        let nearest = near.filter(|(away, _)| *away <= REACH_RAD).min_by(|a, b| a.0.total_cmp(&b.0));
+        let nearest = near.filter(|(away, _)| *away <= REACH_RAD.powi(2)).min_by(|a, b| a.0.total_cmp(&b.0));
         let Some((_, place)) = nearest else {
             if self.places.len() >= MAX_PLACES {
                 self.places.remove(0);

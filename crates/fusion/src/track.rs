@@ -184,21 +184,10 @@ impl Expectation {
     }
 }
 
-/// A bearing against a state, rad: offset and covariance of what is expected.
+/// A bearing against what is expected of it.
 struct Innovation {
     offset: Vector2<f64>,
     model: BearingModel,
-    /// Of the state and of what it shares with the camera's errors.
-    known: Matrix2<f64>,
-    shared: Matrix2<f64>,
-}
-
-impl Innovation {
-    /// Squared Mahalanobis distance where the reported covariance counts so many times.
-    fn nis(&self, line: &SightLine, factor: f64) -> Option<f64> {
-        let spread = self.known + self.shared + self.model.covariance_of(line) * factor;
-        Some(self.offset.dot(&spread.cholesky()?.solve(&self.offset)))
-    }
 }
 
 impl Track {
@@ -354,23 +343,32 @@ impl Track {
     }
 
     /// A bearing against what is expected at its time.
-    fn innovation(
+    fn innovation(&self, time: Timestamp, line: &SightLine) -> Option<Innovation> {
+        let model = BearingModel::new(line.origin, self.position_at(time))?;
+        Some(Innovation { offset: model.offset(line)?, model })
+    }
+
+    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as they are
+    /// found to.
+    fn nis(
         &self,
-        time: Timestamp,
-        camera: &CameraName,
-        line: &SightLine,
+        innovation: &Innovation,
+        interval: f64,
+        (camera, line): (&CameraName, &SightLine),
         uncertainty: &CameraUncertainty,
         motion: &Motion,
-    ) -> Option<Innovation> {
-        let before = self.predicted(time, motion);
-        let model = BearingModel::new(line.origin, before.position())?;
-        let offset = model.offset(line)?;
+    ) -> Option<f64> {
+        let Innovation { offset, model } = innovation;
+        let before = self.imm.predicted(interval, motion.models(self.held));
         let by = model.by_position();
-        let shifts = uncertainty.shifts(&model, before.velocity());
-        let ties = self.ties_of(camera, time.seconds_since(self.updated));
-        let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
-        let known = by * before.position_covariance() * by.transpose() + cross + cross.transpose();
-        Some(Innovation { offset, model, known, shared: shifts * shifts.transpose() })
+        let shifts = uncertainty.shifts(model, before.velocity());
+        let cross = by * self.ties_of(camera, interval).fixed_rows::<3>(0) * shifts.transpose();
+        let spread = by * before.position_covariance() * by.transpose()
+            + cross
+            + cross.transpose()
+            + shifts * shifts.transpose()
+            + model.covariance_of(line) * uncertainty.factor;
+        Some(offset.dot(&spread.cholesky()?.solve(offset)))
     }
 
     /// Probability that a camera can see the target at a time, by what it has seen so far.
@@ -417,16 +415,8 @@ impl Track {
         motion: &Motion,
     ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
-        let innovation = self.innovation(time, camera, line, uncertainty, motion)?;
-        let manoeuvre = self.detector.as_mut().is_some_and(|detector| match detector {
-            Detector::Residual(detector) => {
-                let in_deviations = innovation.model.basis * innovation.offset / line.standard_deviation();
-                detector.see(in_deviations)
-            }
-            Detector::Innovation(detector) => {
-                innovation.nis(line, uncertainty.factor).is_some_and(|nis| detector.see(nis, 2))
-            }
-        });
+        let innovation = self.innovation(time, line)?;
+        let manoeuvre = self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
         }
@@ -455,6 +445,26 @@ impl Track {
         self.gather(camera, &innovation, line, uncertainty);
         let third_difference = self.third_difference(camera, line, motion);
         Some(Taken { manoeuvre, third_difference })
+    }
+
+    /// Whether a detector sees in a bearing that the target has begun to manoeuvre.
+    fn sees_manoeuvre(
+        &mut self,
+        innovation: &Innovation,
+        interval: f64,
+        (camera, line): (&CameraName, &SightLine),
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> bool {
+        let nis = matches!(self.detector, Some(Detector::Innovation(_)))
+            .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))
+            .flatten();
+        self.detector.as_mut().is_some_and(|detector| match detector {
+            Detector::Residual(detector) => {
+                detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
+            }
+            Detector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
+        })
     }
 
     /// Keeps a bearing for the next draw.

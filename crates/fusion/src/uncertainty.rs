@@ -3,6 +3,31 @@
 use crossfix_geometry::{BearingModel, tangent_basis};
 use nalgebra::{Matrix2, Matrix2x3, Matrix6, Rotation3, Unit, Vector2, Vector3};
 
+/// Covariance of a camera's pose in the world's axes as declared: rotation (rad), then position (m).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct PoseUncertainty {
+    covariance: Matrix6<f64>,
+    /// The variances of rotation and position where all axes are alike and nothing is tied, as most poses are
+    /// declared: then all bearings are shifted alike, and no matrices need be multiplied.
+    alike: Option<[f64; 2]>,
+}
+
+impl PoseUncertainty {
+    pub(crate) fn new(covariance: Matrix6<f64>) -> Self {
+        let [rotation, position] = [covariance.m11, covariance.m44];
+        let alike = Self::diagonal(rotation, position);
+        Self { covariance, alike: (covariance == alike).then_some([rotation, position]) }
+    }
+
+    fn diagonal(rotation: f64, position: f64) -> Matrix6<f64> {
+        Matrix6::from_diagonal(&[rotation, rotation, rotation, position, position, position].into())
+    }
+
+    pub(crate) fn covariance(&self) -> &Matrix6<f64> {
+        &self.covariance
+    }
+}
+
 /// What all bearings of an exposure have in common: the uncertainty of its time and of the
 /// camera's pose, and how much worse than it says the camera has been found to be.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,8 +36,8 @@ pub(crate) struct CameraUncertainty {
     pub(crate) time_sd_s: f64,
     /// The reported covariances count this many times.
     pub(crate) factor: f64,
-    /// Covariance of the pose in the world's axes as declared: rotation (rad), then position (m), ...
-    pub(crate) pose: Option<Matrix6<f64>>,
+    /// What is uncertain of the pose as declared, ...
+    pub(crate) pose: Option<PoseUncertainty>,
     /// ... and how many times that is what the camera's lines have shown.
     pub(crate) pose_scale: f64,
     /// Whether the clock's error is taken for noise of each bearing: where the velocity is not known yet, what
@@ -62,16 +87,25 @@ impl CameraUncertainty {
 
     /// What the pose shifts a bearing by as declared: the root of its covariance, rad.
     pub(crate) fn declared_pose(&self, model: &BearingModel) -> Matrix2<f64> {
-        let by = model.by_pose();
-        self.pose.map_or_else(Matrix2::zeros, |pose| self.root(model, &(by * pose * by.transpose())))
+        match self.pose {
+            None => Matrix2::zeros(),
+            Some(PoseUncertainty { alike: Some([rotation, position]), .. }) => {
+                let shift = (rotation + position / model.range.powi(2)).sqrt();
+                self.turn(model) * shift
+            }
+            Some(PoseUncertainty { covariance, alike: None }) => {
+                let by = model.by_pose();
+                let turn = self.turn(model);
+                turn * root(&(turn.transpose() * (by * covariance * by.transpose()) * turn))
+            }
+        }
     }
 
-    /// The root of a covariance on the model's tangents whose columns keep to the camera's axes as the
-    /// direction changes.
-    fn root(&self, model: &BearingModel, covariance: &Matrix2<f64>) -> Matrix2<f64> {
+    /// From tangents in the camera's own axes to the model's: the columns of a root in the former keep to the
+    /// camera's axes as the direction changes.
+    fn turn(&self, model: &BearingModel) -> Matrix2<f64> {
         let direction = Unit::new_unchecked(self.axes.inverse() * model.direction.into_inner());
-        let turn = model.basis.transpose() * (self.axes.matrix() * tangent_basis(&direction));
-        turn * root(&(turn.transpose() * covariance * turn))
+        model.basis.transpose() * (self.axes.matrix() * tangent_basis(&direction))
     }
 
     /// Covariance of what the shared errors shift a bearing by, rad^2.
@@ -109,7 +143,7 @@ mod tests {
         let camera = CameraUncertainty {
             time_sd_s: 0.01,
             factor: 4.0,
-            pose: Some(pose),
+            pose: Some(PoseUncertainty::new(pose)),
             clock_is_noise: false,
             pose_scale: 1.0,
             axes: Rotation3::identity(),
@@ -135,7 +169,8 @@ mod tests {
         factor[(3, 3)] = 0.2;
         factor[(2, 3)] = 0.2 / 40.0;
         let pose = factor * factor.transpose();
-        let camera = CameraUncertainty { pose: Some(pose), ..CameraUncertainty::of_time(0.0) };
+        let camera =
+            CameraUncertainty { pose: Some(PoseUncertainty::new(pose)), ..CameraUncertainty::of_time(0.0) };
         let expected = camera.shared(&model, Vector3::zeros());
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let mut sum = Matrix2::zeros();

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix2x6, Matrix6, Matrix6x2, Matrix6x3, Point3, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x2, Matrix6x3, Point3, Vector2, Vector6};
 
 use crate::range_chart::Chart;
 use crate::uncertainty::CameraUncertainty;
@@ -54,9 +54,7 @@ pub(crate) fn updated(
         Some(origin) => Chart::by_range(origin, prior)?,
         None => Chart::cartesian(prior),
     };
-    let by_state = chart.by_state();
-    let covariance = by_state * prior.covariance * by_state.transpose();
-    let ties = by_state * ties;
+    let (covariance, ties) = chart.expressed(&prior.covariance, ties);
     let is_own = seen_from == Some(line.origin);
     let mut coordinates = Vector6::zeros();
     if !is_own && seen_from.is_some() && covariance.m33 > VAGUE_LOG_RANGE_SD.powi(2) {
@@ -67,20 +65,21 @@ pub(crate) fn updated(
         let model = BearingModel::new(line.origin, point.place)?;
         let offset = model.offset(line)?;
         let shifts = camera.shifts(&model, point.velocity);
-        let mut by = Matrix2x6::zeros();
-        by.fixed_view_mut::<2, 3>(0, 0).copy_from(&(model.by_position() * point.place_by));
+        // Of the state only the place is seen: the first three coordinates.
+        let by: Matrix2x3<f64> = model.by_position() * point.place_by;
         let tied: Matrix6x2<f64> = ties * shifts.transpose();
-        let across: Matrix6x2<f64> = covariance * by.transpose() + tied;
-        let cross: Matrix2<f64> = by * tied;
+        let seen: Matrix6x2<f64> = covariance.fixed_columns::<3>(0) * by.transpose();
+        let across = seen + tied;
+        let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
         let noise =
             camera.noise(&model, point.velocity, &model.covariance_of(line)) + shifts * shifts.transpose();
-        let spread = by * (across - tied) + cross + cross.transpose() + noise;
+        let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
         let determinant = spread.determinant();
         let inverse = spread.try_inverse()?;
         if !(determinant > 0.0 && spread.m11 > 0.0) {
             return None;
         }
-        let innovation: Vector2<f64> = offset + by * coordinates;
+        let innovation: Vector2<f64> = offset + by * coordinates.fixed_rows::<3>(0);
         let gain = across * inverse;
         let next = gain * innovation;
         let moved = (point.place_by * (next - coordinates).fixed_rows::<3>(0)).norm() / model.range;
@@ -91,9 +90,8 @@ pub(crate) fn updated(
         }
         let nis = innovation.dot(&(inverse * innovation));
         let point = chart.point(&coordinates);
-        let state_by = point.state_by;
-        let posterior = covariance - gain * across.transpose();
-        let covariance = state_by * posterior * state_by.transpose();
+        let (covariance, carried, gain) =
+            chart.from(&point, covariance - gain * across.transpose(), &by, gain);
         let state =
             KinematicState { mean: point.mean(), covariance: (covariance + covariance.transpose()) / 2.0 };
         let positive = state.covariance.diagonal().iter().all(|variance| *variance > 0.0);
@@ -101,8 +99,8 @@ pub(crate) fn updated(
             state,
             nis,
             log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
-            carried: state_by * (Matrix6::identity() - gain * by) * by_state,
-            gained: state_by * gain * shifts,
+            carried,
+            gained: gain * shifts,
         });
     }
     None

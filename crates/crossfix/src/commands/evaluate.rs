@@ -1,7 +1,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
-use crossfix_evaluation::{Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory, TrueTarget};
+use crossfix_evaluation::{
+    Delays, Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory, TrueTarget,
+};
 use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame};
 use serde::Serialize;
 
@@ -126,7 +128,7 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
     let mut evaluator = Evaluator::new(question.cutoff_m);
     for ((frame, &time), cameras) in run.truth.iter().zip(&times).zip(run.sightings.cameras_at(&times)) {
         if time >= start && cameras >= question.min_cameras {
-            evaluator.add(&targets(frame), &run.tracks.at(time));
+            evaluator.add(time, &targets(frame), &run.tracks.at(time));
         }
     }
     // Imported data arrive when they are made: there is no latency to speak of.
@@ -146,7 +148,17 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 /// The figures as people read them.
 pub fn render(evaluation: &Evaluation) -> String {
     let Evaluation { report, latency, .. } = evaluation;
-    let head = ["target", "detected", "tracked", "position RMSE [m]", "velocity RMSE [m/s]", "NEES (6)"];
+    let head = [
+        "target",
+        "detected",
+        "tracked",
+        "position RMSE [m]",
+        "velocity RMSE [m/s]",
+        "NEES (6)",
+        "median (5.3)",
+        "position NEES (3)",
+        "velocity NEES (3)",
+    ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     rows.extend(report.targets.iter().map(|target| {
         vec![
@@ -155,19 +167,57 @@ pub fn render(evaluation: &Evaluation) -> String {
             format!("{:.1} %", 100.0 * target.share_tracked),
             output::number(target.position_rmse_m, 3),
             output::number(target.velocity_rmse_mps, 3),
-            output::number(target.mean_nees, 2),
+            output::number(target.nees.mean, 2),
+            output::number(target.nees.median, 2),
+            output::number(target.position_nees.mean, 2),
+            output::number(target.velocity_nees.mean, 2),
         ]
     }));
     let latency = latency.map_or_else(String::new, |latency| {
         format!("\nbearing to track: p50 {:.1} ms, p99 {:.1} ms", latency.p50_ms, latency.p99_ms)
     });
     format!(
-        "{}\n\n{} instants, {} false tracks, {} changes of identity, OSPA {:.3} m, GOSPA {:.3} m{latency}",
+        "{}\n\n{} instants, {} answers: {} off by more than 1 m, {} by more than 4 SD, {} false (farther than {} m \
+         from every target)\n{} false tracks, {} changes of identity, OSPA {:.3} m, GOSPA {:.3} m\n{}{latency}",
         output::table(&rows),
         report.instants,
+        report.answers,
+        percent(report.share_off_by_1_m),
+        percent(report.share_beyond_4_sd),
+        report.false_answers,
+        report.cutoff_m,
         report.false_tracks,
         report.id_switches,
         report.ospa_m,
         report.gospa_m,
+        waits(&report.delays),
     )
+}
+
+fn percent(share: Option<f64>) -> String {
+    share.map_or_else(|| "-".to_owned(), |share| format!("{:.2} %", 100.0 * share))
+}
+
+/// How long the targets waited for an answer, in words.
+fn waits(delays: &Delays) -> String {
+    let first = delays.first_s.map_or_else(
+        || "a target was never answered for".to_owned(),
+        |first| format!("first answer after {first:.1} s"),
+    );
+    let seconds =
+        |value: Option<f64>| value.map_or_else(|| "never".to_owned(), |value| format!("{value:.1} s"));
+    let next = match delays.returns {
+        0 => String::new(),
+        returns => format!(
+            "; of {returns} returns half answered for within {}, 90 % within {}",
+            seconds(delays.next_median_s),
+            seconds(delays.next_p90_s)
+        ),
+    };
+    let unanswered = match delays.unanswered {
+        0 => String::new(),
+        1 => "; one stretch of more than a second without any answer".to_owned(),
+        many => format!("; {many} stretches of more than a second without any answer"),
+    };
+    format!("{first}{next}{unanswered}")
 }

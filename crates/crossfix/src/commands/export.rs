@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use crossfix_evaluation::{Estimate, TrackHistory};
-use crossfix_message::{Channel, Timestamp, TrackFrame};
+use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
 
 use crate::output::{self, Draft};
@@ -10,8 +10,9 @@ use crate::recorded::{self, Lacks};
 
 /// Write the confirmed tracks of a recording as a table.
 ///
-/// Columns t,track_id,x,y,z,vx,vy,vz,sd_m: seconds since the Unix epoch, metres, metres a second, and the root
-/// of the sum of the position's variances, metres. With
+/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m: seconds since the Unix epoch, metres, metres a second,
+/// what the track is (confirmed or coasting; with --all also tentative and one-camera), how many cameras have given
+/// it a bearing within the second before, and the root of the sum of the position's variances, metres. With
 /// --times, the state of each track at those times from its last frame at or before them,
 /// extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
@@ -25,6 +26,20 @@ pub struct Args {
     /// A table (CSV) with a column `t`: the times to answer, seconds since the Unix epoch.
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
+    /// Also the tracks that are not sure yet, and those that one camera alone follows: their range is a guess.
+    #[arg(long)]
+    all: bool,
+}
+
+/// What a track is, in a word.
+fn word(status: TrackState) -> &'static str {
+    match status {
+        TrackState::Confirmed => "confirmed",
+        TrackState::Coasting => "coasting",
+        TrackState::OneCamera => "one-camera",
+        TrackState::Lost => "lost",
+        TrackState::Tentative | TrackState::Unspecified => "tentative",
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -52,30 +67,33 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let draft = Draft::new(&args.csv, &inputs)?;
     let mut writer = csv::Writer::from_path(draft.path())
         .with_context(|| format!("cannot write {}", args.csv.display()))?;
-    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "sd_m"])?;
+    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m"])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
-        for Estimate { id, state } in estimates {
-            let mut record = vec![format!("{time:.9}"), id.to_string()];
-            record.extend(state.mean.iter().map(|value| format!("{value:.6}")));
-            record.push(format!("{:.6}", state.position_covariance().trace().sqrt()));
+        for estimate in estimates {
+            let mut record = vec![format!("{time:.9}"), estimate.id.to_string()];
+            record.extend(estimate.state.mean.iter().map(|value| format!("{value:.6}")));
+            record.push(word(estimate.status).to_owned());
+            record.push(estimate.cameras.to_string());
+            record.push(format!("{:.6}", estimate.position_sd_m()));
             writer.write_record(&record)?;
             rows += 1;
         }
         Ok(())
     };
+    let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
     match &args.times {
         Some(path) => {
             let mut reader =
                 csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?;
             for row in reader.deserialize() {
                 let TimeRow { t } = row.with_context(|| format!("{} needs a column `t`", path.display()))?;
-                write(t, &history.at(Timestamp::from_seconds(t)))?;
+                write(t, &at(Timestamp::from_seconds(t)))?;
             }
         }
         None => {
-            for (time, estimates) in history.frames() {
-                write(time.seconds(), &estimates)?;
+            for time in history.times() {
+                write(time.seconds(), &at(time))?;
             }
         }
     }

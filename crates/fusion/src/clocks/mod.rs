@@ -139,7 +139,7 @@ impl ClockEstimator {
         let Some(before) = self.reported.get(camera) else {
             self.needed |= uncertain;
             self.reported.insert(camera.clone(), reported_sd_s);
-            self.belief.add(camera, deviations, reported.pose);
+            self.belief.add(camera, deviations, reported.pose.map(|pose| *pose.covariance()));
             self.forget_provisional();
             return;
         };

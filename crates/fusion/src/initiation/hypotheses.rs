@@ -88,6 +88,19 @@ impl Hypothesis {
     }
 }
 
+/// An exposure with what its lines are compared by.
+#[derive(Clone, Copy)]
+struct Look<'a> {
+    exposure: &'a Exposure,
+    known: &'a KnownCamera,
+    motion: &'a Motion,
+    lines: &'a [NamedLine],
+    uncertainty: CameraUncertainty,
+    detection: f64,
+    /// Since the camera's exposure before.
+    interval_s: f64,
+}
+
 impl Hypotheses {
     pub(super) fn new(config: &FusionConfig) -> Self {
         Self {
@@ -153,53 +166,70 @@ impl Hypotheses {
         let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
+        let look = Look { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
         let mut next = Vec::with_capacity(self.hypotheses.len());
-        for mut hypothesis in self.hypotheses.drain(..) {
-            let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
-            let prediction = hypothesis.track.expectation(
-                exposure.time,
-                (&exposure.camera, known.camera.pose().position()),
-                &uncertainty,
-                motion,
-            );
-            let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
-            let miss = missed(visible, detection);
-            let ratio = |(i, (_, line)): (usize, &NamedLine)| {
-                let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
-                Some((log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr), i))
-            };
-            let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
-            near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-            let density = motion.density(hypothesis.track.model_probabilities());
-            for &(ratio, i) in near.iter().take(MAX_BRANCHES).filter(|(ratio, _)| *ratio > miss) {
-                let mut child = hypothesis.clone();
-                let (id, line) = &lines[i];
-                let time = (exposure.time, &uncertainty);
-                if child.track.measurement_update(&exposure.camera, &line.line, time, motion).is_some() {
-                    child.track.score += ratio;
-                    child.track.look(&exposure.camera, exposure.time, true, detection, motion);
-                    if let Some(Expectation::Near(prediction)) = &prediction {
-                        child.coincidence.see(
-                            &exposure.camera,
-                            (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
-                            prediction,
-                            (density, self.speed),
-                            ratio,
-                        );
-                    }
-                    child.lines.push((self.period, id.clone()));
-                    next.push(child);
-                }
-            }
-            if expected {
-                hypothesis.track.score += miss;
-                hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
-                hypothesis.coincidence.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
-            }
-            next.push(hypothesis);
+        for hypothesis in std::mem::take(&mut self.hypotheses) {
+            self.extend_one(hypothesis, &look, &mut next);
         }
         self.hypotheses = next;
         self.prune_families();
+    }
+
+    /// Lets one hypothesis go on with each bearing in its gate that is likely enough beside the likeliest way, and
+    /// without any if that is.
+    fn extend_one(&self, mut hypothesis: Hypothesis, look: &Look<'_>, next: &mut Vec<Hypothesis>) {
+        let Look { exposure, known, motion, lines, uncertainty, detection, interval_s } = *look;
+        let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
+        let prediction = hypothesis.track.expectation(
+            exposure.time,
+            (&exposure.camera, known.camera.pose().position()),
+            &uncertainty,
+            motion,
+        );
+        let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
+        let miss = missed(visible, detection);
+        let ratio = |(i, (_, line)): (usize, &NamedLine)| {
+            let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
+            Some((log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr), i))
+        };
+        let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
+        near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let best = near.first().map_or(miss, |(ratio, _)| ratio.max(miss));
+        near.retain(|(ratio, _)| *ratio > miss && *ratio > best - RIVAL_MARGIN);
+        near.truncate(MAX_BRANCHES);
+        let density = motion.density(hypothesis.track.model_probabilities());
+        let taken = |mut child: Hypothesis, (ratio, i): (f64, usize)| {
+            let (id, line) = &lines[i];
+            let time = (exposure.time, &uncertainty);
+            child.track.measurement_update(&exposure.camera, &line.line, time, motion)?;
+            child.track.score += ratio;
+            child.track.look(&exposure.camera, exposure.time, true, detection, motion);
+            if let Some(Expectation::Near(prediction)) = &prediction {
+                child.coincidence.see(
+                    &exposure.camera,
+                    (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
+                    prediction,
+                    (density, self.speed),
+                    ratio,
+                );
+            }
+            child.lines.push((self.period, id.clone()));
+            Some(child)
+        };
+        if miss <= best - RIVAL_MARGIN {
+            // Copies cost more than all the rest: the last way takes the hypothesis itself.
+            let last = near.pop();
+            next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
+            next.extend(last.and_then(|way| taken(hypothesis, way)));
+            return;
+        }
+        next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
+        if expected {
+            hypothesis.track.score += miss;
+            hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
+            hypothesis.coincidence.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
+        }
+        next.push(hypothesis);
     }
 
     /// Keeps the best few of each family.

@@ -106,7 +106,8 @@ fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
 /// that is noise like any other.
 fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     let pose = exposure.uncertainty.pose;
-    let origin_sd_m = pose.map_or(0.0, |pose| (pose.fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());
+    let origin_sd_m =
+        pose.map_or(0.0, |pose| (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());
     lines_of(exposure).map(move |(id, mut timed)| {
         let line = &mut timed.line;
         let at_infinity = BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };

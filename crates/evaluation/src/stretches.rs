@@ -1,0 +1,107 @@
+use std::collections::BTreeMap;
+
+use crossfix_message::Timestamp;
+use serde::Serialize;
+
+/// Instants of a target that lie farther apart than this belong to two stretches, s.
+const GAP_S: f64 = 1.0;
+/// A stretch shorter than this is not held against anybody who gave no answer in it, s.
+const LEAST_S: f64 = 1.0;
+
+/// How long it took until a target was answered for, from the beginning of each stretch of instants that were
+/// asked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Delays {
+    /// From a target's first instant to its first answer, the longest of all targets, s; absent if one was never
+    /// answered for.
+    pub first_s: Option<f64>,
+    /// Stretches after a target's first one: it has gone out of what was asked for, and come back.
+    pub returns: u64,
+    /// From a return to the next answer, the median, s; absent without a return, or if half got no answer.
+    pub next_median_s: Option<f64>,
+    /// The same, for nine returns of ten, s.
+    pub next_p90_s: Option<f64>,
+    /// Stretches (of more than a second) without any answer.
+    pub unanswered: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Stretch {
+    from: Timestamp,
+    to: Timestamp,
+    answered: Option<Timestamp>,
+}
+
+/// The stretches of every target.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Stretches(BTreeMap<u64, Vec<Stretch>>);
+
+impl Stretches {
+    /// Notes an instant of a target, in order of time.
+    pub(crate) fn add(&mut self, target: u64, time: Timestamp, answered: bool) {
+        let stretches = self.0.entry(target).or_default();
+        let goes_on = stretches.last().is_some_and(|last| time.seconds_since(last.to) <= GAP_S);
+        if !goes_on {
+            stretches.push(Stretch { from: time, to: time, answered: None });
+        }
+        if let Some(last) = stretches.last_mut() {
+            last.to = time;
+            if answered && last.answered.is_none() {
+                last.answered = Some(time);
+            }
+        }
+    }
+
+    pub(crate) fn delays(&self) -> Delays {
+        let delay = |stretch: &Stretch| {
+            stretch.answered.map_or(f64::INFINITY, |answered| answered.seconds_since(stretch.from))
+        };
+        let counts = |stretch: &&Stretch| {
+            stretch.answered.is_some() || stretch.to.seconds_since(stretch.from) > LEAST_S
+        };
+        let firsts = self.0.values().filter_map(|stretches| stretches.first());
+        let first_s = firsts.map(delay).fold(0.0, f64::max);
+        let returns = self.0.values().flat_map(|stretches| stretches.iter().skip(1));
+        let mut nexts: Vec<f64> = returns.filter(counts).map(delay).collect();
+        nexts.sort_by(f64::total_cmp);
+        let all = self.0.values().flatten().filter(counts);
+        Delays {
+            first_s: (first_s.is_finite() && !self.0.is_empty()).then_some(first_s),
+            returns: nexts.len() as u64,
+            next_median_s: quantile(&nexts, 0.5),
+            next_p90_s: quantile(&nexts, 0.9),
+            unanswered: all.filter(|stretch| stretch.answered.is_none()).count() as u64,
+        }
+    }
+}
+
+/// A quantile of ascending values, the next one that there is; `None` if that is not finite.
+pub(crate) fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    let place = (share * sorted.len() as f64).ceil() as usize;
+    sorted.get(place.saturating_sub(1)).copied().filter(|value| value.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn delays_by_hand() {
+        let mut stretches = Stretches::default();
+        let at = |s: f64| Timestamp::EPOCH.plus_seconds(s);
+        for (time, answered) in [(0.0, false), (0.5, false), (1.0, true), (1.5, true)] {
+            stretches.add(7, at(time), answered);
+        }
+        // Back after ten seconds, answered for at once; and once more, never.
+        stretches.add(7, at(11.5), true);
+        for k in 0..4 {
+            stretches.add(7, at(20.0 + 0.5 * f64::from(k)), false);
+        }
+        // Too short to be missed.
+        stretches.add(7, at(30.0), false);
+        let delays = stretches.delays();
+        assert_eq!(delays.first_s, Some(1.0));
+        assert_eq!((delays.returns, delays.unanswered), (2, 1));
+        assert_eq!((delays.next_median_s, delays.next_p90_s), (Some(0.0), None));
+    }
+}
