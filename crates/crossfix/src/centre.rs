@@ -121,6 +121,9 @@ impl Centre {
             },
             _ => Vec::new(),
         };
+        if let Some(why) = self.fusion.why_nothing() {
+            self.repeats.warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
+        }
         self.follow(outputs)
     }
 
@@ -223,14 +226,15 @@ impl Centre {
         let mut counters: Vec<Counter> = counters.collect();
         counters.sort_by(|a, b| a.name.cmp(&b.name));
         let left_out = self.fusion.cameras().filter(|report| report.standing == CameraStanding::Excluded);
-        let problems = left_out.map(|report| format!("camera `{}` is left out", report.camera));
+        let left_out = left_out.map(|report| format!("camera `{}` is left out", report.camera));
+        let nothing = self.fusion.why_nothing().map(|why| format!("nothing is found: {why}"));
         Health {
             component: "fusion".to_owned(),
             time_ns: self.now().nanos(),
             handled: self.frames,
             counters,
             cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
-            problems: problems.collect(),
+            problems: left_out.chain(nothing).collect(),
             scene_begins_ns: self.scene_begins.nanos(),
             ..Default::default()
         }

@@ -1,155 +1,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::KinematicState;
-
-/// More models than this say nothing that fewer do not.
-pub const MAX_MODELS: usize = 4;
-
-/// What is believed of a target's restlessness before it has been seen is worth so much calm flight, s: the rates
-/// at which targets leave their calm differ from one to the next by orders of magnitude, so a first manoeuvre
-/// says much. With half of it a target that has turned once is taken to turn again within ten seconds.
-const RESTLESSNESS_PRIOR_S: f64 = 20.0;
-/// A target has left its calm when calm is less likely than this, ...
-const UPSET: f64 = 0.5;
-/// ... and has come to it again when it is likelier than this.
-const CALM: f64 = 0.9;
-
-/// One way of flying: constant velocity driven by white acceleration.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MotionModel {
-    /// Power spectral density of the white acceleration, m^2/s^3.
-    pub density: f64,
-    /// Share of the time that targets fly like this, before anything is known of one.
-    pub share: f64,
-    /// The habit that it belongs to, by number: a target changes between the models of its habit often, and
-    /// its habit seldom.
-    pub habit: u8,
-}
-
-/// The ways in which targets fly, and how often they change from one to another.
-///
-/// The mode is a Markov process in continuous time: at `switching_rate` it is drawn anew from the shares of
-/// the models of its habit, and at `habit_rate` from those of all models. So the transition over an interval
-/// is the same however it is cut. The rate at which a target leaves the calmest habit is its own and is learnt
-/// (see [`Imm`]).
-#[derive(Clone, Debug, PartialEq)]
-pub struct MotionModels {
-    models: Vec<MotionModel>,
-    switching_rate: f64,
-    habit_rate: f64,
-    /// The habit of the quietest model.
-    calm: u8,
-}
-
-/// Weights of the models, in their order; what lies beyond the last model is 0.
-pub type ModelWeights = [f64; MAX_MODELS];
-
-impl MotionModels {
-    /// One to [`MAX_MODELS`] models, with the rates of switching within a habit and of changing it in 1/s. The
-    /// shares are scaled to a sum of 1.
-    ///
-    /// `None` if a density is negative, a share or a rate is not positive (a lone model needs no
-    /// rate), or a number is not finite.
-    pub fn new(models: &[MotionModel], switching_rate: f64, habit_rate: f64) -> Option<Self> {
-        let total: f64 = models.iter().map(|m| m.share).sum();
-        let possible = |m: &MotionModel| m.density >= 0.0 && m.density.is_finite() && m.share > 0.0;
-        let is_rate = |rate: f64| rate.is_finite() && (rate > 0.0 || models.len() == 1);
-        let good = (1..=MAX_MODELS).contains(&models.len()) && models.iter().all(possible);
-        if !(good && is_rate(switching_rate) && is_rate(habit_rate) && total.is_finite()) {
-            return None;
-        }
-        let scaled = |m: &MotionModel| MotionModel { share: m.share / total, ..*m };
-        let calm = models.iter().min_by(|a, b| a.density.total_cmp(&b.density))?.habit;
-        Some(Self { models: models.iter().map(scaled).collect(), switching_rate, habit_rate, calm })
-    }
-
-    /// A single model: a plain Kalman filter.
-    pub fn single(density: f64) -> Option<Self> {
-        Self::new(&[MotionModel { density, share: 1.0, habit: 0 }], 0.0, 0.0)
-    }
-
-    /// The models.
-    pub fn models(&self) -> &[MotionModel] {
-        &self.models
-    }
-
-    /// The same with every model as lively as the liveliest.
-    #[must_use]
-    pub fn widened(&self) -> Self {
-        let widest = self.widest();
-        let models = self.models.iter().map(|m| MotionModel { density: widest, ..*m }).collect();
-        Self { models, ..*self }
-    }
-
-    /// The largest density of acceleration among the models, m^2/s^3.
-    pub fn widest(&self) -> f64 {
-        self.models.iter().map(|m| m.density).fold(0.0, f64::max)
-    }
-
-    /// Probability of each model (columns) an interval of seconds after each (rows), for a target of some
-    /// restlessness.
-    fn transitions(&self, interval: f64, restlessness: &Restlessness) -> [ModelWeights; MAX_MODELS] {
-        let lively = 1.0 - self.calm_share();
-        let leaving = restlessness.rate(self.habit_rate * lively);
-        let leaving_calm = if lively > 0.0 { leaving / lively } else { 0.0 };
-        let same_mode = (-self.switching_rate * interval.abs()).exp();
-        let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
-        for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
-            let rate = if from.habit == self.calm { leaving_calm } else { self.habit_rate };
-            let same_habit = (-rate * interval.abs()).exp();
-            let alike = self.models.iter().filter(|model| model.habit == from.habit);
-            let habit_share: f64 = alike.map(|model| model.share).sum();
-            for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
-                *probability = (1.0 - same_habit) * to.share;
-                if from.habit == to.habit {
-                    let kept = if i == j { same_mode } else { 0.0 };
-                    *probability += same_habit * (kept + (1.0 - same_mode) * to.share / habit_share);
-                }
-            }
-        }
-        transitions
-    }
-
-    /// Share of the time that targets are calm.
-    fn calm_share(&self) -> f64 {
-        self.calm_probability(&self.models.iter().map(|model| model.share).collect::<Vec<_>>())
-    }
-
-    fn calm_probability(&self, probabilities: &[f64]) -> f64 {
-        let calm = self.models.iter().zip(probabilities).filter(|(model, _)| model.habit == self.calm);
-        calm.map(|(_, probability)| probability).sum()
-    }
-}
-
-/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each time it does and
-/// each second that it does not sharpen.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Restlessness {
-    is_calm: bool,
-    /// How often it has been seen to leave its calm, ...
-    upsets: f64,
-    /// ... and for how long it has been calm, s.
-    calm_s: f64,
-}
-
-impl Restlessness {
-    const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
-
-    /// The rate, 1/s; `usual` is that of all targets.
-    fn rate(&self, usual: f64) -> f64 {
-        (usual * RESTLESSNESS_PRIOR_S + self.upsets) / (RESTLESSNESS_PRIOR_S + self.calm_s)
-    }
-
-    /// The target has been calm with this probability for an interval of seconds.
-    fn see(&mut self, calm: f64, interval: f64) {
-        self.calm_s += calm * interval.abs();
-        if self.is_calm && calm < UPSET {
-            self.upsets += 1.0;
-            self.is_calm = false;
-        }
-        self.is_calm |= calm > CALM;
-    }
-}
+use crate::models::{MAX_MODELS, ModelWeights, MotionModels, Restlessness};
 
 /// Interacting multiple models (IMM): a bank of Kalman filters that differ in their process noise,
 /// weighted by how well each predicts (003, equations 10-17, with the errata; there for the
@@ -163,11 +15,12 @@ impl Restlessness {
 /// [`Self::predicted`].
 ///
 /// ```
-/// use crossfix_filter::{Imm, KinematicState, MotionModel, MotionModels};
+/// use crossfix_filter::{Imm, KinematicState, ModeRates, MotionModel, MotionModels};
 /// use nalgebra::{Matrix3, Matrix6, Point3, Vector6};
-/// let quiet = MotionModel { density: 0.001, share: 0.8, habit: 0 };
-/// let lively = MotionModel { density: 10.0, share: 0.2, habit: 0 };
-/// let models = MotionModels::new(&[quiet, lively], 0.1, 0.1).ok_or("models")?;
+/// let quiet = MotionModel { density: 0.001, share: 0.8, calm: true };
+/// let lively = MotionModel { density: 10.0, share: 0.2, calm: false };
+/// let rates = ModeRates { switching_per_s: 0.3, calming_per_s: 0.1, prior_s: 20.0 };
+/// let models = MotionModels::new(&[quiet, lively], rates).ok_or("models")?;
 /// let start = KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() };
 /// let mut imm = Imm::new(start, &models);
 /// let noise = Matrix3::identity() * 0.01;
@@ -368,10 +221,13 @@ mod tests {
     use nalgebra::{Matrix3, Point3};
 
     use super::*;
+    use crate::models::{ModeRates, MotionModel};
 
     fn models() -> MotionModels {
-        let model = |density, share, habit| MotionModel { density, share, habit };
-        MotionModels::new(&[model(0.0, 0.7, 0), model(1.0, 0.2, 1), model(20.0, 0.1, 1)], 0.2, 0.05).unwrap()
+        let model = |density, share, calm| MotionModel { density, share, calm };
+        let models = [model(0.0, 0.7, true), model(1.0, 0.2, false), model(20.0, 0.1, false)];
+        let rates = ModeRates { switching_per_s: 0.2, calming_per_s: 0.05, prior_s: 20.0 };
+        MotionModels::new(&models, rates).unwrap()
     }
 
     fn running() -> Imm {
@@ -393,7 +249,9 @@ mod tests {
             .models()
             .iter()
             .enumerate()
-            .map(|(j, model)| imm.mixed(j, &models.transitions(dt, &imm.restlessness)).predicted(dt, model.density))
+            .map(|(j, model)| {
+                imm.mixed(j, &models.transitions(dt, &imm.restlessness)).predicted(dt, model.density)
+            })
             .collect();
         let (slow, fast) = (combined(&states, &weights), imm.predicted(dt, &models));
         assert!((slow.mean - fast.mean).norm() < 1e-9);
@@ -430,17 +288,5 @@ mod tests {
         assert_eq!(imm.probabilities()[0], 0.0, "so unlikely that it underflows");
         imm.update(0.0, &models(), |s| s.position_updated(far, &Matrix3::identity())).unwrap();
         assert!(imm.combined().is_finite(), "{:?}", imm.combined());
-    }
-
-    #[test]
-    fn models_that_cannot_be_are_refused() {
-        let model = |density, share| MotionModel { density, share, habit: 0 };
-        assert!(MotionModels::new(&[], 1.0, 1.0).is_none());
-        assert!(MotionModels::new(&[model(-1.0, 1.0)], 1.0, 1.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 0.0, 1.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, 1.0); 2], 1.0, 0.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, f64::NAN)], 1.0, 1.0).is_none());
-        assert!(MotionModels::new(&[model(1.0, 1.0); 5], 1.0, 1.0).is_none());
-        assert!(MotionModels::single(1.0).is_some());
     }
 }

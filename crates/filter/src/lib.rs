@@ -11,9 +11,11 @@ mod gate;
 mod imm;
 mod kinematic;
 mod manoeuvre;
+mod models;
 
 pub use axis::{AxisFilter, AxisMeasurement, Innovation};
 pub use gate::Gate;
-pub use imm::{Imm, MAX_MODELS, ModelWeights, MotionModel, MotionModels};
+pub use imm::Imm;
 pub use kinematic::KinematicState;
 pub use manoeuvre::{NormalisedInnovation, SmoothedResidual};
+pub use models::{MAX_MODELS, ModeRates, ModelWeights, MotionModel, MotionModels};

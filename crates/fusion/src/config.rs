@@ -195,10 +195,9 @@ pub struct FlightModel {
     pub acceleration_density: f64,
     /// Share of the time that targets fly like this.
     pub share: f64,
-    /// The habit that it belongs to: a target changes between the models of one habit at
-    /// `switching_rate_per_s` and its habit at `habit_rate_per_s`. 0 to 255. Default 0.
+    /// Whether targets fly like this for long. How often one leaves its calm is learnt of each. Default false.
     #[serde(default)]
-    pub habit: u8,
+    pub calm: bool,
 }
 
 /// How tracks are kept up.
@@ -207,13 +206,18 @@ pub struct FlightModel {
 pub struct Tracking {
     /// `models` (default), `smoothed-residual`, `innovation` or `none`.
     pub manoeuvres: Manoeuvres,
-    /// The ways of flying of `models`. Default: straight (1e-6, 0.998 of the time), drifting (0.3, 0.001) and
-    /// manoeuvring (5, 0.001).
+    /// The ways of flying of `models`, one to four. Default: straight (1e-6, calm, 0.98 of the time), drifting
+    /// (0.3, 0.012), manoeuvring (5, 0.007) and hard turns (60, 0.001).
     pub models: Vec<FlightModel>,
-    /// How often a target changes its way of flying within its habit, 1/s. 1e-9 to 100. Default 0.5.
+    /// How often a target that is not calm changes its way of flying, 1/s. 1e-9 to 100. Default 0.3.
     pub switching_rate_per_s: f64,
-    /// How often a target changes its habit, 1/s. 1e-9 to 100. Default 0.02.
-    pub habit_rate_per_s: f64,
+    /// How often a target that is not calm comes to its calm, 1/s. 1e-9 to 100. Default 0.02; by the shares targets
+    /// leave it every forty minutes in the mean.
+    pub calming_rate_per_s: f64,
+    /// What this says of how often one target leaves its calm is worth so much of its flight, s. 0.001 to 1000000.
+    /// Default 20: one that has turned once is expected to turn again within so many seconds. With half of it the
+    /// track of a target that flies straight after one turn is noisier than it need be.
+    pub restlessness_prior_s: f64,
     /// Power spectral density of the white acceleration where there is one model, m^2/s^3. 1e-12 to
     /// 1000000. Default 3, for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for what flies
     /// straight.
@@ -246,17 +250,18 @@ pub struct Tracking {
 
 impl Default for Tracking {
     fn default() -> Self {
-        let model = |acceleration_density, share, habit| FlightModel { acceleration_density, share, habit };
+        let model = |acceleration_density, share, calm| FlightModel { acceleration_density, share, calm };
         Self {
             manoeuvres: Manoeuvres::default(),
             models: vec![
-                model(1e-6, 0.98, 0),
-                model(0.3, 0.012, 1),
-                model(5.0, 0.007, 1),
-                model(60.0, 0.001, 1),
+                model(1e-6, 0.98, true),
+                model(0.3, 0.012, false),
+                model(5.0, 0.007, false),
+                model(60.0, 0.001, false),
             ],
             switching_rate_per_s: 0.3,
-            habit_rate_per_s: 0.02,
+            calming_rate_per_s: 0.02,
+            restlessness_prior_s: 20.0,
             acceleration_density: 3.0,
             residual_window: 8,
             residual_scale: 0.81,

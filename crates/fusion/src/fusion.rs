@@ -20,6 +20,7 @@ use crate::spatial::Quantity;
 use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{Happening, Tracker};
+use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig};
 
 /// What comes out of the fusion centre.
@@ -111,6 +112,7 @@ pub struct Fusion {
     punctuality: Standings,
     records: BTreeMap<CameraName, CameraRecord>,
     pose_scales: PoseScales,
+    unmet: Unmet,
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
     corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
@@ -139,6 +141,7 @@ impl Fusion {
             punctuality: Standings::default(),
             records: BTreeMap::new(),
             pose_scales: PoseScales::default(),
+            unmet: Unmet::new(&config.initiation),
             corrected: BTreeMap::new(),
             corrected_load: Load::default(),
             counters: Counters::default(),
@@ -231,6 +234,11 @@ impl Fusion {
         self.now
     }
 
+    /// Why no target is found, where two cameras see something at the same time.
+    pub fn why_nothing(&self) -> Option<&WhyNothing> {
+        self.unmet.why()
+    }
+
     /// What has been handled and refused so far.
     pub fn counters(&self) -> &Counters {
         &self.counters
@@ -270,6 +278,7 @@ impl Fusion {
         let happenings = self.tracker.restart(time);
         self.tell(happenings, time, outputs);
         self.initiator = Initiator::new(&self.config);
+        self.unmet = Unmet::new(&self.config.initiation);
         self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
@@ -368,6 +377,11 @@ impl Fusion {
             }
             happenings = step.happenings;
             let rest = Exposure { sightings: step.free, ..exposure.clone() };
+            if self.tracker.has_sure() {
+                self.unmet.found();
+            } else {
+                self.unmet.see(&rest).into_iter().for_each(|name| self.counters.count(name));
+            }
             for start in self.initiator.add(rest, &step.claims, self.cameras.now(), self.tracker.motion()) {
                 happenings.extend(self.tracker.adopt(start));
             }

@@ -50,6 +50,7 @@ pub mod temporal;
 mod track;
 mod tracker;
 mod uncertainty;
+mod unmet;
 mod update;
 mod watch;
 
@@ -63,3 +64,4 @@ pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
 pub use standing::CameraStanding;
 pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};
+pub use unmet::{UnmetLines, WhyNothing};

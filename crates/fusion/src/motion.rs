@@ -1,6 +1,6 @@
 //! How targets move between bearings, and what is done when one turns.
 
-use crossfix_filter::{MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual};
+use crossfix_filter::{ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual};
 
 use crate::{ConfigError, Manoeuvres, Tracking};
 
@@ -39,10 +39,15 @@ impl Motion {
                 let model = |m: &crate::FlightModel| MotionModel {
                     density: m.acceleration_density,
                     share: m.share,
-                    habit: m.habit,
+                    calm: m.calm,
                 };
                 let models: Vec<MotionModel> = config.models.iter().map(model).collect();
-                (MotionModels::new(&models, config.switching_rate_per_s, config.habit_rate_per_s), None)
+                let rates = ModeRates {
+                    switching_per_s: config.switching_rate_per_s,
+                    calming_per_s: config.calming_rate_per_s,
+                    prior_s: config.restlessness_prior_s,
+                };
+                (MotionModels::new(&models, rates), None)
             }
             Manoeuvres::None => (single, None),
             Manoeuvres::SmoothedResidual => {

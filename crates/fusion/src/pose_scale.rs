@@ -3,8 +3,8 @@
 //! Each camera's bearings of a target are off by what its pose is off by; where the target is nobody knows
 //! beforehand. What is left of the lines when the best place is taken out tells how large the cameras' errors
 //! are, and whose: their variances are found by minorising and maximising their likelihood (REML of variance
-//! components), a step a draw. Where nobody has declared a pose's deviation, a careful survey's is where it begins. A clock
-//! that is off by more than its camera says looks like a pose that is.
+//! components), a step a draw. Where nobody has declared a pose's deviation, a careful survey's is where it begins.
+//! A clock that is off by more than its camera says looks like a pose that is.
 
 use std::collections::BTreeMap;
 
@@ -12,16 +12,13 @@ use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 /// The share of a draw in the running means, once there are enough. A draw lasts a third of a second: they
-/// remember some two seconds of one target. With half of it a site would be a minute in learning what it is
+/// remember some three seconds of one target. With half of it a site would be a minute in learning what it is
 /// worth.
-const DRAW_SHARE: f64 = 0.15;
-/// The power of the ratio by which a step goes: the square root is the algorithm's for one batch, and its root
-/// as the means follow late.
-const STEP: f64 = 0.25;
+const DRAW_SHARE: f64 = 0.1;
 /// Cameras of one site have been surveyed alike: each step takes their factors (logarithms) closer to the
 /// median by this share. Without it two of four cameras would be taken to be perfect, and the others for worse
 /// than they are: the lines tell of fewer errors than there are.
-const ALIKE: f64 = 0.05;
+const ALIKE: f64 = 0.1;
 /// Fewer cameras cannot tell whose error it is: two lines that miss each other accuse nobody.
 const LEAST_ACCUSERS: usize = 3;
 /// No pose is known better than this share (variance) of a careful survey: a hundredth of a milliradian.
@@ -106,7 +103,7 @@ impl PoseScales {
                 let share = scale.draws.recip().max(DRAW_SHARE);
                 scale.found += (found - scale.found) * share;
                 scale.expected += (expected - scale.expected) * share;
-                let step = (scale.found / scale.expected).powf(STEP);
+                let step = (scale.found / scale.expected).sqrt();
                 let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { f64::INFINITY };
                 let like_others = (ALIKE * (typical - scale.value.ln())).exp();
                 scale.value = (scale.value * like_others * step.min(most)).clamp(scale.least, scale.greatest);

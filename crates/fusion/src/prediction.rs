@@ -148,7 +148,7 @@ fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Opti
 
 #[cfg(test)]
 mod tests {
-    use crossfix_filter::MotionModel;
+    use crossfix_filter::{ModeRates, MotionModel};
     use nalgebra::{Matrix6, Vector6};
 
     use super::*;
@@ -156,8 +156,9 @@ mod tests {
 
     #[test]
     fn a_true_bearing_fits_and_the_liveliest_model_opens_the_gate() {
-        let model = |density, share| MotionModel { density, share, habit: 0 };
-        let models = MotionModels::new(&[model(0.0, 0.9), model(5.0, 0.1)], 0.1, 0.1).unwrap();
+        let model = |density, share| MotionModel { density, share, calm: density == 0.0 };
+        let rates = ModeRates { switching_per_s: 0.1, calming_per_s: 0.1, prior_s: 20.0 };
+        let models = MotionModels::new(&[model(0.0, 0.9), model(5.0, 0.1)], rates).unwrap();
         let state = KinematicState {
             mean: Vector6::new(0.0, 0.0, 50.0, 10.0, 0.0, 0.0),
             covariance: Matrix6::identity() * 0.01,

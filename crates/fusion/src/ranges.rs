@@ -2,7 +2,7 @@
 //! that no number makes the fusion slow, or its sums too large or too small to be told apart.
 
 use crate::motion::Motion;
-use crate::{ConfigError, FlightModel, FusionConfig};
+use crate::{ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting};
 
 /// A number of the configuration, and from where to where it makes sense.
 struct Range {
@@ -41,7 +41,83 @@ impl FusionConfig {
         let ranges = [self.time_and_bearings(), self.initiation_ranges(), self.tracking_ranges()];
         ranges.iter().flatten().try_for_each(Range::check)?;
         self.models()?;
-        self.probabilities()
+        self.probabilities()?;
+        self.unused().map_or(Ok(()), Err)
+    }
+
+    /// A number that says something else than the default and that nothing uses with the methods chosen: whoever has
+    /// set it thinks that it does something.
+    fn unused(&self) -> Option<ConfigError> {
+        let Self { bearings, initiation, tracking, .. } = self;
+        let usual = Self::default();
+        let equal = bearings.weighting == Weighting::Equal;
+        let grouping = initiation.method == InitiationMethod::Grouping;
+        let pairs = grouping && initiation.solver == SpatialSolver::Pair;
+        let models = tracking.manoeuvres == Manoeuvres::Models;
+        let smoothed = tracking.manoeuvres == Manoeuvres::SmoothedResidual;
+        let innovation = tracking.manoeuvres == Manoeuvres::Innovation;
+        let (first, found) = (&usual.initiation, &usual.tracking);
+        let gate = |gate: Option<f64>| gate.unwrap_or(f64::NAN);
+        let keys = [
+            ("bearings.equal_sd_rad", equal, bearings.equal_sd_rad, usual.bearings.equal_sd_rad),
+            ("initiation.pair_gate_m2", pairs, initiation.pair_gate_m2, first.pair_gate_m2),
+            (
+                "initiation.temporal_gate_m",
+                grouping,
+                gate(initiation.temporal_gate_m),
+                gate(first.temporal_gate_m),
+            ),
+            (
+                "initiation.birth_density_per_m3",
+                !grouping,
+                initiation.birth_density_per_m3,
+                first.birth_density_per_m3,
+            ),
+            ("initiation.pair_s", !grouping, initiation.pair_s, first.pair_s),
+            (
+                "tracking.acceleration_density",
+                !models,
+                tracking.acceleration_density,
+                found.acceleration_density,
+            ),
+            (
+                "tracking.switching_rate_per_s",
+                models,
+                tracking.switching_rate_per_s,
+                found.switching_rate_per_s,
+            ),
+            ("tracking.calming_rate_per_s", models, tracking.calming_rate_per_s, found.calming_rate_per_s),
+            (
+                "tracking.restlessness_prior_s",
+                models,
+                tracking.restlessness_prior_s,
+                found.restlessness_prior_s,
+            ),
+            (
+                "tracking.residual_window",
+                smoothed,
+                tracking.residual_window as f64,
+                found.residual_window as f64,
+            ),
+            ("tracking.residual_scale", smoothed, tracking.residual_scale, found.residual_scale),
+            (
+                "tracking.innovation_window",
+                innovation,
+                tracking.innovation_window as f64,
+                found.innovation_window as f64,
+            ),
+            (
+                "tracking.innovation_false_alarm",
+                innovation,
+                tracking.innovation_false_alarm,
+                found.innovation_false_alarm,
+            ),
+        ];
+        let set = |value: f64, usual: f64| value.to_bits() != usual.to_bits();
+        let (key, _, value, _) =
+            keys.into_iter().find(|(_, used, value, usual)| !used && set(*value, *usual))?;
+        let must = "left out: the method that is chosen does not use it".to_owned();
+        Some(ConfigError { key, value, must })
     }
 
     fn time_and_bearings(&self) -> Vec<Range> {
@@ -76,6 +152,8 @@ impl FusionConfig {
         let it = &self.tracking;
         vec![
             range("tracking.switching_rate_per_s", it.switching_rate_per_s, 1e-9, 100.0),
+            range("tracking.calming_rate_per_s", it.calming_rate_per_s, 1e-9, 100.0),
+            range("tracking.restlessness_prior_s", it.restlessness_prior_s, 1e-3, 1e6),
             range("tracking.acceleration_density", it.acceleration_density, 1e-12, 1e6),
             range("tracking.residual_window", it.residual_window as f64, 1.0, 1000.0),
             range("tracking.residual_scale", it.residual_scale, 1e-3, 1e3),
@@ -129,6 +207,10 @@ mod tests {
         assert_eq!(
             refused(|c| c.initiation.birth_density_per_m3 = 1e150),
             "`initiation.birth_density_per_m3` is 1e150: it must be from 1e-30 to 1"
+        );
+        assert_eq!(
+            refused(|c| c.tracking.acceleration_density = 3.5),
+            "`tracking.acceleration_density` is 3.5: it must be left out: the method that is chosen does not use it"
         );
         assert_eq!(
             refused(|c| c.tracking.clutter_per_sr = 0.0),

@@ -142,6 +142,11 @@ impl Tracker {
         due
     }
 
+    /// Whether any target is followed for sure.
+    pub(crate) fn has_sure(&self) -> bool {
+        self.tracks.values().any(Track::is_confirmed)
+    }
+
     /// A track by its number.
     pub(crate) fn track(&self, id: TrackId) -> Option<&Track> {
         self.tracks.get(&id)

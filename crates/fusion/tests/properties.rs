@@ -95,7 +95,8 @@ fn scaled_config(s: f64, u: f64) -> FusionConfig {
         model.acceleration_density *= s.powi(2) / u.powi(3);
     }
     tracking.switching_rate_per_s /= u;
-    tracking.habit_rate_per_s /= u;
+    tracking.calming_rate_per_s /= u;
+    tracking.restlessness_prior_s *= u;
     tracking.coasting_after_s *= u;
     tracking.lost_after_s *= u;
     tracking.max_position_sd_m *= s;

@@ -3,13 +3,14 @@ use std::time::Duration;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Preview, Timestamp, TrackEvent, TrackFrame,
-    TrackNumber, TrackState, TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, DecodeError, Health, Preview, Timestamp, TrackEvent,
+    TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
 };
 use nalgebra::Point3;
 use rerun::components::MediaType;
 use rerun::{
-    Clear, Color, EncodedImage, Points3D, Radius, RecordingStream, Scalars, TextLog, ViewCoordinates,
+    Clear, Color, EncodedImage, Points3D, Radius, RecordingStream, Scalars, TextLog, TextLogLevel,
+    ViewCoordinates,
 };
 
 use crate::arrivals::Arrivals;
@@ -54,6 +55,8 @@ pub struct Picture {
     limiter: Limiter,
     arrivals: Arrivals,
     viewer: ViewerWatch,
+    /// What the fusion centre has said last that a person should look at.
+    problems: Vec<String>,
 }
 
 impl Picture {
@@ -72,6 +75,7 @@ impl Picture {
             limiter: Limiter::default(),
             arrivals: Arrivals::default(),
             viewer: ViewerWatch::default(),
+            problems: Vec::new(),
         })
     }
 
@@ -92,6 +96,7 @@ impl Picture {
             Channel::Tracks => decode(data).map(|m| self.tracks(&m, arrival)),
             Channel::Events => decode(data).map(|m| self.event(&m)),
             Channel::Truth => decode(data).map(|m| self.truth(&m)),
+            Channel::FusionHealth => decode(data).map(|m| self.health(&m)),
             _ => return Ok(None),
         };
         match read {
@@ -283,6 +288,19 @@ impl Picture {
             other => format!("track {} {what} into {}", TrackNumber(event.track_id), TrackNumber(other)),
         };
         Ok(self.stream.log("events", &TextLog::new(text))?)
+    }
+
+    /// What a person should look at, when it begins to be so.
+    fn health(&mut self, health: &Health) -> Result<(), ViewError> {
+        if health.time_ns == 0 {
+            return Ok(());
+        }
+        self.at(health.time_ns);
+        for problem in health.problems.iter().filter(|problem| !self.problems.contains(problem)) {
+            self.stream.log("events", &TextLog::new(problem.as_str()).with_level(TextLogLevel::WARN))?;
+        }
+        self.problems.clone_from(&health.problems);
+        Ok(())
     }
 
     fn truth(&mut self, frame: &TruthFrame) -> Result<(), ViewError> {

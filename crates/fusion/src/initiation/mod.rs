@@ -7,6 +7,7 @@ mod coincidence;
 mod fixes;
 mod grouped;
 mod hypotheses;
+mod passing;
 mod period;
 mod seeds;
 mod selection;
@@ -23,6 +24,8 @@ use crate::spatial::TimedLine;
 use crate::temporal::LineId;
 use crate::track::{Track, TrackId};
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
+
+pub(crate) use passing::{Passing, Passings};
 
 use grouped::Grouped;
 use hypotheses::Hypotheses;

@@ -6,6 +6,7 @@ use std::f64::consts::PI;
 use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Timestamp};
 
+use super::passing::{Passing, Passings};
 use super::{NamedLine, lines_with_pose};
 use crate::ingress::KnownCamera;
 use crate::prediction::BearingPrediction;
@@ -14,8 +15,6 @@ use crate::spatial::{MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::temporal::LineId;
 use crate::{Exposure, FusionConfig, Initiation};
 
-/// Lines pass each other within this many standard deviations of noise and motion.
-const SIGMAS: f64 = 3.0;
 /// Lines of one camera that are tried beside a pair, the best first.
 const MAX_BRANCHES: usize = 5;
 /// Lines that as many cameras as this agree on need not be tried in other sets.
@@ -53,6 +52,7 @@ impl Seed {
 #[derive(Clone, Debug)]
 pub(super) struct SeedFinder {
     initiation: Initiation,
+    passings: Passings,
     detection_probability: f64,
     line_gate: Gate,
     /// The largest sum of squares of n true lines, by n, with the gate's probability.
@@ -78,6 +78,7 @@ impl SeedFinder {
             .map(|n: usize| chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1)))
             .collect();
         Self {
+            passings: Passings::new(&initiation),
             initiation,
             detection_probability: config.tracking.detection_probability,
             line_gate,
@@ -113,7 +114,7 @@ impl SeedFinder {
                     if both(Rooted::Yes) && exposures.len() == 2 {
                         continue;
                     }
-                    if !self.pass_closely(&lines[a][i].1, &lines[b][j].1) {
+                    if self.passings.of(&lines[a][i].1, &lines[b][j].1) != Passing::Close {
                         continue;
                     }
                     close += 1;
@@ -228,27 +229,6 @@ impl SeedFinder {
     fn agrees(&self, solution: &MapSolution, lines: usize) -> bool {
         let gate = self.set_gates.get(lines).copied().unwrap_or(f64::INFINITY);
         solution.chi_square <= gate
-    }
-
-    /// Whether two lines pass each other as closely as one moving target's may, in front of both.
-    fn pass_closely(&self, first: &TimedLine, second: &TimedLine) -> bool {
-        let (u, v) = (&first.line.direction, &second.line.direction);
-        let base = second.line.origin - first.line.origin;
-        let cosine = u.dot(v);
-        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
-        let (along_u, along_v) = (u.dot(&base), v.dot(&base));
-        let r1 = (along_u - cosine * along_v) / sine_squared;
-        let r2 = (cosine * along_u - along_v) / sine_squared;
-        let in_range = |r: f64| r > 0.0 && r < self.initiation.max_range_m;
-        if !(in_range(r1) && in_range(r2)) {
-            return false;
-        }
-        let apart = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
-        let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
-        let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);
-        let between = second.time.seconds_since(first.time).abs() + unsure;
-        let motion = self.initiation.velocity_prior_sd_mps * between;
-        apart <= SIGMAS * (noise + motion)
     }
 
     /// The lines of camera `c` in the gate of a solution, the nearest first.

@@ -90,7 +90,8 @@ impl OfflineFusion {
         let took = start.elapsed();
         self.busy += took;
         self.longest = self.longest.max(took);
-        self.write(outputs)
+        self.write(outputs)?;
+        self.write_health(self.centre.now(), false)
     }
 
     fn write(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
@@ -99,7 +100,6 @@ impl OfflineFusion {
                 Output::Tracks(frame) => {
                     let time = Timestamp::from_nanos(frame.time_ns);
                     self.put(Channel::Tracks, time, frame.encode())?;
-                    self.write_health(time, false)?;
                 }
                 Output::Event(event) => {
                     let time = Timestamp::from_nanos(event.time_ns);
@@ -114,6 +114,9 @@ impl OfflineFusion {
     }
 
     fn write_health(&mut self, now: Timestamp, ended: bool) -> anyhow::Result<()> {
+        if now == Timestamp::EPOCH {
+            return Ok(());
+        }
         let is_due = self.healthy_at.is_none_or(|then| now.seconds_since(then).abs() >= HEALTH_PERIOD_S);
         if !is_due && !ended {
             return Ok(());

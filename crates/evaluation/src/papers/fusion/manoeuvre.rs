@@ -7,7 +7,7 @@
 //! noise at hand on other flights than those it is judged on.
 
 use crossfix_filter::{
-    Imm, KinematicState, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
+    Imm, KinematicState, ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
 };
 use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
@@ -196,12 +196,13 @@ fn densities() -> impl Iterator<Item = f64> {
 
 /// All methods, tuned for a noise.
 fn methods(deviation: f64, seed: u64) -> Vec<Method> {
-    let model = |density, share| MotionModel { density, share, habit: 0 };
+    let model = |density, share| MotionModel { density, share, calm: false };
+    // A leg in ten to twenty frames ends.
+    let rates = ModeRates { switching_per_s: 1.0, calming_per_s: 1.0, prior_s: 1.0 };
     let mut mixtures = Vec::new();
     for quiet in densities() {
         for lively in densities().filter(|lively| *lively >= 10.0 * quiet) {
-            // A leg in ten to twenty frames ends.
-            let models = MotionModels::new(&[model(quiet, 0.9), model(lively, 0.1)], 1.0, 1.0);
+            let models = MotionModels::new(&[model(quiet, 0.9), model(lively, 0.1)], rates);
             mixtures.extend(models.map(Method::Imm));
         }
     }

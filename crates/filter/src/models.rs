@@ -1,0 +1,199 @@
+//! How targets fly, and how they go over from one way of flying to another.
+
+/// More models than this say nothing that fewer do not.
+pub const MAX_MODELS: usize = 4;
+
+/// A target has left its calm when calm is less likely than this, ...
+const UPSET: f64 = 0.5;
+/// ... and has come to it again when it is likelier than this.
+const CALM: f64 = 0.9;
+
+/// One way of flying: constant velocity driven by white acceleration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MotionModel {
+    /// Power spectral density of the white acceleration, m^2/s^3.
+    pub density: f64,
+    /// Share of the time that targets fly like this, before anything is known of one.
+    pub share: f64,
+    /// Whether targets fly like this for long: each leaves its calm at a rate of its own.
+    pub calm: bool,
+}
+
+/// How often targets go over from one way of flying to another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ModeRates {
+    /// From one model to another of the same kind, calm or not, 1/s: it is drawn anew from their shares.
+    pub switching_per_s: f64,
+    /// How often a target that is not calm comes to its calm, 1/s; by the shares this says how often it leaves
+    /// it in the mean over all targets.
+    pub calming_per_s: f64,
+    /// What is believed of how often one target leaves its calm is worth so much calm flight, s.
+    pub prior_s: f64,
+}
+
+/// The ways in which targets fly, and how often they change from one to another.
+///
+/// Whether a target is calm is a Markov chain of two states in continuous time, and so is its model while it
+/// stays in one of them. So the transition over an interval is the same however it is cut. The rate at which a
+/// target leaves its calm is its own and is learnt: see [`crate::Imm`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct MotionModels {
+    models: Vec<MotionModel>,
+    rates: ModeRates,
+    /// Share of the time that targets are calm.
+    calm_share: f64,
+}
+
+/// Weights of the models, in their order; what lies beyond the last model is 0.
+pub type ModelWeights = [f64; MAX_MODELS];
+
+impl MotionModels {
+    /// One to [`MAX_MODELS`] models. The shares are scaled to a sum of 1.
+    ///
+    /// `None` if a density is negative, a share or a rate is not positive (a lone model needs no
+    /// rate), or a number is not finite.
+    pub fn new(models: &[MotionModel], rates: ModeRates) -> Option<Self> {
+        let total: f64 = models.iter().map(|m| m.share).sum();
+        let possible = |m: &MotionModel| m.density >= 0.0 && m.density.is_finite() && m.share > 0.0;
+        let is_rate = |rate: f64| rate.is_finite() && (rate > 0.0 || models.len() == 1);
+        let good = (1..=MAX_MODELS).contains(&models.len()) && models.iter().all(possible);
+        let ModeRates { switching_per_s, calming_per_s, prior_s } = rates;
+        if !(good && [switching_per_s, calming_per_s, prior_s].into_iter().all(is_rate) && total.is_finite())
+        {
+            return None;
+        }
+        let scaled = |m: &MotionModel| MotionModel { share: m.share / total, ..*m };
+        let models: Vec<MotionModel> = models.iter().map(scaled).collect();
+        let calm_share = models.iter().filter(|model| model.calm).map(|model| model.share).sum();
+        Some(Self { models, rates, calm_share })
+    }
+
+    /// A single model: a plain Kalman filter.
+    pub fn single(density: f64) -> Option<Self> {
+        let rates = ModeRates { switching_per_s: 0.0, calming_per_s: 0.0, prior_s: 0.0 };
+        Self::new(&[MotionModel { density, share: 1.0, calm: true }], rates)
+    }
+
+    /// The models.
+    pub fn models(&self) -> &[MotionModel] {
+        &self.models
+    }
+
+    /// The same with every model as lively as the liveliest.
+    #[must_use]
+    pub fn widened(&self) -> Self {
+        let widest = self.widest();
+        let models = self.models.iter().map(|m| MotionModel { density: widest, ..*m }).collect();
+        Self { models, ..*self }
+    }
+
+    /// The largest density of acceleration among the models, m^2/s^3.
+    pub fn widest(&self) -> f64 {
+        self.models.iter().map(|m| m.density).fold(0.0, f64::max)
+    }
+
+    /// Probability of each model (columns) an interval of seconds after each (rows), for a target of some
+    /// restlessness.
+    pub(crate) fn transitions(
+        &self,
+        interval: f64,
+        restlessness: &Restlessness,
+    ) -> [ModelWeights; MAX_MODELS] {
+        let interval = interval.abs();
+        let (calm, lively) = (self.calm_share, 1.0 - self.calm_share);
+        let of_two = calm > 0.0 && lively > 0.0;
+        let calming = if of_two { self.rates.calming_per_s } else { 0.0 };
+        let usual = if of_two { calming * lively / calm } else { 0.0 };
+        let leaving = if of_two { restlessness.rate(usual, self.rates.prior_s) } else { 0.0 };
+        // What is left of the difference between the two states after the interval.
+        let kept = (-(leaving + calming) * interval).exp();
+        let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
+        for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
+            let (out, back, share) =
+                if from.calm { (leaving, calming, calm) } else { (calming, leaving, lively) };
+            let total = out + back;
+            let stays = if total > 0.0 { (back + out * kept) / total } else { 1.0 };
+            let untouched = (-(self.rates.switching_per_s + out) * interval).exp();
+            for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
+                *probability = if to.calm == from.calm {
+                    let same = if i == j { untouched } else { 0.0 };
+                    same + (stays - untouched) * to.share / share
+                } else {
+                    (1.0 - stays) * to.share / (1.0 - share)
+                };
+            }
+        }
+        transitions
+    }
+
+    /// The probability of being calm.
+    pub(crate) fn calm_probability(&self, probabilities: &[f64]) -> f64 {
+        self.models.iter().zip(probabilities).filter(|(model, _)| model.calm).map(|(_, p)| p).sum()
+    }
+}
+
+/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each time that it does
+/// and each second that it does not sharpens.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Restlessness {
+    is_calm: bool,
+    /// How often it has been seen to leave its calm, ...
+    upsets: f64,
+    /// ... and for how long it has been calm, s.
+    calm_s: f64,
+}
+
+impl Restlessness {
+    pub(crate) const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
+
+    /// The rate, 1/s; `usual` is the mean over all targets, worth `prior_s` seconds of one.
+    fn rate(&self, usual: f64, prior_s: f64) -> f64 {
+        (usual * prior_s + self.upsets) / (prior_s + self.calm_s)
+    }
+
+    /// The target has been calm with this probability for an interval of seconds.
+    pub(crate) fn see(&mut self, calm: f64, interval: f64) {
+        self.calm_s += calm * interval.abs();
+        if self.is_calm && calm < UPSET {
+            self.upsets += 1.0;
+            self.is_calm = false;
+        }
+        self.is_calm |= calm > CALM;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn models_that_cannot_be_are_refused() {
+        let model = |density, share| MotionModel { density, share, calm: false };
+        let rates = ModeRates { switching_per_s: 1.0, calming_per_s: 1.0, prior_s: 1.0 };
+        assert!(MotionModels::new(&[], rates).is_none());
+        assert!(MotionModels::new(&[model(-1.0, 1.0)], rates).is_none());
+        let still = ModeRates { switching_per_s: 0.0, ..rates };
+        assert!(MotionModels::new(&[model(1.0, 1.0); 2], still).is_none());
+        let never = ModeRates { calming_per_s: 0.0, ..rates };
+        assert!(MotionModels::new(&[model(1.0, 1.0); 2], never).is_none());
+        assert!(MotionModels::new(&[model(1.0, f64::NAN)], rates).is_none());
+        assert!(MotionModels::new(&[model(1.0, 1.0); 5], rates).is_none());
+        assert!(MotionModels::single(1.0).is_some());
+    }
+
+    #[test]
+    fn a_target_that_turns_often_is_expected_to_turn_again_and_one_that_never_does_is_not() {
+        let mut restless = Restlessness::UNKNOWN;
+        // Six seconds of calm and two of turning, ten times; and a minute of calm.
+        for _ in 0..10 {
+            restless.see(1.0, 6.0);
+            restless.see(0.0, 2.0);
+        }
+        let mut calm = Restlessness::UNKNOWN;
+        calm.see(1.0, 60.0);
+        let usual = 1e-3;
+        // Ten times in a minute beside twenty seconds in which it was not known.
+        assert!((restless.rate(usual, 20.0) - 10.02 / 80.0).abs() < 1e-12);
+        assert!((calm.rate(usual, 20.0) - 0.02 / 80.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,54 @@
+use crate::Initiation;
+use crate::spatial::{TYPICAL_SPEED, TimedLine};
+
+/// Lines pass each other within this many standard deviations of noise and motion.
+const SIGMAS: f64 = 3.0;
+
+/// How two lines pass each other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Passing {
+    /// They come near each other behind a camera, or too far away.
+    Nowhere,
+    /// Farther apart than one moving target's may.
+    Apart {
+        /// The smallest distance, m.
+        by_m: f64,
+    },
+    /// As closely as one moving target's may.
+    Close,
+}
+
+/// What says how two lines pass each other.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Passings {
+    max_range_m: f64,
+    /// How fast targets are, m/s, standard deviation an axis.
+    speed: f64,
+}
+
+impl Passings {
+    pub(crate) fn new(config: &Initiation) -> Self {
+        Self { max_range_m: config.max_range_m, speed: config.velocity_prior_sd_mps }
+    }
+
+    /// How two lines pass each other.
+    pub(crate) fn of(&self, first: &TimedLine, second: &TimedLine) -> Passing {
+        let (u, v) = (&first.line.direction, &second.line.direction);
+        let base = second.line.origin - first.line.origin;
+        let cosine = u.dot(v);
+        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
+        let (along_u, along_v) = (u.dot(&base), v.dot(&base));
+        let r1 = (along_u - cosine * along_v) / sine_squared;
+        let r2 = (cosine * along_u - along_v) / sine_squared;
+        let in_range = |r: f64| r > 0.0 && r < self.max_range_m;
+        if !(in_range(r1) && in_range(r2)) {
+            return Passing::Nowhere;
+        }
+        let by_m = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
+        let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
+        let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);
+        let between = second.time.seconds_since(first.time).abs() + unsure;
+        let motion = self.speed * between;
+        if by_m <= SIGMAS * (noise + motion) { Passing::Close } else { Passing::Apart { by_m } }
+    }
+}

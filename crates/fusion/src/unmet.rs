@@ -1,0 +1,276 @@
+//! Why nothing is found where cameras see something at the same time.
+//!
+//! Poses that are wrong, clocks that are off and targets beyond all range have one face: no track. While there is
+//! none, the lines of every two cameras are compared, and what most comparisons show is said in one sentence.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+
+use crossfix_message::{CameraName, Timestamp};
+
+use crate::initiation::{Passing, Passings};
+use crate::rooted::Rooted;
+use crate::spatial::TimedLine;
+use crate::{Exposure, Initiation, Sighting};
+
+/// So long there must have been no track before anything is said, s: a target is found within two.
+const PATIENCE_S: f64 = 5.0;
+/// How often two cameras are compared, s.
+const INTERVAL_S: f64 = 0.25;
+/// What so many comparisons of two cameras show counts: the last five seconds.
+const REMEMBERED: usize = 20;
+/// In this share of them both must have seen something.
+const LEAST_SHARE: f64 = 0.8;
+/// What an agent has followed in its image for this long is something, s: clutter comes and goes.
+const SOMETHING_S: f64 = 1.0;
+/// Exposures further apart than this are not compared, s.
+const MAX_APART_S: f64 = 0.5;
+/// Lines of one exposure that are compared: time is bounded.
+const MAX_LINES: usize = 30;
+/// Image tracks of a camera that are remembered: memory is bounded.
+const MAX_IMAGE_TRACKS: usize = 1_000;
+
+/// Why no target is found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WhyNothing {
+    /// The two cameras in which it shows.
+    pub cameras: [CameraName; 2],
+    /// What their lines do.
+    pub lines: UnmetLines,
+}
+
+/// What the lines of two cameras do that find no target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum UnmetLines {
+    /// They pass each other.
+    Apart {
+        /// The median over the comparisons of the smallest distance, m.
+        by_m: f64,
+    },
+    /// They come near each other behind a camera, or beyond the longest range.
+    Nowhere {
+        /// The longest range, m.
+        max_range_m: f64,
+    },
+    /// They meet, and no target's motion explains how.
+    Unsteady,
+}
+
+impl WhyNothing {
+    /// Whether another says the same, its numbers within a third.
+    fn is_like(&self, other: &Self) -> bool {
+        let lines = match (self.lines, other.lines) {
+            (UnmetLines::Apart { by_m: one }, UnmetLines::Apart { by_m: two }) => {
+                (one / two).ln().abs() < 0.3
+            }
+            (one, two) => one == two,
+        };
+        lines && self.cameras == other.cameras
+    }
+}
+
+impl fmt::Display for WhyNothing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [one, other] = &self.cameras;
+        write!(f, "cameras `{one}` and `{other}` see something at the same time, ")?;
+        match self.lines {
+            UnmetLines::Apart { by_m } => {
+                let digits = usize::from(by_m < 10.0);
+                write!(f, "but their lines miss each other by {by_m:.digits$} m: check poses and clocks")
+            }
+            UnmetLines::Nowhere { max_range_m } => {
+                let km = max_range_m / 1000.0;
+                write!(
+                    f,
+                    "but their lines meet nowhere within {km} km of both: check poses and `max_range_m`"
+                )
+            }
+            UnmetLines::Unsteady => {
+                write!(f, "and their lines meet, but not as one target's: check clocks and poses")
+            }
+        }
+    }
+}
+
+/// What one comparison has shown.
+#[derive(Clone, Copy, Debug)]
+enum Shown {
+    /// One of the cameras saw nothing.
+    Nothing,
+    Lines(Passing),
+}
+
+/// What one camera has seen of late.
+#[derive(Clone, Debug)]
+struct Seen {
+    time: Timestamp,
+    lines: Vec<TimedLine>,
+    /// Since when each of its image tracks has been there, and until when.
+    since: BTreeMap<u64, (Timestamp, Timestamp)>,
+}
+
+/// Two cameras' last comparisons.
+#[derive(Clone, Debug)]
+struct Pair {
+    time: Timestamp,
+    shown: VecDeque<Shown>,
+}
+
+/// Compares cameras while nothing is found.
+#[derive(Clone, Debug)]
+pub(crate) struct Unmet {
+    passings: Passings,
+    max_range_m: f64,
+    seen: BTreeMap<CameraName, Seen>,
+    pairs: BTreeMap<[CameraName; 2], Pair>,
+    /// Since when there has been no track.
+    since: Option<Timestamp>,
+    why: Option<WhyNothing>,
+}
+
+impl Unmet {
+    pub(crate) fn new(config: &Initiation) -> Self {
+        Self {
+            passings: Passings::new(config),
+            max_range_m: config.max_range_m,
+            seen: BTreeMap::new(),
+            pairs: BTreeMap::new(),
+            since: None,
+            why: None,
+        }
+    }
+
+    /// Why nothing is found; `None` as long as something is, or it is not clear.
+    pub(crate) fn why(&self) -> Option<&WhyNothing> {
+        self.why.as_ref()
+    }
+
+    /// There is a target: what was compared before says nothing of what comes after it.
+    pub(crate) fn found(&mut self) {
+        self.pairs.clear();
+        (self.since, self.why) = (None, None);
+    }
+
+    /// Takes in an exposure's bearings that belong to no track; returns what each comparison has shown, by the name
+    /// of its counter.
+    pub(crate) fn see(&mut self, exposure: &Exposure) -> Vec<&'static str> {
+        let now = exposure.time;
+        let since = *self.since.get_or_insert(now);
+        let lines = self.note(exposure);
+        let mut counted = Vec::new();
+        let others = self.seen.iter().filter(|(name, seen)| {
+            **name != exposure.camera && now.seconds_since(seen.time).abs() <= MAX_APART_S
+        });
+        for (other, seen) in others {
+            let mut names = [exposure.camera.clone(), other.clone()];
+            names.sort();
+            let fresh = Pair { time: now, shown: VecDeque::new() };
+            let is_new = !self.pairs.contains_key(&names);
+            let pair = self.pairs.entry(names).or_insert(fresh);
+            if !is_new && now.seconds_since(pair.time) < INTERVAL_S {
+                continue;
+            }
+            let shown = compared(&lines, &seen.lines, &self.passings);
+            if let Shown::Lines(passing) = shown {
+                counted.push(counter(passing));
+            }
+            pair.time = now;
+            pair.shown.push_back(shown);
+            if pair.shown.len() > REMEMBERED {
+                pair.shown.pop_front();
+            }
+        }
+        if now.seconds_since(since) >= PATIENCE_S && !counted.is_empty() {
+            let before = self.why.take();
+            self.why = self.conclusion();
+            // The same sentence stays as it is, whatever its digits do.
+            if let Some(before) =
+                before.filter(|before| self.why.as_ref().is_some_and(|why| why.is_like(before)))
+            {
+                self.why = Some(before);
+            }
+        }
+        counted
+    }
+
+    /// Keeps an exposure's lines of what its agent has followed for a while, and returns them.
+    fn note(&mut self, exposure: &Exposure) -> Vec<TimedLine> {
+        let now = exposure.time;
+        let nothing = || Seen { time: now, lines: Vec::new(), since: BTreeMap::new() };
+        let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
+        seen.since.retain(|_, (_, last)| now.seconds_since(*last) <= SOMETHING_S);
+        let mut lines = Vec::new();
+        for Sighting { image_track, line, rooted } in &exposure.sightings {
+            let full = seen.since.len() >= MAX_IMAGE_TRACKS;
+            if *rooted == Rooted::Yes || (full && !seen.since.contains_key(image_track)) {
+                continue;
+            }
+            let (first, last) = seen.since.entry(*image_track).or_insert((now, now));
+            *last = now;
+            if now.seconds_since(*first) >= SOMETHING_S && lines.len() < MAX_LINES {
+                let time_sd_s = exposure.uncertainty.time_sd_s;
+                lines.push(TimedLine { line: *line, time: now, time_sd_s, origin_sd_m: 0.0 });
+            }
+        }
+        (seen.time, seen.lines) = (now, lines.clone());
+        lines
+    }
+
+    /// What most comparisons of the cameras that see something have shown, and in which two it shows most clearly.
+    fn conclusion(&self) -> Option<WhyNothing> {
+        let both = |pair: &Pair| pair.shown.iter().filter(|shown| matches!(shown, Shown::Lines(_))).count();
+        let steady = self.pairs.iter().filter(|(_, pair)| {
+            pair.shown.len() * 2 >= REMEMBERED && both(pair) as f64 >= LEAST_SHARE * pair.shown.len() as f64
+        });
+        let steady: Vec<(&[CameraName; 2], &Pair)> = steady.collect();
+        let kind = |passing: Passing| match passing {
+            Passing::Nowhere => 0,
+            Passing::Apart { .. } => 1,
+            Passing::Close => 2,
+        };
+        let count = |pair: &Pair, wanted: usize| {
+            let lines = pair.shown.iter();
+            lines.filter(|shown| matches!(shown, Shown::Lines(passing) if kind(*passing) == wanted)).count()
+        };
+        let total = |wanted| steady.iter().map(|(_, pair)| count(pair, wanted)).sum::<usize>();
+        let most = (0..3).filter(|&k| total(k) > 0).max_by_key(|&k| total(k))?;
+        let (cameras, pair) = steady.into_iter().max_by_key(|(_, pair)| count(pair, most))?;
+        let lines = match most {
+            0 => UnmetLines::Nowhere { max_range_m: self.max_range_m },
+            1 => UnmetLines::Apart { by_m: median_miss(pair)? },
+            _ => UnmetLines::Unsteady,
+        };
+        Some(WhyNothing { cameras: cameras.clone(), lines })
+    }
+}
+
+fn counter(passing: Passing) -> &'static str {
+    match passing {
+        Passing::Nowhere => "unfound_lines_meet_nowhere",
+        Passing::Apart { .. } => "unfound_lines_miss_each_other",
+        Passing::Close => "unfound_lines_meet",
+    }
+}
+
+/// What the closest two lines of two cameras do.
+fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Shown {
+    let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
+    let closeness = |passing: &Passing| match passing {
+        Passing::Close => f64::NEG_INFINITY,
+        Passing::Apart { by_m } => *by_m,
+        Passing::Nowhere => f64::INFINITY,
+    };
+    let closest = all.min_by(|a, b| closeness(a).total_cmp(&closeness(b)));
+    closest.map_or(Shown::Nothing, Shown::Lines)
+}
+
+/// The median distance at which two cameras' lines miss each other, m.
+fn median_miss(pair: &Pair) -> Option<f64> {
+    let miss = |shown: &Shown| match shown {
+        Shown::Lines(Passing::Apart { by_m }) => Some(*by_m),
+        _ => None,
+    };
+    let mut misses: Vec<f64> = pair.shown.iter().filter_map(miss).collect();
+    misses.sort_by(f64::total_cmp);
+    misses.get(misses.len() / 2).copied()
+}

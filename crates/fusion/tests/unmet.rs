@@ -1,0 +1,74 @@
+//! What the fusion centre says where it finds nothing.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+mod common;
+
+use common::{Scene, found, fusion_of, site, straight};
+use crossfix_fusion::{Fusion, FusionConfig, UnmetLines};
+use crossfix_message::BearingFrame;
+use nalgebra::{Rotation3, Vector3};
+
+/// Feeds frames, each changed by `spoil`, and returns when it was said why nothing is found, s after the first.
+fn said(scene: &Scene, spoil: impl Fn(&mut BearingFrame)) -> (Fusion, Option<f64>) {
+    let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+    let mut when = None;
+    for mut frame in scene.frames(3) {
+        let time_s = frame.capture_time_ns as f64 / 1e9;
+        spoil(&mut frame);
+        fusion.ingest(&frame);
+        if when.is_none() && fusion.why_nothing().is_some() {
+            when = Some(time_s);
+        }
+    }
+    fusion.flush();
+    (fusion, when)
+}
+
+fn two_cameras(seconds: f64) -> Scene {
+    let mut eyes = site();
+    eyes.truncate(2);
+    Scene { eyes, clutter: 0.0, ..Scene::new(vec![straight([0.0, 0.0, 45.0], [-6.0, 7.0, 0.0])], seconds) }
+}
+
+#[test]
+fn lines_that_miss_each_other_are_said_within_ten_seconds_and_by_how_much() {
+    let scene = two_cameras(12.0);
+    // 0.1 rad of a camera that is knocked, at some 150 m: 15 m.
+    let (fusion, when) = said(&scene, |frame| {
+        for track in frame.tracks.iter_mut().filter(|_| frame.camera == "b") {
+            let turned = Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
+            track.bearing = Some(turned.into());
+        }
+    });
+    assert!(when.is_some_and(|when| when < 10.0), "{when:?}");
+    let why = fusion.why_nothing().unwrap();
+    assert_eq!(why.cameras.each_ref().map(|camera| camera.as_str()), ["a", "b"]);
+    assert!(matches!(why.lines, UnmetLines::Apart { by_m } if (10.0..20.0).contains(&by_m)), "{why:?}");
+    let text = why.to_string();
+    assert!(
+        text.starts_with("cameras `a` and `b` see something at the same time, but their lines miss"),
+        "{text}"
+    );
+    assert!(fusion.counters().get("unfound_lines_miss_each_other") > 10);
+}
+
+#[test]
+fn where_a_target_is_found_nothing_is_said() {
+    let scene = two_cameras(12.0);
+    let (fusion, when) = said(&scene, |_| {});
+    assert_eq!(when, None);
+    assert!(found(&fusion, &scene.paths[0]).is_some());
+}
+
+#[test]
+fn clutter_is_not_something() {
+    let scene = Scene { paths: Vec::new(), clutter: 5.0, ..two_cameras(12.0) };
+    // What an agent follows has a number; what it takes up and drops in one picture never has the same again.
+    let (_, when) = said(&scene, |frame| {
+        for (i, track) in frame.tracks.iter_mut().enumerate() {
+            track.track_id = frame.sequence * 1000 + i as u64;
+        }
+    });
+    assert_eq!(when, None);
+}
