@@ -208,7 +208,8 @@ impl Tracker {
         let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
         self.eyes.insert(exposure.camera.clone(), (known.camera.pose().position(), smallest));
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
-        let mut noted = Noted::default();
+        // Where all cameras were silent for long, nothing has told the tracks yet that they are lost.
+        let mut noted = Noted { happenings: self.review(exposure.time), ..Noted::default() };
         for ids in self.in_order_of_choice() {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
@@ -277,7 +278,7 @@ impl Tracker {
     /// follows, then those that are not sure. A ghost must not take a target's bearings.
     fn in_order_of_choice(&self) -> [Vec<TrackId>; 3] {
         let mut order = [const { Vec::new() }; 3];
-        for track in self.tracks.values() {
+        for track in self.tracks.values().filter(|track| track.status != TrackStatus::Lost) {
             let place = if !track.is_confirmed() { 2 } else { usize::from(!track.is_held()) };
             order[place].push(track.id);
         }
