@@ -107,13 +107,15 @@ impl MotionModels {
         let leaving = if of_two { restlessness.rate(usual, self.rates.prior_s) } else { 0.0 };
         // What is left of the difference between the two states after the interval.
         let kept = (-(leaving + calming) * interval).exp();
+        let unswitched = (-self.rates.switching_per_s * interval).exp();
+        let never = [(-leaving * interval).exp(), (-calming * interval).exp()].map(|out| out * unswitched);
         let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
         for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
             let (out, back, share) =
                 if from.calm { (leaving, calming, calm) } else { (calming, leaving, lively) };
             let total = out + back;
             let stays = if total > 0.0 { (back + out * kept) / total } else { 1.0 };
-            let untouched = (-(self.rates.switching_per_s + out) * interval).exp();
+            let untouched = never[usize::from(!from.calm)];
             for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
                 *probability = if to.calm == from.calm {
                     let same = if i == j { untouched } else { 0.0 };

@@ -14,6 +14,9 @@ const MIDDLE: f64 = 2.0;
 const LEAST_SHARE: f64 = 0.3;
 /// What has not been reported for so many times that time is forgotten.
 const FORGOTTEN: f64 = 7.0;
+/// What has been reported in a smaller share of the exposures since is clutter and not remembered: of clutter there
+/// is no end.
+const CLUTTER_SHARE: f64 = 0.03;
 /// What is reported within this share of that time of a camera's first exposure may have been there before.
 const BEGINNING: f64 = 0.2;
 /// Places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
@@ -65,9 +68,12 @@ impl View {
         lines: impl Iterator<Item = &'a SightLine>,
     ) -> Vec<Rooted> {
         let began = *self.began.get_or_insert(time);
-        self.places.retain(|place| time.seconds_since(place.last) <= FORGOTTEN * self.rooted_s);
         let before = self.exposures;
         self.exposures += 1.0;
+        self.places.retain(|place| {
+            let is_recent = time.seconds_since(place.last) <= FORGOTTEN * self.rooted_s;
+            is_recent && place.reports >= CLUTTER_SHARE * (before - place.before)
+        });
         lines.map(|line| self.report(time, began, before, line)).collect()
     }
 

@@ -9,6 +9,8 @@ use mcap::{Compression, McapResult, WriteOptions, Writer};
 
 use crate::{CHANNELS, Entry, RecordingError, Source, schema};
 
+/// The fastest: what fills recordings is floating-point numbers, which higher levels hardly make smaller.
+const COMPRESSION_LEVEL: u32 = 1;
 /// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
 const CHUNK_BYTES: u64 = 512 * 1024;
 
@@ -52,6 +54,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
     pub fn new(sink: W) -> Result<Self, RecordingError> {
         let writer = WriteOptions::new()
             .compression(Some(Compression::Zstd))
+            .compression_level(COMPRESSION_LEVEL)
             .compression_threads(0)
             .chunk_size(Some(CHUNK_BYTES))
             // Chunks are put together in memory and written whole: a crash leaves no half header.
