@@ -136,6 +136,12 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// When it began.
+    pub(crate) born: Timestamp,
+    /// Whether a detector has been found to report two ends of the target.
+    pub(crate) has_ends: bool,
+    /// How often it has been compared with the tracks that were there before it.
+    pub(crate) comparisons: u32,
     /// Where the camera stands that gave the newest bearing.
     follower: Option<Point3<f64>>,
     /// When the last draw was.
@@ -208,6 +214,9 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            born: fix.time,
+            has_ends: false,
+            comparisons: 0,
             follower: None,
             drawn: fix.time,
             published: None,

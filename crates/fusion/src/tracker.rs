@@ -32,10 +32,15 @@ const PUBLISHED_EVERY_S: f64 = 0.5;
 const MAX_SCORE: f64 = 40.0;
 /// A camera that is turned by no more than this shows a target beside where the others have it, rad.
 const BESIDE_RAD: f64 = 0.1;
-/// The smallest target that is found, px: what lies closer together is one. With half of it the two ends of a
-/// target make two tracks.
-const SMALLEST_TARGET_PX: f64 = 6.0;
+/// The smallest target that is found, px: what lies closer together for every camera is one. With half of it the two
+/// ends of a target make two tracks, with twice as much targets in formation are one.
+const SMALLEST_TARGET_PX: f64 = 7.0;
 
+/// A new track is compared with the older ones this often, s, ...
+const COMPARED_EVERY_S: f64 = 1.0;
+/// ... and so many times: its place is well known by then, and two targets that fly side by side have been seen
+/// apart.
+const COMPARISONS: u32 = 5;
 /// A track that one camera alone was following is found again within this distance (squared
 /// Mahalanobis, P = 0.999 999).
 const FOUND_AGAIN_GATE: f64 = 30.7;
@@ -236,6 +241,7 @@ impl Tracker {
         }
         happenings.extend(self.review(exposure.time));
         happenings.extend(self.merge(exposure.time));
+        happenings.extend(self.prove(exposure.time));
         Step { free, claims, used, fittings, third_differences, happenings }
     }
 
@@ -444,6 +450,36 @@ impl Tracker {
             .collect()
     }
 
+    /// Compares each track a few times while it is young with those that were there before it: a detector that
+    /// reports the two ends of a target makes two tracks.
+    fn prove(&mut self, now: Timestamp) -> Vec<Happening> {
+        let is_due = |track: &&Track| {
+            let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
+            track.status == TrackStatus::Confirmed
+                && track.comparisons < COMPARISONS
+                && now.seconds_since(track.born) >= next_s
+        };
+        let due: Vec<TrackId> = self.tracks.values().filter(is_due).map(|track| track.id).collect();
+        let mut happenings = Vec::new();
+        for id in due {
+            let older = self.tracks.range(..id).map(|(_, old)| old);
+            let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
+            let same = self.tracks.get(&id).and_then(|new| older.find(|old| self.is_one_image(old, new)));
+            let same = same.map(|old| old.id);
+            if let Some(track) = self.tracks.get_mut(&id) {
+                track.comparisons += 1;
+                if let Some(old) = same {
+                    track.status = TrackStatus::Lost;
+                    happenings.push(Happening { kind: TrackEventKind::Merged, track: id, other: Some(old) });
+                }
+            }
+            if let Some(old) = same.and_then(|old| self.tracks.get_mut(&old)) {
+                old.has_ends = true;
+            }
+        }
+        happenings
+    }
+
     /// Takes a track over that the initiation has found, and numbers it. Where it has used the
     /// bearings of a track that one camera alone was following and lies where that may have gone, it
     /// is the same target found again: it goes on under the old number. Where it lies elsewhere, the
@@ -503,9 +539,11 @@ impl Tracker {
     /// one target: a detector may report its two ends.
     fn is_one_image(&self, old: &Track, new: &Track) -> bool {
         let [there, here] = [old.position_at(new.updated), new.position_at(new.updated)];
+        // What was split once is split again, and where a track begins it is less sure where.
+        let times = if old.has_ends { 2.0 } else { 1.0 };
         let mut eyes = new.residuals.keys().map(|camera| self.eyes.get(camera));
         eyes.all(|eye| {
-            eye.is_some_and(|(origin, smallest)| (there - origin).angle(&(here - origin)) < *smallest)
+            eye.is_some_and(|(origin, smallest)| (there - origin).angle(&(here - origin)) < times * smallest)
         })
     }
 }
