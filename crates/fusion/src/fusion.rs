@@ -1,27 +1,23 @@
 use std::collections::BTreeMap;
 
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, CameraResidual, Payload, Timestamp,
-    TrackEvent, TrackFrame, TrackState,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent, TrackFrame,
 };
 
-use nalgebra::{Matrix6, Vector6};
-
 use crate::calibrations::KnownCameras;
+use crate::camera_record::CameraRecord;
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
 use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
-use crate::noise::WhiteNoise;
 use crate::pose_scale::PoseScales;
-use crate::rooted::View;
-use crate::spatial::Quantity;
 use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{Track, TrackId};
 use crate::tracker::{Happening, Tracker};
+use crate::uncertainty::PoseUncertainty;
 use crate::unmet::{Unmet, WhyNothing};
-use crate::{ConfigError, Counters, FusionConfig};
+use crate::{ConfigError, Counters, FusionConfig, messages};
 
 /// What comes out of the fusion centre.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,50 +47,6 @@ pub struct CameraReport {
 
 /// A camera whose noise is so many times (variance) what it reports is doubted.
 const DOUBTED_NOISE: f64 = 2.0;
-/// A clock whose variance (logarithm) and offset (in its deviations) change by less than this changes no track.
-const NOTICED_CLOCK: f64 = 0.1;
-
-/// What is learnt of a camera from its own bearings.
-#[derive(Clone, Debug)]
-struct CameraRecord {
-    noise: WhiteNoise,
-    view: View,
-    /// The deviation and the offset of its clock that the tracks know of, s.
-    time_sd_s: f64,
-    offset_s: f64,
-}
-
-impl CameraRecord {
-    fn new(config: &FusionConfig, exposure: &Exposure) -> Self {
-        let view = View::new(config.tracking.coasting_after_s);
-        let (time_sd_s, offset_s) = (exposure.uncertainty.time_sd_s, exposure.correction_s);
-        Self { noise: WhiteNoise::default(), view, time_sd_s, offset_s }
-    }
-
-    /// By how much, in its deviations so far, the clock is found to be ahead of what was known, and how its
-    /// variance has changed; `None` if that is little.
-    fn clock_change(&mut self, exposure: &Exposure) -> Option<(f64, f64)> {
-        let (sd_s, offset_s) = (exposure.uncertainty.time_sd_s, exposure.correction_s);
-        let ratio = (sd_s / self.time_sd_s).powi(2);
-        let ahead = (offset_s - self.offset_s) / self.time_sd_s;
-        let known = self.time_sd_s > 0.0 && sd_s > 0.0;
-        if known && ratio.ln().abs() < NOTICED_CLOCK && ahead.abs() < NOTICED_CLOCK {
-            return None;
-        }
-        (self.time_sd_s, self.offset_s) = (sd_s, offset_s);
-        known.then_some((ahead, ratio))
-    }
-
-    /// Puts into an exposure what is known of its camera, and takes what it shows in.
-    fn tell(&mut self, exposure: &mut Exposure) {
-        exposure.uncertainty.factor = self.noise.factor();
-        let lines = exposure.sightings.iter().map(|sighting| &sighting.line);
-        let rooted = self.view.see(exposure.time, lines);
-        for (sighting, rooted) in exposure.sightings.iter_mut().zip(rooted) {
-            sighting.rooted = rooted;
-        }
-    }
-}
 
 /// The fusion centre as a state machine: frames in, tracks out; no clock, no thread, no socket.
 #[derive(Debug)]
@@ -160,7 +112,8 @@ impl Fusion {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
         let is_declared = calibration.pose_covariance.is_some();
-        let pose_covariance = Some(calibration.pose_covariance.unwrap_or_else(careful_survey));
+        let pose_covariance =
+            Some(calibration.pose_covariance.unwrap_or_else(PoseUncertainty::of_careful_survey));
         let known = KnownCamera { camera: calibration.camera, pose_covariance, is_declared };
         if self.cameras.insert(calibration.name.clone(), calibration.valid_from, known) {
             self.pose_scales.calibrate(&calibration.name, is_declared);
@@ -479,7 +432,7 @@ impl Fusion {
                 crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
                 _ => "tracks_lost",
             });
-            outputs.push(Output::Event(event(happening, time)));
+            outputs.push(Output::Event(messages::event(happening, time)));
         }
     }
 
@@ -490,7 +443,7 @@ impl Fusion {
         let tracks: Vec<crossfix_message::Track> = due
             .iter()
             .filter_map(|id| self.tracker.track(*id))
-            .map(|t| self.track_message(t, exposure.time))
+            .map(|t| messages::track(t, exposure.time, self.tracker.motion()))
             .collect();
         if !tracks.is_empty() {
             let frame = TrackFrame {
@@ -503,65 +456,6 @@ impl Fusion {
             };
             self.sequence += 1;
             outputs.push(Output::Tracks(frame.stamped()));
-        }
-    }
-}
-
-/// Covariance of a pose of which nobody has said how sure it is: what a careful survey reaches, 1 mrad and
-/// 5 cm an axis. A camera of which half as much were assumed would be believed before the others are.
-fn careful_survey() -> Matrix6<f64> {
-    const ROTATION_SD_RAD: f64 = 1e-3;
-    const POSITION_SD_M: f64 = 0.05;
-    let [rotation, position] = [ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2)];
-    Matrix6::from_diagonal(&Vector6::new(rotation, rotation, rotation, position, position, position))
-}
-
-fn event(happening: Happening, time: Timestamp) -> TrackEvent {
-    TrackEvent {
-        time_ns: time.nanos(),
-        kind: happening.kind.into(),
-        track_id: happening.track.0,
-        other_id: happening.other.map_or(0, |id| id.0),
-        ..Default::default()
-    }
-    .stamped()
-}
-
-impl Fusion {
-    /// A track as of `time`.
-    fn track_message(&self, track: &Track, time: Timestamp) -> crossfix_message::Track {
-        let now = track.predicted(time, self.tracker.motion());
-        let state = match track.status {
-            TrackStatus::Tentative => TrackState::Tentative,
-            TrackStatus::Confirmed => TrackState::Confirmed,
-            TrackStatus::Coasting => TrackState::Coasting,
-            TrackStatus::OneCamera => TrackState::OneCamera,
-            TrackStatus::Lost => TrackState::Lost,
-        };
-        let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {
-            camera: camera.as_str().to_owned(),
-            time_ns: residual.time.nanos(),
-            angle_rad: residual.angle,
-            nis: residual.nis,
-        });
-        let weak = |quantity: Quantity| {
-            let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
-            Some(axis.direction.into_inner().into())
-        };
-        crossfix_message::Track {
-            id: track.id.0,
-            state: state.into(),
-            position: Some(now.position().into()),
-            velocity: Some(now.velocity().into()),
-            // Symmetric, so columns are rows.
-            covariance: now.covariance.as_slice().to_vec(),
-            residuals: residuals.collect(),
-            solver: track.solver.into(),
-            rank: track.observability.rank as u32,
-            condition_number: track.observability.condition_number,
-            updated_ns: track.updated.nanos(),
-            weak_position_axis: weak(Quantity::Position),
-            weak_velocity_axis: weak(Quantity::Velocity),
         }
     }
 }

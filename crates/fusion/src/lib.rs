@@ -12,23 +12,49 @@
 //! far the best. The papers' way is there too: periods solved for fixes
 //! ([`spatial`]), and fixes grouped into tracks ([`temporal`]).
 //!
+//! Three cameras look at a place over which a target flies; two seconds of their bearings, no two of them of one
+//! time, are a track:
+//!
 //! ```
 //! use crossfix_fusion::{Fusion, FusionConfig};
-//! use crossfix_message::BearingFrame;
+//! use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
+//! use crossfix_message::{BearingFrame, BearingTrack, CameraCalibration, ImageTrackState, Timestamp};
+//! use nalgebra::{Point3, Vector3};
 //!
+//! let size = ImageSize { width: 1920, height: 1080 };
+//! let lens = Intrinsics { size, fx: 1400.0, fy: 1400.0, cx: 959.5, cy: 539.5, distortion: Distortion::None };
+//! let mut cameras = Vec::new();
 //! let mut fusion = Fusion::new(FusionConfig::default())?;
-//! // A frame of a camera whose calibration nobody gave is counted, not used.
-//! let frame = BearingFrame { camera: "north".into(), ..Default::default() };
-//! let outputs = fusion.ingest(&frame);
-//! assert_eq!(outputs.len(), 1);
-//! assert_eq!(fusion.counters().get("rejected_unknown_camera"), 1);
-//! # Ok::<(), crossfix_fusion::ConfigError>(())
+//! for (name, place) in [("west", [-150.0, 0.0, 2.0]), ("south", [0.0, -140.0, 5.0]), ("east", [160.0, 20.0, 3.0])] {
+//!     let camera = Camera::new(lens, Pose::looking_at(place.into(), [0.0, 0.0, 40.0].into())?)?;
+//!     fusion.calibrate(&CameraCalibration::new(&name.parse()?, &camera, Timestamp::EPOCH))?;
+//!     cameras.push((name, camera));
+//! }
+//! for k in 0..120 {
+//!     let (name, camera) = &cameras[k % 3];
+//!     let seconds = k as f64 / 60.0;
+//!     let target = Point3::new(-10.0 + 8.0 * seconds, 5.0, 40.0);
+//!     let direction: Vector3<f64> = camera.pose().camera_from_world(target).normalize();
+//!     let (bearing, variance) = (Some(direction.into()), 0.0005_f64.powi(2));
+//!     let state = ImageTrackState::Tracking.into();
+//!     let seen = BearingTrack { bearing, covariance_xx: variance, covariance_yy: variance, state, ..Default::default() };
+//!     let capture_time_ns = Timestamp::EPOCH.plus_seconds(1.0 + seconds).nanos();
+//!     fusion.ingest(&BearingFrame {
+//!         camera: (*name).into(), sequence: k as u64, capture_time_ns, tracks: vec![seen], ..Default::default()
+//!     });
+//! }
+//! fusion.flush();
+//! let track = fusion.tracks().find(|track| track.is_confirmed()).ok_or("no track")?;
+//! assert!((track.state().position() - Point3::new(-10.0 + 8.0 * 119.0 / 60.0, 5.0, 40.0)).norm() < 0.05);
+//! assert!((track.state().velocity() - Vector3::new(8.0, 0.0, 0.0)).norm() < 0.2);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
 //! [`BearingFrame`]: crossfix_message::BearingFrame
 
 mod assignment;
 mod calibrations;
+mod camera_record;
 mod clocks;
 mod config;
 mod counters;
@@ -36,6 +62,7 @@ mod event_time;
 mod fusion;
 mod ingress;
 mod initiation;
+mod messages;
 mod motion;
 mod noise;
 mod pose_scale;

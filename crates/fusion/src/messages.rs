@@ -1,0 +1,57 @@
+//! What the fusion centre says, in the words of the wire.
+
+use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackState};
+
+use crate::motion::Motion;
+use crate::spatial::Quantity;
+use crate::track::{Track, TrackStatus};
+use crate::tracker::Happening;
+
+/// Something that happened to a track.
+pub(crate) fn event(happening: Happening, time: Timestamp) -> TrackEvent {
+    TrackEvent {
+        time_ns: time.nanos(),
+        kind: happening.kind.into(),
+        track_id: happening.track.0,
+        other_id: happening.other.map_or(0, |id| id.0),
+        ..Default::default()
+    }
+    .stamped()
+}
+
+/// A track as of `time`.
+pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix_message::Track {
+    let now = track.predicted(time, motion);
+    let state = match track.status {
+        TrackStatus::Tentative => TrackState::Tentative,
+        TrackStatus::Confirmed => TrackState::Confirmed,
+        TrackStatus::Coasting => TrackState::Coasting,
+        TrackStatus::OneCamera => TrackState::OneCamera,
+        TrackStatus::Lost => TrackState::Lost,
+    };
+    let residuals = track.residuals.iter().map(|(camera, residual)| CameraResidual {
+        camera: camera.as_str().to_owned(),
+        time_ns: residual.time.nanos(),
+        angle_rad: residual.angle,
+        nis: residual.nis,
+    });
+    let weak = |quantity: Quantity| {
+        let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
+        Some(axis.direction.into_inner().into())
+    };
+    crossfix_message::Track {
+        id: track.id.0,
+        state: state.into(),
+        position: Some(now.position().into()),
+        velocity: Some(now.velocity().into()),
+        // Symmetric, so columns are rows.
+        covariance: now.covariance.as_slice().to_vec(),
+        residuals: residuals.collect(),
+        solver: track.solver.into(),
+        rank: track.observability.rank as u32,
+        condition_number: track.observability.condition_number,
+        updated_ns: track.updated.nanos(),
+        weak_position_axis: weak(Quantity::Position),
+        weak_velocity_axis: weak(Quantity::Velocity),
+    }
+}

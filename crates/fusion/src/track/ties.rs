@@ -1,0 +1,187 @@
+//! What ties a track to the errors that all bearings of a camera share, and what its bearings tell of them.
+
+use crossfix_geometry::SightLine;
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x3, Unit, Vector2};
+
+use super::{Innovation, Track};
+use crate::motion::Motion;
+use crate::noise::LastThree;
+use crate::pose_scale::Sample;
+use crate::uncertainty::CameraUncertainty;
+use crate::update::Updated;
+use crate::watch::Visibility;
+
+/// Bearings further apart than this share of the time for which one holds a track tell no noise from jerks.
+const CLOSE_BEARINGS: f64 = 0.1;
+/// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a mast is seen.
+const DRAW_S: f64 = 0.3;
+
+/// What ties a track to the shared errors of a camera that has seen it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Ties {
+    /// Covariance of position and velocity with the errors, each in its own deviations.
+    pub(super) covariance: Matrix6x3<f64>,
+    /// Whether the camera can see the target, when it was exposed last.
+    pub(super) visibility: Visibility,
+    pub(super) last_three: LastThree,
+    pub(super) drawn: Option<Drawn>,
+}
+
+/// What a camera has seen of the target since the last draw: see [`crate::pose_scale`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Drawn {
+    offsets: Vector2<f64>,
+    count: f64,
+    by_position: Matrix2x3<f64>,
+    /// Covariance of each bearing's noise, rad^2.
+    noise: Matrix2<f64>,
+    pose: Matrix2<f64>,
+}
+
+impl Ties {
+    pub(super) fn new(time: Timestamp) -> Self {
+        Self {
+            covariance: Matrix6x3::zeros(),
+            visibility: Visibility::new(time),
+            last_three: LastThree::default(),
+            drawn: None,
+        }
+    }
+
+    /// The same `interval` seconds on: the position goes on with the velocity.
+    pub(super) fn predicted(&self, interval: f64) -> Matrix6x3<f64> {
+        let mut covariance = self.covariance;
+        let velocity = covariance.fixed_rows::<3>(3).into_owned();
+        let mut position = covariance.fixed_rows_mut::<3>(0);
+        position += velocity * interval;
+        covariance
+    }
+}
+
+impl Track {
+    pub(super) fn ties_of(&self, camera: &CameraName, interval: f64) -> Matrix6x3<f64> {
+        self.ties.get(camera).map_or_else(Matrix6x3::zeros, |ties| ties.predicted(interval))
+    }
+
+    /// Keeps a bearing for the next draw.
+    pub(super) fn gather(
+        &mut self,
+        camera: &CameraName,
+        innovation: &Innovation,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+    ) {
+        let own = innovation.model.covariance_of(line);
+        if let Some(ties) = self.ties.get_mut(camera) {
+            let before = ties.drawn.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
+            ties.drawn = Some(Drawn {
+                offsets: before.0 + innovation.offset,
+                count: before.1 + 1.0,
+                by_position: innovation.model.by_position(),
+                noise: own * uncertainty.factor,
+                pose: uncertainty.declared_pose(&innovation.model),
+            });
+        }
+    }
+
+    /// What the cameras have seen of the target since the last draw, if it is time for the next.
+    pub(crate) fn draw(&mut self) -> Vec<Sample> {
+        if self.updated.seconds_since(self.drawn) < DRAW_S {
+            return Vec::new();
+        }
+        self.drawn = self.updated;
+        // Cameras see it at other times within a draw: a velocity that is not known moves it in between.
+        let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
+        let drawn = self.ties.iter_mut().filter_map(|(camera, ties)| Some((camera, ties.drawn.take()?)));
+        let sample = |(camera, drawn): (&CameraName, Drawn)| {
+            let moved = drawn.by_position * (speed * DRAW_S / 10.0);
+            Sample {
+                camera: camera.clone(),
+                offset: drawn.offsets / drawn.count,
+                by_position: drawn.by_position,
+                noise: drawn.noise / drawn.count + moved * moved.transpose(),
+                pose: drawn.pose,
+            }
+        };
+        drawn.map(sample).collect()
+    }
+
+    /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances): what they
+    /// have done to the track is as well.
+    pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
+        let Some(ties) = self.ties.get_mut(camera) else {
+            return;
+        };
+        let mut shared = ties.covariance.fixed_columns_mut::<2>(0);
+        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
+        shared *= ratio.sqrt();
+        self.imm.add_covariance(&change);
+    }
+
+    /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was taken off its
+    /// times, and its variance to be `ratio` times what it was: the track lies by as much beside where it was
+    /// thought to be.
+    pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
+        let Some(ties) = self.ties.get_mut(camera) else {
+            return;
+        };
+        let mut shared = ties.covariance.fixed_columns_mut::<1>(2);
+        let moved = shared.clone_owned() * ahead;
+        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
+        shared *= ratio.sqrt();
+        self.imm.shift(&moved);
+        self.imm.add_covariance(&change);
+    }
+
+    pub(super) fn third_difference(
+        &mut self,
+        camera: &CameraName,
+        line: &SightLine,
+        motion: &Motion,
+    ) -> Option<f64> {
+        let (now, state) = (self.updated, self.imm.combined());
+        let (place, velocity) = (state.position(), state.velocity());
+        let expected =
+            |time: Timestamp| Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6);
+        let last_three = &mut self.ties.get_mut(camera)?.last_three;
+        last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
+    }
+
+    /// Carries the ties to all cameras' errors through an update, by the mean over the models; returns the
+    /// mean squared distance of the bearing.
+    pub(super) fn carry(&mut self, camera: &CameraName, interval: f64, results: &[Option<Updated>]) -> f64 {
+        let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), Matrix6x3::zeros());
+        for (result, weight) in results.iter().zip(self.imm.probabilities()) {
+            if let Some(after) = result {
+                nis += after.nis * weight;
+                carried += after.carried * *weight;
+                gained += after.gained * *weight;
+            }
+        }
+        if !self.ties.contains_key(camera) {
+            self.ties.insert(camera.clone(), Ties::new(self.updated));
+        }
+        for (name, ties) in &mut self.ties {
+            ties.covariance = carried * ties.predicted(interval);
+            if name == camera {
+                ties.covariance -= gained;
+            }
+        }
+        self.keep_ties_possible();
+        nis
+    }
+
+    /// The ties are carried by the mean over the models: where one model alone is surer than they allow, it is
+    /// not believed.
+    fn keep_ties_possible(&mut self) {
+        let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
+        // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
+        let mut squares: Vec<Matrix6<f64>> = squares.collect();
+        squares.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
+        let shared: Matrix6<f64> = squares.iter().sum();
+        if shared.amax() > 0.0 {
+            self.imm.exceed(&shared);
+        }
+    }
+}
