@@ -89,7 +89,11 @@ impl Tracker {
         for id in due {
             let older = self.tracks.range(..id).map(|(_, old)| old);
             let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
-            let same = self.tracks.get(&id).and_then(|new| older.find(|old| self.is_one_image(old, new)));
+            // Two targets that cross part again.
+            let stays = |old: &Track, new: &Track| {
+                [0.0, COMPARED_EVERY_S].iter().all(|&s| self.is_one_image(old, new, now.plus_seconds(s)))
+            };
+            let same = self.tracks.get(&id).and_then(|new| older.find(|old| stays(old, new)));
             let same = same.map(|old| old.id);
             if let Some(track) = self.tracks.get_mut(&id) {
                 track.comparisons += 1;
@@ -123,7 +127,8 @@ impl Tracker {
             self.tracks.insert(track.id, track);
             return Vec::new();
         }
-        if self.tracks.values().any(|old| old.is_confirmed() && self.is_one_image(old, &track)) {
+        if self.tracks.values().any(|old| old.is_confirmed() && self.is_one_image(old, &track, track.updated))
+        {
             return Vec::new();
         }
         let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();
@@ -147,10 +152,10 @@ impl Tracker {
         happenings
     }
 
-    /// Whether two tracks lie so close together for every camera that sees the new one that they are parts of
-    /// one target: a detector may report its two ends.
-    fn is_one_image(&self, old: &Track, new: &Track) -> bool {
-        let [there, here] = [old.position_at(new.updated), new.position_at(new.updated)];
+    /// Whether two tracks lie so close together at a time for every camera that sees the new one that they are parts
+    /// of one target: a detector may report its two ends.
+    fn is_one_image(&self, old: &Track, new: &Track, time: Timestamp) -> bool {
+        let [there, here] = [old.position_at(time), new.position_at(time)];
         // What was split once is split again, and where a track begins it is less sure where.
         let times = if old.has_ends { 2.0 } else { 1.0 };
         let mut eyes = new.residuals.keys().map(|camera| self.eyes.get(camera));
