@@ -8,7 +8,7 @@ use std::fmt;
 
 use crossfix_message::{CameraName, Timestamp};
 
-use crate::initiation::{Passing, Passings};
+use crate::initiation::{Passing, Passings, lines_with_pose};
 use crate::rooted::Rooted;
 use crate::spatial::TimedLine;
 use crate::{Exposure, Initiation, Sighting};
@@ -200,7 +200,9 @@ impl Unmet {
         let seen = self.seen.entry(exposure.camera.clone()).or_insert_with(nothing);
         seen.since.retain(|_, (_, last)| now.seconds_since(*last) <= SOMETHING_S);
         let mut lines = Vec::new();
-        for Sighting { image_track, line, rooted } in &exposure.sightings {
+        for (Sighting { image_track, rooted, .. }, (_, timed)) in
+            exposure.sightings.iter().zip(lines_with_pose(exposure))
+        {
             let full = seen.since.len() >= MAX_IMAGE_TRACKS;
             if *rooted == Rooted::Yes || (full && !seen.since.contains_key(image_track)) {
                 continue;
@@ -208,8 +210,7 @@ impl Unmet {
             let (first, last) = seen.since.entry(*image_track).or_insert((now, now));
             *last = now;
             if now.seconds_since(*first) >= SOMETHING_S && lines.len() < MAX_LINES {
-                let time_sd_s = exposure.uncertainty.time_sd_s;
-                lines.push(TimedLine { line: *line, time: now, time_sd_s, origin_sd_m: 0.0 });
+                lines.push(timed);
             }
         }
         (seen.time, seen.lines) = (now, lines.clone());

@@ -35,7 +35,7 @@ use period::Periods;
 const MAX_LINES: usize = 500;
 
 /// A sight line with its name.
-type NamedLine = (LineId, TimedLine);
+pub(crate) type NamedLine = (LineId, TimedLine);
 
 /// A track that begins.
 #[derive(Clone, Debug)]
@@ -107,7 +107,7 @@ fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
 
 /// The same with what is uncertain of the camera's pose: where one bearing of each camera must meet,
 /// that is noise like any other.
-fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
+pub(crate) fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     let pose = exposure.uncertainty.pose;
     let origin_sd_m =
         pose.map_or(0.0, |pose| (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());

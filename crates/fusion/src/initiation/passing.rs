@@ -46,9 +46,10 @@ impl Passings {
         }
         let by_m = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
         let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
+        let poses = first.origin_sd_m + second.origin_sd_m;
         let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);
         let between = second.time.seconds_since(first.time).abs() + unsure;
         let motion = self.speed * between;
-        if by_m <= SIGMAS * (noise + motion) { Passing::Close } else { Passing::Apart { by_m } }
+        if by_m <= SIGMAS * (noise + poses + motion) { Passing::Close } else { Passing::Apart { by_m } }
     }
 }

@@ -251,6 +251,7 @@ impl SeedFinder {
             return Vec::new();
         }
         let moved = self.initiation.velocity_prior_sd_mps * TYPICAL_SPEED * first.time_sd_s;
+        let moved = moved.hypot(first.origin_sd_m);
         let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
             return Vec::new();
         };

@@ -2,6 +2,17 @@ use nalgebra::{Matrix3x2, Point3, Vector3};
 
 use super::TimedLine;
 
+/// About how far away a target is, m: the longest range of the first line with another, the target taken to stand
+/// still; not less than the longest base.
+pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
+    let base = others.iter().map(|other| (other.line.origin - first.line.origin).norm()).fold(0.0, f64::max);
+    let range = |other: &&TimedLine| {
+        let solution = pair(first, other, Vector3::zeros())?;
+        Some(solution.first_range.max(solution.second_range)).filter(|range| range.is_finite())
+    };
+    others.iter().filter_map(range).fold(base, f64::max)
+}
+
 /// Two ranges and how badly the lines miss each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PairSolution {

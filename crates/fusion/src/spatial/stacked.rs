@@ -3,6 +3,7 @@ use nalgebra::{Unit, Vector3};
 
 use super::motion::displacement;
 use super::observability::determined;
+use super::pair::typical_range;
 use super::{Motion, Observability, RangeSolution, TimedLine, WeakAxis, pair};
 
 /// The papers' system for n cameras: n ranges and the velocity from n lines, 3(n - 1) equations in
@@ -27,15 +28,15 @@ pub fn stacked_with(lines: &[TimedLine], motion: Motion) -> Option<RangeSolution
         return None;
     }
     let n = lines.len();
-    let base = others.iter().map(|l| (l.line.origin - first.line.origin).norm()).fold(0.0, f64::max);
-    let scales: Vec<f64> = std::iter::repeat_n(base, n)
+    let range = typical_range(first, &others.iter().collect::<Vec<_>>());
+    let scales: Vec<f64> = std::iter::repeat_n(range, n)
         .chain(motion.terms(0.0).into_iter().flat_map(|(scale, _)| [scale; 3]))
         .collect();
     let (a, b) = system(first, others, motion, &scales);
     let svd = a.thin_svd().ok()?;
     let unknowns = scales.len();
     let values: Vec<f64> = (0..unknowns).map(|i| svd.S()[i]).collect();
-    let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * base;
+    let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * range;
     let observability = Observability::of_singular_values(&values, noise, |worst| {
         let combination: Vec<f64> = (0..unknowns).map(|row| svd.V()[(row, worst)]).collect();
         let directions: Vec<Unit<Vector3<f64>>> = lines.iter().map(|l| l.line.direction).collect();

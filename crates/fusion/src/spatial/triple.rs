@@ -1,6 +1,7 @@
 use nalgebra::{Matrix6, Vector3, Vector6};
 
 use super::observability::determined;
+use super::pair::typical_range;
 use super::{Observability, RangeSolution, TimedLine, WeakAxis, pair};
 
 /// The three-receiver algorithm: three ranges and the velocity from three lines of three times
@@ -8,7 +9,7 @@ use super::{Observability, RangeSolution, TimedLine, WeakAxis, pair};
 ///
 /// The system is regular only if the three times differ and the lines do not lie in a plane
 /// (`det A = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the
-/// lines: unknowns are scaled by the length of the base and by `velocity_scale`, and a singular
+/// lines, their deviation times the range: unknowns are scaled by the range and by `velocity_scale`, and a singular
 /// direction counts if the noise leaves it better known than its scale. `None` if even the first
 /// two lines are parallel.
 pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSolution> {
@@ -27,18 +28,18 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     let b = Vector6::new(b2.x, b2.y, b2.z, b3.x, b3.y, b3.z);
 
     // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long (benches/solvers).
-    let base = b2.norm().max(b3.norm());
+    let range = typical_range(first, &[second, third]);
     let scale = Matrix6::from_diagonal(&Vector6::new(
-        base,
-        base,
-        base,
+        range,
+        range,
+        range,
         velocity_scale,
         velocity_scale,
         velocity_scale,
     ));
     let svd = (a * scale).try_svd(true, true, f64::EPSILON, 200)?;
     let (u, v_t) = (svd.u?, svd.v_t?);
-    let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * base;
+    let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * range;
     let values = svd.singular_values;
     let mut observability = Observability::of_singular_values(values.as_slice(), noise, |worst| {
         let combination: Vec<f64> = v_t.row(worst).iter().copied().collect();
@@ -108,6 +109,19 @@ mod tests {
         assert_eq!(solution.observability.weak_axis.unwrap().quantity, Quantity::Velocity);
         assert!((solution.position - position).norm() < 1e-6);
         assert!(solution.velocity.norm() < 1e-6);
+    }
+
+    #[test]
+    fn a_base_of_20_m_tells_no_velocity_of_what_is_a_kilometre_away() {
+        let cameras = [[-10.0, 0.0, 0.0], [10.0, 0.0, 1.0], [0.0, 5.0, 0.0]].map(Point3::from);
+        let velocity = Vector3::new(5.0, 8.0, -1.0);
+        let solve = |position: Point3<f64>| {
+            let timed = cameras.iter().zip([0.0, 0.1, 0.2]);
+            let lines: Vec<_> = timed.map(|(c, t)| line_at(*c, position + velocity * t, t)).collect();
+            triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap().observability
+        };
+        assert!(!solve(Point3::new(30.0, 1000.0, 50.0)).is_full());
+        assert!(solve(Point3::new(3.0, 10.0, 12.0)).is_full());
     }
 
     #[test]
