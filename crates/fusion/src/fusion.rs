@@ -377,12 +377,14 @@ impl Fusion {
             // Beside the targets that two others see: they accuse nobody, but its clock may be wrong.
             self.clocks.suspect(camera);
         }
-        if let Some(standing) = self.standings.review(camera) {
+        let lapsed = self.standings.lapse(camera, time).then_some(CameraStanding::Good);
+        if let Some(standing) = self.standings.review(camera).or(lapsed) {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
             if standing == CameraStanding::Excluded {
+                self.standings.acquit_others(camera);
                 // It may be its clock that is wrong: bearings compared and not used can tell.
                 self.clocks.suspect(camera);
             }

@@ -19,6 +19,9 @@ const DRAW_SHARE: f64 = 0.1;
 /// median by this share. Without it two of four cameras would be taken to be perfect, and the others for worse
 /// than they are: the lines tell of fewer errors than there are.
 const ALIKE: f64 = 0.1;
+/// A step changes a factor (variance) by no more than this: a target whose bearings were mixed up with another's for
+/// a moment makes no camera doubtful.
+const LARGEST_STEP: f64 = 2.5;
 /// Fewer cameras cannot tell whose error it is: two lines that miss each other accuse nobody.
 const LEAST_ACCUSERS: usize = 3;
 /// No pose is known better than this share (variance) of a careful survey: a hundredth of a milliradian.
@@ -103,8 +106,8 @@ impl PoseScales {
                 let share = scale.draws.recip().max(DRAW_SHARE);
                 scale.found += (found - scale.found) * share;
                 scale.expected += (expected - scale.expected) * share;
-                let step = (scale.found / scale.expected).sqrt();
-                let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { f64::INFINITY };
+                let step = (scale.found / scale.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+                let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
                 let like_others = (ALIKE * (typical - scale.value.ln())).exp();
                 scale.value = (scale.value * like_others * step.min(most)).clamp(scale.least, scale.greatest);
                 let ratio = scale.value / scale.told;

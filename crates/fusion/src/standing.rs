@@ -98,6 +98,28 @@ impl Standings {
         record.wrong += (share - record.wrong) * (step_s / record.evidence_s.max(step_s)).min(1.0);
     }
 
+    /// A camera has been left out: what was held against the others was found beside what it said.
+    pub(crate) fn acquit_others(&mut self, camera: &CameraName) {
+        for (_, record) in
+            self.records.iter_mut().filter(|(name, record)| *name != camera && !record.excluded)
+        {
+            (record.wrong, record.evidence_s) = (0.0, 0.0);
+        }
+    }
+
+    /// A camera's exposure at a time says nothing for or against it. Where that goes on for long, as there is no
+    /// target left to compare it with, a verdict lapses: returns whether one has.
+    pub(crate) fn lapse(&mut self, camera: &CameraName, time: Timestamp) -> bool {
+        let lapsed = self
+            .records
+            .get_mut(camera)
+            .filter(|record| record.excluded && time.seconds_since(record.last) > MEMORY_S);
+        lapsed.is_some_and(|record| {
+            *record = Record { wrong: 0.0, evidence_s: 0.0, last: time, excluded: false };
+            true
+        })
+    }
+
     /// Whether a camera is left out.
     pub(crate) fn is_excluded(&self, camera: &CameraName) -> bool {
         self.records.get(camera).is_some_and(|record| record.excluded)
@@ -148,6 +170,33 @@ mod tests {
                 "{rate} Hz"
             );
         }
+    }
+
+    #[test]
+    fn a_verdict_lapses_where_nothing_is_left_to_compare_with() {
+        let (mut standings, camera) = (Standings::default(), name("a"));
+        let at = |seconds: f64| Timestamp::EPOCH.plus_seconds(seconds);
+        for k in 0..50 {
+            standings.learn(&camera, at(0.1 * f64::from(k)), &[Fitting::Beside]);
+        }
+        assert_eq!(standings.review(&camera), Some(CameraStanding::Excluded));
+        assert!(!standings.lapse(&camera, at(9.0)));
+        assert!(standings.lapse(&camera, at(10.0)));
+        assert!(!standings.is_excluded(&camera) && !standings.lapse(&camera, at(20.0)));
+    }
+
+    #[test]
+    fn what_was_held_against_others_beside_a_camera_that_is_left_out_is_void() {
+        let (mut standings, [one, other]) = (Standings::default(), ["a", "b"].map(name));
+        for k in 0..50 {
+            let time = Timestamp::EPOCH.plus_seconds(0.1 * f64::from(k));
+            standings.learn(&one, time, &[Fitting::Beside]);
+            standings.learn(&other, time, &[Fitting::Beside]);
+        }
+        assert_eq!(standings.review(&one), Some(CameraStanding::Excluded));
+        standings.acquit_others(&one);
+        assert_eq!(standings.review(&other), None);
+        assert!(standings.is_excluded(&one) && !standings.is_excluded(&other));
     }
 
     #[test]
