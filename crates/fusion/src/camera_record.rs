@@ -6,6 +6,9 @@ use crate::{Exposure, FusionConfig};
 
 /// A clock whose variance (logarithm) and offset (in its deviations) change by less than this changes no track.
 const NOTICED_CLOCK: f64 = 0.1;
+/// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and what is known of a
+/// clock must not be divided by next to nothing.
+const RIGHT_CLOCK_S: f64 = 1e-9;
 
 /// What is learnt of a camera from its own bearings.
 #[derive(Clone, Debug)]
@@ -30,7 +33,7 @@ impl CameraRecord {
         let (sd_s, offset_s) = (exposure.uncertainty.time_sd_s, exposure.correction_s);
         let ratio = (sd_s / self.time_sd_s).powi(2);
         let ahead = (offset_s - self.offset_s) / self.time_sd_s;
-        let known = self.time_sd_s > 0.0 && sd_s > 0.0;
+        let known = self.time_sd_s > RIGHT_CLOCK_S && sd_s > RIGHT_CLOCK_S;
         if known && ratio.ln().abs() < NOTICED_CLOCK && ahead.abs() < NOTICED_CLOCK {
             return None;
         }
