@@ -22,7 +22,8 @@ pub struct TrackHistory {
 #[derive(Clone, Debug)]
 struct Said {
     status: TrackState,
-    cameras: usize,
+    /// When each camera gave its newest bearing.
+    bearings: Vec<Timestamp>,
     state: Option<KinematicState>,
 }
 
@@ -41,11 +42,8 @@ impl TrackHistory {
         let time = Timestamp::from_nanos(frame.time_ns);
         self.times.insert(time);
         for track in &frame.tracks {
-            let lately = |r: &&crossfix_message::CameraResidual| {
-                time.seconds_since(Timestamp::from_nanos(r.time_ns)) <= LATELY_S
-            };
-            let cameras = track.residuals.iter().filter(lately).count();
-            let said = Said { status: track.state(), cameras, state: state(track) };
+            let bearings = track.residuals.iter().map(|r| Timestamp::from_nanos(r.time_ns)).collect();
+            let said = Said { status: track.state(), bearings, state: state(track) };
             self.tracks.entry(track.id).or_default().insert(time, said);
         }
     }
@@ -64,7 +62,9 @@ impl TrackHistory {
         let said = self.tracks.iter().filter_map(|(&id, said)| {
             let (&then, said) = said.range(..=time).next_back()?;
             let state = said.state.as_ref()?.predicted(time.seconds_since(then), 0.0);
-            Some(Estimate { id, status: said.status, cameras: said.cameras, state })
+            let lately = |bearing: &&Timestamp| time.seconds_since(**bearing) <= LATELY_S;
+            let cameras = said.bearings.iter().filter(lately).count();
+            Some(Estimate { id, status: said.status, cameras, state })
         });
         said.filter(|said| said.status != TrackState::Lost).collect()
     }

@@ -1,3 +1,5 @@
+//! How long targets wait for an answer.
+
 use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;
@@ -15,9 +17,10 @@ pub struct Delays {
     /// From a target's first instant to its first answer, the longest of all targets, s; absent if one was never
     /// answered for.
     pub first_s: Option<f64>,
-    /// Stretches after a target's first one: it has gone out of what was asked for, and come back.
+    /// Stretches after a target's first one: it has gone out of what was asked for for more than a second, and come
+    /// back. Those of less than a second that got no answer do not count.
     pub returns: u64,
-    /// From a return to the next answer, the median, s; absent without a return, or if half got no answer.
+    /// From a return to the next answer, the median, s; absent without a return, or if more than half got no answer.
     pub next_median_s: Option<f64>,
     /// The same, for nine returns of ten, s.
     pub next_p90_s: Option<f64>,
@@ -59,8 +62,12 @@ impl Stretches {
         let counts = |stretch: &&Stretch| {
             stretch.answered.is_some() || stretch.to.seconds_since(stretch.from) > LEAST_S
         };
-        let firsts = self.0.values().filter_map(|stretches| stretches.first());
-        let first_s = firsts.map(delay).fold(0.0, f64::max);
+        let first = |stretches: &Vec<Stretch>| {
+            let answered = stretches.iter().find_map(|stretch| stretch.answered);
+            let waited = |begun: &Stretch| answered.map(|answered| answered.seconds_since(begun.from));
+            stretches.first().and_then(waited).unwrap_or(f64::INFINITY)
+        };
+        let first_s = self.0.values().map(first).fold(0.0, f64::max);
         let returns = self.0.values().flat_map(|stretches| stretches.iter().skip(1));
         let mut nexts: Vec<f64> = returns.filter(counts).map(delay).collect();
         nexts.sort_by(f64::total_cmp);

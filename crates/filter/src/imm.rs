@@ -127,7 +127,10 @@ impl Imm {
             *state = next;
         }
         self.combined = combined(&self.states, &self.probabilities);
-        self.restlessness.see(models.calm_probability(self.probabilities()), interval);
+        // Where all models are alike the bearings say nothing of which it is.
+        if models.models().iter().any(|model| model.density != models.models()[0].density) {
+            self.restlessness.see(models.calm_probability(self.probabilities()), interval);
+        }
         Some(largest + sum.ln())
     }
 

@@ -184,6 +184,19 @@ mod tests {
     }
 
     #[test]
+    fn a_transition_is_a_probability_and_the_same_however_its_interval_is_cut() {
+        let model = |share, calm| MotionModel { density: share, share, calm };
+        let models = [model(0.5, true), model(0.2, true), model(0.2, false), model(0.1, false)];
+        let rates = ModeRates { switching_per_s: 0.3, calming_per_s: 0.1, prior_s: 20.0 };
+        let models = MotionModels::new(&models, rates).unwrap();
+        let restless = Restlessness { is_calm: true, upsets: 3.0, calm_s: 40.0 };
+        let at = |seconds| nalgebra::Matrix4::from_fn(|i, j| models.transitions(seconds, &restless)[i][j]);
+        assert!((at(0.7) * at(1.8) - at(2.5)).amax() < 1e-12);
+        assert!((at(2.5) * nalgebra::Vector4::repeat(1.0)).iter().all(|sum| (sum - 1.0).abs() < 1e-12));
+        assert!((at(0.0) - nalgebra::Matrix4::identity()).amax() < 1e-12);
+    }
+
+    #[test]
     fn a_target_that_turns_often_is_expected_to_turn_again_and_one_that_never_does_is_not() {
         let mut restless = Restlessness::UNKNOWN;
         // Six seconds of calm and two of turning, ten times; and a minute of calm.

@@ -76,7 +76,7 @@ impl FusionConfig {
             ("initiation.pair_s", !grouping, initiation.pair_s, first.pair_s),
             (
                 "tracking.acceleration_density",
-                !models,
+                !models || (grouping && initiation.temporal_gate_m.is_none()),
                 tracking.acceleration_density,
                 found.acceleration_density,
             ),
@@ -212,6 +212,10 @@ mod tests {
             refused(|c| c.tracking.acceleration_density = 3.5),
             "`tracking.acceleration_density` is 3.5: it must be left out: the method that is chosen does not use it"
         );
+        let mut grouping = FusionConfig::default();
+        grouping.initiation.method = InitiationMethod::Grouping;
+        grouping.tracking.acceleration_density = 3.5;
+        assert_eq!(grouping.validate(), Ok(()), "the gate between fixes uses it");
         assert_eq!(
             refused(|c| c.tracking.clutter_per_sr = 0.0),
             "`tracking.clutter_per_sr` is 0: it must be from 1e-9 to 1000000"

@@ -113,7 +113,7 @@ impl Standings {
         let lapsed = self
             .records
             .get_mut(camera)
-            .filter(|record| record.excluded && time.seconds_since(record.last) > MEMORY_S);
+            .filter(|record| record.excluded && time.seconds_since(record.last).abs() > MEMORY_S);
         lapsed.is_some_and(|record| {
             *record = Record { wrong: 0.0, evidence_s: 0.0, last: time, excluded: false };
             true

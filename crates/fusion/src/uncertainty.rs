@@ -3,6 +3,9 @@
 use crossfix_geometry::{BearingModel, tangent_basis};
 use nalgebra::{Matrix2, Matrix2x3, Matrix6, Rotation3, Unit, Vector2, Vector3};
 
+/// Variances that differ by less than this share of them are one: what turning them leaves is far less.
+const ROUNDING: f64 = 1e-9;
+
 /// Covariance of a camera's pose in the world's axes as declared: rotation (rad), then position (m).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PoseUncertainty {
@@ -16,7 +19,14 @@ impl PoseUncertainty {
     pub(crate) fn new(covariance: Matrix6<f64>) -> Self {
         let [rotation, position] = [covariance.m11, covariance.m44];
         let alike = Self::diagonal(rotation, position);
-        Self { covariance, alike: (covariance == alike).then_some([rotation, position]) }
+        // A covariance that was turned into the world's axes has rounding beside its diagonal.
+        let [turns, moves] = [(0, rotation), (3, position)].map(|(from, variance)| {
+            let off = (covariance - alike).fixed_view::<3, 3>(from, from).amax();
+            off <= ROUNDING * variance.abs()
+        });
+        let tied = covariance.fixed_view::<3, 3>(0, 3).amax() > 0.0;
+        let is_alike = turns && moves && !tied && rotation >= 0.0 && position >= 0.0;
+        Self { covariance, alike: is_alike.then_some([rotation, position]) }
     }
 
     fn diagonal(rotation: f64, position: f64) -> Matrix6<f64> {

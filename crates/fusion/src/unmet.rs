@@ -17,6 +17,8 @@ use crate::{Exposure, Initiation, Sighting};
 const PATIENCE_S: f64 = 5.0;
 /// How often two cameras are compared, s.
 const INTERVAL_S: f64 = 0.25;
+/// What they show is concluded this often, s: counting costs more than comparing.
+const CONCLUDED_EVERY_S: f64 = 1.0;
 /// What so many comparisons of two cameras show counts: the last five seconds.
 const REMEMBERED: usize = 20;
 /// In this share of them both must have seen something.
@@ -125,6 +127,8 @@ pub(crate) struct Unmet {
     pairs: BTreeMap<[CameraName; 2], Pair>,
     /// Since when there has been no track.
     since: Option<Timestamp>,
+    /// When it was concluded last.
+    concluded: Option<Timestamp>,
     why: Option<WhyNothing>,
 }
 
@@ -136,6 +140,7 @@ impl Unmet {
             seen: BTreeMap::new(),
             pairs: BTreeMap::new(),
             since: None,
+            concluded: None,
             why: None,
         }
     }
@@ -148,7 +153,7 @@ impl Unmet {
     /// There is a target: what was compared before says nothing of what comes after it.
     pub(crate) fn found(&mut self) {
         self.pairs.clear();
-        (self.since, self.why) = (None, None);
+        (self.since, self.concluded, self.why) = (None, None, None);
     }
 
     /// Takes in an exposure's bearings that belong to no track; returns what each comparison has shown, by the name
@@ -180,7 +185,11 @@ impl Unmet {
                 pair.shown.pop_front();
             }
         }
-        if now.seconds_since(since) >= PATIENCE_S && !counted.is_empty() {
+        let is_due = self.concluded.is_none_or(|then| now.seconds_since(then) >= CONCLUDED_EVERY_S);
+        if is_due && now.seconds_since(since) >= PATIENCE_S {
+            self.concluded = Some(now);
+            // A camera that is silent, or that sees nothing any more, has no part in it.
+            self.pairs.retain(|_, pair| now.seconds_since(pair.time) <= PATIENCE_S);
             let before = self.why.take();
             self.why = self.conclusion();
             // The same sentence stays as it is, whatever its digits do.

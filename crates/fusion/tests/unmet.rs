@@ -55,6 +55,31 @@ fn lines_that_miss_each_other_are_said_within_ten_seconds_and_by_how_much() {
 }
 
 #[test]
+fn nothing_is_said_any_more_when_the_target_or_a_camera_is_gone() {
+    let scene = Scene { time_s: 0.0..25.0, ..two_cameras() };
+    let knocked = |frame: &mut BearingFrame| {
+        for track in frame.tracks.iter_mut().filter(|_| frame.camera == "b") {
+            let turned = Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
+            track.bearing = Some(turned.into());
+        }
+    };
+    let (fusion, when) = said(&scene, |frame| {
+        knocked(frame);
+        if frame.capture_time_ns > 12_000_000_000 {
+            frame.tracks.clear();
+        }
+    });
+    assert!(when.is_some() && fusion.why_nothing().is_none(), "{:?}", fusion.why_nothing());
+    let (fusion, when) = said(&scene, |frame| {
+        knocked(frame);
+        if frame.capture_time_ns > 12_000_000_000 && frame.camera == "b" {
+            frame.camera = "nobody".to_owned();
+        }
+    });
+    assert!(when.is_some() && fusion.why_nothing().is_none(), "{:?}", fusion.why_nothing());
+}
+
+#[test]
 fn where_a_target_is_found_nothing_is_said() {
     let scene = two_cameras();
     let (fusion, when) = said(&scene, |_| {});

@@ -187,7 +187,8 @@ impl Hypotheses {
             motion,
         );
         let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
-        let miss = missed(visible, detection);
+        // Where the camera does not look, a line that is left out costs nothing.
+        let miss = if expected { missed(visible, detection) } else { 0.0 };
         let ratio = |(i, (_, line)): (usize, &NamedLine)| {
             let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
             Some((log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr), i))
@@ -216,14 +217,11 @@ impl Hypotheses {
             child.lines.push((self.period, id.clone()));
             Some(child)
         };
-        if miss <= best - RIVAL_MARGIN {
-            // Copies cost more than all the rest: the last way takes the hypothesis itself.
-            let last = near.pop();
-            next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
-            next.extend(last.and_then(|way| taken(hypothesis, way)));
+        let before = next.len();
+        next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
+        if miss <= best - RIVAL_MARGIN && next.len() > before {
             return;
         }
-        next.extend(near.into_iter().filter_map(|way| taken(hypothesis.clone(), way)));
         if expected {
             hypothesis.track.score += miss;
             hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);

@@ -2,15 +2,16 @@ use nalgebra::{Matrix3x2, Point3, Vector3};
 
 use super::TimedLine;
 
-/// About how far away a target is, m: the longest range of the first line with another, the target taken to stand
-/// still; not less than the longest base.
+/// About how far away a target is, m: the longer range of the first line and the one that crosses it at the widest
+/// angle, the target taken to stand still; not less than the longest base.
 pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
     let base = others.iter().map(|other| (other.line.origin - first.line.origin).norm()).fold(0.0, f64::max);
-    let range = |other: &&TimedLine| {
-        let solution = pair(first, other, Vector3::zeros())?;
-        Some(solution.first_range.max(solution.second_range)).filter(|range| range.is_finite())
-    };
-    others.iter().filter_map(range).fold(base, f64::max)
+    let along = |other: &TimedLine| first.line.direction.dot(&other.line.direction).abs();
+    let elsewhere = others.iter().filter(|other| other.line.origin != first.line.origin);
+    let widest = elsewhere.min_by(|one, other| along(one).total_cmp(&along(other)));
+    let solution = widest.and_then(|other| pair(first, other, Vector3::zeros()));
+    let range = solution.map_or(base, |solution| solution.first_range.max(solution.second_range));
+    if range.is_finite() { range.max(base) } else { base }
 }
 
 /// Two ranges and how badly the lines miss each other.

@@ -124,11 +124,15 @@ impl Tracker {
         if let Some(old) = same {
             track.id = old.id;
             track.score = track.score.max(old.score);
+            (track.has_ends, track.comparisons) = (old.has_ends, old.comparisons);
             self.tracks.insert(track.id, track);
             return Vec::new();
         }
-        if self.tracks.values().any(|old| old.is_confirmed() && self.is_one_image(old, &track, track.updated))
-        {
+        if self.tracks.values().any(|old| {
+            old.status == TrackStatus::Confirmed
+                && old.is_held()
+                && self.is_one_image(old, &track, track.updated)
+        }) {
             return Vec::new();
         }
         let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();

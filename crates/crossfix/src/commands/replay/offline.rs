@@ -114,7 +114,7 @@ impl OfflineFusion {
     }
 
     fn write_health(&mut self, now: Timestamp, ended: bool) -> anyhow::Result<()> {
-        if now == Timestamp::EPOCH {
+        if now == Timestamp::EPOCH && !ended {
             return Ok(());
         }
         let is_due = self.healthy_at.is_none_or(|then| now.seconds_since(then).abs() >= HEALTH_PERIOD_S);
