@@ -3,9 +3,11 @@
 /// More models than this say nothing that fewer do not.
 pub const MAX_MODELS: usize = 4;
 
-/// A target has left its calm when calm is less likely than this, ...
+/// A target has left its calm when calm is less likely than this (a probability): when it is likelier that it has. Of
+/// half of it only hard manoeuvres would count, ...
 const UPSET: f64 = 0.5;
-/// ... and has come to it again when it is likelier than this.
+/// ... and it has come to it again when calm is likelier than this. Well above the other, so that one manoeuvre in which
+/// the probability goes to and fro counts once.
 const CALM: f64 = 0.9;
 
 /// One way of flying: constant velocity driven by white acceleration.

@@ -16,6 +16,33 @@ const fn range(key: &'static str, value: f64, least: f64, most: f64) -> Range {
     Range { key, value, least, most }
 }
 
+/// A key and its number.
+type Key = (&'static str, fn(&FusionConfig) -> f64);
+
+// What each method alone uses.
+const OF_EQUAL_WEIGHTS: &[Key] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
+const OF_PAIRS: &[Key] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
+const OF_GROUPING: &[Key] =
+    &[("initiation.temporal_gate_m", |c| c.initiation.temporal_gate_m.unwrap_or(f64::NAN))];
+const OF_HYPOTHESES: &[Key] = &[
+    ("initiation.birth_density_per_m3", |c| c.initiation.birth_density_per_m3),
+    ("initiation.pair_s", |c| c.initiation.pair_s),
+];
+const OF_ONE_MODEL: &[Key] = &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
+const OF_MODELS: &[Key] = &[
+    ("tracking.switching_rate_per_s", |c| c.tracking.switching_rate_per_s),
+    ("tracking.calming_rate_per_s", |c| c.tracking.calming_rate_per_s),
+    ("tracking.restlessness_prior_s", |c| c.tracking.restlessness_prior_s),
+];
+const OF_SMOOTHED_RESIDUAL: &[Key] = &[
+    ("tracking.residual_window", |c| c.tracking.residual_window as f64),
+    ("tracking.residual_scale", |c| c.tracking.residual_scale),
+];
+const OF_INNOVATION: &[Key] = &[
+    ("tracking.innovation_window", |c| c.tracking.innovation_window as f64),
+    ("tracking.innovation_false_alarm", |c| c.tracking.innovation_false_alarm),
+];
+
 impl Range {
     fn check(&self) -> Result<(), ConfigError> {
         let &Self { key, value, least, most } = self;
@@ -50,74 +77,27 @@ impl FusionConfig {
     fn unused(&self) -> Option<ConfigError> {
         let Self { bearings, initiation, tracking, .. } = self;
         let usual = Self::default();
-        let equal = bearings.weighting == Weighting::Equal;
         let grouping = initiation.method == InitiationMethod::Grouping;
         let pairs = grouping && initiation.solver == SpatialSolver::Pair;
-        let models = tracking.manoeuvres == Manoeuvres::Models;
-        let smoothed = tracking.manoeuvres == Manoeuvres::SmoothedResidual;
-        let innovation = tracking.manoeuvres == Manoeuvres::Innovation;
-        let (first, found) = (&usual.initiation, &usual.tracking);
-        let gate = |gate: Option<f64>| gate.unwrap_or(f64::NAN);
+        // The gate between fixes is from the covariances unless it is given.
+        let one_model =
+            tracking.manoeuvres != Manoeuvres::Models || (grouping && initiation.temporal_gate_m.is_none());
         let keys = [
-            ("bearings.equal_sd_rad", equal, bearings.equal_sd_rad, usual.bearings.equal_sd_rad),
-            ("initiation.pair_gate_m2", pairs, initiation.pair_gate_m2, first.pair_gate_m2),
-            (
-                "initiation.temporal_gate_m",
-                grouping,
-                gate(initiation.temporal_gate_m),
-                gate(first.temporal_gate_m),
-            ),
-            (
-                "initiation.birth_density_per_m3",
-                !grouping,
-                initiation.birth_density_per_m3,
-                first.birth_density_per_m3,
-            ),
-            ("initiation.pair_s", !grouping, initiation.pair_s, first.pair_s),
-            (
-                "tracking.acceleration_density",
-                !models || (grouping && initiation.temporal_gate_m.is_none()),
-                tracking.acceleration_density,
-                found.acceleration_density,
-            ),
-            (
-                "tracking.switching_rate_per_s",
-                models,
-                tracking.switching_rate_per_s,
-                found.switching_rate_per_s,
-            ),
-            ("tracking.calming_rate_per_s", models, tracking.calming_rate_per_s, found.calming_rate_per_s),
-            (
-                "tracking.restlessness_prior_s",
-                models,
-                tracking.restlessness_prior_s,
-                found.restlessness_prior_s,
-            ),
-            (
-                "tracking.residual_window",
-                smoothed,
-                tracking.residual_window as f64,
-                found.residual_window as f64,
-            ),
-            ("tracking.residual_scale", smoothed, tracking.residual_scale, found.residual_scale),
-            (
-                "tracking.innovation_window",
-                innovation,
-                tracking.innovation_window as f64,
-                found.innovation_window as f64,
-            ),
-            (
-                "tracking.innovation_false_alarm",
-                innovation,
-                tracking.innovation_false_alarm,
-                found.innovation_false_alarm,
-            ),
+            (bearings.weighting == Weighting::Equal, OF_EQUAL_WEIGHTS),
+            (pairs, OF_PAIRS),
+            (grouping, OF_GROUPING),
+            (!grouping, OF_HYPOTHESES),
+            (one_model, OF_ONE_MODEL),
+            (tracking.manoeuvres == Manoeuvres::Models, OF_MODELS),
+            (tracking.manoeuvres == Manoeuvres::SmoothedResidual, OF_SMOOTHED_RESIDUAL),
+            (tracking.manoeuvres == Manoeuvres::Innovation, OF_INNOVATION),
         ];
-        let set = |value: f64, usual: f64| value.to_bits() != usual.to_bits();
-        let (key, _, value, _) =
-            keys.into_iter().find(|(_, used, value, usual)| !used && set(*value, *usual))?;
-        let must = "left out: the method that is chosen does not use it".to_owned();
-        Some(ConfigError { key, value, must })
+        let unused = keys.into_iter().filter(|(is_used, _)| !is_used).flat_map(|(_, keys)| keys);
+        let mut set = unused.filter(|(_, number)| number(self).to_bits() != number(&usual).to_bits());
+        set.next().map(|(key, number)| {
+            let must = "left out: the method that is chosen does not use it".to_owned();
+            ConfigError { key, value: number(self), must }
+        })
     }
 
     fn time_and_bearings(&self) -> Vec<Range> {
