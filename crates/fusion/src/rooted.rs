@@ -38,6 +38,8 @@ pub(crate) enum Rooted {
 #[derive(Clone, Copy, Debug)]
 struct Place {
     middle: Unit<Vector3<f64>>,
+    /// Where its middle was at [`Self::first`].
+    start: Unit<Vector3<f64>>,
     first: Timestamp,
     last: Timestamp,
     reports: f64,
@@ -90,7 +92,8 @@ impl View {
             if self.places.len() >= MAX_PLACES {
                 self.places.remove(0);
             }
-            self.places.push(Place { middle: line.direction, first: time, last: time, reports: 1.0, before });
+            let (middle, start) = (line.direction, line.direction);
+            self.places.push(Place { middle, start, first: time, last: time, reports: 1.0, before });
             return if may_be_old(time) { Rooted::Unknown } else { Rooted::No };
         };
         let share = (time.seconds_since(place.last).max(0.0) / (MIDDLE * rooted_s)).min(1.0);
@@ -98,6 +101,11 @@ impl View {
         place.middle = Unit::new_normalize(place.middle.into_inner() + moved);
         place.last = place.last.max(time);
         place.reports += 1.0;
+        // What sways comes back; a middle that goes on is of something that flies slowly.
+        if (place.middle.into_inner() - place.start.into_inner()).norm() > REACH_RAD {
+            (place.start, place.first) = (place.middle, time);
+            return Rooted::No;
+        }
         let exposures = before + 1.0 - place.before;
         if time.seconds_since(place.first) < rooted_s {
             return if may_be_old(place.first) { Rooted::Unknown } else { Rooted::No };

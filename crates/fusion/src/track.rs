@@ -151,6 +151,8 @@ impl Track {
         for (camera, timed, uncertainty) in lines {
             track.note_start(fix, camera, timed, &uncertainty);
         }
+        // Not each solver holds all that poses and clocks can have done to its fix.
+        track.keep_ties_possible();
         track
     }
 
@@ -169,8 +171,10 @@ impl Track {
         let shifts = uncertainty.shifts(&model, here.velocity());
         let moved = (here.velocity().norm() * time_sd_s).powi(2) + origin_sd_m.powi(2);
         let noise = model.covariance_of(line) + Matrix2::identity() * (moved / model.range.powi(2));
-        let inverse = noise.try_inverse()?;
-        let nis = offset.dot(&(inverse * offset));
+        // By its root: a sum of squares is not negative, however nearly singular the noise is.
+        let factor = noise.cholesky()?;
+        let nis = factor.l().solve_lower_triangular(&offset)?.norm_squared();
+        let inverse = factor.inverse();
         self.residuals.insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
         let mut by = Matrix2x6::zeros();
         by.fixed_view_mut::<2, 3>(0, 0).copy_from(&model.by_position());
@@ -326,6 +330,7 @@ impl Track {
         let manoeuvre = self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
+            self.keep_ties_possible();
         }
         let seen_from = self.follower.filter(|_| !self.held);
         let ties = self.ties_of(camera, interval);

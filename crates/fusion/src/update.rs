@@ -88,13 +88,15 @@ pub(crate) fn updated(
         if !(is_own || settled || round == MAX_ROUNDS) {
             continue;
         }
-        let nis = innovation.dot(&(inverse * innovation));
+        // Not negative but for rounding, where the spread is nearly singular.
+        let nis = innovation.dot(&(inverse * innovation)).max(0.0);
         let point = chart.point(&coordinates);
         let (covariance, carried, gain) =
             chart.from(&point, covariance - gain * across.transpose(), &by, gain);
         let state =
             KinematicState { mean: point.mean(), covariance: (covariance + covariance.transpose()) / 2.0 };
-        let positive = state.covariance.diagonal().iter().all(|variance| *variance > 0.0);
+        // Where a place was known to no kilometre, rounding may leave of it less than nothing.
+        let positive = state.covariance.cholesky().is_some();
         return (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
             state,
             nis,

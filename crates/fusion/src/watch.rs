@@ -1,5 +1,7 @@
 //! What a camera reports beside the targets that are followed.
 
+use std::f64::consts::PI;
+
 use crossfix_message::Timestamp;
 
 use crate::ingress::KnownCamera;
@@ -8,6 +10,8 @@ use crate::ingress::KnownCamera;
 const MEMORY: f64 = 2.0;
 /// Strangers in an exposure that may always be, however few there were.
 const LEAST_STRANGERS: f64 = 0.02;
+/// No image covers less than this, sr: a microradian squared, which keeps densities finite for any lens.
+const LEAST_VIEW_SR: f64 = 1e-12;
 
 /// What hides a target from cameras hides it for about so long, s.
 const HIDDEN_S: f64 = 0.25;
@@ -92,6 +96,8 @@ impl Watch {
     pub(crate) fn strangers_per_sr(&self, known: &KnownCamera) -> f64 {
         let lens = known.camera.model().intrinsics();
         let [width, height] = [lens.size.width, lens.size.height].map(f64::from);
-        (self.strangers + LEAST_STRANGERS) * (lens.fx / width) * (lens.fy / height)
+        // Whatever a calibration says, no camera sees more than all directions or less than a point.
+        let view_sr = ((width / lens.fx) * (height / lens.fy)).clamp(LEAST_VIEW_SR, 4.0 * PI);
+        (self.strangers + LEAST_STRANGERS) / view_sr
     }
 }

@@ -237,8 +237,7 @@ fn two_cameras_know_less_than_three_and_both_say_so_honestly() {
     let (of_three, three, three_variance) = honesty(&site());
     let (of_two, two, two_variance) = honesty(&site()[..2]);
     assert_eq!(of_three, 200);
-    // What hangs before two cameras from the beginning as a tree stands there is not taken for a target.
-    assert!(of_two >= 197, "{of_two}");
+    assert_eq!(of_two, 200);
     // Chi-square of six degrees of freedom: the mean of 200 has a standard deviation of 0.245.
     for nees in [three, two] {
         assert!((nees - 6.0).abs() < 3.0 * (12.0_f64 / 200.0).sqrt(), "{nees}");

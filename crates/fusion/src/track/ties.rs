@@ -121,15 +121,16 @@ impl Track {
 
     /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was taken off its
     /// times, and its variance to be `ratio` times what it was: the track lies by as much beside where it was
-    /// thought to be.
+    /// thought to be. What makes a variance smaller has been learnt of the error that the track holds; what makes
+    /// it larger is an error that has come since, of which the track holds nothing.
     pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
         let Some(ties) = self.ties.get_mut(camera) else {
             return;
         };
         let mut shared = ties.covariance.fixed_columns_mut::<1>(2);
         let moved = shared.clone_owned() * ahead;
-        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
-        shared *= ratio.sqrt();
+        let change = shared.clone_owned() * shared.transpose() * (ratio.min(1.0) - 1.0);
+        shared *= ratio.min(ratio.recip()).sqrt();
         self.imm.shift(&moved);
         self.imm.add_covariance(&change);
     }
@@ -174,7 +175,7 @@ impl Track {
 
     /// The ties are carried by the mean over the models: where one model alone is surer than they allow, it is
     /// not believed.
-    fn keep_ties_possible(&mut self) {
+    pub(super) fn keep_ties_possible(&mut self) {
         let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
         // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
         let mut squares: Vec<Matrix6<f64>> = squares.collect();
