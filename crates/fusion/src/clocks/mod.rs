@@ -9,6 +9,7 @@
 
 mod adjustment;
 mod belief;
+mod common_time;
 mod curve;
 mod lesson;
 mod window;
