@@ -12,13 +12,15 @@ use nalgebra::{Unit, Vector2, Vector3};
 const MEDIAN: f64 = 1.386_294;
 /// How much more of the draws lies below the median by each unit of the logarithm of the scale.
 const SLOPE: f64 = 0.346_574;
-/// Draws that the estimate remembers: it is then known to 10 %. With half as many a camera at its word would
-/// be doubted by chance.
+/// Draws that the estimate remembers: it is then known to 10 %. With half as many a camera must report a third of
+/// its variance before it is noticed, and not half of it.
 const MEMORY: f64 = 200.0;
-/// Before as many draws nothing is concluded.
-const LEAST_DRAWS: f64 = 150.0;
-/// Within this (logarithm) of what it reports a camera is taken at its word.
-const HONEST: f64 = 0.4;
+/// Standard error of the logarithm of the scale after one draw (simulated: neighbouring ones share three of their
+/// four bearings).
+const ERROR_OF_ONE: f64 = 1.9;
+/// So many standard errors from what it reports a camera is no more taken at its word. With half as many one in
+/// twenty is doubted by chance.
+const DOUBT: f64 = 3.0;
 
 /// The last bearings that a camera gave of a track.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -74,6 +76,7 @@ impl WhiteNoise {
     /// How many times the reported covariance the noise is; 1 as long as that is not clear, and where it is
     /// less: what a camera reports holds errors that last longer than four pictures, too.
     pub(crate) fn factor(&self) -> f64 {
-        if self.draws < LEAST_DRAWS || self.log_factor < HONEST { 1.0 } else { self.log_factor.exp() }
+        let is_clear = self.log_factor * self.draws.sqrt() > DOUBT * ERROR_OF_ONE;
+        if is_clear { self.log_factor.exp() } else { 1.0 }
     }
 }
