@@ -1,3 +1,5 @@
+mod jumps;
+
 use std::collections::BTreeMap;
 
 use crossfix_message::{
@@ -12,6 +14,7 @@ use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReas
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::pose_scale::PoseScales;
+use crate::site_time::{SiteTime, Turn, moved};
 use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
 use crate::track::{Track, TrackId};
 use crate::tracker::{Happening, Tracker};
@@ -65,6 +68,7 @@ pub struct Fusion {
     records: BTreeMap<CameraName, CameraRecord>,
     pose_scales: PoseScales,
     unmet: Unmet,
+    site_time: SiteTime,
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
     /// camera may be corrected to the same time: their reported times tell them apart.
     corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
@@ -94,6 +98,7 @@ impl Fusion {
             records: BTreeMap::new(),
             pose_scales: PoseScales::default(),
             unmet: Unmet::new(&config.initiation),
+            site_time: SiteTime::default(),
             corrected: BTreeMap::new(),
             corrected_load: Load::default(),
             counters: Counters::default(),
@@ -125,6 +130,19 @@ impl Fusion {
     pub fn ingest(&mut self, frame: &BearingFrame) -> Vec<Output> {
         self.counters.count("frames");
         let mut outputs = Vec::new();
+        let name = frame.camera.parse::<CameraName>().ok();
+        let known = name.filter(|name| self.cameras.now().contains_key(name));
+        match known.map_or(Turn::Now(0.0), |name| self.site_time.see(&name, frame)) {
+            Turn::Now(0.0) => self.take(frame, &mut outputs),
+            Turn::Now(behind_s) => self.take(&moved(frame, behind_s), &mut outputs),
+            Turn::Waits => {}
+            Turn::Together(frames, step) => self.take_after(&frames, step.as_ref(), &mut outputs),
+        }
+        self.drain(&mut outputs);
+        outputs
+    }
+
+    fn take(&mut self, frame: &BearingFrame, outputs: &mut Vec<Output>) {
         match self.read(frame) {
             Ok((mut exposure, left_out)) => {
                 for reason in left_out {
@@ -136,9 +154,9 @@ impl Fusion {
                 let arrival = self.buffer.insert(exposure);
                 let refused =
                     matches!(arrival, Err(RejectionReason::Late { .. } | RejectionReason::Future { .. }));
-                self.note_time(&camera, time, !refused, &mut outputs);
+                self.note_time(&camera, time, !refused, outputs);
                 if let Some(time) = self.buffer.take_restart() {
-                    self.restart(time, &mut outputs);
+                    self.restart(time, outputs);
                 }
                 match arrival {
                     Ok(Arrival::InOrder) => {}
@@ -148,8 +166,6 @@ impl Fusion {
             }
             Err(reason) => outputs.push(self.reject(frame, reason)),
         }
-        self.drain(&mut outputs);
-        outputs
     }
 
     /// Says that a camera has come to its end, so that nothing waits for it.
@@ -163,12 +179,8 @@ impl Fusion {
     /// Handles everything that still waits: the end of a recording.
     pub fn flush(&mut self) -> Vec<Output> {
         let mut outputs = Vec::new();
-        while let Some(next) = self.buffer.pop() {
-            self.handle(next, &mut outputs);
-        }
-        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
-            self.process(&exposure, &mut outputs);
-        }
+        self.site_time.end().iter().for_each(|frame| self.take(frame, &mut outputs));
+        self.finish(&mut outputs);
         outputs
     }
 
@@ -218,21 +230,6 @@ impl Fusion {
         while let Some(next) = self.buffer.release() {
             self.handle(next, outputs);
         }
-    }
-
-    /// Takes the order of time up anew from a time long passed: what was made of a time that never was
-    /// is forgotten.
-    fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
-        self.counters.count("event_time_restarts");
-        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
-            let by_s = exposure.time.seconds_since(time);
-            self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
-        }
-        let happenings = self.tracker.restart(time);
-        self.tell(happenings, time, outputs);
-        self.initiator = Initiator::new(&self.config);
-        self.unmet = Unmet::new(&self.config.initiation);
-        self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
     fn handle(&mut self, next: Result<Exposure, (Exposure, RejectionReason)>, outputs: &mut Vec<Output>) {

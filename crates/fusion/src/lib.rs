@@ -71,6 +71,7 @@ mod range_chart;
 mod ranges;
 mod reacquisition;
 mod rooted;
+mod site_time;
 pub mod spatial;
 mod standing;
 pub mod temporal;

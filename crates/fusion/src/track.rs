@@ -411,6 +411,17 @@ impl Track {
         self.held
     }
 
+    /// All clocks have stepped by so much, s.
+    pub(crate) fn step_time(&mut self, step_s: f64) {
+        let residuals = self.residuals.values_mut().map(|residual| &mut residual.time);
+        let own = [&mut self.updated, &mut self.observed, &mut self.born, &mut self.drawn];
+        for time in own.into_iter().chain(residuals) {
+            *time = time.plus_seconds(step_s);
+        }
+        self.published = None;
+        self.ties.values_mut().for_each(|ties| ties.step_time(step_s));
+    }
+
     /// Looks at what the bearings tell apart if that was a second ago.
     pub(crate) fn observe_again(&mut self) {
         if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {

@@ -194,6 +194,24 @@ impl Tracker {
         happenings
     }
 
+    /// All clocks have stepped by so much, s.
+    pub(crate) fn step_time(&mut self, step_s: f64) {
+        self.watches.clear();
+        self.tracks.values_mut().for_each(|track| track.step_time(step_s));
+    }
+
+    /// How well an exposure fits the sure tracks: the log-likelihood ratio of its bearings being theirs against
+    /// being nobody's, each track's best.
+    pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
+        let camera = (&exposure.camera, known.camera.pose().position());
+        let best = |track: &Track| {
+            let expected = track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+            let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
+            fits.map(|fit| log_likelihood_ratio(&fit, 1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
+        };
+        self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
+    }
+
     /// Takes in one exposure: what of it belongs to tracks updates them.
     pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);

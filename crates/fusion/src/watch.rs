@@ -61,6 +61,11 @@ impl Visibility {
         Self::UNKNOWN + (self.visible - Self::UNKNOWN) * kept
     }
 
+    /// All clocks have stepped by so much, s.
+    pub(crate) fn step_time(&mut self, step_s: f64) {
+        self.time = self.time.plus_seconds(step_s);
+    }
+
     /// The camera has been exposed and has seen the target or not; `detection` is the probability that it
     /// reports one that is visible.
     pub(crate) fn look(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {

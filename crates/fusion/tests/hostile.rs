@@ -195,16 +195,23 @@ fn a_clock_ahead_after_one_that_died_ahead_blinds_nobody() {
     assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
 }
 
-#[test]
-fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found() {
+/// A site whose clocks are all ten minutes ahead for a second, of agents that number their frames or do not.
+fn all_clocks_ahead(numbered: bool) -> (Scene, Fusion) {
     let scene = two_targets(0.0..10.0);
     let mut fusion = of_the_site();
     for mut frame in scene.frames(3) {
         if (2_000_000_000..3_000_000_000).contains(&frame.capture_time_ns) {
             frame.capture_time_ns += 600_000_000_000;
         }
+        frame.sequence *= u64::from(numbered);
         fusion.ingest(&frame);
     }
+    (scene, fusion)
+}
+
+#[test]
+fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found() {
+    let (scene, mut fusion) = all_clocks_ahead(false);
     assert_eq!(fusion.counters().get("event_time_restarts"), 1);
     // Two seconds and a few frames, not ten minutes.
     assert!(fusion.counters().get("rejected_late") < 75, "{:?}", fusion.counters());
@@ -213,6 +220,16 @@ fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found(
     let count = |name| fusion.counters().get(name);
     let refused = count("rejected_late") + count("rejected_future");
     assert_eq!(count("frames"), count("exposures") + refused, "{:?}", fusion.counters());
+}
+
+#[test]
+fn where_frames_are_numbered_the_tracks_outlive_all_clocks_being_ahead() {
+    let (scene, mut fusion) = all_clocks_ahead(true);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    fusion.flush();
+    let count = |name| fusion.counters().get(name);
+    assert_eq!((count("tracks_born"), count("site_time_steps")), (2, 2));
+    assert_eq!(count("frames"), count("exposures"), "{:?}", fusion.counters());
 }
 
 #[test]

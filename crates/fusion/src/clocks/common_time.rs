@@ -12,6 +12,8 @@ const STEPS: usize = 10;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Standing {
     pub(super) offset: f64,
+    /// How surely that is known, s^2: what has just been begun to be learnt accuses nobody.
+    pub(super) learnt: f64,
     pub(super) variance: f64,
 }
 
@@ -24,7 +26,7 @@ impl Standing {
         }
         let liars = LIARS_SD_S.powi(2).max(self.variance);
         let odds = LIARS / (1.0 - LIARS) * (self.variance / liars).sqrt();
-        let honest = (1.0 + odds * (self.offset.powi(2) / self.variance / 2.0).exp()).recip();
+        let honest = (1.0 + odds * (self.offset.powi(2) / (self.variance + self.learnt) / 2.0).exp()).recip();
         (honest / self.variance + (1.0 - honest) / liars).recip()
     }
 }
@@ -32,28 +34,28 @@ impl Standing {
 /// How much each clock says of true time: its share, and the variance that is believed of it, s^2 (expectation and
 /// maximisation, from the clocks' median on). Clocks that are right by definition say all.
 pub(super) fn common_time(clocks: &[Standing]) -> Vec<(f64, f64)> {
+    if clocks.is_empty() {
+        return Vec::new();
+    }
     let right = clocks.iter().filter(|clock| clock.variance <= 0.0).count();
     if right > 0 {
         let share = |clock: &Standing| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
         return clocks.iter().map(|clock| (share(clock), clock.variance)).collect();
     }
-    let mut common = median(clocks);
+    // Summed by where they stand and not by the cameras' names: rounding decides nothing.
+    let mut order: Vec<usize> = (0..clocks.len()).collect();
+    order.sort_by(|&i, &k| clocks[i].offset.total_cmp(&clocks[k].offset));
+    let mut common =
+        (clocks[order[order.len() / 2]].offset + clocks[order[(order.len() - 1) / 2]].offset) / 2.0;
     let mut weights = Vec::new();
     for _ in 0..STEPS {
         let believed = |clock: &Standing| Standing { offset: clock.offset - common, ..*clock }.believed();
         weights = clocks.iter().map(|clock| (believed(clock).recip(), believed(clock))).collect();
-        let total: f64 = weights.iter().map(|(share, _)| share).sum();
+        let total: f64 = order.iter().map(|&i| weights[i].0).sum();
         weights.iter_mut().for_each(|(share, _)| *share /= total);
-        common = weights.iter().zip(clocks).map(|((share, _), clock)| share * clock.offset).sum();
+        common = order.iter().map(|&i| weights[i].0 * clocks[i].offset).sum();
     }
     weights
-}
-
-fn median(clocks: &[Standing]) -> f64 {
-    let mut offsets: Vec<f64> = clocks.iter().map(|clock| clock.offset).collect();
-    offsets.sort_unstable_by(f64::total_cmp);
-    let middle = |k: usize| offsets.get(k).copied().unwrap_or(0.0);
-    (middle(offsets.len() / 2) + middle(offsets.len().saturating_sub(1) / 2)) / 2.0
 }
 
 #[cfg(test)]
@@ -62,8 +64,10 @@ mod tests {
 
     /// What clocks of so many deviations say together that stand so, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
-        let clocks: Vec<Standing> =
-            clocks.iter().map(|(offset, sd)| Standing { offset: *offset, variance: sd.powi(2) }).collect();
+        let clocks: Vec<Standing> = clocks
+            .iter()
+            .map(|(offset, sd)| Standing { offset: *offset, learnt: 0.0, variance: sd.powi(2) })
+            .collect();
         let weights = common_time(&clocks);
         let offset = weights.iter().zip(&clocks).map(|((share, _), clock)| share * clock.offset).sum();
         let variance: f64 = weights.iter().map(|(share, variance)| share.powi(2) * variance).sum();

@@ -227,6 +227,14 @@ impl ClockEstimator {
         }
     }
 
+    /// All clocks have stepped by so much, s: what was learnt stays, what was being looked at is of another time.
+    pub(crate) fn step_time(&mut self, step_s: f64) {
+        self.belief.step_time(step_s);
+        (self.provisional, self.round) = (None, None);
+        self.windows.clear();
+        (self.now, self.next_look, self.next_adjustment) = (Timestamp::MIN, Timestamp::MIN, Timestamp::MIN);
+    }
+
     /// Takes a bearing of a track in, by the time that the camera gave it.
     pub(crate) fn update(&mut self, track: &Track, exposure: &Exposure, line: &SightLine) {
         let time = exposure.time.plus_seconds(exposure.correction_s);

@@ -49,6 +49,12 @@ impl Ties {
         }
     }
 
+    /// All clocks have stepped by so much, s.
+    pub(super) fn step_time(&mut self, step_s: f64) {
+        self.visibility.step_time(step_s);
+        self.last_three = LastThree::default();
+    }
+
     /// The same `interval` seconds on: the position goes on with the velocity.
     pub(super) fn predicted(&self, interval: f64) -> Matrix6x3<f64> {
         let mut covariance = self.covariance;
