@@ -15,9 +15,11 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 /// remember some three seconds of one target. With half of it a site would be a minute in learning what it is
 /// worth.
 const DRAW_SHARE: f64 = 0.1;
-/// Cameras of one site have been surveyed alike: each step takes their factors (logarithms) closer to the
-/// median by this share. Without it two of four cameras would be taken to be perfect, and the others for worse
-/// than they are: the lines tell of fewer errors than there are.
+/// Cameras of one site have been surveyed alike: each step takes their variances closer to the median by this
+/// share, as if one of ten draws were of an average camera. A camera whose lines happen to meet the others' is
+/// so not taken for perfect, while one that is far off loses a tenth of its error at most. Without it two of four
+/// cameras would be taken to be perfect, and the others for worse than they are: the lines tell of fewer errors
+/// than there are; with twice as much one that is off by 0.2 degrees draws the others with it.
 const ALIKE: f64 = 0.1;
 /// A step changes a factor (variance) by no more than this, so that a camera that is knocked is known in two seconds. With
 /// half of it that takes five, with twice as much one wrong start doubts a good camera.
@@ -114,8 +116,8 @@ impl PoseScales {
                 scale.expected += (expected - scale.expected) * share;
                 let step = (scale.found / scale.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
                 let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
-                let like_others = (ALIKE * (typical - scale.value.ln())).exp();
-                scale.value = (scale.value * like_others * step.min(most)).clamp(scale.least, scale.greatest);
+                let own = scale.value * step.min(most);
+                scale.value = (own + (typical.exp() - own) * ALIKE).clamp(scale.least, scale.greatest);
                 let ratio = scale.value / scale.told;
                 if ratio.ln().abs() > NOTICED {
                     scale.told = scale.value;

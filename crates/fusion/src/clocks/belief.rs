@@ -273,11 +273,7 @@ impl Belief {
     /// How much each clock says of true time.
     fn weights(&self) -> Vec<Weight> {
         let clocks = self.cameras.values();
-        let stands = |clock: &Clock| Standing {
-            offset: self.relative(clock, 0, 0.0),
-            learnt: clock.place.map_or(0.0, |place| self.covariance[(place, place)]),
-            variance: clock.prior,
-        };
+        let stands = |clock: &Clock| Standing { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
         let weights = common_time(&clocks.clone().map(stands).collect::<Vec<_>>());
         clocks
             .zip(weights)
@@ -332,9 +328,7 @@ impl Belief {
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
             // No clock is worse known than what was reported of it, as far as that is believed.
-            sd_s: (own + common)
-                .min(Standing { offset, learnt: own, variance: clock.prior }.believed())
-                .sqrt(),
+            sd_s: (own + common).min(Standing { offset, variance: clock.prior }.believed()).sqrt(),
             relative_sd_s: own.sqrt(),
             drift,
             drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),

@@ -12,8 +12,6 @@ const STEPS: usize = 10;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Standing {
     pub(super) offset: f64,
-    /// How surely that is known, s^2: what has just been begun to be learnt accuses nobody.
-    pub(super) learnt: f64,
     pub(super) variance: f64,
 }
 
@@ -26,7 +24,7 @@ impl Standing {
         }
         let liars = LIARS_SD_S.powi(2).max(self.variance);
         let odds = LIARS / (1.0 - LIARS) * (self.variance / liars).sqrt();
-        let honest = (1.0 + odds * (self.offset.powi(2) / (self.variance + self.learnt) / 2.0).exp()).recip();
+        let honest = (1.0 + odds * (self.offset.powi(2) / self.variance / 2.0).exp()).recip();
         (honest / self.variance + (1.0 - honest) / liars).recip()
     }
 }
@@ -64,10 +62,8 @@ mod tests {
 
     /// What clocks of so many deviations say together that stand so, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
-        let clocks: Vec<Standing> = clocks
-            .iter()
-            .map(|(offset, sd)| Standing { offset: *offset, learnt: 0.0, variance: sd.powi(2) })
-            .collect();
+        let clocks: Vec<Standing> =
+            clocks.iter().map(|(offset, sd)| Standing { offset: *offset, variance: sd.powi(2) }).collect();
         let weights = common_time(&clocks);
         let offset = weights.iter().zip(&clocks).map(|((share, _), clock)| share * clock.offset).sum();
         let variance: f64 = weights.iter().map(|(share, variance)| share.powi(2) * variance).sum();
