@@ -29,8 +29,9 @@ const LARGEST_STEP: f64 = 2.5;
 const MOST_OF_A_DRAW: f64 = 30.0;
 /// Fewer cameras cannot tell whose error it is: two lines that miss each other accuse nobody.
 const LEAST_ACCUSERS: usize = 3;
-/// No pose is known better than this share (variance) of a careful survey: a hundredth of a milliradian.
-const LEAST: f64 = 1e-4;
+/// No pose is known better than this share (variance) of a careful survey: a microradian, which keeps covariances
+/// regular. With ten microradians tracks seen from kilometres away said that they knew half of what they did.
+const LEAST: f64 = 1e-6;
 /// No pose is worse than this many times (variance) what is said of it and still a pose.
 const MOST: f64 = 1e6;
 /// Nor is one that is declared.

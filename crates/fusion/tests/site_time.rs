@@ -6,7 +6,7 @@ mod common;
 
 use std::collections::BTreeSet;
 
-use common::{Path, Scene, fusion_of, straight};
+use common::{Path, Scene, found, fusion_of, straight};
 use crossfix_fusion::{Fusion, FusionConfig, Output};
 use crossfix_message::{BearingFrame, TrackEventKind};
 
@@ -47,10 +47,10 @@ fn run(scene: &Scene, frames: &[BearingFrame]) -> (Fusion, BTreeSet<u64>) {
 
 /// How far the only sure track is from the target where the clocks are ahead by so much, m.
 fn error_m(fusion: &Fusion, ahead_s: f64) -> f64 {
-    let mut sure = fusion.tracks().filter(|track| track.is_confirmed());
-    let (track, another) = (sure.next().unwrap(), sure.next());
-    assert!(another.is_none());
-    (track.state().position() - path()(track.updated.seconds() - ahead_s).unwrap()).norm()
+    assert_eq!(fusion.tracks().filter(|track| track.is_confirmed()).count(), 1);
+    let shown: Path = Box::new(move |t| path()(t - ahead_s));
+    let track = found(fusion, &shown).unwrap();
+    (track.state().position() - shown(track.updated.seconds()).unwrap()).norm()
 }
 
 #[test]
