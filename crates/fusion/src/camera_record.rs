@@ -27,6 +27,11 @@ impl CameraRecord {
         Self { noise: WhiteNoise::default(), view, time_sd_s, offset_s }
     }
 
+    /// Forgets when it has seen what.
+    pub(crate) fn look_anew(&mut self, config: &FusionConfig) {
+        self.view = View::new(config.tracking.coasting_after_s);
+    }
+
     /// By how much, in its deviations so far, the clock is found to be ahead of what was known, and how its
     /// variance has changed; `None` if that is little.
     pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<(f64, f64)> {

@@ -265,6 +265,14 @@ impl EventBuffer {
         self.restarted = Some(time);
     }
 
+    /// Forgets all times: the clocks of all cameras have stepped. Nothing is held.
+    pub(crate) fn begin_anew(&mut self) {
+        let ended = std::mem::take(&mut self.ended);
+        let heard = self.streams.keys().filter(|camera| !ended.contains(*camera)).cloned();
+        let expected = heard.collect();
+        *self = Self { expected, ended, ..Self::new(self.config.clone()) };
+    }
+
     /// The time at which the order was taken up anew with the last frame, if it was: what has been made of
     /// later times is to be forgotten.
     pub(crate) fn take_restart(&mut self) -> Option<Timestamp> {

@@ -14,7 +14,7 @@ use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReas
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::pose_scale::PoseScales;
-use crate::site_time::{SiteTime, Turn, moved};
+use crate::site_time::{SiteTime, Turn};
 use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
 use crate::track::{Track, TrackId};
 use crate::tracker::{Happening, Tracker};
@@ -98,7 +98,7 @@ impl Fusion {
             records: BTreeMap::new(),
             pose_scales: PoseScales::default(),
             unmet: Unmet::new(&config.initiation),
-            site_time: SiteTime::default(),
+            site_time: SiteTime::new(config.event_time.lateness_s),
             corrected: BTreeMap::new(),
             corrected_load: Load::default(),
             counters: Counters::default(),
@@ -132,11 +132,10 @@ impl Fusion {
         let mut outputs = Vec::new();
         let name = frame.camera.parse::<CameraName>().ok();
         let known = name.filter(|name| self.cameras.now().contains_key(name));
-        match known.map_or(Turn::Now(0.0), |name| self.site_time.see(&name, frame)) {
-            Turn::Now(0.0) => self.take(frame, &mut outputs),
-            Turn::Now(behind_s) => self.take(&moved(frame, behind_s), &mut outputs),
+        match known.map_or(Turn::Now, |name| self.site_time.see(&name, frame)) {
+            Turn::Now => self.take(frame, &mut outputs),
             Turn::Waits => {}
-            Turn::Together(frames, step) => self.take_after(&frames, step.as_ref(), &mut outputs),
+            Turn::Together(frames, step_s) => self.take_after(&frames, step_s, &mut outputs),
         }
         self.drain(&mut outputs);
         outputs
@@ -170,8 +169,10 @@ impl Fusion {
 
     /// Says that a camera has come to its end, so that nothing waits for it.
     pub fn camera_ended(&mut self, camera: &CameraName) -> Vec<Output> {
-        self.buffer.end(camera);
         let mut outputs = Vec::new();
+        self.site_time.forget(camera);
+        self.site_time.end().iter().for_each(|frame| self.take(frame, &mut outputs));
+        self.buffer.end(camera);
         self.drain(&mut outputs);
         outputs
     }

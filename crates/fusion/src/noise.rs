@@ -19,7 +19,7 @@ const MEMORY: f64 = 200.0;
 /// four bearings).
 const ERROR_OF_ONE: f64 = 1.9;
 /// So many standard errors from what it reports a camera is no more taken at its word. With half as many one in
-/// twenty is doubted by chance.
+/// four is doubted by chance before its first two hundred draws are over.
 const DOUBT: f64 = 3.0;
 
 /// The last bearings that a camera gave of a track.

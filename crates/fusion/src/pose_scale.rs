@@ -103,7 +103,7 @@ impl PoseScales {
         let mut logarithms: Vec<f64> =
             samples.iter().filter_map(|sample| Some(self.scales.get(&sample.camera)?.value.ln())).collect();
         logarithms.sort_unstable_by(f64::total_cmp);
-        let typical = logarithms.get(logarithms.len() / 2).copied().unwrap_or(0.0);
+        let typical = logarithms.get(logarithms.len().saturating_sub(1) / 2).copied().unwrap_or(0.0);
         let mut changed = Vec::new();
         for (sample, (found, expected)) in samples.iter().zip(found) {
             let scale = self.scales.get_mut(&sample.camera);
@@ -118,7 +118,9 @@ impl PoseScales {
                 let step = (scale.found / scale.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
                 let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
                 let own = scale.value * step.min(most);
-                scale.value = (own + (typical.exp() - own) * ALIKE).clamp(scale.least, scale.greatest);
+                let next = own + (typical.exp() - own) * ALIKE;
+                let next = next.clamp(scale.value / LARGEST_STEP, scale.value * LARGEST_STEP);
+                scale.value = next.clamp(scale.least, scale.greatest);
                 let ratio = scale.value / scale.told;
                 if ratio.ln().abs() > NOTICED {
                     scale.told = scale.value;

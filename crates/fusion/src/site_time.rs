@@ -1,28 +1,33 @@
 //! A step of all clocks at once: the source of time that the cameras share was off and has been set right.
 //!
-//! A camera's frames are numbered and come in a rhythm. Where the numbers go on by one and the time does not, its
-//! clock has stepped, or it has stood still; where most cameras do so by as much, it is the site's time. Until
-//! that is clear the frames of those that have stepped wait.
+//! A camera's frames are numbered and come in a rhythm. Where the numbers go on and the time does not go on with
+//! them, its clock has stepped, or it has stood still. Where all cameras that are heard do so by as much, within the
+//! time for which late frames are waited for anyway, it is the site's time: agents of one host, or hosts that follow
+//! one source. Until that is clear the frames of those that have stepped wait; where it does not become clear each
+//! clock has stepped for itself.
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{BearingFrame, CameraName, Timestamp};
 
 /// A frame that is off its camera's rhythm by less than this has only been late, s. With half of it the frames of
-/// phones, which have no rate, are held up; a step of less moves targets by no more than they are gated by.
+/// phones, which have no rate, are held up.
 const LEAST_STEP_S: f64 = 0.25;
-/// The same in its periods: frames in between may have been numbered otherwise.
+/// The same in its periods. With half of it a frame or two that were numbered and not sent are a step.
 const LEAST_STEP_PERIODS: f64 = 4.0;
-/// Frames after which a camera's rhythm is known.
+/// Frames after which a camera's rhythm is known. With half of it two frames close together make a rhythm.
 const KNOWN_RHYTHM: u32 = 5;
-/// The share of a frame in the running mean of its camera's period.
+/// The share of a frame in the running mean of its camera's period. With half of it a new rate is learnt in a second.
 const PERIOD_SHARE: f64 = 0.1;
-/// Cameras that were silent for longer than this are not asked, s.
+/// Cameras that were silent for longer than this are not asked, and after a longer gap a rhythm says nothing, s. With
+/// half of it cameras of 1 Hz are asked by chance.
 const LIVE_S: f64 = 2.0;
-/// No decision takes longer than this by any camera's frames, s, ...
-const LONGEST_S: f64 = 1.0;
-/// ... or more frames than this: where all are silent but one that is quick.
+/// The share of the time for which late frames are waited for that a decision may take. With half of it hosts whose
+/// frames are a tenth of a second apart on their way do not step together; with all of it what waits is late.
+const SHARE_OF_LATENESS: f64 = 0.5;
+/// No more frames than this wait, of no more bearings: memory is bounded.
 const MOST_WAITING: usize = 200;
+const MOST_BEARINGS_WAITING: usize = 20_000;
 
 /// A frame by a clock that is ahead of its camera's.
 pub(crate) fn moved(frame: &BearingFrame, ahead_s: f64) -> BearingFrame {
@@ -52,18 +57,22 @@ impl Rhythm {
     fn step(&self, sequence: u64, time: Timestamp) -> Option<f64> {
         let numbers =
             sequence.checked_sub(self.sequence).filter(|n| *n > 0 && self.frames >= KNOWN_RHYTHM)?;
-        let step = time.seconds_since(self.time) - numbers as f64 * self.period_s;
-        (step.abs() > LEAST_STEP_S.max(LEAST_STEP_PERIODS * self.period_s)).then_some(step)
+        let due_s = numbers as f64 * self.period_s;
+        let since_s = time.seconds_since(self.time);
+        let step = since_s - due_s;
+        // Where numbers are missing for long, the rhythm does not say when the next was due.
+        let is_known = due_s <= LIVE_S && (step > 0.0 || since_s < 0.0);
+        (is_known && step.abs() > LEAST_STEP_S.max(LEAST_STEP_PERIODS * self.period_s)).then_some(step)
     }
 
     /// Takes the next frame in; returns how far the camera has gone on with it, s.
     fn go_on(&mut self, sequence: u64, time: Timestamp, step: Option<f64>) -> f64 {
         let numbers = sequence.saturating_sub(self.sequence);
         let since_s = time.seconds_since(self.time) - step.unwrap_or(0.0);
-        if numbers == 0 {
-            // Numbered anew, or out of order: what went before says nothing of what comes.
+        if numbers == 0 || step.is_some() || since_s <= 0.0 {
+            // Numbered anew, out of order, or at another rate from now on: the rhythm has to show again.
             (self.period_s, self.frames) = (0.0, 0);
-        } else if step.is_none() && since_s > 0.0 {
+        } else {
             let share = PERIOD_SHARE.max(f64::from(self.frames + 1).recip());
             self.period_s += (since_s / numbers as f64 - self.period_s) * share;
             self.frames = self.frames.saturating_add(1);
@@ -76,10 +85,8 @@ impl Rhythm {
 }
 
 /// Cameras that have stepped, until it is clear whether all have.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct Pending {
-    /// When the first would have been exposed, by its clock as it was.
-    since: Timestamp,
     frames: Vec<BearingFrame>,
     steps: BTreeMap<CameraName, f64>,
     /// How far the cameras had gone on then, s.
@@ -89,35 +96,31 @@ struct Pending {
 /// What becomes of a frame.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Turn {
-    /// It is taken at once; its clock has yet to step as the others have, by so much, s.
-    Now(f64),
+    /// It is taken at once.
+    Now,
     /// It waits.
     Waits,
-    /// It and those that waited are taken: all clocks seem to have stepped, or each for itself.
-    Together(Vec<BearingFrame>, Option<Step>),
-}
-
-/// What looks like a step of all clocks.
-#[derive(Debug, PartialEq)]
-pub(crate) struct Step {
-    /// By so much, s.
-    pub(crate) by_s: f64,
-    /// Cameras that have not come so far yet.
-    behind: Vec<CameraName>,
+    /// What waited is taken, and it after that: all clocks have stepped by so much, s, or each for itself.
+    Together(Vec<BearingFrame>, Option<f64>),
 }
 
 /// Watches the cameras' times for steps that all make.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct SiteTime {
+    longest_s: f64,
     rhythms: BTreeMap<CameraName, Rhythm>,
     /// How far all cameras together have gone on, s: there is no other clock here.
     gone_s: f64,
     pending: Option<Pending>,
-    /// Cameras that have not stepped with the others yet, and by how much they are behind, s.
-    behind: BTreeMap<CameraName, f64>,
 }
 
 impl SiteTime {
+    /// Of a site where late frames are waited for so long.
+    pub(crate) fn new(lateness_s: f64) -> Self {
+        let longest_s = SHARE_OF_LATENESS * lateness_s;
+        Self { longest_s, rhythms: BTreeMap::new(), gone_s: 0.0, pending: None }
+    }
+
     /// Takes a known camera's frame.
     pub(crate) fn see(&mut self, camera: &CameraName, frame: &BearingFrame) -> Turn {
         let (sequence, time) = (frame.sequence, Timestamp::from_nanos(frame.capture_time_ns));
@@ -125,57 +128,36 @@ impl SiteTime {
         let (before, step) = (*rhythm, rhythm.step(sequence, time));
         self.gone_s += rhythm.go_on(sequence, time, step);
         rhythm.heard_s = self.gone_s;
-        let is_alike = |behind: f64| step.is_some_and(|step| (behind - step).abs() < LEAST_STEP_S);
-        if self.behind.get(camera).copied().is_some_and(is_alike) {
-            // It comes after the others, as was expected.
-            self.behind.remove(camera);
-            return Turn::Now(0.0);
-        }
         // A clock that was none of the site's steps for itself.
-        let was = before.time.plus_seconds(self.behind_s(camera));
-        if let Some(step) = step.filter(|_| self.is_of_site(camera, was)) {
-            let pending = self.pending.get_or_insert_with(|| Pending {
-                since: before.time.plus_seconds(before.period_s),
-                frames: Vec::new(),
-                steps: BTreeMap::new(),
-                gone_s: self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect(),
-            });
+        if let Some(step) = step.filter(|_| self.is_of_site(camera, before.time)) {
+            let gone_s = || self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect();
+            let pending =
+                self.pending.get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
             pending.steps.insert(camera.clone(), step);
         }
-        match &mut self.pending {
-            Some(pending) if pending.steps.contains_key(camera) => {
-                pending.frames.push(frame.clone());
-                self.decide().unwrap_or(Turn::Waits)
-            }
-            Some(_) => match self.decide() {
-                Some(Turn::Together(mut frames, step)) => {
+        let Some(pending) = &mut self.pending else {
+            return Turn::Now;
+        };
+        let waits = pending.steps.contains_key(camera);
+        if waits {
+            pending.frames.push(frame.clone());
+        }
+        match self.decide() {
+            Some(step) => {
+                let mut frames = self.end();
+                if !waits {
                     frames.push(frame.clone());
-                    Turn::Together(frames, step)
                 }
-                _ => Turn::Now(0.0),
-            },
-            None => Turn::Now(self.behind_s(camera)),
+                Turn::Together(frames, step)
+            }
+            None if waits => Turn::Waits,
+            None => Turn::Now,
         }
     }
 
-    /// Whether a camera's time is what most others have that have not stepped.
-    fn is_of_site(&self, camera: &CameraName, time: Timestamp) -> bool {
-        let has_stepped =
-            |name| self.pending.as_ref().is_some_and(|pending| pending.steps.contains_key(name));
-        let others = self.rhythms.iter().filter(|(name, _)| *name != camera && !has_stepped(name));
-        let mut times: Vec<Timestamp> = others.map(|(_, rhythm)| rhythm.time).collect();
-        times.sort_unstable();
-        times.get(times.len() / 2).is_none_or(|others| time.seconds_since(*others).abs() < LIVE_S)
-    }
-
-    /// All clocks have stepped indeed: those that are behind are expected to.
-    pub(crate) fn confirm(&mut self, step: &Step) {
-        self.behind = step.behind.iter().map(|camera| (camera.clone(), step.by_s)).collect();
-    }
-
-    /// How far a camera's clock has yet to step to where the others are, s.
-    pub(crate) fn behind_s(&self, camera: &CameraName) -> f64 {
-        self.behind.get(camera).copied().unwrap_or(0.0)
+    /// Says that a camera has come to its end: nobody asks it any more.
+    pub(crate) fn forget(&mut self, camera: &CameraName) {
+        self.rhythms.remove(camera);
     }
 
     /// Gives out what waits: no more frames come.
@@ -183,36 +165,37 @@ impl SiteTime {
         self.pending.take().map_or_else(Vec::new, |pending| pending.frames)
     }
 
-    /// Whether all clocks have stepped, or each for itself, if that is clear.
-    fn decide(&mut self) -> Option<Turn> {
+    fn live(&self) -> impl Iterator<Item = (&CameraName, &Rhythm)> {
+        let longest_s = LIVE_S * self.rhythms.len() as f64;
+        self.rhythms.iter().filter(move |(_, rhythm)| self.gone_s - rhythm.heard_s <= longest_s)
+    }
+
+    /// Whether a camera's time is what most others have that have not stepped.
+    fn is_of_site(&self, camera: &CameraName, time: Timestamp) -> bool {
+        let has_stepped =
+            |name| self.pending.as_ref().is_some_and(|pending| pending.steps.contains_key(name));
+        let others = self.live().filter(|(name, _)| *name != camera && !has_stepped(name));
+        let mut times: Vec<Timestamp> = others.map(|(_, rhythm)| rhythm.time).collect();
+        times.sort_unstable();
+        times.get(times.len() / 2).is_none_or(|others| time.seconds_since(*others).abs() < LIVE_S)
+    }
+
+    /// By how much all clocks have stepped, s, or that each has for itself, if either is clear.
+    fn decide(&self) -> Option<Option<f64>> {
         let pending = self.pending.as_ref()?;
         let mut steps: Vec<f64> = pending.steps.values().copied().collect();
         steps.sort_unstable_by(f64::total_cmp);
         let step = steps[steps.len() / 2];
-        let alike = steps.iter().filter(|other| (**other - step).abs() < LEAST_STEP_S).count();
-        let is_live = |rhythm: &Rhythm| self.gone_s - rhythm.heard_s <= LIVE_S * self.rhythms.len() as f64;
-        let gone_s = |name: &CameraName, rhythm: &Rhythm| {
+        let is_alike = steps.iter().all(|other| (other - step).abs() < LEAST_STEP_S);
+        if is_alike && steps.len() >= 2 && self.live().all(|(name, _)| pending.steps.contains_key(name)) {
+            return Some(Some(step));
+        }
+        let gone_s = |(name, rhythm): (&CameraName, &Rhythm)| {
             rhythm.gone_s - pending.gone_s.get(name).copied().unwrap_or(0.0)
         };
-        // Exposed since then by a clock that has not stepped, unless its frames have been long on their way.
-        let is_steady = |name: &CameraName, rhythm: &Rhythm| {
-            let old = -LIVE_S..LEAST_STEP_S / 2.0;
-            gone_s(name, rhythm) > LEAST_STEP_S / 2.0
-                && !old.contains(&rhythm.time.seconds_since(pending.since))
-        };
-        let live = || self.rhythms.iter().filter(|(_, rhythm)| is_live(rhythm));
-        let others = || live().filter(|(name, _)| !pending.steps.contains_key(*name));
-        let steady = others().filter(|(name, rhythm)| is_steady(name, rhythm)).count();
-        let half = (others().count() + steps.len()) / 2;
-        let is_sites = alike >= 2 && alike > half;
-        let longest_s = live().map(|(name, rhythm)| gone_s(name, rhythm)).fold(0.0, f64::max);
-        let is_alone = others().next().is_none();
-        let too_long = longest_s > LONGEST_S || pending.frames.len() >= MOST_WAITING;
-        if !(is_sites || steady >= half.max(1) || is_alone || too_long) {
-            return None;
-        }
-        let step =
-            is_sites.then(|| Step { by_s: step, behind: others().map(|(name, _)| name.clone()).collect() });
-        Some(Turn::Together(self.end(), step))
+        let bearings: usize = pending.frames.iter().map(|frame| frame.tracks.len()).sum();
+        let is_full = pending.frames.len() >= MOST_WAITING || bearings > MOST_BEARINGS_WAITING;
+        let is_late = self.live().map(gone_s).fold(0.0, f64::max) > self.longest_s;
+        (is_full || is_late || self.live().count() < 2).then_some(None)
     }
 }

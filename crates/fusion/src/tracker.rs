@@ -197,6 +197,7 @@ impl Tracker {
     /// All clocks have stepped by so much, s.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.watches.clear();
+        self.reacquisition = Reacquisition::default();
         self.tracks.values_mut().for_each(|track| track.step_time(step_s));
     }
 

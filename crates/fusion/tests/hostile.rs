@@ -195,13 +195,13 @@ fn a_clock_ahead_after_one_that_died_ahead_blinds_nobody() {
     assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
 }
 
-/// A site whose clocks are all ten minutes ahead for a second, of agents that number their frames or do not.
-fn all_clocks_ahead(numbered: bool) -> (Scene, Fusion) {
+/// A site whose clocks are all ahead for a second, of agents that number their frames or do not.
+fn all_clocks_ahead(ahead_ns: i64, numbered: bool) -> (Scene, Fusion) {
     let scene = two_targets(0.0..10.0);
     let mut fusion = of_the_site();
     for mut frame in scene.frames(3) {
         if (2_000_000_000..3_000_000_000).contains(&frame.capture_time_ns) {
-            frame.capture_time_ns += 600_000_000_000;
+            frame.capture_time_ns += ahead_ns;
         }
         frame.sequence *= u64::from(numbered);
         fusion.ingest(&frame);
@@ -211,7 +211,7 @@ fn all_clocks_ahead(numbered: bool) -> (Scene, Fusion) {
 
 #[test]
 fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found() {
-    let (scene, mut fusion) = all_clocks_ahead(false);
+    let (scene, mut fusion) = all_clocks_ahead(600_000_000_000, false);
     assert_eq!(fusion.counters().get("event_time_restarts"), 1);
     // Two seconds and a few frames, not ten minutes.
     assert!(fusion.counters().get("rejected_late") < 75, "{:?}", fusion.counters());
@@ -224,7 +224,7 @@ fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found(
 
 #[test]
 fn where_frames_are_numbered_the_tracks_outlive_all_clocks_being_ahead() {
-    let (scene, mut fusion) = all_clocks_ahead(true);
+    let (scene, mut fusion) = all_clocks_ahead(1_500_000_000, true);
     assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
     fusion.flush();
     let count = |name| fusion.counters().get(name);

@@ -7,7 +7,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
-use super::common_time::{Standing, common_time};
+use super::common_time::{Common, Reading, common_time};
 
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
 const OFFSET_WALK: f64 = 1e-12;
@@ -35,13 +35,6 @@ struct Clock {
     drift_prior: f64,
 }
 
-/// A clock's share in what all say, and the variance that it is believed to have, s^2.
-struct Weight {
-    clock: Clock,
-    share: f64,
-    variance: f64,
-}
-
 /// Offsets and drifts of all clocks against the first, and what the poses are off by (world's axes:
 /// rotation, rad, then position, m), as one normal distribution, as of an epoch.
 ///
@@ -58,6 +51,8 @@ pub(super) struct Belief {
     site: [f64; 2],
     /// The poses' covariances as they were reported.
     poses: BTreeMap<CameraName, Matrix6<f64>>,
+    /// What all clocks say together: made anew whenever one of them is known otherwise.
+    common: Common,
 }
 
 impl Belief {
@@ -89,6 +84,7 @@ impl Belief {
             }
         }
         self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior });
+        self.settle();
         self.calibrate(camera, pose);
     }
 
@@ -180,6 +176,7 @@ impl Belief {
             self.covariance[(k, k)] += OFFSET_WALK * dt;
             self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
         }
+        self.settle();
     }
 
     /// Mean and covariance of some components of the state.
@@ -206,6 +203,7 @@ impl Belief {
         if possible && next_mean.iter().chain(next.iter()).all(|value| value.is_finite()) {
             self.mean = next_mean;
             self.covariance = (&next + next.transpose()) / 2.0;
+            self.settle();
         }
     }
 
@@ -218,6 +216,7 @@ impl Belief {
         };
         (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let place = clock.place;
+        self.settle();
         for (i, stepped) in self.reference_offset_and_drift().into_iter().enumerate() {
             self.site[i] += site[i] - stepped;
         }
@@ -226,6 +225,7 @@ impl Belief {
         for (place, [offset, drift]) in place.into_iter().zip(stood) {
             (self.mean[place], self.mean[place + 1]) = (offset, drift);
         }
+        self.settle();
     }
 
     /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.
@@ -255,6 +255,7 @@ impl Belief {
             self.covariance.column_mut(place + i).fill(0.0);
             self.covariance[(place + i, place + i)] = variance;
         }
+        self.settle();
     }
 
     /// Forgets all that was learnt of any clock.
@@ -270,15 +271,16 @@ impl Belief {
         *self = anew;
     }
 
-    /// How much each clock says of true time.
-    fn weights(&self) -> Vec<Weight> {
+    /// Finds out how much each clock says of true time, by where they stand now.
+    fn settle(&mut self) {
         let clocks = self.cameras.values();
-        let stands = |clock: &Clock| Standing { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
-        let weights = common_time(&clocks.clone().map(stands).collect::<Vec<_>>());
-        clocks
-            .zip(weights)
-            .map(|(clock, (share, variance))| Weight { clock: *clock, share, variance })
-            .collect()
+        let stands = |clock: &Clock| Reading { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
+        self.common = common_time(&clocks.map(stands).collect::<Vec<_>>());
+    }
+
+    /// The clocks, and how much each says of true time.
+    fn shares(&self) -> impl Iterator<Item = (&Clock, f64)> {
+        self.cameras.values().zip(self.common.shares.iter().copied())
     }
 
     /// A clock's components in the state, with the offset as of `ahead` seconds after the epoch.
@@ -296,9 +298,10 @@ impl Belief {
     /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
     /// variance and the variance of that common time.
     fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
-        let weights = self.weights();
-        let variance = |w: &Weight| if component == 0 { w.variance } else { w.clock.drift_prior };
-        let common = weights.iter().map(|w| w.share.powi(2) * variance(w)).sum();
+        let common = match component {
+            0 => self.common.variance,
+            _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
+        };
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let mut put = |clock: &Clock, weight: f64| {
             if let Some(place) = clock.place.filter(|_| weight != 0.0) {
@@ -309,7 +312,7 @@ impl Belief {
             }
         };
         put(clock, 1.0);
-        weights.iter().for_each(|other| put(&other.clock, -other.share));
+        self.shares().for_each(|(other, share)| put(other, -share));
         let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
         let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
         let along = |(&i, a): (&usize, &f64)| -> f64 {
@@ -328,7 +331,7 @@ impl Belief {
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
             // No clock is worse known than what was reported of it, as far as that is believed.
-            sd_s: (own + common).min(Standing { offset, variance: clock.prior }.believed()).sqrt(),
+            sd_s: (own + common).min(Reading { offset, variance: clock.prior }.believed(offset)).sqrt(),
             relative_sd_s: own.sqrt(),
             drift,
             drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
@@ -339,18 +342,17 @@ impl Belief {
     /// behind its reported one.
     pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
-        let weights = self.weights();
         let offset = |clock: &Clock| self.relative(clock, 0, ahead);
-        let common = weights.iter().map(|w| w.share * offset(&w.clock)).sum::<f64>()
+        let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
             - (self.site[0] + self.site[1] * ahead);
         self.cameras.values().map(|clock| offset(clock) - common).fold(0.0, f64::max).min(MAX_OFFSET_S)
     }
 
     /// Offset and drift of the reference against true time as of the epoch.
     fn reference_offset_and_drift(&self) -> [f64; 2] {
-        let weights = self.weights();
         std::array::from_fn(|i| {
-            self.site[i] - weights.iter().map(|w| w.share * self.relative(&w.clock, i, 0.0)).sum::<f64>()
+            let common = self.shares().map(|(clock, share)| share * self.relative(clock, i, 0.0));
+            self.site[i] - common.sum::<f64>()
         })
     }
 }

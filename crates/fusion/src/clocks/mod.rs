@@ -232,7 +232,9 @@ impl ClockEstimator {
         self.belief.step_time(step_s);
         (self.provisional, self.round) = (None, None);
         self.windows.clear();
-        (self.now, self.next_look, self.next_adjustment) = (Timestamp::MIN, Timestamp::MIN, Timestamp::MIN);
+        for time in [&mut self.now, &mut self.next_look, &mut self.next_adjustment] {
+            *time = time.plus_seconds(step_s);
+        }
     }
 
     /// Takes a bearing of a track in, by the time that the camera gave it.

@@ -5,11 +5,16 @@ use crossfix_message::{BearingFrame, Timestamp};
 use super::{Fusion, Output};
 use crate::Counters;
 use crate::clocks::ClockEstimator;
-use crate::event_time::EventBuffer;
 use crate::ingress::{self, RejectionReason};
 use crate::initiation::Initiator;
-use crate::site_time::{Step, moved};
+use crate::site_time::moved;
 use crate::unmet::Unmet;
+
+/// All clocks have stepped forward, and the cameras have not stood still, where that is so much likelier by the
+/// targets' bearings (logarithm): a host that sleeps is the commoner.
+const STEP_MARGIN: f64 = 8.0;
+/// A longer step forward is not told from a host that slept, s: where a target is after that nobody knows.
+const LONGEST_FORWARD_S: f64 = 2.0;
 
 impl Fusion {
     /// Handles everything that waits.
@@ -37,26 +42,22 @@ impl Fusion {
         self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
-    /// Takes frames in that have waited until it was clear whether all clocks have stepped.
+    /// Takes frames in that have waited until it was clear whether all clocks have stepped, s.
     pub(super) fn take_after(
         &mut self,
         frames: &[BearingFrame],
-        step: Option<&Step>,
+        step_s: Option<f64>,
         outputs: &mut Vec<Output>,
     ) {
-        if let Some(step) = step.filter(|step| self.has_stepped(frames, step.by_s)) {
-            self.step_time(step.by_s, outputs);
-            self.site_time.confirm(step);
+        if let Some(step_s) = step_s.filter(|step_s| self.has_stepped(frames, *step_s)) {
+            self.step_time(step_s, outputs);
         }
-        for frame in frames {
-            let behind_s = frame.camera.parse().map_or(0.0, |camera| self.site_time.behind_s(&camera));
-            self.take(&moved(frame, behind_s), outputs);
-        }
+        frames.iter().for_each(|frame| self.take(frame, outputs));
     }
 
-    /// Whether frames that come after a step of the site's time show the targets where they would be if the time
-    /// had gone on without it. Time that has gone back has stepped; where it has gone forward the cameras may all
-    /// have stood still.
+    /// Whether all clocks have stepped by so much, s. Time that has gone back has. Where it has gone forward all
+    /// cameras may have stood still, as those of a host that slept; they have not, if their bearings show the
+    /// targets where they would be without it, and not where they would be with it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         let fit = |ahead_s: f64| -> f64 {
             let of_frame = |frame: &BearingFrame| {
@@ -69,18 +70,17 @@ impl Fusion {
             };
             frames.iter().filter_map(of_frame).sum()
         };
-        step_s < 0.0 || fit(step_s) > fit(0.0)
+        step_s < 0.0 || (step_s < LONGEST_FORWARD_S && fit(step_s) > fit(0.0) + STEP_MARGIN)
     }
 
     /// All clocks have stepped at once: the tracks go on by the new time.
     fn step_time(&mut self, step_s: f64, outputs: &mut Vec<Output>) {
         self.counters.count("site_time_steps");
         self.finish(outputs);
-        self.buffer = EventBuffer::new(self.config.event_time.clone());
-        self.cameras.now().keys().for_each(|camera| self.buffer.expect(camera));
+        self.buffer.begin_anew();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);
-        self.records.clear();
+        self.records.values_mut().for_each(|record| record.look_anew(&self.config));
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
     }
