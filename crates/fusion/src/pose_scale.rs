@@ -103,7 +103,8 @@ impl PoseScales {
         let mut logarithms: Vec<f64> =
             samples.iter().filter_map(|sample| Some(self.scales.get(&sample.camera)?.value.ln())).collect();
         logarithms.sort_unstable_by(f64::total_cmp);
-        let typical = logarithms.get(logarithms.len().saturating_sub(1) / 2).copied().unwrap_or(0.0);
+        let middle = |k: usize| logarithms.get(k).copied().unwrap_or(0.0);
+        let typical = (middle(logarithms.len() / 2) + middle(logarithms.len().saturating_sub(1) / 2)) / 2.0;
         let mut changed = Vec::new();
         for (sample, (found, expected)) in samples.iter().zip(found) {
             let scale = self.scales.get_mut(&sample.camera);
