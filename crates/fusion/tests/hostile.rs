@@ -223,6 +223,17 @@ fn after_all_clocks_were_ahead_the_order_is_taken_up_anew_and_targets_are_found(
 }
 
 #[test]
+fn clocks_that_are_all_ten_minutes_ahead_and_numbered_frames_lose_no_frame_and_targets_are_found() {
+    let (scene, mut fusion) = all_clocks_ahead(600_000_000_000, true);
+    assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
+    fusion.flush();
+    let count = |name| fusion.counters().get(name);
+    let refused = count("rejected_late") + count("rejected_future");
+    assert_eq!(count("frames"), count("exposures") + refused, "{:?}", fusion.counters());
+    assert!(refused < 75, "{:?}", fusion.counters());
+}
+
+#[test]
 fn where_frames_are_numbered_the_tracks_outlive_all_clocks_being_ahead() {
     let (scene, mut fusion) = all_clocks_ahead(1_500_000_000, true);
     assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()));
