@@ -122,16 +122,33 @@ impl Imm {
             return None;
         }
         let sum: f64 = logarithms.iter().map(|l| (l - largest).exp()).sum();
-        self.probabilities = logarithms.map(|l| (l - largest).exp() / sum);
+        self.probabilities = models.possible(&weights, logarithms.map(|l| (l - largest).exp() / sum));
         for (state, next) in self.states.iter_mut().zip(states.into_iter().flatten()) {
             *state = next;
         }
         self.combined = combined(&self.states, &self.probabilities);
-        // Where all models are alike the bearings say nothing of which it is.
-        if models.models().iter().any(|model| model.density != models.models()[0].density) {
+        // Where an axis is not seen the measurements do not tell how often it does.
+        if !models.is_partial {
             self.restlessness.see(models.calm_probability(self.probabilities()), interval);
         }
         Some(largest + sum.ln())
+    }
+
+    /// Takes in that for the last `interval` seconds the target may have moved by other models than was thought, and
+    /// that no measurement would have shown it.
+    pub fn relive(&mut self, interval: f64, models: &MotionModels) {
+        for state in &mut self.states {
+            state.time_update(-interval, 0.0);
+        }
+        let transitions = models.transitions(interval, &self.restlessness);
+        let mut states: Vec<KinematicState> =
+            (0..self.states.len()).map(|j| self.mixed(j, &transitions)).collect();
+        for (state, model) in states.iter_mut().zip(models.models()) {
+            state.time_update(interval, model.density);
+        }
+        self.probabilities = self.probabilities_after(&transitions);
+        self.states = states;
+        self.combined = combined(&self.states, &self.probabilities);
     }
 
     /// Widens every model's knowledge to at least these standard deviations and forgets what ties

@@ -10,6 +10,11 @@ const UPSET: f64 = 0.5;
 /// the probability goes to and fro counts once.
 const CALM: f64 = 0.9;
 
+/// How often a target counts as having left its calm, beside what has been seen, where an axis of its motion is not
+/// seen: Jeffreys' prior of a rate. The mean over all targets is right in the mean alone, and there nothing shows in
+/// time that it was wrong of this one.
+const UNSEEN_UPSETS: f64 = 0.5;
+
 /// One way of flying: constant velocity driven by white acceleration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionModel {
@@ -44,6 +49,8 @@ pub struct MotionModels {
     rates: ModeRates,
     /// Share of the time that targets are calm.
     calm_share: f64,
+    /// Whether an axis of the motion is not seen.
+    pub(crate) is_partial: bool,
 }
 
 /// Weights of the models, in their order; what lies beyond the last model is 0.
@@ -67,7 +74,7 @@ impl MotionModels {
         let scaled = |m: &MotionModel| MotionModel { share: m.share / total, ..*m };
         let models: Vec<MotionModel> = models.iter().map(scaled).collect();
         let calm_share = models.iter().filter(|model| model.calm).map(|model| model.share).sum();
-        Some(Self { models, rates, calm_share })
+        Some(Self { models, rates, calm_share, is_partial: false })
     }
 
     /// A single model: a plain Kalman filter.
@@ -81,12 +88,28 @@ impl MotionModels {
         &self.models
     }
 
-    /// The same with every model as lively as the liveliest.
+    /// The same where an axis of the motion is not seen: what is not calm may be as lively along it as the liveliest,
+    /// and that a target flies evenly across it is no evidence that it is calm.
     #[must_use]
-    pub fn widened(&self) -> Self {
+    pub fn partial(&self) -> Self {
         let widest = self.widest();
-        let models = self.models.iter().map(|m| MotionModel { density: widest, ..*m }).collect();
-        Self { models, ..*self }
+        let density = |m: &MotionModel| if m.calm { m.density } else { widest };
+        let models = self.models.iter().map(|m| MotionModel { density: density(m), ..*m }).collect();
+        Self { models, is_partial: true, ..*self }
+    }
+
+    /// Weights after a measurement, where an axis is not seen with no more of them calm than before it.
+    pub(crate) fn possible(&self, before: &ModelWeights, after: ModelWeights) -> ModelWeights {
+        let [calm_before, calm] = [before, &after].map(|weights| self.calm_probability(weights));
+        if !self.is_partial || calm <= calm_before || calm_before >= 1.0 || calm >= 1.0 {
+            return after;
+        }
+        let (fewer, more) = (calm_before / calm, (1.0 - calm_before) / (1.0 - calm));
+        let mut weights = after;
+        for (weight, model) in weights.iter_mut().zip(&self.models) {
+            *weight *= if model.calm { fewer } else { more };
+        }
+        weights
     }
 
     /// The largest density of acceleration among the models, m^2/s^3.
@@ -106,7 +129,8 @@ impl MotionModels {
         let of_two = calm > 0.0 && lively > 0.0;
         let calming = if of_two { self.rates.calming_per_s } else { 0.0 };
         let usual = if of_two { calming * lively / calm } else { 0.0 };
-        let leaving = if of_two { restlessness.rate(usual, self.rates.prior_s) } else { 0.0 };
+        let unseen = if self.is_partial { UNSEEN_UPSETS } else { 0.0 };
+        let leaving = if of_two { restlessness.rate(usual, self.rates.prior_s, unseen) } else { 0.0 };
         // What is left of the difference between the two states after the interval.
         let kept = (-(leaving + calming) * interval).exp();
         let unswitched = (-self.rates.switching_per_s * interval).exp();
@@ -150,9 +174,10 @@ pub(crate) struct Restlessness {
 impl Restlessness {
     pub(crate) const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
 
-    /// The rate, 1/s; `usual` is the mean over all targets, worth `prior_s` seconds of one.
-    fn rate(&self, usual: f64, prior_s: f64) -> f64 {
-        (usual * prior_s + self.upsets) / (prior_s + self.calm_s)
+    /// The rate, 1/s, had it left its calm so many times more than has been seen; `usual` is the mean over all
+    /// targets, worth `prior_s` seconds of one.
+    fn rate(&self, usual: f64, prior_s: f64, more: f64) -> f64 {
+        (usual * prior_s + self.upsets + more) / (prior_s + self.calm_s)
     }
 
     /// The target has been calm with this probability for an interval of seconds.
@@ -199,6 +224,24 @@ mod tests {
     }
 
     #[test]
+    fn where_an_axis_is_not_seen_no_target_becomes_calm_and_each_may_have_left_its_calm() {
+        let model = |density, share, calm| MotionModel { density, share, calm };
+        let models = [model(0.01, 0.8, true), model(1.0, 0.1, false), model(20.0, 0.1, false)];
+        let rates = ModeRates { switching_per_s: 0.3, calming_per_s: 0.1, prior_s: 20.0 };
+        let models = MotionModels::new(&models, rates).unwrap();
+        let partial = models.partial();
+        assert_eq!(partial.models().iter().map(|m| m.density).collect::<Vec<_>>(), [0.01, 20.0, 20.0]);
+        let (before, after) = ([0.5, 0.3, 0.2, 0.0], [0.9, 0.05, 0.05, 0.0]);
+        assert_eq!(models.possible(&before, after), after);
+        for (weight, expected) in partial.possible(&before, after).iter().zip([0.5, 0.25, 0.25, 0.0]) {
+            assert!((weight - expected).abs() < 1e-12);
+        }
+        assert_eq!(partial.possible(&after, before), before, "less calm it may be found to be");
+        let stays = |models: &MotionModels| models.transitions(1.0, &Restlessness::UNKNOWN)[0][0];
+        assert!(stays(&partial) < stays(&models));
+    }
+
+    #[test]
     fn a_target_that_turns_often_is_expected_to_turn_again_and_one_that_never_does_is_not() {
         let mut restless = Restlessness::UNKNOWN;
         // Six seconds of calm and two of turning, ten times; and a minute of calm.
@@ -210,7 +253,7 @@ mod tests {
         calm.see(1.0, 60.0);
         let usual = 1e-3;
         // Ten times in a minute beside twenty seconds in which it was not known.
-        assert!((restless.rate(usual, 20.0) - 10.02 / 80.0).abs() < 1e-12);
-        assert!((calm.rate(usual, 20.0) - 0.02 / 80.0).abs() < 1e-12);
+        assert!((restless.rate(usual, 20.0, 0.0) - 10.02 / 80.0).abs() < 1e-12);
+        assert!((calm.rate(usual, 20.0, 0.0) - 0.02 / 80.0).abs() < 1e-12);
     }
 }

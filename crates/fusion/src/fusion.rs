@@ -299,6 +299,7 @@ impl Fusion {
             let is_declared = self.cameras.now().get(&moved).is_some_and(|known| known.is_declared);
             self.pose_scales.calibrate(&moved, is_declared);
             self.records.remove(&moved);
+            self.initiator.forget(&moved);
         }
         let Some(known) = self.cameras.at(&exposure.camera, exposure.time) else {
             return;
@@ -334,6 +335,9 @@ impl Fusion {
                 self.unmet.see(&rest).into_iter().for_each(|name| self.counters.count(name));
             }
             for start in self.initiator.add(rest, &step.claims, self.cameras.now(), self.tracker.motion()) {
+                happenings.extend(self.tracker.adopt(start));
+            }
+            for start in self.initiator.hand_over(&exposure, &step.used, known, self.tracker.motion()) {
                 happenings.extend(self.tracker.adopt(start));
             }
             (step.fittings, step.used)

@@ -65,7 +65,7 @@ impl Motion {
             value: config.models.len() as f64,
             must: "one to four models with densities of 0 and more and positive shares".to_owned(),
         })?;
-        let unheld = models.widened();
+        let unheld = models.partial();
         Ok(Self { models, unheld, holding_s: config.coasting_after_s, detector })
     }
 

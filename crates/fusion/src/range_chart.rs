@@ -8,6 +8,7 @@
 //! is nearly Gaussian.
 
 use crossfix_filter::KinematicState;
+use crossfix_geometry::passing_ranges;
 use nalgebra::{
     Matrix2x3, Matrix3, Matrix3x2, Matrix6, Matrix6x2, Matrix6x3, Point3, Unit, Vector3, Vector6,
 };
@@ -156,12 +157,7 @@ impl RangeChart {
 
     /// The logarithm of the range against the chart's own.
     fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
-        let (u, v) = (&self.direction, &line.direction);
-        let base = line.origin - self.origin;
-        let cosine = u.dot(v);
-        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
-        let here = (u.dot(&base) - cosine * v.dot(&base)) / sine_squared;
-        let there = (cosine * u.dot(&base) - v.dot(&base)) / sine_squared;
+        let [here, there] = passing_ranges((self.origin, &self.direction), (line.origin, &line.direction));
         (here > 0.0 && there > 0.0).then(|| (here / self.range).ln())
     }
 }

@@ -156,6 +156,17 @@ impl Track {
         track
     }
 
+    /// A tentative track of what one camera alone has followed: see [`Self::start`].
+    pub(crate) fn start_alone(
+        fix: &Fix,
+        (camera, line, uncertainty): (&CameraName, &TimedLine, CameraUncertainty),
+        motion: &Motion,
+    ) -> Self {
+        let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
+        (track.held, track.follower) = (false, Some(line.line.origin));
+        track
+    }
+
     /// Notes a line of the fix that the track starts with.
     fn note_start(
         &mut self,
@@ -182,7 +193,8 @@ impl Track {
         // The least-squares solution errs by -P H' R^-1 times the error of the line.
         let covariance = -(fix.state.covariance * by.transpose() * inverse * shifts);
         let visibility = Visibility::seen(*time);
-        self.ties.insert(camera.clone(), Ties { covariance, visibility, ..Ties::new(*time) });
+        self.ties
+            .insert(camera.clone(), Ties { covariance, visibility, seen: Some(*time), ..Ties::new(*time) });
         self.information += by.transpose() * inverse * by;
         Some(())
     }
@@ -229,14 +241,13 @@ impl Track {
 
     /// How many other cameras than this one have lately seen the target.
     pub(crate) fn others_than(&self, camera: &CameraName, motion: &Motion) -> usize {
-        let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        self.residuals.iter().filter(|(name, r)| *name != camera && lately(r)).count()
+        let lately = |ties: &Ties| ties.has_seen_lately(self.updated, motion.holding_s);
+        self.ties.iter().filter(|(name, ties)| lately(ties) && *name != camera).count()
     }
 
     /// Whether a camera has lately given the track a bearing.
     fn is_followed_by(&self, camera: &CameraName, motion: &Motion) -> bool {
-        let lately = |r: &MeasurementResidual| self.updated.seconds_since(r.time) <= motion.holding_s;
-        self.residuals.get(camera).is_some_and(lately)
+        self.ties.get(camera).is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
     }
 
     /// Whether the track is too uncertain for a camera that has not been following it: any line that
@@ -347,13 +358,20 @@ impl Track {
         self.updated = time;
         self.follower = Some(line.origin);
         self.solver = Solver::Kalman;
+        self.ties.get_mut(camera).into_iter().for_each(|ties| ties.see(time));
         let residual = MeasurementResidual { time, angle: innovation.offset.norm(), nis };
         if let Some(newest) = self.residuals.get_mut(camera) {
             *newest = residual;
         } else {
             self.residuals.insert(camera.clone(), residual);
         }
-        self.held = self.cameras_lately(motion.holding_s) >= 2;
+        let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
+        let is_held = self.ties.values().filter(lately).count() >= 2;
+        let was_held = std::mem::replace(&mut self.held, is_held);
+        if was_held && !is_held {
+            // By now it shows that one camera alone has seen it for so long.
+            self.imm.relive(motion.holding_s, motion.models(false));
+        }
         self.gather(camera, &innovation, line, uncertainty);
         let third_difference = self.third_difference(camera, line, motion);
         Some(Taken { manoeuvre, third_difference })
@@ -397,12 +415,6 @@ impl Track {
             position += told;
         }
         self.information = if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
-    }
-
-    /// Cameras that have given a bearing within the last seconds before [`Self::updated`].
-    fn cameras_lately(&self, seconds: f64) -> usize {
-        let lately = |r: &&MeasurementResidual| self.updated.seconds_since(r.time) <= seconds;
-        self.residuals.values().filter(lately).count()
     }
 
     /// Whether two cameras have lately seen the target. One alone tells nothing of the range, and

@@ -99,10 +99,14 @@ impl Watch {
 
     /// How many bearings are nobody's, 1/sr about the optical axis.
     pub(crate) fn strangers_per_sr(&self, known: &KnownCamera) -> f64 {
-        let lens = known.camera.model().intrinsics();
-        let [width, height] = [lens.size.width, lens.size.height].map(f64::from);
-        // Whatever a calibration says, no camera sees more than all directions or less than a point.
-        let view_sr = ((width / lens.fx) * (height / lens.fy)).clamp(LEAST_VIEW_SR, 4.0 * PI);
-        (self.strangers + LEAST_STRANGERS) / view_sr
+        (self.strangers + LEAST_STRANGERS) / view_sr(known)
     }
+}
+
+/// How much a camera sees, sr about the optical axis.
+pub(crate) fn view_sr(known: &KnownCamera) -> f64 {
+    let lens = known.camera.model().intrinsics();
+    let [width, height] = [lens.size.width, lens.size.height].map(f64::from);
+    // Whatever a calibration says, no camera sees more than all directions or less than a point.
+    ((width / lens.fx) * (height / lens.fy)).clamp(LEAST_VIEW_SR, 4.0 * PI)
 }

@@ -8,6 +8,7 @@ mod common;
 use common::{Path, Scene, found, fusion_of, site, straight};
 use crossfix_fusion::{Fusion, FusionConfig, TrackStatus};
 use crossfix_message::BearingFrame;
+use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -97,4 +98,67 @@ fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_a_direction_and_says_s
         let left: Vec<TrackStatus> = fusion.tracks().map(|track| track.status).collect();
         assert_eq!(left, [TrackStatus::OneCamera], "seed {seed}");
     }
+}
+
+/// Flies straight until a time, then accelerates by 3 m/s^2 for three seconds along the sight line of the first camera.
+fn along_the_sight_line(x: f64, onset_s: f64) -> Path {
+    let eye = Point3::new(-150.0, -20.0, 2.0);
+    let (from, velocity) = (Point3::new(x, 10.0, 40.0), Vector3::new(2.0, 1.0, 0.1));
+    let away = (from + velocity * onset_s - eye).normalize();
+    Box::new(move |t| {
+        let (turning, after) = ((t - onset_s).clamp(0.0, 3.0), (t - onset_s - 3.0).max(0.0));
+        Some(from + velocity * t + away * (1.5 * turning.powi(2) + 9.0 * after))
+    })
+}
+
+#[test]
+fn what_a_target_does_along_the_last_cameras_sight_line_lies_within_what_is_claimed() {
+    let (mut far_off, mut answers) = (0, 0);
+    for (seed, onset_s) in (0..10).zip([10.0, 11.0, 12.0].into_iter().cycle()) {
+        let path = || along_the_sight_line(-30.0 + 5.0 * seed as f64, onset_s);
+        let scene = Scene::new(vec![path()], onset_s + 6.0);
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        for mut frame in scene.frames(seed) {
+            let time = frame.capture_time_ns as f64 / 1e9;
+            if time > 9.0 && frame.camera != "a" {
+                frame.tracks.clear();
+            }
+            fusion.ingest(&frame);
+            // That the others are silent for good shows after 1.5 s.
+            for track in fusion.tracks().filter(|track| track.is_confirmed() && time > 10.6) {
+                let error = track.state().position() - path()(track.updated.seconds()).unwrap();
+                let spread = track.state().position_covariance().cholesky().unwrap();
+                far_off += usize::from(error.dot(&spread.solve(&error)) > 16.0);
+                answers += 1;
+            }
+        }
+    }
+    assert!(answers > 500, "{answers}");
+    // Beyond four deviations: with one axis of every turn taken for seen it were a quarter.
+    assert!(far_off * 100 <= answers, "{far_off} of {answers}");
+}
+
+#[test]
+fn what_two_cameras_see_one_after_the_other_is_one_target_only_if_it_is() {
+    let (mut ghosts, mut crossings) = (0, 0);
+    for seed in 0..40 {
+        // The first camera sees one target and loses it; the second one sees another, elsewhere, from then on.
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let scene = Scene { detection: 0.9, ..Scene::new(crowd(2, &mut rng), 8.0) };
+        let others = [(0, "a", 0.0..4.0), (1, "b", 4.0..8.0)].map(|(path, camera, time_s)| {
+            let only = crowd(2, &mut ChaCha8Rng::seed_from_u64(seed)).swap_remove(path);
+            (camera, Scene { time_s, detection: 0.9, ..Scene::new(vec![only], 8.0) })
+        });
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        for (camera, scene) in others {
+            for frame in scene.frames(seed).into_iter().filter(|frame| frame.camera == camera) {
+                crossings += usize::from(!frame.tracks.is_empty());
+                fusion.ingest(&frame);
+            }
+        }
+        fusion.flush();
+        ghosts += fusion.counters().get("tracks_confirmed");
+    }
+    assert!(crossings > 2000, "{crossings}");
+    assert_eq!(ghosts, 0, "of 40");
 }

@@ -57,6 +57,28 @@ fn targets_that_cross_keep_their_numbers() {
     }
 }
 
+#[test]
+fn a_target_that_one_camera_at_a_time_sees_is_found_and_kept() {
+    for (turn_s, found_by_s) in [(1.0, 4.0), (4.0, 9.5)] {
+        for seed in SEEDS {
+            let path = || straight([0.0, -20.0, 45.0], [4.0, 2.0, 0.2]);
+            let scene = Scene::new(vec![path()], 24.0);
+            let mut flight = Flight::with(FusionConfig::default(), scene, seed, |frame| {
+                let turn = frame.capture_time_ns as f64 / 1e9 / turn_s;
+                if frame.camera != ["a", "b", "c"][turn as usize % 3] {
+                    frame.tracks.clear();
+                }
+                true
+            });
+            let before = assert_one_each(flight.until(found_by_s), 1, seed);
+            let after = assert_one_each(flight.until(22.0), 1, seed);
+            assert_eq!(before, after, "seed {seed}");
+            assert!(flight.error(0) < 3.0, "seed {seed}: {}", flight.error(0));
+            assert_eq!(flight.fusion.counters().get("tracks_born"), 1, "seed {seed}");
+        }
+    }
+}
+
 /// Comes from `side` metres off the x axis to `near` metres from it, stays for ten seconds, parts.
 fn meeting(side: f64, near: f64) -> Path {
     Box::new(move |t| {

@@ -71,6 +71,31 @@ pub struct SightLine {
     pub covariance: Matrix2<f64>,
 }
 
+/// Squared sine below which two directions are parallel: their lines pass nearest at a range beyond all use.
+const PARALLEL: f64 = 1e-9;
+
+/// The ranges (m) at which two rays pass nearest to each other, each given by its origin and direction; negative
+/// where that is behind the origin.
+///
+/// ```
+/// use crossfix_geometry::passing_ranges;
+/// use nalgebra::{Point3, Vector3};
+/// let north = (Point3::origin(), &Vector3::y_axis());
+/// let west = (Point3::new(30.0, 40.0, 1.0), &-Vector3::x_axis());
+/// let [along_north, along_west] = passing_ranges(north, west);
+/// assert!((along_north - 40.0).abs() < 1e-9 && (along_west - 30.0).abs() < 1e-9);
+/// ```
+pub fn passing_ranges(
+    (origin, u): (Point3<f64>, &Unit<Vector3<f64>>),
+    (other_origin, v): (Point3<f64>, &Unit<Vector3<f64>>),
+) -> [f64; 2] {
+    let base = other_origin - origin;
+    let cosine = u.dot(v);
+    let sine_squared = (1.0 - cosine * cosine).max(PARALLEL);
+    let (along_u, along_v) = (u.dot(&base), v.dot(&base));
+    [along_u - cosine * along_v, cosine * along_u - along_v].map(|range| range / sine_squared)
+}
+
 impl SightLine {
     /// The distance of a point from the ray, metres; from the origin if the point lies behind it.
     pub fn miss_distance(&self, point: Point3<f64>) -> f64 {

@@ -33,7 +33,7 @@ mod model;
 mod pose;
 mod scanning;
 
-pub use bearing::{Bearing, SightLine, tangent_basis};
+pub use bearing::{Bearing, SightLine, passing_ranges, tangent_basis};
 pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, PixelCovariance};
 pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};

@@ -6,11 +6,13 @@
 mod coincidence;
 mod fixes;
 mod grouped;
+mod handover;
 mod hypotheses;
 mod passing;
 mod period;
 mod seeds;
 mod selection;
+mod sight;
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -28,6 +30,7 @@ use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 pub(crate) use passing::{Passing, Passings};
 
 use grouped::Grouped;
+use handover::Handover;
 use hypotheses::Hypotheses;
 use period::Periods;
 
@@ -52,6 +55,7 @@ pub(crate) struct Start {
 pub(crate) struct Initiator {
     periods: Periods,
     method: Method,
+    handover: Handover,
 }
 
 #[derive(Debug)]
@@ -69,7 +73,31 @@ impl Initiator {
             InitiationMethod::Hypotheses => Method::Hypotheses(Hypotheses::new(config)),
             InitiationMethod::Grouping => Method::Grouped(Grouped::new(config)),
         };
-        Self { periods: Periods::new(initiation.period_s, if pairs { 2 } else { 3 }), method }
+        Self {
+            periods: Periods::new(initiation.period_s, if pairs { 2 } else { 3 }),
+            method,
+            handover: Handover::new(config),
+        }
+    }
+
+    /// Forgets what a camera that has been moved has followed alone.
+    pub(crate) fn forget(&mut self, camera: &CameraName) {
+        self.handover.forget_camera(camera);
+    }
+
+    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns the tracks that
+    /// begin with it of targets that cameras see one after another.
+    pub(crate) fn hand_over(
+        &mut self,
+        exposure: &Exposure,
+        used: &[(usize, TrackId)],
+        known: &KnownCamera,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        match self.method {
+            Method::Hypotheses(_) => self.handover.see(exposure, used, known, motion),
+            Method::Grouped(_) => Vec::new(),
+        }
     }
 
     /// Takes in what an exposure has left over, with what of it (by index) a track has used that

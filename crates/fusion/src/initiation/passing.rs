@@ -1,3 +1,5 @@
+use crossfix_geometry::passing_ranges;
+
 use crate::Initiation;
 use crate::spatial::{TYPICAL_SPEED, TimedLine};
 
@@ -35,11 +37,7 @@ impl Passings {
     pub(crate) fn of(&self, first: &TimedLine, second: &TimedLine) -> Passing {
         let (u, v) = (&first.line.direction, &second.line.direction);
         let base = second.line.origin - first.line.origin;
-        let cosine = u.dot(v);
-        let sine_squared = (1.0 - cosine * cosine).max(1e-9);
-        let (along_u, along_v) = (u.dot(&base), v.dot(&base));
-        let r1 = (along_u - cosine * along_v) / sine_squared;
-        let r2 = (cosine * along_u - along_v) / sine_squared;
+        let [r1, r2] = passing_ranges((first.line.origin, u), (second.line.origin, v));
         let in_range = |r: f64| r > 0.0 && r < self.max_range_m;
         if !(in_range(r1) && in_range(r2)) {
             return Passing::Nowhere;

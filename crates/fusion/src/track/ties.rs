@@ -17,6 +17,12 @@ const CLOSE_BEARINGS: f64 = 0.1;
 /// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a mast is seen.
 const DRAW_S: f64 = 0.3;
 
+/// A camera's bearing holds a track for so many times what has lain between its last two, so that it may miss none and
+/// come late, ...
+const HOLDING_PERIODS: f64 = 1.5;
+/// ... where these lay no further apart than so many times what a bearing holds a track for.
+const LONGEST_PERIOD: f64 = 2.0;
+
 /// What ties a track to the shared errors of a camera that has seen it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Ties {
@@ -24,6 +30,10 @@ pub(super) struct Ties {
     pub(super) covariance: Matrix6x3<f64>,
     /// Whether the camera can see the target, when it was exposed last.
     pub(super) visibility: Visibility,
+    /// When it gave the track its last bearing, ...
+    pub(super) seen: Option<Timestamp>,
+    /// ... and how long after the one before, s.
+    pub(super) period_s: f64,
     pub(super) last_three: LastThree,
     pub(super) drawn: Option<Drawn>,
 }
@@ -44,6 +54,8 @@ impl Ties {
         Self {
             covariance: Matrix6x3::zeros(),
             visibility: Visibility::new(time),
+            seen: None,
+            period_s: 0.0,
             last_three: LastThree::default(),
             drawn: None,
         }
@@ -52,7 +64,21 @@ impl Ties {
     /// All clocks have stepped by so much, s.
     pub(super) fn step_time(&mut self, step_s: f64) {
         self.visibility.step_time(step_s);
+        self.seen = self.seen.map(|seen| seen.plus_seconds(step_s));
         self.last_three = LastThree::default();
+    }
+
+    /// The camera has given the track a bearing.
+    pub(super) fn see(&mut self, time: Timestamp) {
+        self.period_s = self.seen.map_or(0.0, |seen| time.seconds_since(seen).abs());
+        self.seen = Some(time);
+    }
+
+    /// Whether the camera has given the track a bearing so lately that it holds it, as one does for `holding_s`
+    /// seconds: a camera that sees the target every two seconds has not lost it after one and a half.
+    pub(super) fn has_seen_lately(&self, now: Timestamp, holding_s: f64) -> bool {
+        let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
+        self.seen.is_some_and(|seen| now.seconds_since(seen) <= holding_s.max(HOLDING_PERIODS * period_s))
     }
 
     /// The same `interval` seconds on: the position goes on with the velocity.

@@ -25,15 +25,15 @@ impl Flight {
         Self::with(FusionConfig::default(), scene, seed, |_| true)
     }
 
-    /// The same with another configuration, and without the frames that get lost.
+    /// The same with another configuration, the frames as they arrive, and without those that get lost.
     pub fn with(
         config: FusionConfig,
         scene: Scene,
         seed: u64,
-        arrives: impl Fn(&BearingFrame) -> bool,
+        arrives: impl Fn(&mut BearingFrame) -> bool,
     ) -> Self {
         let mut frames = scene.frames(seed);
-        frames.retain(arrives);
+        frames.retain_mut(arrives);
         let fusion = fusion_of(config, &scene.eyes);
         Self { fusion, paths: scene.paths, frames: frames.into_iter().peekable() }
     }

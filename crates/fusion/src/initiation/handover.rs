@@ -1,0 +1,436 @@
+//! Targets that cameras see one after another, and never two at a time.
+//!
+//! What one camera alone follows is a direction that turns. When it loses sight of it, another may have begun to see
+//! it: the new camera's line crosses the direction that the old one would have by now in one place, and place and
+//! turning give a velocity across the old line. How the new line turns, and where the next camera sees it, tells
+//! whether that was so.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+use crossfix_filter::{Gate, KinematicState};
+use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
+use crossfix_message::{CameraName, Solver, Timestamp};
+use nalgebra::{Matrix3, Vector3, Vector6};
+
+use super::coincidence::Coincidence;
+use super::sight::Sight;
+use super::{Start, lines_with_pose};
+use crate::ingress::KnownCamera;
+use crate::motion::Motion;
+use crate::rooted::Rooted;
+use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
+use crate::temporal::LineId;
+use crate::track::{Expectation, Track, TrackId, TrackStatus};
+use crate::tracker::log_likelihood_ratio;
+use crate::uncertainty::CameraUncertainty;
+use crate::watch::view_sr;
+use crate::{Exposure, FusionConfig, Tracking};
+
+/// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what flies past a camera
+/// is lost again and again; twice as much takes strangers for it.
+const TURNING_SD: f64 = 0.3;
+/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, as the liveliest targets have. It is used only to
+/// follow a direction within one camera.
+const TURNING_DENSITY: f64 = 3e-4;
+/// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if all ranges over a
+/// factor of 150 were equally likely.
+const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
+/// A camera has lost sight of what it followed if it would so seldom (logarithm) have missed it so often by chance:
+/// once in 100 times, which are two exposures where it reports nine of ten.
+const LOST: f64 = -4.6;
+/// Two cameras that have seen something together for longer than this, s, and have not made a target of it, see
+/// different things.
+const TOGETHER_S: f64 = 1.0;
+/// That it is one target must be so many times (logarithm) likelier than that each camera sees another, and than
+/// any other reading of the same lines: a chance of 1 in 3000.
+const MARGIN: f64 = 8.0;
+/// A reading less likely than this (logarithm) is given up.
+const GIVEN_UP: f64 = -5.0;
+/// Directions followed in one camera, lost ones tried in one exposure, and readings of one: time is bounded.
+const MAX_SEEN: usize = 20;
+const MAX_LOST: usize = 20;
+const MAX_READINGS: usize = 4;
+
+/// What one camera alone follows, as of its last line.
+#[derive(Clone, Debug)]
+struct Seen {
+    sight: Sight,
+    first: Timestamp,
+    /// Its last line with what is uncertain of the camera's pose, ...
+    line: TimedLine,
+    /// ... and of the camera.
+    uncertainty: CameraUncertainty,
+    /// Log-likelihood ratio of being a target, whatever its place, against being clutter.
+    score: f64,
+    /// Its lines so far, ...
+    lines: f64,
+    /// ... the exposures between them without one, ...
+    gaps: f64,
+    /// ... and those since the last.
+    missed: f64,
+    /// The ways in which other cameras may have seen it since.
+    readings: Vec<Reading>,
+}
+
+/// What one camera has followed and others may have seen since, as one target.
+#[derive(Clone, Debug)]
+struct Reading {
+    track: Box<Track>,
+    coincidence: Coincidence,
+    newest: LineId,
+}
+
+/// The newest exposure, and what else its lines are compared by.
+#[derive(Clone, Copy)]
+struct Look<'a> {
+    exposure: &'a Exposure,
+    known: &'a KnownCamera,
+    motion: &'a Motion,
+    /// Whether a track knows the line, by index.
+    is_owned: &'a [bool],
+}
+
+impl Look<'_> {
+    /// What is uncertain of the exposure's camera: what a clock shifts is not known before the velocity is.
+    fn uncertainty(&self) -> CameraUncertainty {
+        CameraUncertainty { clock_is_noise: true, ..self.exposure.uncertainty }
+    }
+
+    /// What the camera should see of a track.
+    fn expectation(&self, track: &Track) -> Option<Expectation> {
+        let seen_from = (&self.exposure.camera, self.known.camera.pose().position());
+        track.expectation(self.exposure.time, seen_from, &self.uncertainty(), self.motion)
+    }
+}
+
+/// What the cameras follow one by one, and how it goes together.
+#[derive(Debug)]
+pub(super) struct Handover {
+    tracking: Tracking,
+    gate: Gate,
+    /// How fast targets are, m/s, standard deviation an axis.
+    speed: f64,
+    pair_s: f64,
+    seen: BTreeMap<CameraName, Vec<Seen>>,
+}
+
+impl Seen {
+    fn first(line: TimedLine, exposure: &Exposure, index: usize) -> Self {
+        let time = exposure.time;
+        Self {
+            sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
+            first: time,
+            line,
+            uncertainty: CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
+            score: 0.0,
+            lines: 1.0,
+            gaps: 0.0,
+            missed: 0.0,
+            readings: Vec::new(),
+        }
+    }
+
+    /// Whether the camera no longer sees it, and has not only missed it a few times; or is silent itself.
+    fn is_lost(&self, now: Timestamp, tracking: &Tracking) -> bool {
+        let share = (self.lines / (self.lines + self.gaps)).min(tracking.detection_probability);
+        let is_silent = now.seconds_since(self.sight.time) > tracking.coasting_after_s;
+        is_silent || self.missed * (1.0 - share).ln() <= LOST
+    }
+
+    /// Whether it is sure to be something, and not the camera's false alarms.
+    fn is_sure(&self, tracking: &Tracking) -> bool {
+        self.score >= tracking.confirm_score
+    }
+
+    /// Where it is expected at a time.
+    fn at(&self, time: Timestamp) -> Sight {
+        let mut sight = self.sight.clone();
+        sight.predict(time, TURNING_DENSITY);
+        sight
+    }
+
+    /// A track of it, in the place where its direction at a time crosses another line; the target may be as
+    /// fast as `speed` (m/s, standard deviation) along the direction.
+    fn placed(
+        &self,
+        camera: &CameraName,
+        (line, time): (&SightLine, Timestamp),
+        speed: f64,
+        motion: &Motion,
+    ) -> Option<Track> {
+        let Self { sight, line: last, uncertainty, .. } = self;
+        let by_now = self.at(time).direction;
+        let [range, there] = passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
+        if range <= 0.0 || there <= 0.0 {
+            return None;
+        }
+        let along = sight.direction.into_inner();
+        let velocity = (sight.rate - along * along.dot(&sight.rate)) * range;
+        let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
+        let [across, along_squared] = [model.basis * model.basis.transpose(), along * along.transpose()];
+        // A range that is off by a share has the place off along the direction, and the velocity by the same share.
+        let scale = stacked(along * range, velocity) * UNKNOWN_LOG_RANGE_SD;
+        let direction_variance = model.covariance_of(&last.line).trace() / 2.0;
+        let (tie, turning) = (sight.tie, sight.rate_variance);
+        let mut covariance = scale * scale.transpose();
+        let mut add = |row: usize, column: usize, block: Matrix3<f64>| {
+            let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
+            view += block;
+        };
+        add(0, 0, across * (direction_variance * range.powi(2)));
+        add(0, 3, across * (tie * range.powi(2)));
+        add(3, 0, across * (tie * range.powi(2)));
+        add(3, 3, across * (turning * range.powi(2)) + along_squared * speed.powi(2));
+        let mean = stacked(last.line.origin.coords + along * range, velocity);
+        let state = KinematicState { mean, covariance };
+        let observability = Observability::unexamined(6);
+        let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
+        let fix = Fix { time: sight.time, state, velocity, solver, observability };
+        Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
+    }
+}
+
+fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
+    let mut both = Vector6::zeros();
+    both.fixed_rows_mut::<3>(0).copy_from(&place);
+    both.fixed_rows_mut::<3>(3).copy_from(&velocity);
+    both
+}
+
+impl Reading {
+    /// Takes the exposure's best line in that is nobody's.
+    fn advance(&mut self, look: &Look<'_>, rules: &Handover) {
+        let Look { exposure, known, is_owned, .. } = *look;
+        let Some(expected) = look.expectation(&self.track) else {
+            return;
+        };
+        let open = exposure.sightings.iter().enumerate().filter(|(i, _)| !is_owned[*i]);
+        let fits =
+            open.filter_map(|(i, sighting)| Some((expected.fit(&sighting.line, rules.gate)?.log_density, i)));
+        if let Some((log_density, index)) = fits.max_by(|a, b| a.0.total_cmp(&b.0)) {
+            self.take(look, index, &expected, log_density - rules.strangers_per_sr(known).ln(), rules);
+        }
+    }
+
+    /// Takes a line in; `None` if the numbers fail.
+    fn take(
+        &mut self,
+        look: &Look<'_>,
+        index: usize,
+        expected: &Expectation,
+        first_ratio: f64,
+        rules: &Handover,
+    ) -> Option<()> {
+        let Look { exposure, motion, .. } = *look;
+        let Exposure { camera, time, uncertainty, sightings, .. } = exposure;
+        let line = &sightings[index].line;
+        let density = motion.density(self.track.model_probabilities());
+        self.track.measurement_update(camera, line, (*time, &look.uncertainty()), motion)?;
+        self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
+        let timed = (line, *time, uncertainty.time_sd_s);
+        match expected {
+            Expectation::Near(prediction) => {
+                self.coincidence.see(camera, timed, prediction, (density, rules.speed), first_ratio);
+            }
+            Expectation::Along { .. } => {
+                let range = (self.track.state().position() - line.origin).norm();
+                self.coincidence.see_first(camera, (line, *time), rules.speed / range, first_ratio);
+            }
+        }
+        self.newest = (camera.clone(), exposure.sequence, index);
+        Some(())
+    }
+
+    fn ratio(&self) -> f64 {
+        self.coincidence.log_ratio().unwrap_or(f64::NEG_INFINITY)
+    }
+}
+
+impl Handover {
+    pub(super) fn new(config: &FusionConfig) -> Self {
+        Self {
+            gate: Gate::with_probability(config.tracking.gate_probability),
+            tracking: config.tracking.clone(),
+            speed: config.initiation.velocity_prior_sd_mps,
+            pair_s: config.initiation.pair_s,
+            seen: BTreeMap::new(),
+        }
+    }
+
+    /// Forgets what a camera has followed.
+    pub(super) fn forget_camera(&mut self, camera: &CameraName) {
+        self.seen.remove(camera);
+    }
+
+    /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks that are sure now.
+    pub(super) fn see(
+        &mut self,
+        exposure: &Exposure,
+        used: &[(usize, TrackId)],
+        known: &KnownCamera,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        let mut is_owned = vec![false; exposure.sightings.len()];
+        used.iter().for_each(|(index, _)| is_owned[*index] = true);
+        let look = Look { exposure, known, motion, is_owned: &is_owned };
+        self.forget(exposure.time);
+        let begun = self.follow(&look);
+        self.advance(&look);
+        self.cross(&look, &begun);
+        self.settle()
+    }
+
+    /// Forgets what no camera has seen for as long as a track would be kept, and what was never sure at once.
+    fn forget(&mut self, now: Timestamp) {
+        let (tracking, pair_s) = (&self.tracking, self.pair_s);
+        let lost_after_s = tracking.lost_after_s;
+        for seen in self.seen.values_mut() {
+            for one in seen.iter_mut() {
+                one.readings.retain(|reading| {
+                    now.seconds_since(reading.track.updated) <= lost_after_s && reading.ratio() > GIVEN_UP
+                });
+            }
+            seen.retain(|one| {
+                let silent_s = now.seconds_since(one.sight.time);
+                if one.is_sure(tracking) {
+                    silent_s <= lost_after_s || !one.readings.is_empty()
+                } else {
+                    silent_s <= pair_s || !one.is_lost(now, tracking)
+                }
+            });
+        }
+    }
+
+    /// Goes on with what the exposure's camera follows; returns the lines (by index) of what it has begun to follow
+    /// not long ago, with when.
+    fn follow(&mut self, look: &Look<'_>) -> Vec<(usize, Timestamp)> {
+        let Look { exposure, is_owned, .. } = *look;
+        let factor = exposure.uncertainty.factor;
+        let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
+        let seen = self.seen.entry(exposure.camera.clone()).or_default();
+        let mut taken = vec![false; with_pose.len()];
+        let (gate, mut begun, mut explained) = (self.gate, Vec::new(), BTreeSet::new());
+        for (place, one) in seen.iter_mut().enumerate() {
+            let sight = one.at(exposure.time);
+            let near = exposure.sightings.iter().enumerate().take(taken.len()).filter(|(i, _)| !taken[*i]);
+            let fits =
+                near.filter_map(|(i, sighting)| Some((sight.density(&sighting.line, factor, gate)?, i)));
+            let Some((log_density, index)) = fits.max_by(|a, b| a.0.total_cmp(&b.0)) else {
+                one.missed += 1.0;
+                continue;
+            };
+            taken[index] = true;
+            if is_owned[index] || exposure.sightings[index].rooted == Rooted::Yes {
+                explained.insert(place);
+                continue;
+            }
+            one.score = (one.score + log_density - exposure.clutter_per_sr.ln())
+                .min(2.0 * self.tracking.confirm_score);
+            one.sight = sight;
+            one.sight.update(&exposure.sightings[index].line);
+            one.gaps += std::mem::take(&mut one.missed);
+            (one.line, one.lines) = (with_pose[index].clone(), one.lines + 1.0);
+            begun.push((index, one.first));
+        }
+        let mut place = 0..;
+        seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
+        for (index, line) in with_pose.into_iter().enumerate() {
+            let is_open =
+                !taken[index] && !is_owned[index] && exposure.sightings[index].rooted != Rooted::Yes;
+            if is_open && seen.len() < MAX_SEEN {
+                seen.push(Seen::first(line, exposure, index));
+            }
+        }
+        begun
+    }
+
+    /// Goes on with the readings that the exposure's lines may be part of.
+    fn advance(&mut self, look: &Look<'_>) {
+        let mut all = std::mem::take(&mut self.seen);
+        for reading in all.values_mut().flatten().flat_map(|one| &mut one.readings) {
+            reading.advance(look, self);
+        }
+        self.seen = all;
+    }
+
+    /// Tries what other cameras have lost sight of with what this one has begun to see since.
+    fn cross(&mut self, look: &Look<'_>, begun: &[(usize, Timestamp)]) {
+        let Look { exposure, known, motion, is_owned } = *look;
+        let now = exposure.time;
+        let mut all = std::mem::take(&mut self.seen);
+        let others = all.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
+        let lost = others.flat_map(|(camera, seen)| seen.iter_mut().map(move |one| (camera, one)));
+        let mut lost: Vec<(&CameraName, &mut Seen)> = lost
+            .filter(|(_, one)| {
+                let silent_s = now.seconds_since(one.sight.time);
+                one.is_sure(&self.tracking)
+                    && one.is_lost(now, &self.tracking)
+                    && (self.pair_s..=self.tracking.lost_after_s).contains(&silent_s)
+            })
+            .collect();
+        lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
+        for (camera, one) in lost.into_iter().take(MAX_LOST) {
+            let since = begun.iter().filter(|(_, first)| one.sight.time.seconds_since(*first) < TOGETHER_S);
+            for &(index, _) in since.filter(|(index, _)| !is_owned[*index]) {
+                let name = (exposure.camera.clone(), exposure.sequence, index);
+                let is_read = one.readings.iter().any(|reading| reading.newest == name);
+                if is_read || one.readings.len() >= MAX_READINGS {
+                    continue;
+                }
+                let line = &exposure.sightings[index].line;
+                let reading = one.placed(camera, (line, now), self.speed, motion).and_then(|track| {
+                    let unlikely = track.state().velocity().norm_squared() / (2.0 * self.speed.powi(2));
+                    let expected = look.expectation(&track)?;
+                    let fit = expected.fit(line, self.gate)?;
+                    let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known)) - unlikely;
+                    let coincidence = Coincidence::of_one(camera, one.sight.clone());
+                    let mut reading = Reading { track: Box::new(track), coincidence, newest: name };
+                    reading.take(look, index, &expected, ratio, self)?;
+                    (reading.ratio() > GIVEN_UP).then_some(reading)
+                });
+                one.readings.extend(reading);
+            }
+        }
+        self.seen = all;
+    }
+
+    /// The readings that are sure, each of which settles what becomes of the lines that began it.
+    fn settle(&mut self) -> Vec<Start> {
+        let mut starts = Vec::new();
+        let all: Vec<(f64, LineId)> = self
+            .seen
+            .values()
+            .flatten()
+            .flat_map(|one| &one.readings)
+            .map(|r| (r.ratio(), r.newest.clone()))
+            .collect();
+        for seen in self.seen.values_mut() {
+            seen.retain(|one| {
+                let best = one.readings.iter().max_by(|a, b| a.ratio().total_cmp(&b.ratio()));
+                let Some(best) = best.filter(|best| best.ratio() >= MARGIN && best.track.is_placed()) else {
+                    return true;
+                };
+                let rival = |ratio: f64| ratio > best.ratio() - MARGIN;
+                let own = one.readings.iter().filter(|other| rival(other.ratio())).count();
+                let others =
+                    all.iter().filter(|(ratio, newest)| *newest == best.newest && rival(*ratio)).count();
+                if own > 1 || others > 1 {
+                    return true;
+                }
+                let mut track = Track::clone(&best.track);
+                track.status = TrackStatus::Confirmed;
+                track.score = one.score;
+                track.observe();
+                starts.push(Start { track, cameras: 2, claimed_by: BTreeSet::new() });
+                false
+            });
+        }
+        starts
+    }
+
+    /// How many other targets a camera sees, 1/sr: one, as nothing else is known.
+    fn strangers_per_sr(&self, known: &KnownCamera) -> f64 {
+        1.0 / view_sr(known)
+    }
+}

@@ -1,0 +1,112 @@
+//! What one camera alone sees of a target: a direction that turns.
+
+use std::f64::consts::PI;
+
+use crossfix_filter::Gate;
+use crossfix_geometry::SightLine;
+use crossfix_message::Timestamp;
+use nalgebra::{Matrix2, Unit, Vector3};
+
+use crate::prediction::{BearingPrediction, log_density};
+
+/// What it counts that noise is as reported, in coordinates of bearings (two each).
+const PRIOR_COORDINATES: f64 = 10.0;
+
+/// A line as one camera alone goes on with it: a direction that turns evenly.
+#[derive(Clone, Debug)]
+pub(super) struct Sight {
+    pub(super) direction: Unit<Vector3<f64>>,
+    /// How fast the direction turns, rad/s.
+    pub(super) rate: Vector3<f64>,
+    /// Variances of the direction (rad^2) and its rate (rad^2/s^2) along each tangent, and their
+    /// covariance.
+    pub(super) variance: f64,
+    pub(super) rate_variance: f64,
+    pub(super) tie: f64,
+    pub(super) time: Timestamp,
+    /// What pose and clock shift all bearings of the camera by, as far as is known (rad, world), and
+    /// its variance along each tangent once the first prediction has told it.
+    shift: Vector3<f64>,
+    pub(super) shift_variance: Option<f64>,
+    /// Squared innovations by what the reported noise lets expect, and how many coordinates these are.
+    squares: f64,
+    coordinates: f64,
+}
+
+impl Sight {
+    /// A first line, of a target that may move across it at `rate_sd` (rad/s).
+    pub(super) fn first(line: &SightLine, time: Timestamp, rate_sd: f64) -> Self {
+        Self {
+            direction: line.direction,
+            rate: Vector3::zeros(),
+            variance: line.covariance.trace() / 2.0,
+            rate_variance: rate_sd.powi(2),
+            tie: 0.0,
+            time,
+            shift: Vector3::zeros(),
+            shift_variance: None,
+            squares: PRIOR_COORDINATES,
+            coordinates: PRIOR_COORDINATES,
+        }
+    }
+
+    /// Where the line is expected at a time; `density` is that of the white acceleration that drives
+    /// it, rad^2/s^3.
+    pub(super) fn predict(&mut self, time: Timestamp, density: f64) {
+        let dt = time.seconds_since(self.time);
+        self.direction = Unit::new_normalize(self.direction.into_inner() + self.rate * dt);
+        // A clock's correction may take it back in time: that makes it no surer.
+        let noise = density * dt.abs();
+        self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + noise * dt * dt / 3.0;
+        self.tie += dt * self.rate_variance + noise * dt / 2.0;
+        self.rate_variance += noise;
+        self.time = time;
+    }
+
+    /// How much likelier (logarithm) a line is where the target of all cameras is predicted than where
+    /// this camera alone expects it; learns the camera's shift.
+    pub(super) fn log_ratio(&mut self, line: &SightLine, prediction: &BearingPrediction) -> Option<f64> {
+        let to_tangents = prediction.basis().transpose();
+        let noise = prediction.noise_of(line) * self.factor();
+        let seen = to_tangents * line.direction.into_inner();
+        let own = noise + Matrix2::identity() * self.variance;
+        let alone = log_density(&own, seen - to_tangents * self.direction.into_inner())?;
+        let (spread, common) = prediction.spreads();
+        let variance = *self.shift_variance.get_or_insert(common.trace() / 2.0);
+        let spread = spread + noise + Matrix2::identity() * variance;
+        let off = seen - to_tangents * self.shift;
+        let together = log_density(&spread, off)?;
+        let gain = variance / (spread.trace() / 2.0);
+        self.shift += prediction.basis() * off * gain;
+        self.shift_variance = Some(variance * (1.0 - gain));
+        Some(together - alone)
+    }
+
+    /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times; `None` if it lies
+    /// outside the gate.
+    pub(super) fn density(&self, line: &SightLine, factor: f64, gate: Gate) -> Option<f64> {
+        let variance = self.variance + line.covariance.trace() / 2.0 * factor.max(self.factor());
+        let squared = (line.direction.into_inner() - self.direction.into_inner()).norm_squared() / variance;
+        gate.holds(squared).then(|| -squared / 2.0 - (2.0 * PI * variance).ln())
+    }
+
+    pub(super) fn update(&mut self, line: &SightLine) {
+        let reported = line.covariance.trace() / 2.0;
+        let off = line.direction.into_inner() - self.direction.into_inner();
+        self.squares += off.norm_squared() / (self.variance + reported);
+        self.coordinates += 2.0;
+        let spread = self.variance + reported * self.factor();
+        let (gain, rate_gain) = (self.variance / spread, self.tie / spread);
+        self.direction = Unit::new_normalize(self.direction.into_inner() + off * gain);
+        self.rate += off * rate_gain;
+        self.rate_variance -= rate_gain * self.tie;
+        self.tie -= gain * self.tie;
+        self.variance -= gain * self.variance;
+    }
+
+    /// How many times the lines' reported covariances count, as far as these have shown: where noise is larger than
+    /// it says, every small difference would pass for evidence.
+    fn factor(&self) -> f64 {
+        (self.squares / self.coordinates).max(1.0)
+    }
+}
