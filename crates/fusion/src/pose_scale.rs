@@ -121,7 +121,11 @@ impl PoseScales {
                 let own = scale.value * step.min(most);
                 let next = own + (typical.exp() - own) * ALIKE;
                 let next = next.clamp(scale.value / LARGEST_STEP, scale.value * LARGEST_STEP);
-                scale.value = next.clamp(scale.least, scale.greatest);
+                let next = next.clamp(scale.least, scale.greatest);
+                // What has been found so far is less by the new factor: not at all where noise hides the pose, and
+                // inversely to it where the pose is all. Held against the old one, an error would count ten times.
+                scale.found /= (next / scale.value).max(1.0).sqrt();
+                scale.value = next;
                 let ratio = scale.value / scale.told;
                 if ratio.ln().abs() > NOTICED {
                     scale.told = scale.value;

@@ -192,9 +192,7 @@ impl Track {
         by.fixed_view_mut::<2, 3>(0, 3).copy_from(&(model.by_position() * dt));
         // The least-squares solution errs by -P H' R^-1 times the error of the line.
         let covariance = -(fix.state.covariance * by.transpose() * inverse * shifts);
-        let visibility = Visibility::seen(*time);
-        self.ties
-            .insert(camera.clone(), Ties { covariance, visibility, seen: Some(*time), ..Ties::new(*time) });
+        self.ties.insert(camera.clone(), Ties::begun(*time, covariance));
         self.information += by.transpose() * inverse * by;
         Some(())
     }

@@ -5,10 +5,14 @@
 
 mod common;
 
-use common::{Scene, eye, found, fusion_of, site, straight};
+use common::{Eye, Scene, eye, found, fusion_of, site, straight};
 use crossfix_fusion::{CameraStanding, ClockEstimate, Clocks, Fusion, FusionConfig};
-use crossfix_message::{BearingFrame, CameraName, Timestamp};
-use nalgebra::{Matrix6, Point3};
+use crossfix_geometry::{Camera, Pose};
+use crossfix_message::{BearingFrame, CameraCalibration, CameraName, Timestamp};
+use nalgebra::{Matrix6, Point3, Rotation3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 /// A clock that is wrong: ahead by so much at time 0, and gaining.
 #[derive(Clone, Copy)]
@@ -107,7 +111,7 @@ fn a_trusted_camera_sets_the_time_of_the_others() {
 }
 
 /// Five cameras, so that one of them can be outvoted.
-fn five() -> Vec<common::Eye> {
+fn five() -> Vec<Eye> {
     let middle = [0.0, 0.0, 40.0];
     let mut eyes = site();
     eyes.push(eye("d", [-40.0, 150.0, 4.0], middle, 0.015));
@@ -124,8 +128,8 @@ fn a_camera_that_was_knocked_is_left_out_and_comes_back_when_it_is_straightened(
         let time = frame.capture_time_ns as f64 / 1e9;
         if frame.camera == "b" && (15.0..35.0).contains(&time) {
             for track in &mut frame.tracks {
-                let turned = nalgebra::Rotation3::from_euler_angles(0.0, 0.02, 0.0)
-                    * nalgebra::Vector3::from(track.bearing.unwrap());
+                let turned =
+                    Rotation3::from_euler_angles(0.0, 0.02, 0.0) * Vector3::from(track.bearing.unwrap());
                 track.bearing = Some(turned.into());
             }
         }
@@ -167,24 +171,29 @@ fn a_camera_worse_than_it_says_counts_less() {
     assert!(others.clone().all(|report| report.standing == CameraStanding::Good), "{reports:?}");
 }
 
+/// The calibration of a camera whose pose is off by deviations of its rotation (rad) and place (m) along each axis.
+fn wrongly_posed(
+    eye: &Eye,
+    (rotation_sd, position_sd): (f64, f64),
+    rng: &mut ChaCha8Rng,
+) -> CameraCalibration {
+    let mut normal = |sd: f64| Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(rng) }) * sd;
+    let pose = eye.camera.pose();
+    let rotation = *(pose.rotation() * Rotation3::new(normal(rotation_sd))).matrix();
+    let wrong = Pose::new(rotation, pose.position() + normal(position_sd)).unwrap();
+    let camera = Camera::new(*eye.camera.model().intrinsics(), wrong).unwrap();
+    CameraCalibration::new(&eye.name, &camera, Timestamp::EPOCH)
+}
+
 /// Mean NEES over runs in each of which the poses are off by what their calibrations say.
 fn nees_with_wrong_poses(runs: u32, rotation_sd: f64, position_sd: f64) -> f64 {
     let scene = Scene::new(vec![straight([-40.0, 30.0, 50.0], [8.0, -6.0, 0.5])], 8.0);
     let mut sum = 0.0;
     for run in 0..runs {
         let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
-        let mut rng: rand_chacha::ChaCha8Rng = rand::SeedableRng::seed_from_u64(u64::from(run));
-        let mut normal =
-            || -> f64 { rand_distr::Distribution::sample(&rand_distr::StandardNormal, &mut rng) };
+        let mut rng = ChaCha8Rng::seed_from_u64(u64::from(run));
         for eye in &scene.eyes {
-            let pose = eye.camera.pose();
-            let turn = nalgebra::Rotation3::new(nalgebra::Vector3::from_fn(|_, _| rotation_sd * normal()));
-            let step = nalgebra::Vector3::from_fn(|_, _| position_sd * normal());
-            let rotation = *(pose.rotation() * turn).matrix();
-            let wrong = crossfix_geometry::Pose::new(rotation, pose.position() + step).unwrap();
-            let intrinsics = *eye.camera.model().intrinsics();
-            let camera = crossfix_geometry::Camera::new(intrinsics, wrong).unwrap();
-            let message = crossfix_message::CameraCalibration::new(&eye.name, &camera, Timestamp::EPOCH);
+            let message = wrongly_posed(eye, (rotation_sd, position_sd), &mut rng);
             fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();
         }
         let mut outputs = Vec::new();
@@ -215,4 +224,43 @@ fn the_uncertainty_of_poses_is_in_the_covariance_however_many_bearings_there_are
     // makes it a little careful.
     let standard_error = (6.0 / f64::from(runs)).sqrt();
     assert!((2.0..3.0 + 3.0 * standard_error).contains(&nees), "{nees}");
+}
+
+#[test]
+fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_are_worse_than_they_say() {
+    let mut squares = Vec::new();
+    for seed in 0..30 {
+        let mut rng = ChaCha8Rng::seed_from_u64(100 + seed);
+        let mut scene = Scene::new(vec![circling()], 25.0);
+        scene.eyes.push(eye("d", [-70.0, 130.0, 4.0], [0.0, 0.0, 40.0], 0.05));
+        let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
+        for eye in &scene.eyes {
+            // A metre off along each axis, and nobody says so.
+            fusion.calibrate(&wrongly_posed(eye, (0.0, 1.0), &mut rng)).unwrap();
+        }
+        for frame in scene.frames(seed) {
+            fusion.ingest(&frame);
+        }
+        let tracks: Vec<_> = fusion.tracks().filter(|track| track.is_confirmed()).collect();
+        let [track] = tracks[..] else {
+            // Lines that miss each other by too much for any two begin no track; two pairs of cameras may each have
+            // one that fits them.
+            assert_eq!(
+                tracks.is_empty(),
+                fusion.why_nothing().is_some(),
+                "seed {seed}: nothing found is said"
+            );
+            continue;
+        };
+        let lately = |time: Timestamp| track.updated.seconds_since(time) < 1.0;
+        let cameras = track.residuals.values().filter(|residual| lately(residual.time)).count();
+        assert!(cameras >= 3, "seed {seed}: {cameras} cameras agree");
+        let error = track.state().position() - circling()(track.updated.seconds()).unwrap();
+        assert!(error.norm() < 2.0, "seed {seed}: {error}");
+        squares.push(error.dot(&(track.state().position_covariance().try_inverse().unwrap() * error)));
+    }
+    squares.sort_by(f64::total_cmp);
+    assert!(squares.len() >= 15, "{squares:?}");
+    // Three degrees of freedom, and a median of 2.4 where the poses were known to be what they are.
+    assert!(squares[squares.len() / 2] < 20.0, "{squares:?}");
 }

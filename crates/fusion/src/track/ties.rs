@@ -23,6 +23,13 @@ const HOLDING_PERIODS: f64 = 1.5;
 /// ... where these lay no further apart than so many times what a bearing holds a track for.
 const LONGEST_PERIOD: f64 = 2.0;
 
+/// Something beside a target is steady if it moves by less than this share of how far away it is from draw to draw, ...
+const STEADY: f64 = 0.2;
+/// ... for so many draws, a second and a half. With half of it what flies by in the same direction is taken for the target.
+const STEADY_DRAWS: u32 = 5;
+/// So many cameras must have it beside the target: one may be turned, and it is for the others to accuse it.
+const LEAST_BESIDE: usize = 2;
+
 /// What ties a track to the shared errors of a camera that has seen it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Ties {
@@ -31,11 +38,15 @@ pub(super) struct Ties {
     /// Whether the camera can see the target, when it was exposed last.
     pub(super) visibility: Visibility,
     /// When it gave the track its last bearing, ...
-    pub(super) seen: Option<Timestamp>,
+    seen: Option<Timestamp>,
     /// ... and how long after the one before, s.
-    pub(super) period_s: f64,
+    period_s: f64,
     pub(super) last_three: LastThree,
     pub(super) drawn: Option<Drawn>,
+    /// The same of what it has seen beside the target, where it has not seen that.
+    beside: Option<Drawn>,
+    /// Where that was in the last draw (rad), and for how many draws it has been there.
+    steady: (Vector2<f64>, u32),
 }
 
 /// What a camera has seen of the target since the last draw: see [`crate::pose_scale`].
@@ -49,7 +60,48 @@ pub(super) struct Drawn {
     pose: Matrix2<f64>,
 }
 
+impl Drawn {
+    /// What is gathered with one bearing more.
+    fn with(
+        before: Option<Self>,
+        innovation: &Innovation,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+    ) -> Self {
+        let (offsets, count) = before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
+        Self {
+            offsets: offsets + innovation.offset,
+            count: count + 1.0,
+            by_position: innovation.model.by_position(),
+            noise: innovation.model.covariance_of(line) * uncertainty.factor,
+            pose: uncertainty.declared_pose(&innovation.model),
+        }
+    }
+
+    /// The mean, of a target whose velocity is known to `speed`, m/s.
+    fn sample(self, camera: &CameraName, speed: f64) -> Sample {
+        let moved = self.by_position * (speed * DRAW_S / 10.0);
+        Sample {
+            camera: camera.clone(),
+            offset: self.offsets / self.count,
+            by_position: self.by_position,
+            noise: self.noise / self.count + moved * moved.transpose(),
+            pose: self.pose,
+        }
+    }
+}
+
 impl Ties {
+    /// What the camera has seen beside the target since the last draw, if it has long been in the same place.
+    fn steady_beside(&mut self) -> Option<Drawn> {
+        let beside = self.beside.take().filter(|_| self.drawn.is_none());
+        let place = beside.map(|drawn| drawn.offsets / drawn.count);
+        let (before, draws) = self.steady;
+        let stays = place.is_some_and(|place| (place - before).norm() < STEADY * before.norm());
+        self.steady = place.map_or((Vector2::zeros(), 0), |place| (place, if stays { draws + 1 } else { 0 }));
+        beside.filter(|_| self.steady.1 >= STEADY_DRAWS)
+    }
+
     pub(super) fn new(time: Timestamp) -> Self {
         Self {
             covariance: Matrix6x3::zeros(),
@@ -58,7 +110,14 @@ impl Ties {
             period_s: 0.0,
             last_three: LastThree::default(),
             drawn: None,
+            beside: None,
+            steady: (Vector2::zeros(), 0),
         }
+    }
+
+    /// Of a camera that has given the bearing with which the track begins.
+    pub(super) fn begun(time: Timestamp, covariance: Matrix6x3<f64>) -> Self {
+        Self { covariance, visibility: Visibility::seen(time), seen: Some(time), ..Self::new(time) }
     }
 
     /// All clocks have stepped by so much, s.
@@ -104,20 +163,26 @@ impl Track {
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) {
-        let own = innovation.model.covariance_of(line);
         if let Some(ties) = self.ties.get_mut(camera) {
-            let before = ties.drawn.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
-            ties.drawn = Some(Drawn {
-                offsets: before.0 + innovation.offset,
-                count: before.1 + 1.0,
-                by_position: innovation.model.by_position(),
-                noise: own * uncertainty.factor,
-                pose: uncertainty.declared_pose(&innovation.model),
-            });
+            ties.drawn = Some(Drawn::with(ties.drawn, innovation, line, uncertainty));
         }
     }
 
-    /// What the cameras have seen of the target since the last draw, if it is time for the next.
+    /// Keeps a bearing for the next draw that a camera has beside the target, and none of it.
+    pub(crate) fn gather_beside(
+        &mut self,
+        camera: &CameraName,
+        (line, time): (&SightLine, Timestamp),
+        uncertainty: &CameraUncertainty,
+    ) {
+        if let (Some(innovation), Some(ties)) = (self.innovation(time, line), self.ties.get_mut(camera)) {
+            ties.beside = Some(Drawn::with(ties.beside, &innovation, line, uncertainty));
+        }
+    }
+
+    /// What the cameras have seen of the target since the last draw, if it is time for the next. Where as many
+    /// cameras as see it have long had something beside it in the same place, it is the target, and the poses are
+    /// worse than they say.
     pub(crate) fn draw(&mut self) -> Vec<Sample> {
         if self.updated.seconds_since(self.drawn) < DRAW_S {
             return Vec::new();
@@ -125,18 +190,18 @@ impl Track {
         self.drawn = self.updated;
         // Cameras see it at other times within a draw: a velocity that is not known moves it in between.
         let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
-        let drawn = self.ties.iter_mut().filter_map(|(camera, ties)| Some((camera, ties.drawn.take()?)));
-        let sample = |(camera, drawn): (&CameraName, Drawn)| {
-            let moved = drawn.by_position * (speed * DRAW_S / 10.0);
-            Sample {
-                camera: camera.clone(),
-                offset: drawn.offsets / drawn.count,
-                by_position: drawn.by_position,
-                noise: drawn.noise / drawn.count + moved * moved.transpose(),
-                pose: drawn.pose,
+        let (mut samples, mut beside) = (Vec::new(), Vec::new());
+        for (camera, ties) in &mut self.ties {
+            let steady = ties.steady_beside();
+            match ties.drawn.take() {
+                Some(drawn) => samples.push(drawn.sample(camera, speed)),
+                None => beside.extend(steady.map(|drawn| drawn.sample(camera, speed))),
             }
-        };
-        drawn.map(sample).collect()
+        }
+        if beside.len() >= samples.len().max(LEAST_BESIDE) {
+            samples.extend(beside);
+        }
+        samples
     }
 
     /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances): what they

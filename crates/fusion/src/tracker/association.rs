@@ -59,6 +59,9 @@ impl Tracker {
             });
             let gain = taken.and(column).and_then(|column| gains.get(&(row, column))).copied();
             let sees = known.expects(track.position_at(exposure.time), self.max_range_m);
+            if sure && taken.is_none() && track.is_held() {
+                note_beside(track, exposure, known);
+            }
             if sure && (taken.is_some() || sees) {
                 let others = track.others_than(&exposure.camera, &self.motion);
                 noted.fittings.add(others, fitting(track, exposure, known, taken.is_some()));
@@ -127,6 +130,16 @@ impl Tracker {
             }
         }
         candidates
+    }
+}
+
+/// Keeps the line that passes nearest to a track, of an exposure that has none of it.
+fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
+    let expected = track.position_at(exposure.time) - known.camera.pose().position();
+    let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
+    let beside = exposure.sightings.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
+    if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
+        track.gather_beside(&exposure.camera, (&nearest.line, exposure.time), &exposure.uncertainty);
     }
 }
 
