@@ -17,12 +17,24 @@ pub(crate) struct BearingPrediction {
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
     steady: Matrix2<f64>,
-    /// What of this poses and clocks add, which is the same in many bearings, rad^2.
-    common: Matrix2<f64>,
+    /// What poses and clocks of the camera shift all its bearings by, rad^2, and how that goes with the track's error.
+    shift: Matrix2<f64>,
+    cross: Matrix2<f64>,
     /// What each model's process noise adds along both tangents, rad^2, and its probability.
     added: ModelWeights,
     weights: ModelWeights,
     widest: f64,
+}
+
+/// A bearing against a prediction, with what its camera shifts all of its bearings by apart, along the tangents.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct GivenShift {
+    /// Covariance of the shift, rad^2.
+    pub(crate) shift: Matrix2<f64>,
+    /// What of a shift the bearing is off by: the track has taken the rest of it in.
+    pub(crate) left: Matrix2<f64>,
+    /// Covariance of the rest, rad^2.
+    pub(crate) spread: Matrix2<f64>,
 }
 
 /// How a bearing fits a prediction.
@@ -54,6 +66,7 @@ impl BearingPrediction {
         let common =
             shifts * shifts.transpose() + uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
         let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
+        let shift = shifts * shifts.transpose();
         let steady = by * state.position_covariance() * by.transpose() + cross + cross.transpose() + common;
         let range = model.range;
         let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
@@ -65,7 +78,8 @@ impl BearingPrediction {
             model,
             factor: uncertainty.factor,
             steady,
-            common,
+            shift,
+            cross,
             added,
             weights: imm.predicted_probabilities(interval, models),
             widest: models.widest() * spread,
@@ -81,8 +95,8 @@ impl BearingPrediction {
             + Matrix2::identity() * (moved / model.range).powi(2);
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
-        let (common, added) = (Matrix2::zeros(), [0.0; MAX_MODELS]);
-        Some(Self { model, factor: 1.0, steady, common, added, weights, widest: 0.0 })
+        let (shift, cross, added) = (Matrix2::zeros(), Matrix2::zeros(), [0.0; MAX_MODELS]);
+        Some(Self { model, factor: 1.0, steady, shift, cross, added, weights, widest: 0.0 })
     }
 
     /// Range of the target, m.
@@ -95,16 +109,15 @@ impl BearingPrediction {
         &self.model.basis
     }
 
-    /// Covariance of the predicted direction without what pose and clock of the camera add, and that,
-    /// rad^2.
-    pub(crate) fn spreads(&self) -> (Matrix2<f64>, Matrix2<f64>) {
+    /// What a bearing is expected to be off by, where what the camera shifts all of its own by is known.
+    pub(crate) fn given_shift(&self, line: &SightLine, least_factor: f64) -> GivenShift {
         let added: f64 = self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
-        (self.steady - self.common + Matrix2::identity() * added, self.common)
-    }
-
-    /// Covariance of a bearing, rad^2.
-    pub(crate) fn noise_of(&self, line: &SightLine) -> Matrix2<f64> {
-        self.model.covariance_of(line) * self.factor
+        let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
+        // Of the shift s the track has taken C V^-1 s in, with C the covariance of the two and V the shift's.
+        let taken = self.shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| self.cross * inverse);
+        let left = Matrix2::identity() + taken;
+        let spread = self.steady - left * self.shift * left.transpose();
+        GivenShift { shift: self.shift, left, spread: spread + noise + Matrix2::identity() * added }
     }
 
     /// How a bearing fits; `None` if it lies outside the gate.
@@ -115,7 +128,7 @@ impl BearingPrediction {
         if innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
-        let spread = self.steady + self.noise_of(line);
+        let spread = self.steady + self.model.covariance_of(line) * self.factor;
         let gate_distance = distance(&spread, self.widest, innovation)?.0;
         if !gate.holds(gate_distance) {
             return None;
@@ -143,7 +156,8 @@ fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Opti
     let determinant = xx * yy - xy * xy;
     let squared =
         (yy * vector.x * vector.x - 2.0 * xy * vector.x * vector.y + xx * vector.y * vector.y) / determinant;
-    (determinant > 0.0 && squared.is_finite()).then_some((squared, determinant))
+    // Of a matrix that is less than nothing the determinant is positive too.
+    (determinant > 0.0 && xx > 0.0 && squared.is_finite()).then_some((squared, determinant))
 }
 
 #[cfg(test)]

@@ -80,8 +80,8 @@ impl Coincidence {
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
         // What an unsure clock shifts a bearing by is not known before the velocity is.
         let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
-        let shift = sight.shift_variance.map_or(clock, |variance| variance.max(clock));
-        self.vague |= shift > VAGUE * line.covariance.trace() / 2.0;
+        let pose = sight.shift_variance();
+        self.vague |= pose.max(clock) > VAGUE * line.covariance.trace() / 2.0;
         sight.update(line);
     }
 

@@ -11,6 +11,7 @@ use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
+use crate::rooted::Rooted;
 use crate::spatial::{Fix, Observability, VelocityKnowledge};
 use crate::temporal::LineId;
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
@@ -31,9 +32,6 @@ const LEAST_SCORE: f64 = -12.0;
 /// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
 /// nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
-/// What several cameras see is one target if that is so many times (logarithm) likelier than that
-/// each sees another.
-const COINCIDENCE_MARGIN: f64 = 5.0;
 /// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
 const MAX_HYPOTHESES: usize = 6_000;
 
@@ -156,7 +154,8 @@ impl Hypotheses {
         self.begin(seeds, exposures, motion);
         self.prune();
         let now = exposures.last().map(|exposure| exposure.time);
-        now.map_or_else(Vec::new, |now| self.confirm(now, motion))
+        let pairs = logarithm_of_pairs(exposures);
+        now.map_or_else(Vec::new, |now| self.confirm(now, pairs, motion))
     }
 
     /// Lets every hypothesis go on with each bearing in its gate, and without any.
@@ -300,8 +299,9 @@ impl Hypotheses {
         self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
-    /// The best hypotheses without common lines that are likely enough and have no rival.
-    fn confirm(&mut self, now: Timestamp, motion: &Motion) -> Vec<Start> {
+    /// The best hypotheses without common lines that are likely enough and have no rival. One target must be likelier
+    /// than that each camera sees another by the number of pairs of lines of which it may be so by chance.
+    fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &Motion) -> Vec<Start> {
         // The best come first, and the others are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));
@@ -314,7 +314,7 @@ impl Hypotheses {
                 let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
                     && hypothesis.track.is_placed();
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= COINCIDENCE_MARGIN);
+                let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= pairs);
                 let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
@@ -345,4 +345,17 @@ impl Hypotheses {
         let claimed_by = hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
         Start { track, cameras: hypothesis.cameras().len(), claimed_by }
     }
+}
+
+/// How many pairs there are of what two cameras see and is not rooted, where they see most; the logarithm.
+fn logarithm_of_pairs(exposures: &[&Exposure]) -> f64 {
+    let mut lines: BTreeMap<&CameraName, usize> = BTreeMap::new();
+    for exposure in exposures {
+        let count = exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes).count();
+        let most = lines.entry(&exposure.camera).or_default();
+        *most = count.max(*most);
+    }
+    let mut counts: Vec<usize> = lines.into_values().collect();
+    counts.sort_unstable();
+    counts.iter().rev().take(2).map(|&count| (count.max(1) as f64).ln()).sum()
 }

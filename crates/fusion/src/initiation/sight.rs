@@ -7,7 +7,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Unit, Vector3};
 
-use crate::prediction::{BearingPrediction, log_density};
+use crate::prediction::{BearingPrediction, GivenShift, log_density};
 
 /// What it counts that noise is as reported, in coordinates of bearings (two each).
 const PRIOR_COORDINATES: f64 = 10.0;
@@ -24,10 +24,10 @@ pub(super) struct Sight {
     pub(super) rate_variance: f64,
     pub(super) tie: f64,
     pub(super) time: Timestamp,
-    /// What pose and clock shift all bearings of the camera by, as far as is known (rad, world), and
-    /// its variance along each tangent once the first prediction has told it.
+    /// What the pose shifts all bearings of the camera by, as far as is known (rad, world), and its covariance along
+    /// the tangents once the first prediction has told it.
     shift: Vector3<f64>,
-    pub(super) shift_variance: Option<f64>,
+    shift_covariance: Option<Matrix2<f64>>,
     /// Squared innovations by what the reported noise lets expect, and how many coordinates these are.
     squares: f64,
     coordinates: f64,
@@ -44,7 +44,7 @@ impl Sight {
             tie: 0.0,
             time,
             shift: Vector3::zeros(),
-            shift_variance: None,
+            shift_covariance: None,
             squares: PRIOR_COORDINATES,
             coordinates: PRIOR_COORDINATES,
         }
@@ -64,22 +64,28 @@ impl Sight {
     }
 
     /// How much likelier (logarithm) a line is where the target of all cameras is predicted than where
-    /// this camera alone expects it; learns the camera's shift.
+    /// this camera alone expects it; learns the camera's shift, which is the same in all its lines.
     pub(super) fn log_ratio(&mut self, line: &SightLine, prediction: &BearingPrediction) -> Option<f64> {
         let to_tangents = prediction.basis().transpose();
-        let noise = prediction.noise_of(line) * self.factor();
+        let turn = to_tangents * line.basis;
+        let own = turn * line.covariance * turn.transpose() * self.factor();
         let seen = to_tangents * line.direction.into_inner();
-        let own = noise + Matrix2::identity() * self.variance;
-        let alone = log_density(&own, seen - to_tangents * self.direction.into_inner())?;
-        let (spread, common) = prediction.spreads();
-        let variance = *self.shift_variance.get_or_insert(common.trace() / 2.0);
-        let spread = spread + noise + Matrix2::identity() * variance;
-        let off = seen - to_tangents * self.shift;
+        let alone = seen - to_tangents * self.direction.into_inner();
+        let alone = log_density(&(own + Matrix2::identity() * self.variance), alone)?;
+        let GivenShift { shift, left, spread } = prediction.given_shift(line, self.factor());
+        let known = self.shift_covariance.unwrap_or(shift);
+        let spread = spread + left * known * left.transpose();
+        let off = seen - left * (to_tangents * self.shift);
         let together = log_density(&spread, off)?;
-        let gain = variance / (spread.trace() / 2.0);
-        self.shift += prediction.basis() * off * gain;
-        self.shift_variance = Some(variance * (1.0 - gain));
+        let gain = known * left.transpose() * spread.try_inverse()?;
+        self.shift += prediction.basis() * (gain * off);
+        self.shift_covariance = Some(known - gain * left * known);
         Some(together - alone)
+    }
+
+    /// What of the camera's shift is not known, variance along each tangent, rad^2.
+    pub(super) fn shift_variance(&self) -> f64 {
+        self.shift_covariance.map_or(0.0, |covariance| covariance.trace() / 2.0)
     }
 
     /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times; `None` if it lies
