@@ -1,4 +1,4 @@
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix6, Unit, Vector3, Vector6};
 
 use crate::KinematicState;
 use crate::models::{MAX_MODELS, ModelWeights, MotionModels, Restlessness};
@@ -42,6 +42,9 @@ pub struct Imm {
     probabilities: ModelWeights,
     combined: KinematicState,
     restlessness: Restlessness,
+    /// How probable calm can be, at most, since an axis of the motion is not seen: what it was before, and what the
+    /// transitions have made of it since. Measurements of the other axes may find less, and no more.
+    calm_most: Option<f64>,
 }
 
 impl Imm {
@@ -52,7 +55,7 @@ impl Imm {
             *probability = model.share;
         }
         let states = vec![state.clone(); models.models().len()];
-        Self { states, probabilities, combined: state, restlessness: Restlessness::UNKNOWN }
+        Self { states, probabilities, combined: state, restlessness: Restlessness::UNKNOWN, calm_most: None }
     }
 
     /// Mean and covariance over all models.
@@ -103,6 +106,7 @@ impl Imm {
     ) -> Option<f64> {
         let transitions = models.transitions(interval, &self.restlessness);
         let weights = self.probabilities_after(&transitions);
+        let calm_before = self.calm_most.unwrap_or_else(|| models.calm_probability(self.probabilities()));
         let mut states: [Option<KinematicState>; MAX_MODELS] = Default::default();
         let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
         for (j, (next, model)) in states.iter_mut().zip(models.models()).enumerate() {
@@ -122,7 +126,9 @@ impl Imm {
             return None;
         }
         let sum: f64 = logarithms.iter().map(|l| (l - largest).exp()).sum();
-        self.probabilities = models.possible(&weights, logarithms.map(|l| (l - largest).exp() / sum));
+        self.calm_most = models.is_partial.then(|| models.calm_after(calm_before, &transitions));
+        let probabilities = logarithms.map(|l| (l - largest).exp() / sum);
+        self.probabilities = models.no_calmer(self.calm_most.unwrap_or(1.0), probabilities);
         for (state, next) in self.states.iter_mut().zip(states.into_iter().flatten()) {
             *state = next;
         }
@@ -134,20 +140,33 @@ impl Imm {
         Some(largest + sum.ln())
     }
 
-    /// Takes in that for the last `interval` seconds the target may have moved by other models than was thought, and
-    /// that no measurement would have shown it.
-    pub fn relive(&mut self, interval: f64, models: &MotionModels) {
-        for state in &mut self.states {
-            state.time_update(-interval, 0.0);
-        }
-        let transitions = models.transitions(interval, &self.restlessness);
-        let mut states: Vec<KinematicState> =
+    /// Takes in that for the last `interval` seconds what the target did along an axis was not seen: it may have moved
+    /// by the models of `since` in place of those of `before`, and no measurement would have shown it.
+    pub fn relive(
+        &mut self,
+        interval: f64,
+        along: &Unit<Vector3<f64>>,
+        (before, since): (&MotionModels, &MotionModels),
+    ) {
+        let transitions = since.transitions(interval, &self.restlessness);
+        let states: Vec<KinematicState> =
             (0..self.states.len()).map(|j| self.mixed(j, &transitions)).collect();
-        for (state, model) in states.iter_mut().zip(models.models()) {
-            state.time_update(interval, model.density);
-        }
         self.probabilities = self.probabilities_after(&transitions);
+        self.calm_most = Some(since.calm_probability(self.probabilities()));
         self.states = states;
+        let axis = along.into_inner() * along.transpose();
+        for ((state, old), new) in self.states.iter_mut().zip(before.models()).zip(since.models()) {
+            let more = axis * (new.density - old.density).max(0.0);
+            for (row, column, share) in [
+                (0, 0, interval.powi(3) / 3.0),
+                (0, 3, interval.powi(2) / 2.0),
+                (3, 0, interval.powi(2) / 2.0),
+                (3, 3, interval),
+            ] {
+                let mut block = state.covariance.fixed_view_mut::<3, 3>(row, column);
+                block += more * share;
+            }
+        }
         self.combined = combined(&self.states, &self.probabilities);
     }
 

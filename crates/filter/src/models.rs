@@ -98,18 +98,29 @@ impl MotionModels {
         Self { models, is_partial: true, ..*self }
     }
 
-    /// Weights after a measurement, where an axis is not seen with no more of them calm than before it.
-    pub(crate) fn possible(&self, before: &ModelWeights, after: ModelWeights) -> ModelWeights {
-        let [calm_before, calm] = [before, &after].map(|weights| self.calm_probability(weights));
-        if !self.is_partial || calm <= calm_before || calm_before >= 1.0 || calm >= 1.0 {
-            return after;
+    /// The probability of calm after an interval, by its transitions, of a target that is calm with some probability.
+    pub(crate) fn calm_after(&self, calm: f64, transitions: &[ModelWeights; MAX_MODELS]) -> f64 {
+        let mut after = 0.0;
+        for (is_calm, probability) in [(true, calm), (false, 1.0 - calm)] {
+            let rows = transitions.iter().zip(&self.models);
+            let row = rows.filter(|(_, model)| model.calm == is_calm).map(|(row, _)| row).next();
+            after += row.map_or(0.0, |row| self.calm_probability(row)) * probability;
         }
-        let (fewer, more) = (calm_before / calm, (1.0 - calm_before) / (1.0 - calm));
-        let mut weights = after;
-        for (weight, model) in weights.iter_mut().zip(&self.models) {
+        after
+    }
+
+    /// Weights of which no more than `most` are calm.
+    pub(crate) fn no_calmer(&self, most: f64, weights: ModelWeights) -> ModelWeights {
+        let calm = self.calm_probability(&weights);
+        if calm <= most || calm >= 1.0 {
+            return weights;
+        }
+        let (fewer, more) = (most / calm, (1.0 - most) / (1.0 - calm));
+        let mut less = weights;
+        for (weight, model) in less.iter_mut().zip(&self.models) {
             *weight *= if model.calm { fewer } else { more };
         }
-        weights
+        less
     }
 
     /// The largest density of acceleration among the models, m^2/s^3.
@@ -231,12 +242,15 @@ mod tests {
         let models = MotionModels::new(&models, rates).unwrap();
         let partial = models.partial();
         assert_eq!(partial.models().iter().map(|m| m.density).collect::<Vec<_>>(), [0.01, 20.0, 20.0]);
-        let (before, after) = ([0.5, 0.3, 0.2, 0.0], [0.9, 0.05, 0.05, 0.0]);
-        assert_eq!(models.possible(&before, after), after);
-        for (weight, expected) in partial.possible(&before, after).iter().zip([0.5, 0.25, 0.25, 0.0]) {
+        let weights = [0.9, 0.05, 0.05, 0.0];
+        for (weight, expected) in partial.no_calmer(0.5, weights).iter().zip([0.5, 0.25, 0.25, 0.0]) {
             assert!((weight - expected).abs() < 1e-12);
         }
-        assert_eq!(partial.possible(&after, before), before, "less calm it may be found to be");
+        assert_eq!(partial.no_calmer(0.95, weights), weights, "less calm it may be found to be");
+        let transitions = partial.transitions(2.0, &Restlessness::UNKNOWN);
+        let all_calm = transitions[0][0];
+        assert!((partial.calm_after(1.0, &transitions) - all_calm).abs() < 1e-12);
+        assert!(partial.calm_after(0.0, &transitions) < all_calm);
         let stays = |models: &MotionModels| models.transitions(1.0, &Restlessness::UNKNOWN)[0][0];
         assert!(stays(&partial) < stays(&models));
     }

@@ -15,7 +15,7 @@ pub(crate) struct Motion {
     /// Of tracks that several cameras hold in their place.
     models: MotionModels,
     /// Of tracks that one camera alone follows: what the target does along its sight line nobody
-    /// sees, so every model is as uncertain as the liveliest.
+    /// sees, so every model that is not calm is as uncertain as the liveliest.
     unheld: MotionModels,
     /// A camera's bearing holds a track for so long, s.
     pub(crate) holding_s: f64,

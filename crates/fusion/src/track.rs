@@ -164,6 +164,8 @@ impl Track {
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
         (track.held, track.follower) = (false, Some(line.line.origin));
+        // A pose that is off turns no direction faster.
+        track.ties.values_mut().for_each(Ties::forget_velocity);
         track
     }
 
@@ -368,7 +370,15 @@ impl Track {
         let was_held = std::mem::replace(&mut self.held, is_held);
         if was_held && !is_held {
             // By now it shows that one camera alone has seen it for so long.
-            self.imm.relive(motion.holding_s, motion.models(false));
+            let others = self.ties.iter().filter(|(name, _)| *name != camera);
+            let silent_s = others.filter_map(|(_, ties)| ties.silent_s(time)).fold(f64::INFINITY, f64::min);
+            if silent_s.is_finite() {
+                self.imm.relive(
+                    silent_s.max(0.0),
+                    &line.direction,
+                    (motion.models(true), motion.models(false)),
+                );
+            }
         }
         self.gather(camera, &innovation, line, uncertainty);
         let third_difference = self.third_difference(camera, line, motion);

@@ -49,6 +49,11 @@ impl Coincidence {
         Self { sights: vec![(camera.clone(), sight)], silent: Vec::new(), log_ratio: 0.0, vague: false }
     }
 
+    /// Whether a camera has given it a line.
+    pub(super) fn knows(&self, camera: &CameraName) -> bool {
+        self.sights.iter().any(|(name, _)| name == camera)
+    }
+
     /// A camera's first line, with its log-likelihood ratio; the target may move across it at `rate_sd` (rad/s).
     pub(super) fn see_first(
         &mut self,
@@ -58,7 +63,6 @@ impl Coincidence {
         first_ratio: f64,
     ) {
         self.log_ratio += first_ratio;
-        self.sights.retain(|(name, _)| name != camera);
         self.sights.push((camera.clone(), Sight::first(line, time, rate_sd)));
     }
 

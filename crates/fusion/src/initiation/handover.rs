@@ -15,14 +15,14 @@ use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::coincidence::Coincidence;
 use super::sight::Sight;
-use super::{Start, lines_with_pose};
+use super::{MAX_LINES, Start, lines_with_pose};
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
 use crate::rooted::Rooted;
 use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
 use crate::temporal::LineId;
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
-use crate::tracker::log_likelihood_ratio;
+use crate::tracker::{log_likelihood_ratio, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::watch::view_sr;
 use crate::{Exposure, FusionConfig, Tracking};
@@ -30,8 +30,8 @@ use crate::{Exposure, FusionConfig, Tracking};
 /// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what flies past a camera
 /// is lost again and again; twice as much takes strangers for it.
 const TURNING_SD: f64 = 0.3;
-/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, as the liveliest targets have. It is used only to
-/// follow a direction within one camera.
+/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of it what turns hard is
+/// lost, with twice as much two directions are too soon alike.
 const TURNING_DENSITY: f64 = 3e-4;
 /// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if all ranges over a
 /// factor of 150 were equally likely.
@@ -47,18 +47,21 @@ const TOGETHER_S: f64 = 1.0;
 const MARGIN: f64 = 8.0;
 /// A reading less likely than this (logarithm) is given up.
 const GIVEN_UP: f64 = -5.0;
-/// Directions followed in one camera, lost ones tried in one exposure, and readings of one: time is bounded.
+/// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others tried with one: time
+/// is bounded.
 const MAX_SEEN: usize = 20;
 const MAX_LOST: usize = 20;
 const MAX_READINGS: usize = 4;
+const MAX_TRIED: usize = 50;
 
 /// What one camera alone follows, as of its last line.
 #[derive(Clone, Debug)]
 struct Seen {
     sight: Sight,
     first: Timestamp,
-    /// Its last line with what is uncertain of the camera's pose, ...
+    /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2), ...
     line: TimedLine,
+    pose_variance: f64,
     /// ... and of the camera.
     uncertainty: CameraUncertainty,
     /// Log-likelihood ratio of being a target, whatever its place, against being clutter.
@@ -69,13 +72,17 @@ struct Seen {
     gaps: f64,
     /// ... and those since the last.
     missed: f64,
-    /// The ways in which other cameras may have seen it since.
+    /// The ways in which other cameras may have seen it since, ...
     readings: Vec<Reading>,
+    /// ... and what has been tried: what is refuted once is not tried again.
+    tried: BTreeSet<(CameraName, Timestamp)>,
 }
 
 /// What one camera has followed and others may have seen since, as one target.
 #[derive(Clone, Debug)]
 struct Reading {
+    /// The camera that saw it first, and since when.
+    of: (CameraName, Timestamp),
     track: Box<Track>,
     coincidence: Coincidence,
     newest: LineId,
@@ -112,6 +119,7 @@ pub(super) struct Handover {
     /// How fast targets are, m/s, standard deviation an axis.
     speed: f64,
     pair_s: f64,
+    max_range_m: f64,
     seen: BTreeMap<CameraName, Vec<Seen>>,
 }
 
@@ -121,6 +129,7 @@ impl Seen {
         Self {
             sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
             first: time,
+            pose_variance: pose_variance(&line, exposure, index),
             line,
             uncertainty: CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
             score: 0.0,
@@ -128,6 +137,7 @@ impl Seen {
             gaps: 0.0,
             missed: 0.0,
             readings: Vec::new(),
+            tried: BTreeSet::new(),
         }
     }
 
@@ -156,13 +166,13 @@ impl Seen {
         &self,
         camera: &CameraName,
         (line, time): (&SightLine, Timestamp),
-        speed: f64,
+        (speed, max_range_m): (f64, f64),
         motion: &Motion,
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let by_now = self.at(time).direction;
         let [range, there] = passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
-        if range <= 0.0 || there <= 0.0 {
+        if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
             return None;
         }
         let along = sight.direction.into_inner();
@@ -171,7 +181,7 @@ impl Seen {
         let [across, along_squared] = [model.basis * model.basis.transpose(), along * along.transpose()];
         // A range that is off by a share has the place off along the direction, and the velocity by the same share.
         let scale = stacked(along * range, velocity) * UNKNOWN_LOG_RANGE_SD;
-        let direction_variance = model.covariance_of(&last.line).trace() / 2.0;
+        let direction_variance = sight.variance + self.pose_variance;
         let (tie, turning) = (sight.tie, sight.rate_variance);
         let mut covariance = scale * scale.transpose();
         let mut add = |row: usize, column: usize, block: Matrix3<f64>| {
@@ -191,6 +201,12 @@ impl Seen {
     }
 }
 
+/// What the pose adds to a line's variance along each tangent, rad^2.
+fn pose_variance(with_pose: &TimedLine, exposure: &Exposure, index: usize) -> f64 {
+    let own = exposure.sightings[index].line.covariance * exposure.uncertainty.factor;
+    (with_pose.line.covariance - own).trace().max(0.0) / 2.0
+}
+
 fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
     let mut both = Vector6::zeros();
     both.fixed_rows_mut::<3>(0).copy_from(&place);
@@ -199,18 +215,20 @@ fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
 }
 
 impl Reading {
-    /// Takes the exposure's best line in that is nobody's.
-    fn advance(&mut self, look: &Look<'_>, rules: &Handover) {
+    /// Takes the exposure's best line in; returns whether it is still open what this is: not if a track has the line.
+    fn advance(&mut self, look: &Look<'_>, rules: &Handover) -> bool {
         let Look { exposure, known, is_owned, .. } = *look;
         let Some(expected) = look.expectation(&self.track) else {
-            return;
+            return true;
         };
-        let open = exposure.sightings.iter().enumerate().filter(|(i, _)| !is_owned[*i]);
-        let fits =
-            open.filter_map(|(i, sighting)| Some((expected.fit(&sighting.line, rules.gate)?.log_density, i)));
-        if let Some((log_density, index)) = fits.max_by(|a, b| a.0.total_cmp(&b.0)) {
+        let lines = exposure.sightings.iter().enumerate().take(MAX_LINES);
+        let fits = lines
+            .filter_map(|(i, sighting)| Some((expected.fit(&sighting.line, rules.gate)?.log_density, i)));
+        let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
+        if let Some((log_density, index)) = best.filter(|(_, index)| !is_owned[*index]) {
             self.take(look, index, &expected, log_density - rules.strangers_per_sr(known).ln(), rules);
         }
+        best.is_none_or(|(_, index)| !is_owned[index])
     }
 
     /// Takes a line in; `None` if the numbers fail.
@@ -229,10 +247,16 @@ impl Reading {
         self.track.measurement_update(camera, line, (*time, &look.uncertainty()), motion)?;
         self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
         let timed = (line, *time, uncertainty.time_sd_s);
+        // That two cameras which see something at once agree says nothing of what the first one has seen before.
+        let is_joint = self.track.residuals.iter().any(|(name, residual)| {
+            *name != self.of.0 && name != camera && time.seconds_since(residual.time) < TOGETHER_S
+        });
+        let first_ratio = if is_joint { 0.0 } else { first_ratio };
         match expected {
             Expectation::Near(prediction) => {
                 self.coincidence.see(camera, timed, prediction, (density, rules.speed), first_ratio);
             }
+            Expectation::Along { .. } if self.coincidence.knows(camera) => {}
             Expectation::Along { .. } => {
                 let range = (self.track.state().position() - line.origin).norm();
                 self.coincidence.see_first(camera, (line, *time), rules.speed / range, first_ratio);
@@ -254,6 +278,7 @@ impl Handover {
             tracking: config.tracking.clone(),
             speed: config.initiation.velocity_prior_sd_mps,
             pair_s: config.initiation.pair_s,
+            max_range_m: config.initiation.max_range_m,
             seen: BTreeMap::new(),
         }
     }
@@ -278,7 +303,7 @@ impl Handover {
         let begun = self.follow(&look);
         self.advance(&look);
         self.cross(&look, &begun);
-        self.settle()
+        self.settle(&look)
     }
 
     /// Forgets what no camera has seen for as long as a track would be kept, and what was never sure at once.
@@ -305,23 +330,34 @@ impl Handover {
     /// Goes on with what the exposure's camera follows; returns the lines (by index) of what it has begun to follow
     /// not long ago, with when.
     fn follow(&mut self, look: &Look<'_>) -> Vec<(usize, Timestamp)> {
-        let Look { exposure, is_owned, .. } = *look;
+        let Look { exposure, known, is_owned, .. } = *look;
         let factor = exposure.uncertainty.factor;
+        let strangers = self.strangers_per_sr(known).ln();
         let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
         let seen = self.seen.entry(exposure.camera.clone()).or_default();
         let mut taken = vec![false; with_pose.len()];
         let (gate, mut begun, mut explained) = (self.gate, Vec::new(), BTreeSet::new());
-        for (place, one) in seen.iter_mut().enumerate() {
+        let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
+        // Those that are best known choose first; one that is lost takes nothing that may be a stranger.
+        let mut order: Vec<usize> = (0..seen.len()).collect();
+        order.sort_by(|&a, &b| {
+            seen[a].at(exposure.time).variance.total_cmp(&seen[b].at(exposure.time).variance)
+        });
+        for place in order {
+            let one = &mut seen[place];
             let sight = one.at(exposure.time);
+            let is_lost = one.is_lost(exposure.time, &self.tracking);
             let near = exposure.sightings.iter().enumerate().take(taken.len()).filter(|(i, _)| !taken[*i]);
             let fits =
                 near.filter_map(|(i, sighting)| Some((sight.density(&sighting.line, factor, gate)?, i)));
-            let Some((log_density, index)) = fits.max_by(|a, b| a.0.total_cmp(&b.0)) else {
+            let fits = fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > strangers + MARGIN));
+            let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
+            let Some((log_density, index)) = best else {
                 one.missed += 1.0;
                 continue;
             };
             taken[index] = true;
-            if is_owned[index] || exposure.sightings[index].rooted == Rooted::Yes {
+            if is_known(index) {
                 explained.insert(place);
                 continue;
             }
@@ -330,15 +366,15 @@ impl Handover {
             one.sight = sight;
             one.sight.update(&exposure.sightings[index].line);
             one.gaps += std::mem::take(&mut one.missed);
-            (one.line, one.lines) = (with_pose[index].clone(), one.lines + 1.0);
+            one.lines += 1.0;
+            one.pose_variance = pose_variance(&with_pose[index], exposure, index);
+            one.line = with_pose[index].clone();
             begun.push((index, one.first));
         }
         let mut place = 0..;
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
-            let is_open =
-                !taken[index] && !is_owned[index] && exposure.sightings[index].rooted != Rooted::Yes;
-            if is_open && seen.len() < MAX_SEEN {
+            if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
                 seen.push(Seen::first(line, exposure, index));
             }
         }
@@ -348,8 +384,8 @@ impl Handover {
     /// Goes on with the readings that the exposure's lines may be part of.
     fn advance(&mut self, look: &Look<'_>) {
         let mut all = std::mem::take(&mut self.seen);
-        for reading in all.values_mut().flatten().flat_map(|one| &mut one.readings) {
-            reading.advance(look, self);
+        for one in all.values_mut().flatten() {
+            one.readings.retain_mut(|reading| reading.advance(look, self));
         }
         self.seen = all;
     }
@@ -372,61 +408,79 @@ impl Handover {
         lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
         for (camera, one) in lost.into_iter().take(MAX_LOST) {
             let since = begun.iter().filter(|(_, first)| one.sight.time.seconds_since(*first) < TOGETHER_S);
-            for &(index, _) in since.filter(|(index, _)| !is_owned[*index]) {
+            for &(index, first) in since.filter(|(index, _)| !is_owned[*index]) {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
-                if is_read || one.readings.len() >= MAX_READINGS {
+                let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;
+                if is_read || is_full || !one.tried.insert((exposure.camera.clone(), first)) {
                     continue;
                 }
                 let line = &exposure.sightings[index].line;
-                let reading = one.placed(camera, (line, now), self.speed, motion).and_then(|track| {
-                    let unlikely = track.state().velocity().norm_squared() / (2.0 * self.speed.powi(2));
-                    let expected = look.expectation(&track)?;
-                    let fit = expected.fit(line, self.gate)?;
-                    let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known)) - unlikely;
-                    let coincidence = Coincidence::of_one(camera, one.sight.clone());
-                    let mut reading = Reading { track: Box::new(track), coincidence, newest: name };
-                    reading.take(look, index, &expected, ratio, self)?;
-                    (reading.ratio() > GIVEN_UP).then_some(reading)
-                });
+                let reading = one
+                    .placed(camera, (line, now), (self.speed, self.max_range_m), motion)
+                    .and_then(|track| {
+                        let unlikely = track.state().velocity().norm_squared() / (2.0 * self.speed.powi(2));
+                        let expected = look.expectation(&track)?;
+                        let fit = expected.fit(line, self.gate)?;
+                        let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known)) - unlikely;
+                        let coincidence = Coincidence::of_one(camera, one.sight.clone());
+                        let mut reading = Reading {
+                            of: (camera.clone(), one.first),
+                            track: Box::new(track),
+                            coincidence,
+                            newest: name,
+                        };
+                        reading.take(look, index, &expected, ratio, self)?;
+                        (reading.ratio() > GIVEN_UP).then_some(reading)
+                    });
                 one.readings.extend(reading);
             }
         }
         self.seen = all;
     }
 
-    /// The readings that are sure, each of which settles what becomes of the lines that began it.
-    fn settle(&mut self) -> Vec<Start> {
-        let mut starts = Vec::new();
-        let all: Vec<(f64, LineId)> = self
-            .seen
-            .values()
-            .flatten()
-            .flat_map(|one| &one.readings)
-            .map(|r| (r.ratio(), r.newest.clone()))
+    /// The readings that an exposure has made sure. Others of the same lines are rivals, unless they are the same
+    /// target.
+    fn settle(&mut self, look: &Look<'_>) -> Vec<Start> {
+        let Look { exposure, motion, .. } = *look;
+        let is_new = |reading: &Reading| {
+            let (camera, sequence, _) = &reading.newest;
+            *camera == exposure.camera && *sequence == exposure.sequence
+        };
+        let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
+        let all: Vec<&Reading> = self.seen.values().flatten().flat_map(|one| &one.readings).collect();
+        let mut sure: Vec<&Reading> = all
+            .iter()
+            .copied()
+            .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
+            .filter(|one| {
+                let mut rivals = all.iter().filter(|other| {
+                    other.ratio() > one.ratio() - MARGIN && (other.newest == one.newest || other.of == one.of)
+                });
+                rivals.all(|other| same_target(&state(one), &state(other)))
+            })
             .collect();
-        for seen in self.seen.values_mut() {
-            seen.retain(|one| {
-                let best = one.readings.iter().max_by(|a, b| a.ratio().total_cmp(&b.ratio()));
-                let Some(best) = best.filter(|best| best.ratio() >= MARGIN && best.track.is_placed()) else {
-                    return true;
-                };
-                let rival = |ratio: f64| ratio > best.ratio() - MARGIN;
-                let own = one.readings.iter().filter(|other| rival(other.ratio())).count();
-                let others =
-                    all.iter().filter(|(ratio, newest)| *newest == best.newest && rival(*ratio)).count();
-                if own > 1 || others > 1 {
-                    return true;
-                }
-                let mut track = Track::clone(&best.track);
+        sure.sort_by(|one, other| other.ratio().total_cmp(&one.ratio()));
+        let mut found: Vec<Track> = Vec::new();
+        for reading in sure {
+            if found.iter().all(|track| !same_target(track.state(), &state(reading))) {
+                let mut track = Track::clone(&reading.track);
                 track.status = TrackStatus::Confirmed;
-                track.score = one.score;
+                track.score = self.tracking.confirm_score;
+                track.born = track.updated;
                 track.observe();
-                starts.push(Start { track, cameras: 2, claimed_by: BTreeSet::new() });
-                false
-            });
+                found.push(track);
+            }
         }
-        starts
+        let is_found =
+            |reading: &Reading| found.iter().any(|track| same_target(track.state(), &state(reading)));
+        let settled: BTreeSet<(CameraName, Timestamp)> =
+            all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.clone()).collect();
+        for (camera, seen) in &mut self.seen {
+            seen.retain(|one| !settled.contains(&(camera.clone(), one.first)));
+        }
+        let start = |track| Start { track, cameras: 2, claimed_by: BTreeSet::new() };
+        found.into_iter().map(start).collect()
     }
 
     /// How many other targets a camera sees, 1/sr: one, as nothing else is known.

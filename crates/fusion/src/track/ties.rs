@@ -127,6 +127,16 @@ impl Ties {
         self.last_three = LastThree::default();
     }
 
+    /// For how long the camera has given the track no bearing, s.
+    pub(super) fn silent_s(&self, now: Timestamp) -> Option<f64> {
+        Some(now.seconds_since(self.seen?))
+    }
+
+    /// Takes the velocity for tied to none of the errors.
+    pub(super) fn forget_velocity(&mut self) {
+        self.covariance.fixed_rows_mut::<3>(3).fill(0.0);
+    }
+
     /// The camera has given the track a bearing.
     pub(super) fn see(&mut self, time: Timestamp) {
         self.period_s = self.seen.map_or(0.0, |seen| time.seconds_since(seen).abs());
