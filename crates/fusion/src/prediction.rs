@@ -26,6 +26,17 @@ pub(crate) struct BearingPrediction {
     widest: f64,
 }
 
+/// A line of which a track has been made, along the tangents.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Beginning {
+    /// What of it the track leaves, rad.
+    pub(crate) left: Vector2<f64>,
+    /// Covariances of the camera's shift, of the line's noise, and of the track's place as seen from there, rad^2.
+    pub(crate) shift: Matrix2<f64>,
+    pub(crate) noise: Matrix2<f64>,
+    pub(crate) placed: Matrix2<f64>,
+}
+
 /// A bearing against a prediction, with what its camera shifts all of its bearings by apart, along the tangents.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GivenShift {
@@ -118,6 +129,13 @@ impl BearingPrediction {
         let left = Matrix2::identity() + taken;
         let spread = self.steady - left * self.shift * left.transpose();
         GivenShift { shift: self.shift, left, spread: spread + noise + Matrix2::identity() * added }
+    }
+
+    /// What is left of a line of which the track has been made.
+    pub(crate) fn beginning(&self, line: &SightLine) -> Option<Beginning> {
+        let noise = self.model.covariance_of(line) * self.factor;
+        let placed = self.steady - self.cross - self.cross.transpose() - self.shift;
+        Some(Beginning { left: self.model.offset(line)?, shift: self.shift, noise, placed })
     }
 
     /// How a bearing fits; `None` if it lies outside the gate.

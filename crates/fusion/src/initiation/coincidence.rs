@@ -10,7 +10,7 @@ use crate::watch::independent_share;
 
 /// Logarithm of the probability that a camera is blind for a target that it should see.
 const BLIND: f64 = -4.6;
-/// A camera's bearings that are shifted by so many times their own variance agree with nothing.
+/// A camera whose clock shifts its bearings by so many times their own variance agrees with nothing.
 const VAGUE: f64 = 10.0;
 
 /// How much likelier it is that lines are one target's than that every camera sees a target of its
@@ -25,7 +25,7 @@ pub(super) struct Coincidence {
     /// Cameras that should see the target and never have, with the logarithm of that probability.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
-    /// Whether poses or clocks are so uncertain that it says nothing.
+    /// Whether clocks are so uncertain that it says nothing.
     vague: bool,
 }
 
@@ -47,6 +47,18 @@ impl Coincidence {
     /// Of what one camera has followed so far.
     pub(super) fn of_one(camera: &CameraName, sight: Sight) -> Self {
         Self { sights: vec![(camera.clone(), sight)], silent: Vec::new(), log_ratio: 0.0, vague: false }
+    }
+
+    /// Learns what a camera shifts its first line by, of which the target's place has been made.
+    pub(super) fn begin_shift(
+        &mut self,
+        camera: &CameraName,
+        line: &SightLine,
+        prediction: &BearingPrediction,
+    ) {
+        if let Some((_, sight)) = self.sights.iter_mut().find(|(name, _)| name == camera) {
+            sight.begin_shift(line, prediction);
+        }
     }
 
     /// Whether a camera has given it a line.
@@ -84,8 +96,7 @@ impl Coincidence {
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
         // What an unsure clock shifts a bearing by is not known before the velocity is.
         let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
-        let pose = sight.shift_variance();
-        self.vague |= pose.max(clock) > VAGUE * line.covariance.trace() / 2.0;
+        self.vague |= clock > VAGUE * line.covariance.trace() / 2.0;
         sight.update(line);
     }
 
@@ -101,7 +112,7 @@ impl Coincidence {
         }
     }
 
-    /// The log-likelihood ratio; `None` if poses or clocks are too uncertain for it.
+    /// The log-likelihood ratio; `None` if clocks are too uncertain for it.
     pub(super) fn log_ratio(&self) -> Option<f64> {
         if self.vague {
             return None;

@@ -270,7 +270,18 @@ impl Hypotheses {
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
             let lines = seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
-            let coincidence = Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
+            let mut coincidence = Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
+            for ((camera, sequence, index), timed) in &seed.lines {
+                let seen_from = (camera, timed.line.origin);
+                let of = |exposure: &&&Exposure| exposure.camera == *camera && exposure.sequence == *sequence;
+                let own = exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index));
+                let expected = uncertainty
+                    .get(camera)
+                    .and_then(|uncertainty| track.expectation(timed.time, seen_from, uncertainty, motion));
+                if let (Some(own), Some(Expectation::Near(prediction))) = (own, expected) {
+                    coincidence.begin_shift(camera, &own.line, &prediction);
+                }
+            }
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
             self.hypotheses.push(Hypothesis {
                 family: self.families,

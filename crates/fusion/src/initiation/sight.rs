@@ -7,7 +7,7 @@ use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix2, Unit, Vector3};
 
-use crate::prediction::{BearingPrediction, GivenShift, log_density};
+use crate::prediction::{BearingPrediction, Beginning, GivenShift, log_density};
 
 /// What it counts that noise is as reported, in coordinates of bearings (two each).
 const PRIOR_COORDINATES: f64 = 10.0;
@@ -50,6 +50,17 @@ impl Sight {
         }
     }
 
+    /// Learns the camera's shift from the first line, of which the target's place has been made: what is left of the
+    /// line is shift and noise, in the proportion of their covariances.
+    pub(super) fn begin_shift(&mut self, line: &SightLine, prediction: &BearingPrediction) -> Option<()> {
+        let Beginning { left, shift, noise, placed } = prediction.beginning(line)?;
+        let total = shift + noise;
+        let gain = shift * total.try_inverse()?;
+        self.shift = prediction.basis() * (gain * left);
+        self.shift_covariance = Some(shift - gain * (total - placed) * gain.transpose());
+        Some(())
+    }
+
     /// Where the line is expected at a time; `density` is that of the white acceleration that drives
     /// it, rad^2/s^3.
     pub(super) fn predict(&mut self, time: Timestamp, density: f64) {
@@ -81,11 +92,6 @@ impl Sight {
         self.shift += prediction.basis() * (gain * off);
         self.shift_covariance = Some(known - gain * left * known);
         Some(together - alone)
-    }
-
-    /// What of the camera's shift is not known, variance along each tangent, rad^2.
-    pub(super) fn shift_variance(&self) -> f64 {
-        self.shift_covariance.map_or(0.0, |covariance| covariance.trace() / 2.0)
     }
 
     /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times; `None` if it lies
