@@ -123,8 +123,11 @@ impl PoseScales {
                 let next = next.clamp(scale.value / LARGEST_STEP, scale.value * LARGEST_STEP);
                 let next = next.clamp(scale.least, scale.greatest);
                 // What has been found so far is less by the new factor: not at all where noise hides the pose, and
-                // inversely to it where the pose is all. Held against the old one, an error would count ten times.
-                scale.found /= (next / scale.value).max(1.0).sqrt();
+                // inversely to it where the pose is all. Held against the old one, an error would count ten times; a
+                // declared pose's factor is bounded, and real flights are better for counting it so.
+                if scale.greatest > DECLARED_MOST {
+                    scale.found /= (next / scale.value).max(1.0).sqrt();
+                }
                 scale.value = next;
                 let ratio = scale.value / scale.told;
                 if ratio.ln().abs() > NOTICED {
