@@ -79,6 +79,25 @@ fn a_target_that_one_camera_at_a_time_sees_is_found_and_kept() {
     }
 }
 
+#[test]
+fn two_targets_that_one_camera_at_a_time_sees_are_both_found() {
+    for seed in SEEDS {
+        // Each camera sees both from the same exposure on.
+        let paths = vec![
+            straight([0.0, -20.0, 45.0], [4.0, 2.0, 0.2]),
+            straight([20.0, 30.0, 60.0], [-3.0, -2.0, 0.1]),
+        ];
+        let scene = Scene::new(paths, 12.0);
+        let mut flight = Flight::with(FusionConfig::default(), scene, seed, |frame| {
+            if frame.camera != ["a", "b", "c"][(frame.capture_time_ns / 2_000_000_000) as usize % 3] {
+                frame.tracks.clear();
+            }
+            true
+        });
+        assert_one_each(flight.until(11.0), 2, seed);
+    }
+}
+
 /// Comes from `side` metres off the x axis to `near` metres from it, stays for ten seconds, parts.
 fn meeting(side: f64, near: f64) -> Path {
     Box::new(move |t| {

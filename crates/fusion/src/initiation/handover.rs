@@ -57,6 +57,8 @@ const MAX_TRIED: usize = 50;
 /// What one camera alone follows, as of its last line.
 #[derive(Clone, Debug)]
 struct Seen {
+    /// Two that begin with one exposure are told apart by it.
+    number: u64,
     sight: Sight,
     first: Timestamp,
     /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2), ...
@@ -75,14 +77,14 @@ struct Seen {
     /// The ways in which other cameras may have seen it since, ...
     readings: Vec<Reading>,
     /// ... and what has been tried: what is refuted once is not tried again.
-    tried: BTreeSet<(CameraName, Timestamp)>,
+    tried: BTreeSet<u64>,
 }
 
 /// What one camera has followed and others may have seen since, as one target.
 #[derive(Clone, Debug)]
 struct Reading {
-    /// The camera that saw it first, and since when.
-    of: (CameraName, Timestamp),
+    /// The camera that saw it first, and the number of what it saw.
+    of: (CameraName, u64),
     track: Box<Track>,
     coincidence: Coincidence,
     newest: LineId,
@@ -121,12 +123,23 @@ pub(super) struct Handover {
     pair_s: f64,
     max_range_m: f64,
     seen: BTreeMap<CameraName, Vec<Seen>>,
+    /// How many directions have been followed.
+    count: u64,
+}
+
+/// A line that a camera has begun to follow, by its index, with what it follows there.
+#[derive(Clone, Copy, Debug)]
+struct Begun {
+    index: usize,
+    number: u64,
+    first: Timestamp,
 }
 
 impl Seen {
-    fn first(line: TimedLine, exposure: &Exposure, index: usize) -> Self {
+    fn first(number: u64, line: TimedLine, exposure: &Exposure, index: usize) -> Self {
         let time = exposure.time;
         Self {
+            number,
             sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
             first: time,
             pose_variance: pose_variance(&line, exposure, index),
@@ -280,6 +293,7 @@ impl Handover {
             pair_s: config.initiation.pair_s,
             max_range_m: config.initiation.max_range_m,
             seen: BTreeMap::new(),
+            count: 0,
         }
     }
 
@@ -327,9 +341,8 @@ impl Handover {
         }
     }
 
-    /// Goes on with what the exposure's camera follows; returns the lines (by index) of what it has begun to follow
-    /// not long ago, with when.
-    fn follow(&mut self, look: &Look<'_>) -> Vec<(usize, Timestamp)> {
+    /// Goes on with what the exposure's camera follows; returns its lines of that.
+    fn follow(&mut self, look: &Look<'_>) -> Vec<Begun> {
         let Look { exposure, known, is_owned, .. } = *look;
         let factor = exposure.uncertainty.factor;
         let strangers = self.strangers_per_sr(known).ln();
@@ -369,13 +382,14 @@ impl Handover {
             one.lines += 1.0;
             one.pose_variance = pose_variance(&with_pose[index], exposure, index);
             one.line = with_pose[index].clone();
-            begun.push((index, one.first));
+            begun.push(Begun { index, number: one.number, first: one.first });
         }
         let mut place = 0..;
         seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
         for (index, line) in with_pose.into_iter().enumerate() {
             if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
-                seen.push(Seen::first(line, exposure, index));
+                self.count += 1;
+                seen.push(Seen::first(self.count, line, exposure, index));
             }
         }
         begun
@@ -391,7 +405,7 @@ impl Handover {
     }
 
     /// Tries what other cameras have lost sight of with what this one has begun to see since.
-    fn cross(&mut self, look: &Look<'_>, begun: &[(usize, Timestamp)]) {
+    fn cross(&mut self, look: &Look<'_>, begun: &[Begun]) {
         let Look { exposure, known, motion, is_owned } = *look;
         let now = exposure.time;
         let mut all = std::mem::take(&mut self.seen);
@@ -407,12 +421,12 @@ impl Handover {
             .collect();
         lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
         for (camera, one) in lost.into_iter().take(MAX_LOST) {
-            let since = begun.iter().filter(|(_, first)| one.sight.time.seconds_since(*first) < TOGETHER_S);
-            for &(index, first) in since.filter(|(index, _)| !is_owned[*index]) {
+            let since = begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
+            for &Begun { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
                 let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;
-                if is_read || is_full || !one.tried.insert((exposure.camera.clone(), first)) {
+                if is_read || is_full || !one.tried.insert(number) {
                     continue;
                 }
                 let line = &exposure.sightings[index].line;
@@ -425,7 +439,7 @@ impl Handover {
                         let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known)) - unlikely;
                         let coincidence = Coincidence::of_one(camera, one.sight.clone());
                         let mut reading = Reading {
-                            of: (camera.clone(), one.first),
+                            of: (camera.clone(), one.number),
                             track: Box::new(track),
                             coincidence,
                             newest: name,
@@ -474,10 +488,10 @@ impl Handover {
         }
         let is_found =
             |reading: &Reading| found.iter().any(|track| same_target(track.state(), &state(reading)));
-        let settled: BTreeSet<(CameraName, Timestamp)> =
-            all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.clone()).collect();
-        for (camera, seen) in &mut self.seen {
-            seen.retain(|one| !settled.contains(&(camera.clone(), one.first)));
+        let settled: BTreeSet<u64> =
+            all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.1).collect();
+        for seen in self.seen.values_mut() {
+            seen.retain(|one| !settled.contains(&one.number));
         }
         let start = |track| Start { track, cameras: 2, claimed_by: BTreeSet::new() };
         found.into_iter().map(start).collect()
