@@ -4,7 +4,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot set itself up has failed")]
 
-use crossfix_fusion::spatial::{TimedLine, map, stacked, triple};
+use crossfix_fusion::papers::{stacked, triple};
+use crossfix_fusion::spatial::{TimedLine, map};
 use crossfix_geometry::{SightLine, tangent_basis};
 use crossfix_message::Timestamp;
 use divan::{Bencher, black_box};

@@ -9,8 +9,7 @@
 //! time ([`Track`], interacting models of iterated extended Kalman filters);
 //! the others are gathered into observation periods, in which sets of them
 //! begin hypotheses that are followed until one reading of the bearings is by
-//! far the best. The papers' way is there too: periods solved for fixes
-//! ([`spatial`]), and fixes grouped into tracks ([`temporal`]).
+//! far the best. The papers' way can be chosen in its place ([`papers`]).
 //!
 //! Three cameras look at a place over which a target flies; two seconds of their bearings, no two of them of one
 //! time, are a track:
@@ -65,6 +64,7 @@ mod initiation;
 mod messages;
 mod motion;
 mod noise;
+pub mod papers;
 mod pose_scale;
 mod prediction;
 mod range_chart;
@@ -74,7 +74,6 @@ mod rooted;
 mod site_time;
 pub mod spatial;
 mod standing;
-pub mod temporal;
 mod track;
 mod tracker;
 mod uncertainty;

@@ -4,8 +4,6 @@
 //! 002, by solving each period for fixes and grouping these ([`Grouped`]).
 
 mod coincidence;
-mod fixes;
-mod grouped;
 mod handover;
 mod hypotheses;
 mod passing;
@@ -22,14 +20,14 @@ use nalgebra::Vector3;
 
 use crate::ingress::KnownCamera;
 use crate::motion::Motion;
-use crate::spatial::TimedLine;
-use crate::temporal::LineId;
+use crate::papers::Grouped;
+use crate::spatial::{LineId, TimedLine};
 use crate::track::{Track, TrackId};
 use crate::{Exposure, FusionConfig, InitiationMethod, Sighting, SpatialSolver};
 
 pub(crate) use passing::{Passing, Passings};
+pub(crate) use seeds::SeedFinder;
 
-use grouped::Grouped;
 use handover::Handover;
 use hypotheses::Hypotheses;
 use period::Periods;
@@ -125,7 +123,7 @@ impl Initiator {
 }
 
 /// An exposure's sight lines with their names.
-fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
+pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
         let time_sd_s = exposure.uncertainty.time_sd_s;

@@ -11,8 +11,7 @@ use super::{NamedLine, lines_with_pose};
 use crate::ingress::KnownCamera;
 use crate::prediction::BearingPrediction;
 use crate::rooted::Rooted;
-use crate::spatial::{MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
-use crate::temporal::LineId;
+use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
 
 /// Lines of one camera that are tried beside a pair, the best first.
@@ -33,24 +32,24 @@ const MAX_PAIRS: usize = 250_000;
 
 /// A set of lines that may be one target's.
 #[derive(Clone, Debug)]
-pub(super) struct Seed {
+pub(crate) struct Seed {
     /// One a camera, in order of time.
-    pub(super) lines: Vec<NamedLine>,
+    pub(crate) lines: Vec<NamedLine>,
     /// Position and velocity at the newest line's time.
-    pub(super) solution: MapSolution,
+    pub(crate) solution: MapSolution,
     /// Log-likelihood ratio of being a new target's against being clutter.
-    pub(super) score: f64,
+    pub(crate) score: f64,
 }
 
 impl Seed {
-    pub(super) fn time(&self) -> Option<Timestamp> {
+    pub(crate) fn time(&self) -> Option<Timestamp> {
         self.lines.iter().map(|(_, line)| line.time).max()
     }
 }
 
 /// What finds seeds.
 #[derive(Clone, Debug)]
-pub(super) struct SeedFinder {
+pub(crate) struct SeedFinder {
     initiation: Initiation,
     passings: Passings,
     detection_probability: f64,
@@ -70,7 +69,7 @@ struct Growing<'a> {
 
 impl SeedFinder {
     /// Of sets of so many cameras at least that are so likely at least (log-likelihood ratio).
-    pub(super) fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
+    pub(crate) fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
         let initiation = config.initiation.clone();
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
         // n lines have 2 n - 3 degrees of freedom, as the velocity has a prior.
@@ -89,7 +88,7 @@ impl SeedFinder {
     }
 
     /// Every set of lines of one period that may be one target's, the most likely first.
-    pub(super) fn find(
+    pub(crate) fn find(
         &self,
         exposures: &[&Exposure],
         cameras: &BTreeMap<CameraName, KnownCamera>,

@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::temporal::LineId;
+use crate::spatial::LineId;
 
 /// Comparisons of readings in one period, about a tenth of a second's worth; half of them are kept for the question
 /// how sure each choice is.

@@ -1,43 +1,20 @@
-//! Spatial processing: one sight line of each of several cameras, taken at
-//! different times, becomes a fix.
+//! Spatial processing: sight lines of several cameras, taken at different times, become a fix.
 //!
-//! | function | unknowns | where it is from |
-//! |---|---|---|
-//! | [`pair`] | two ranges | 002, equations 7-9 |
-//! | [`triple`] | three ranges, velocity | 002, equations 10-11 |
-//! | [`stacked`] | n ranges, velocity | the same for n cameras |
-//! | [`stacked_with`] | n ranges, velocity, acceleration | the same with equation 5 in full |
-//! | [`map`] | position, velocity | weighted, with a prior on the velocity |
-//!
-//! [`pair_range_covariance`] and [`triple_range_covariance`] are the paper's accuracy of ranges
-//! (equations 12 and 13); [`Observability`] says what a system could see, and what not.
-//!
-//! All work in the world frame: where the paper turns the axes of receiver k
-//! into those of receiver 1 (`P_k`) and has the base vector `b_k`, here the
-//! sight lines are world vectors and `b_k` is the difference of the cameras'
-//! centres. That is the same system in other axes.
+//! [`map`] is the weighted solution for position and velocity, with a prior on the velocity; [`Observability`] says
+//! what a system could see, and what not. The papers' own systems are in [`crate::papers`].
 
-mod accuracy;
 mod map;
-mod motion;
 mod observability;
-mod pair;
-mod stacked;
-mod triple;
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::SightLine;
-use crossfix_message::Timestamp;
-use nalgebra::{Matrix2, Point3, Vector3};
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Matrix2;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-pub use accuracy::{pair_range_covariance, triple_range_covariance};
 pub use map::{MapSolution, map};
-pub use motion::Motion;
+pub(crate) use observability::determined;
 pub use observability::{Observability, Quantity, WeakAxis};
-pub use pair::{PairSolution, pair};
-pub use stacked::{stacked, stacked_with};
-pub use triple::triple;
 
 /// A sight line with the time at which it was seen.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,21 +43,8 @@ impl TimedLine {
     }
 }
 
-/// Ranges and velocity: what the papers' systems solve for.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RangeSolution {
-    /// Range from each camera, m, in the order of the lines.
-    pub ranges: Vec<f64>,
-    /// Velocity at the first line's time, m/s.
-    pub velocity: Vector3<f64>,
-    /// Acceleration, m/s^2, where the motion has one (002, equation 5).
-    pub acceleration: Option<Vector3<f64>>,
-    /// The target at the first line's time, refined by the pair solution with the displacement
-    /// removed (002, below equation 11).
-    pub position: Point3<f64>,
-    /// How well the system was conditioned, and whether the pseudo-inverse had to be used.
-    pub observability: Observability,
-}
+/// A sight line's name: camera, sequence number of the frame, place in the frame.
+pub type LineId = (CameraName, u64, usize);
 
 /// One period's solution: where something was, and how fast.
 #[derive(Clone, Debug, PartialEq)]
@@ -122,7 +86,7 @@ pub(crate) fn chi_square(p: f64, dimensions: usize) -> f64 {
 #[cfg(test)]
 pub(crate) mod tests_support {
     use crossfix_geometry::{Bearing, tangent_basis};
-    use nalgebra::{Unit, Vector2};
+    use nalgebra::{Point3, Unit, Vector2, Vector3};
 
     use super::*;
 

@@ -1,7 +1,8 @@
 //! Where the paper's system breaks: one period of three cameras whose times or places cannot carry
 //! position and velocity.
 
-use crossfix_fusion::spatial::{Observability, Quantity, TimedLine, WeakAxis, map, pair, triple};
+use crossfix_fusion::papers::{pair, triple};
+use crossfix_fusion::spatial::{Observability, Quantity, TimedLine, WeakAxis, map};
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 

@@ -5,8 +5,8 @@
 //! spatial gate, which is told below.
 
 use crossfix_filter::KinematicState;
-use crossfix_fusion::spatial::{Fix, Observability, TimedLine, VelocityKnowledge, pair, triple};
-use crossfix_fusion::temporal::{Grouping, GroupingRules, LineId, PeriodFix, TemporalGate};
+use crossfix_fusion::papers::{Grouping, GroupingRules, PeriodFix, TemporalGate, pair, triple};
+use crossfix_fusion::spatial::{Fix, LineId, Observability, TimedLine, VelocityKnowledge};
 use crossfix_geometry::Camera;
 use crossfix_message::{CameraName, Solver};
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};

@@ -1,8 +1,8 @@
 use nalgebra::{Matrix6, Vector3, Vector6};
 
-use super::observability::determined;
 use super::pair::typical_range;
-use super::{Observability, RangeSolution, TimedLine, WeakAxis, pair};
+use super::{RangeSolution, pair};
+use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
 /// The three-receiver algorithm: three ranges and the velocity from three lines of three times
 /// (002, equations 10-11), by the pseudo-inverse where the system cannot carry all six.
@@ -77,9 +77,9 @@ fn condition_number(a: &Matrix6<f64>) -> f64 {
 mod tests {
     use nalgebra::Point3;
 
-    use super::super::Quantity;
-    use super::super::tests_support::{coplanar_cameras, line_at, orthogonal_cameras};
     use super::*;
+    use crate::spatial::Quantity;
+    use crate::spatial::tests_support::{coplanar_cameras, line_at, orthogonal_cameras};
 
     #[test]
     fn exact_lines_give_exact_ranges_and_velocity() {

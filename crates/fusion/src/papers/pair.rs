@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3x2, Point3, Vector3};
 
-use super::TimedLine;
+use crate::spatial::TimedLine;
 
 /// About how far away a target is, m: the longer range of the first line and the one that crosses it at the widest
 /// angle, the target taken to stand still; not less than the longest base.
@@ -34,7 +34,8 @@ pub struct PairSolution {
 /// lines are parallel.
 ///
 /// ```
-/// use crossfix_fusion::spatial::{TimedLine, pair};
+/// use crossfix_fusion::papers::pair;
+/// use crossfix_fusion::spatial::TimedLine;
 /// # use crossfix_geometry::*;
 /// # use crossfix_message::Timestamp;
 /// # use nalgebra::{Matrix2, Point3, Vector3};

@@ -4,13 +4,11 @@ use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Solver, Timestamp};
 
-use super::seeds::SeedFinder;
-use super::{NamedLine, lines_of};
+use super::grouping::PeriodFix;
+use super::{RangeSolution, pair, stacked, triple};
 use crate::ingress::KnownCamera;
-use crate::spatial::{
-    Fix, MapSolution, RangeSolution, TimedLine, VelocityKnowledge, map, pair, stacked, triple,
-};
-use crate::temporal::PeriodFix;
+use crate::initiation::{NamedLine, SeedFinder, lines_of};
+use crate::spatial::{Fix, MapSolution, TimedLine, VelocityKnowledge, map};
 use crate::{Exposure, FusionConfig, Initiation, SpatialSolver};
 
 /// A target is not faster than this many standard deviations of the velocity prior.

@@ -1,4 +1,4 @@
-//! Temporal processing: fixes of successive periods are grouped by the
+//! 002's temporal processing: fixes of successive periods are grouped by the
 //! residual from the group's extrapolation, with an accumulated indicator, and
 //! the best groups without common sight lines are handed over (002, temporal
 //! processing of both algorithms).
@@ -12,18 +12,14 @@
 
 use std::collections::BTreeSet;
 
-use crossfix_message::CameraName;
 use nalgebra::{Point3, Vector3};
 
-use crate::spatial::{Fix, TimedLine, VelocityKnowledge};
+use crate::spatial::{Fix, LineId, TimedLine, VelocityKnowledge};
 
 /// Groups kept from one period to the next: the best ones, so that clutter cannot fill the memory.
 const MAX_GROUPS: usize = 5_000;
 /// Fixes of one period that are grouped, the first ones: with [`MAX_GROUPS`] it bounds the time.
 const MAX_FIXES: usize = 500;
-
-/// A sight line's name: camera, sequence number of the frame, place in the frame.
-pub type LineId = (CameraName, u64, usize);
 
 /// A fix with the sight lines that it was made of.
 #[derive(Clone, Debug, PartialEq)]

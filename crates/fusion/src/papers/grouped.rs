@@ -5,24 +5,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_message::CameraName;
 
 use super::fixes::{FixFinder, SPEED_SIGMAS};
-use super::{NamedLine, Start};
+use super::grouping::{Group, Grouping, GroupingRules, TemporalGate};
 use crate::ingress::KnownCamera;
+use crate::initiation::{NamedLine, Start};
 use crate::motion::Motion;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
-use crate::temporal::{Group, Grouping, GroupingRules, TemporalGate};
 use crate::track::Track;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig};
 
 /// Solves periods for fixes and groups the fixes.
 #[derive(Debug)]
-pub(super) struct Grouped {
+pub(crate) struct Grouped {
     finder: FixFinder,
     grouping: Grouping,
 }
 
 impl Grouped {
-    pub(super) fn new(config: &FusionConfig) -> Self {
+    pub(crate) fn new(config: &FusionConfig) -> Self {
         let initiation = &config.initiation;
         let gate = match initiation.temporal_gate_m {
             Some(beta) => TemporalGate::Distance(beta),
@@ -42,7 +42,7 @@ impl Grouped {
     }
 
     /// Takes one period in and returns a tentative track for every group that is good enough.
-    pub(super) fn advance(
+    pub(crate) fn advance(
         &mut self,
         exposures: &[&Exposure],
         cameras: &BTreeMap<CameraName, KnownCamera>,

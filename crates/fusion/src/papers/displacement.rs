@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 /// The scales say what is known beforehand, as standard deviations an axis: the rank is decided
 /// against them, and where the data cannot carry an unknown the answer stays near zero of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Motion {
+pub enum Displacement {
     /// `dM = V dt`: three unknowns.
     Velocity {
         /// Scale of V, m/s.
@@ -20,7 +20,7 @@ pub enum Motion {
     },
 }
 
-impl Motion {
+impl Displacement {
     /// The scale of each vector of unknowns, with the factor by which it moves the target in `dt`.
     pub(crate) fn terms(self, dt: f64) -> Vec<(f64, f64)> {
         match self {

@@ -1,10 +1,10 @@
 use faer::{Col, Mat};
 use nalgebra::{Unit, Vector3};
 
-use super::motion::displacement;
-use super::observability::determined;
+use super::displacement::displacement;
 use super::pair::typical_range;
-use super::{Motion, Observability, RangeSolution, TimedLine, WeakAxis, pair};
+use super::{Displacement, RangeSolution, pair};
+use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
 /// The papers' system for n cameras: n ranges and the velocity from n lines, 3(n - 1) equations in
 /// n + 3 unknowns (002: "with n > 3 only the dimensions change"), unweighted.
@@ -12,7 +12,7 @@ use super::{Motion, Observability, RangeSolution, TimedLine, WeakAxis, pair};
 /// Rank and pseudo-inverse as in [`super::triple`], which is the case n = 3. `None` for fewer than
 /// three lines, if all are of one camera, or if those that the range is refined with are parallel.
 pub fn stacked(lines: &[TimedLine], velocity_scale: f64) -> Option<RangeSolution> {
-    stacked_with(lines, Motion::Velocity { velocity_scale })
+    stacked_with(lines, Displacement::Velocity { velocity_scale })
 }
 
 /// The same with a motion of choice (002, equation 5): n ranges and three unknowns, or six with
@@ -22,7 +22,7 @@ pub fn stacked(lines: &[TimedLine], velocity_scale: f64) -> Option<RangeSolution
 /// least: five cameras, or four of which one gives a second instant, or three with two each. With
 /// fewer, or with instants that lie too close together for the noise, the rank is not full, and
 /// what cannot be seen is left at zero.
-pub fn stacked_with(lines: &[TimedLine], motion: Motion) -> Option<RangeSolution> {
+pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSolution> {
     let (first, others) = lines.split_first()?;
     if others.len() < 2 {
         return None;
@@ -62,7 +62,12 @@ pub fn stacked_with(lines: &[TimedLine], motion: Motion) -> Option<RangeSolution
 
 /// The matrix, its columns scaled, and the right-hand side of `r1 a1 - r_k a_k' + dM_k = b_k`
 /// (002, equations 4 and 5); rows of zeros make up for equations that are missing.
-fn system(first: &TimedLine, others: &[TimedLine], motion: Motion, scales: &[f64]) -> (Mat<f64>, Col<f64>) {
+fn system(
+    first: &TimedLine,
+    others: &[TimedLine],
+    motion: Displacement,
+    scales: &[f64],
+) -> (Mat<f64>, Col<f64>) {
     // The matrix grows with n, so faer: from 64 cameras on its SVD is the faster one, and the
     // shape is known only at run time (benches/solvers).
     let n = others.len() + 1;
@@ -101,14 +106,15 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
-    use super::super::tests_support::{line_at, noisy_line_at, orthogonal_cameras};
-    use super::super::{Quantity, triple};
+    use super::super::triple;
     use super::*;
+    use crate::spatial::Quantity;
+    use crate::spatial::tests_support::{line_at, noisy_line_at, orthogonal_cameras};
 
     const POSITION: Point3<f64> = Point3::new(3.0, -5.0, 2.0);
     const VELOCITY: Vector3<f64> = Vector3::new(10.0, -4.0, 1.5);
     const ACCELERATION: Vector3<f64> = Vector3::new(-3.0, 2.0, 4.0);
-    const MOTION: Motion = Motion::Acceleration { velocity_scale: 15.0, acceleration_scale: 5.0 };
+    const MOTION: Displacement = Displacement::Acceleration { velocity_scale: 15.0, acceleration_scale: 5.0 };
 
     fn five_cameras() -> Vec<Point3<f64>> {
         let mut cameras = orthogonal_cameras().to_vec();
