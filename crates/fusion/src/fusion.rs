@@ -6,16 +6,13 @@ use crossfix_message::{
     BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent, TrackFrame,
 };
 
-use crate::calibrations::KnownCameras;
-use crate::camera_record::CameraRecord;
+use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera};
 use crate::clocks::{ClockEstimate, ClockEstimator};
 use crate::event_time::{Arrival, EventBuffer};
-use crate::ingress::{self, Exposure, KnownCamera, Load, Rejection, RejectionReason};
+use crate::ingress::{self, Exposure, Load, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
-use crate::pose_scale::PoseScales;
 use crate::site_time::{SiteTime, Turn};
-use crate::standing::{CameraStanding, Fitting, Fittings, Standings};
 use crate::track::{Track, TrackId};
 use crate::tracker::{Happening, Tracker};
 use crate::uncertainty::PoseUncertainty;
@@ -48,25 +45,15 @@ pub struct CameraReport {
     pub clock: Option<ClockEstimate>,
 }
 
-/// A camera whose noise is so many times (variance) what it reports is doubted.
-const DOUBTED_NOISE: f64 = 2.0;
-
 /// The fusion centre as a state machine: frames in, tracks out; no clock, no thread, no socket.
 #[derive(Debug)]
 pub struct Fusion {
     config: FusionConfig,
-    cameras: KnownCameras,
+    cameras: Cameras,
     buffer: EventBuffer,
     tracker: Tracker,
     initiator: Initiator,
     clocks: ClockEstimator,
-    standings: Standings,
-    /// The same where two others see a target.
-    misfits: Standings,
-    /// How the frames' times fit.
-    punctuality: Standings,
-    records: BTreeMap<CameraName, CameraRecord>,
-    pose_scales: PoseScales,
     unmet: Unmet,
     site_time: SiteTime,
     /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
@@ -87,16 +74,11 @@ impl Fusion {
         config.validate()?;
         let motion = Motion::new(&config.tracking)?;
         Ok(Self {
-            cameras: KnownCameras::default(),
+            cameras: Cameras::new(config.tracking.coasting_after_s),
             buffer: EventBuffer::new(config.event_time.clone()),
             tracker: Tracker::new(config.tracking.clone(), config.initiation.max_range_m, motion),
             initiator: Initiator::new(&config),
             clocks: ClockEstimator::new(config.clocks.clone()),
-            standings: Standings::default(),
-            misfits: Standings::default(),
-            punctuality: Standings::default(),
-            records: BTreeMap::new(),
-            pose_scales: PoseScales::default(),
             unmet: Unmet::new(&config.initiation),
             site_time: SiteTime::new(config.event_time.lateness_s),
             corrected: BTreeMap::new(),
@@ -117,12 +99,10 @@ impl Fusion {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
         let is_declared = calibration.pose_covariance.is_some();
-        let pose_covariance =
-            Some(calibration.pose_covariance.unwrap_or_else(PoseUncertainty::of_careful_survey));
+        let declared = calibration.pose_covariance;
+        let pose_covariance = declared.unwrap_or_else(PoseUncertainty::of_careful_survey);
         let known = KnownCamera { camera: calibration.camera, pose_covariance, is_declared };
-        if self.cameras.insert(calibration.name.clone(), calibration.valid_from, known) {
-            self.pose_scales.calibrate(&calibration.name, is_declared);
-        }
+        self.cameras.calibrate(calibration.name, calibration.valid_from, known);
         Ok(())
     }
 
@@ -131,7 +111,7 @@ impl Fusion {
         self.counters.count("frames");
         let mut outputs = Vec::new();
         let name = frame.camera.parse::<CameraName>().ok();
-        let known = name.filter(|name| self.cameras.now().contains_key(name));
+        let known = name.filter(|name| self.cameras.get(name).is_some());
         match known.map_or(Turn::Now, |name| self.site_time.see(&name, frame)) {
             Turn::Now => self.take(frame, &mut outputs),
             Turn::Waits => {}
@@ -187,11 +167,11 @@ impl Fusion {
 
     /// What is thought of each camera, ordered by name.
     pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
-        self.cameras.now().keys().map(|camera| CameraReport {
-            camera: camera.clone(),
-            standing: self.standing(camera),
-            noise_factor: self.noise_factor(camera),
-            clock: self.clocks.estimate(camera),
+        self.cameras.iter().map(|(name, camera)| CameraReport {
+            camera: name.clone(),
+            standing: camera.standing(),
+            noise_factor: camera.noise_factor(),
+            clock: self.clocks.estimate(name),
         })
     }
 
@@ -294,62 +274,65 @@ impl Fusion {
         self.now = Some(exposure.time);
         self.tracker.begin(exposure.time);
         for moved in self.cameras.advance(exposure.time) {
-            let pose_covariance = self.cameras.now().get(&moved).and_then(|known| known.pose_covariance);
-            self.clocks.calibrate(&moved, pose_covariance);
-            let is_declared = self.cameras.now().get(&moved).is_some_and(|known| known.is_declared);
-            self.pose_scales.calibrate(&moved, is_declared);
-            self.records.remove(&moved);
+            self.clocks.calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
             self.initiator.forget(&moved);
         }
-        let Some(known) = self.cameras.at(&exposure.camera, exposure.time) else {
+        let Some(camera) = self.cameras.get_mut(&exposure.camera) else {
             return;
         };
         self.counters.count("exposures");
         let mut exposure = exposure.clone();
-        exposure.uncertainty.pose_scale = self.pose_scales.of(&exposure.camera);
-        exposure.clutter_per_sr = self.tracker.clutter_per_sr(&exposure.camera, known);
-        if !self.records.contains_key(&exposure.camera) {
-            self.records.insert(exposure.camera.clone(), CameraRecord::new(&self.config, &exposure));
+        camera.tell(&mut exposure, self.config.tracking.clutter_per_sr);
+        if let Some(change) = camera.clock_change(&exposure) {
+            self.tracker.set_clock(&exposure.camera, change);
         }
-        if let Some(record) = self.records.get_mut(&exposure.camera) {
-            record.tell(&mut exposure);
-            if let Some((ahead, ratio)) = record.clock_change(&exposure) {
-                self.tracker.set_clock(&exposure.camera, ahead, ratio);
-            }
-        }
-        let excluded = self.is_excluded(&exposure.camera);
         let mut happenings = Vec::new();
-        let (fittings, used) = if excluded {
+        let (fittings, used) = if camera.is_excluded() {
             self.counters.count("exposures_of_excluded_cameras");
-            self.tracker.compare(&exposure, known)
+            self.tracker.compare(&exposure, camera.known())
         } else {
-            let step = self.tracker.step(&exposure, known);
-            if let Some(record) = self.records.get_mut(&exposure.camera) {
-                step.third_differences.iter().for_each(|squared| record.noise.see(*squared));
-            }
-            happenings = step.happenings;
-            let rest = Exposure { sightings: step.free, ..exposure.clone() };
-            if self.tracker.has_sure() {
-                self.unmet.found();
-            } else {
-                self.unmet.see(&rest).into_iter().for_each(|name| self.counters.count(name));
-            }
-            for start in self.initiator.add(rest, &step.claims, self.cameras.now(), self.tracker.motion()) {
-                happenings.extend(self.tracker.adopt(start));
-            }
-            for start in self.initiator.hand_over(&exposure, &step.used, known, self.tracker.motion()) {
-                happenings.extend(self.tracker.adopt(start));
-            }
-            (step.fittings, step.used)
+            self.follow(&exposure, &mut happenings)
         };
         for samples in self.tracker.draws() {
-            for (camera, ratio) in self.pose_scales.learn(&samples) {
+            for (camera, ratio) in self.cameras.learn_poses(&samples) {
                 self.tracker.rescale_pose(&camera, ratio);
             }
         }
         self.compare_clocks(&exposure, &used);
-        self.judge(&exposure.camera, exposure.time, &fittings, outputs);
+        self.judge(&exposure, &fittings, outputs);
         self.say(&exposure, happenings, outputs);
+    }
+
+    /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns how it fits the
+    /// tracks, and which has used which of its sightings (by index).
+    fn follow(
+        &mut self,
+        exposure: &Exposure,
+        happenings: &mut Vec<Happening>,
+    ) -> (Fittings, Vec<(usize, TrackId)>) {
+        let Self { cameras, tracker, initiator, unmet, counters, .. } = self;
+        let Some(known) = cameras.known(&exposure.camera) else {
+            return Default::default();
+        };
+        let step = tracker.step(exposure, known, cameras);
+        happenings.extend(step.happenings);
+        let rest = Exposure { sightings: step.free, ..exposure.clone() };
+        if tracker.has_sure() {
+            unmet.found();
+        } else {
+            unmet.see(&rest).into_iter().for_each(|name| counters.count(name));
+        }
+        for start in initiator.add(rest, &step.claims, cameras, tracker.motion()) {
+            happenings.extend(tracker.adopt(start, cameras));
+        }
+        for start in initiator.hand_over(exposure, &step.used, known, tracker.motion()) {
+            happenings.extend(tracker.adopt(start, cameras));
+        }
+        let seen = (step.third_differences.as_slice(), step.strangers);
+        if let Some(camera) = cameras.get_mut(&exposure.camera) {
+            camera.learn_noise(exposure.time, seen, tracker.motion().holding_s);
+        }
+        (step.fittings, step.used)
     }
 
     /// Learns from the bearings of tracks what they say of the camera's clock.
@@ -366,63 +349,30 @@ impl Fusion {
     }
 
     /// Learns from an exposure how far its camera can be believed.
-    fn judge(
-        &mut self,
-        camera: &CameraName,
-        time: Timestamp,
-        fittings: &Fittings,
-        outputs: &mut Vec<Output>,
-    ) {
-        self.standings.learn(camera, time, &fittings.of_three);
-        self.misfits.learn(camera, time, &fittings.of_two);
-        if self.misfits.review(camera) == Some(CameraStanding::Excluded) {
-            // Beside the targets that two others see: they accuse nobody, but its clock may be wrong.
-            self.clocks.suspect(camera);
+    fn judge(&mut self, exposure: &Exposure, fittings: &Fittings, outputs: &mut Vec<Output>) {
+        let judgement = self.cameras.judge(&exposure.camera, exposure.time, fittings);
+        if judgement.suspects_clock {
+            // Bearings compared and not used can tell.
+            self.clocks.suspect(&exposure.camera);
         }
-        let lapsed = self.standings.lapse(camera, time).then_some(CameraStanding::Good);
-        if let Some(standing) = self.standings.review(camera).or(lapsed) {
+        if let Some(standing) = judgement.standing {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_excluded",
                 _ => "cameras_readmitted",
             });
-            if standing == CameraStanding::Excluded {
-                self.standings.acquit_others(camera);
-                // It may be its clock that is wrong: bearings compared and not used can tell.
-                self.clocks.suspect(camera);
-            }
-            outputs.push(Output::Camera(camera.clone(), standing));
+            outputs.push(Output::Camera(exposure.camera.clone(), standing));
         }
     }
 
-    fn noise_factor(&self, camera: &CameraName) -> f64 {
-        self.records.get(camera).map_or(1.0, |record| record.noise.factor())
-    }
-
-    fn is_excluded(&self, camera: &CameraName) -> bool {
-        self.standings.is_excluded(camera) || self.punctuality.is_excluded(camera)
-    }
-
-    /// Takes in whether a frame of a camera came in time; one whose frames are refused says nothing.
+    /// Takes in whether a frame of a camera came in time.
     fn note_time(&mut self, camera: &CameraName, time: Timestamp, accepted: bool, outputs: &mut Vec<Output>) {
-        let fitting = if accepted { Fitting::Fits } else { Fitting::Refused };
-        self.punctuality.learn(camera, time, &[fitting]);
-        if let Some(standing) = self.punctuality.review(camera) {
+        let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, accepted));
+        if let Some(standing) = changed {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_out_of_time",
                 _ => "cameras_in_time_again",
             });
             outputs.push(Output::Camera(camera.clone(), standing));
-        }
-    }
-
-    /// How far a camera is believed.
-    fn standing(&self, camera: &CameraName) -> CameraStanding {
-        if self.is_excluded(camera) {
-            CameraStanding::Excluded
-        } else if self.pose_scales.is_doubted(camera) || self.noise_factor(camera) > DOUBTED_NOISE {
-            CameraStanding::Doubted
-        } else {
-            CameraStanding::Good
         }
     }
 

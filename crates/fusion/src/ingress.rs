@@ -4,9 +4,9 @@ use std::fmt;
 
 use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
-use nalgebra::{Matrix2, Matrix6, Point3};
+use nalgebra::Matrix2;
 
-use crate::rooted::Rooted;
+use crate::cameras::{KnownCamera, Rooted};
 use crate::uncertainty::{CameraUncertainty, PoseUncertainty};
 use crate::{Bearings, Counters, Weighting};
 
@@ -71,31 +71,6 @@ impl Load {
     /// Whether it is more than may wait, whatever the clocks say.
     pub(crate) fn is_too_much(self) -> bool {
         self.exposures > MAX_WAITING || self.sightings > MAX_SIGHTINGS_WAITING
-    }
-}
-
-/// A camera as its calibration describes it.
-#[derive(Clone, Debug)]
-pub(crate) struct KnownCamera {
-    pub(crate) camera: Camera,
-    /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
-    pub(crate) pose_covariance: Option<Matrix6<f64>>,
-    /// Whether somebody has said how sure the pose is.
-    pub(crate) is_declared: bool,
-}
-
-impl KnownCamera {
-    /// Whether its pose, or what is known of it, is another.
-    pub(crate) fn is_elsewhere(&self, other: &Self) -> bool {
-        let (one, two) = (self.camera.pose(), other.camera.pose());
-        one.position() != two.position()
-            || one.rotation() != two.rotation()
-            || self.pose_covariance != other.pose_covariance
-    }
-
-    /// Whether the camera should report a target at a place: in its image, and not too far away.
-    pub(crate) fn expects(&self, place: Point3<f64>, max_range_m: f64) -> bool {
-        (place - self.camera.pose().position()).norm() <= max_range_m && self.camera.sees(place)
     }
 }
 
@@ -226,7 +201,7 @@ pub(crate) fn read(
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty {
-            pose: pose.map(PoseUncertainty::new),
+            pose: Some(PoseUncertainty::new(*pose)),
             axes: *camera.pose().rotation(),
             ..CameraUncertainty::of_time(sd)
         },

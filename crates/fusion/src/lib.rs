@@ -52,8 +52,7 @@
 //! [`BearingFrame`]: crossfix_message::BearingFrame
 
 mod assignment;
-mod calibrations;
-mod camera_record;
+mod cameras;
 mod clocks;
 mod config;
 mod counters;
@@ -63,24 +62,21 @@ mod ingress;
 mod initiation;
 mod messages;
 mod motion;
-mod noise;
 pub mod papers;
-mod pose_scale;
 mod prediction;
 mod range_chart;
 mod ranges;
 mod reacquisition;
-mod rooted;
 mod site_time;
 pub mod spatial;
-mod standing;
 mod track;
 mod tracker;
 mod uncertainty;
 mod unmet;
 mod update;
-mod watch;
+mod visibility;
 
+pub use cameras::CameraStanding;
 pub use clocks::ClockEstimate;
 pub use config::{
     Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod,
@@ -89,6 +85,5 @@ pub use config::{
 pub use counters::Counters;
 pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
-pub use standing::CameraStanding;
 pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};
 pub use unmet::{UnmetLines, WhyNothing};

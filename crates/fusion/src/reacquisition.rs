@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use crossfix_filter::Gate;
 
-use crate::ingress::KnownCamera;
+use crate::cameras::KnownCamera;
 use crate::motion::Motion;
 use crate::track::{Track, TrackId};
 use crate::tracker::{log_likelihood_ratio, missed};

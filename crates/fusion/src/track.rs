@@ -13,7 +13,7 @@ use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_V
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
-use crate::watch::Visibility;
+use crate::visibility::Visibility;
 
 pub(crate) use expectation::Expectation;
 use ties::Ties;

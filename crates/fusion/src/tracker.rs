@@ -8,16 +8,12 @@ use std::collections::BTreeMap;
 
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
-use nalgebra::Point3;
 
-use crate::ingress::KnownCamera;
+use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, Sample};
 use crate::motion::Motion;
-use crate::pose_scale::Sample;
 use crate::prediction::Fit;
 use crate::reacquisition::{Look, Reacquisition};
-use crate::standing::Fittings;
 use crate::track::{Track, TrackId, TrackStatus};
-use crate::watch::Watch;
 
 use association::fitting;
 
@@ -28,10 +24,6 @@ use crate::{Exposure, Sighting, Tracking};
 const MERGE_GATE: f64 = 11.34;
 /// Every track's state goes out at least this often, s.
 const PUBLISHED_EVERY_S: f64 = 0.5;
-/// The smallest target that is found, px: what lies closer together for every camera is one. With half of it the two
-/// ends of a target make two tracks, with twice as much targets in formation are one.
-const SMALLEST_TARGET_PX: f64 = 7.0;
-
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Happening {
@@ -59,10 +51,7 @@ pub(crate) struct Tracker {
     began: Option<Timestamp>,
     /// Of the next track in this run.
     next_number: u64,
-    watches: BTreeMap<CameraName, Watch>,
     reacquisition: Reacquisition,
-    /// Where each camera stands, and how small a target it shows (rad).
-    eyes: BTreeMap<CameraName, (Point3<f64>, f64)>,
 }
 
 /// What is noted while an exposure's bearings are given to the tracks.
@@ -86,6 +75,8 @@ pub(crate) struct Step {
     pub(crate) fittings: Fittings,
     /// Squared third differences of the camera's bearings of tracks, by the noise that it reports.
     pub(crate) third_differences: Vec<f64>,
+    /// How many of its sightings no track has taken.
+    pub(crate) strangers: usize,
     pub(crate) happenings: Vec<Happening>,
 }
 
@@ -100,9 +91,7 @@ impl Tracker {
             tracks: BTreeMap::new(),
             began: None,
             next_number: 1,
-            watches: BTreeMap::new(),
             reacquisition: Reacquisition::default(),
-            eyes: BTreeMap::new(),
         }
     }
 
@@ -179,10 +168,8 @@ impl Tracker {
         &self.motion
     }
 
-    /// Goes back to a time: gives up the tracks that bearings of later times have updated, and forgets
-    /// what the cameras reported beside them.
+    /// Goes back to a time: gives up the tracks that bearings of later times have updated.
     pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<Happening> {
-        self.watches.clear();
         let mut happenings = Vec::new();
         for track in self.tracks.values_mut() {
             track.published = None;
@@ -196,7 +183,6 @@ impl Tracker {
 
     /// All clocks have stepped by so much, s.
     pub(crate) fn step_time(&mut self, step_s: f64) {
-        self.watches.clear();
         self.reacquisition = Reacquisition::default();
         self.tracks.values_mut().for_each(|track| track.step_time(step_s));
     }
@@ -214,10 +200,8 @@ impl Tracker {
     }
 
     /// Takes in one exposure: what of it belongs to tracks updates them.
-    pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera) -> Step {
+    pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera, cameras: &Cameras) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
-        let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
-        self.eyes.insert(exposure.camera.clone(), (known.camera.pose().position(), smallest));
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
         // Where all cameras were silent for long, nothing has told the tracks yet that they are lost.
         let mut noted = Noted { happenings: self.review(exposure.time), ..Noted::default() };
@@ -238,17 +222,10 @@ impl Tracker {
                 free.push(sighting.clone());
             }
         }
-        let time = exposure.time;
-        let watch = self.watches.get_mut(&exposure.camera);
-        if let Some(watch) = watch {
-            watch.see(time, strangers, self.motion.holding_s);
-        } else {
-            self.watches.insert(exposure.camera.clone(), Watch::first(time, strangers));
-        }
         happenings.extend(self.review(exposure.time));
         happenings.extend(self.merge(exposure.time));
-        happenings.extend(self.prove(exposure.time));
-        Step { free, claims, used, fittings, third_differences, happenings }
+        happenings.extend(self.prove(exposure.time, cameras));
+        Step { free, claims, used, fittings, third_differences, strangers, happenings }
     }
 
     /// What the cameras have seen of sure targets, by target, where it is time to compare them.
@@ -263,8 +240,8 @@ impl Tracker {
     }
 
     /// A camera's clock is known otherwise: see [`Track::set_clock`].
-    pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
-        self.tracks.values_mut().for_each(|track| track.set_clock(camera, ahead, ratio));
+    pub(crate) fn set_clock(&mut self, camera: &CameraName, change: ClockChange) {
+        self.tracks.values_mut().for_each(|track| track.set_clock(camera, change));
     }
 
     /// Takes up what a second camera sees of the tracks that one alone follows.
@@ -284,11 +261,6 @@ impl Tracker {
             }
             self.tracks.insert(track.id, track);
         }
-    }
-
-    /// Density of a camera's false bearings, 1/sr: as many as it reports beside the targets.
-    pub(crate) fn clutter_per_sr(&self, camera: &CameraName, known: &KnownCamera) -> f64 {
-        self.watches.get(camera).map_or(self.config.clutter_per_sr, |watch| watch.strangers_per_sr(known))
     }
 }
 

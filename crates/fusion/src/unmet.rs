@@ -8,8 +8,8 @@ use std::fmt;
 
 use crossfix_message::{CameraName, Timestamp};
 
+use crate::cameras::Rooted;
 use crate::initiation::{Passing, Passings, lines_with_pose};
-use crate::rooted::Rooted;
 use crate::spatial::TimedLine;
 use crate::{Exposure, Initiation, Sighting};
 

@@ -302,7 +302,7 @@ fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
         basis: nalgebra::Matrix3x2::identity(),
         covariance: nalgebra::Matrix2::identity(),
     };
-    let sighting = crate::Sighting { image_track: 1, line, rooted: crate::rooted::Rooted::Unknown };
+    let sighting = crate::Sighting { image_track: 1, line, rooted: crate::cameras::Rooted::Unknown };
     Exposure { sightings: vec![sighting; sightings], ..exposure(camera, time_s) }
 }
 

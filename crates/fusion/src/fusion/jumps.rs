@@ -36,6 +36,7 @@ impl Fusion {
             self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
         }
         let happenings = self.tracker.restart(time);
+        self.cameras.forget_strangers();
         self.tell(happenings, time, outputs);
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
@@ -80,7 +81,8 @@ impl Fusion {
         self.buffer.begin_anew();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);
-        self.records.values_mut().for_each(|record| record.look_anew(&self.config));
+        self.cameras.forget_strangers();
+        self.cameras.look_anew();
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
     }

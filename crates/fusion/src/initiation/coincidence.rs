@@ -6,7 +6,7 @@ use crossfix_message::{CameraName, Timestamp};
 use super::sight::Sight;
 use crate::prediction::BearingPrediction;
 use crate::spatial::TYPICAL_SPEED;
-use crate::watch::independent_share;
+use crate::visibility::independent_share;
 
 /// Logarithm of the probability that a camera is blind for a target that it should see.
 const BLIND: f64 = -4.6;

@@ -16,14 +16,14 @@ use nalgebra::{Matrix3, Vector3, Vector6};
 use super::coincidence::Coincidence;
 use super::sight::Sight;
 use super::{MAX_LINES, Start, lines_with_pose};
-use crate::ingress::KnownCamera;
+use crate::cameras::KnownCamera;
+use crate::cameras::Rooted;
+use crate::cameras::view_sr;
 use crate::motion::Motion;
-use crate::rooted::Rooted;
 use crate::spatial::{Fix, LineId, Observability, TimedLine, VelocityKnowledge};
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, same_target};
 use crate::uncertainty::CameraUncertainty;
-use crate::watch::view_sr;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what flies past a camera

@@ -9,9 +9,9 @@ use super::coincidence::Coincidence;
 use super::seeds::{Seed, SeedFinder};
 use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
-use crate::ingress::KnownCamera;
+use crate::cameras::Rooted;
+use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::Motion;
-use crate::rooted::Rooted;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
 use crate::tracker::{log_likelihood_ratio, missed, same_target};
@@ -129,12 +129,12 @@ impl Hypotheses {
     pub(super) fn advance(
         &mut self,
         exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, KnownCamera>,
+        cameras: &Cameras,
         motion: &Motion,
     ) -> Vec<Start> {
         self.period += 1;
         for exposure in exposures {
-            if let Some(known) = cameras.get(&exposure.camera) {
+            if let Some(known) = cameras.known(&exposure.camera) {
                 self.extend(exposure, known, motion);
             }
         }

@@ -12,13 +12,13 @@ mod seeds;
 mod selection;
 mod sight;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use crossfix_geometry::BearingModel;
 use crossfix_message::CameraName;
 use nalgebra::Vector3;
 
-use crate::ingress::KnownCamera;
+use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::Motion;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
@@ -104,7 +104,7 @@ impl Initiator {
         &mut self,
         exposure: Exposure,
         claims: &[(usize, TrackId)],
-        cameras: &BTreeMap<CameraName, KnownCamera>,
+        cameras: &Cameras,
         motion: &Motion,
     ) -> Vec<Start> {
         if let Method::Hypotheses(hypotheses) = &mut self.method {

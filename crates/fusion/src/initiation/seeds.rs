@@ -1,16 +1,16 @@
 //! Sets of lines of one period, one a camera, that may be one target's.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 
 use crossfix_filter::Gate;
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::Timestamp;
 
 use super::passing::{Passing, Passings};
 use super::{NamedLine, lines_with_pose};
-use crate::ingress::KnownCamera;
+use crate::cameras::Cameras;
+use crate::cameras::Rooted;
 use crate::prediction::BearingPrediction;
-use crate::rooted::Rooted;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
 
@@ -63,7 +63,7 @@ pub(crate) struct SeedFinder {
 /// A pair of lines that pass each other closely, as they are extended.
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
-    cameras: &'a BTreeMap<CameraName, KnownCamera>,
+    cameras: &'a Cameras,
     lines: &'a [Vec<NamedLine>],
 }
 
@@ -88,11 +88,7 @@ impl SeedFinder {
     }
 
     /// Every set of lines of one period that may be one target's, the most likely first.
-    pub(crate) fn find(
-        &self,
-        exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, KnownCamera>,
-    ) -> Vec<Seed> {
+    pub(crate) fn find(&self, exposures: &[&Exposure], cameras: &Cameras) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
         let growing = Growing { exposures, cameras, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
@@ -154,7 +150,7 @@ impl SeedFinder {
     /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first
     /// (002, equation 12).
     fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
-        let camera = |i: usize| Some(&growing.cameras.get(&growing.exposures[i].camera)?.camera);
+        let camera = |i: usize| Some(&growing.cameras.known(&growing.exposures[i].camera)?.camera);
         let mut pairs = Vec::new();
         for a in 0..growing.exposures.len() {
             for b in a + 1..growing.exposures.len() {
@@ -238,7 +234,7 @@ impl SeedFinder {
         solution: &MapSolution,
         c: usize,
     ) -> Vec<usize> {
-        let known = growing.cameras.get(&growing.exposures[c].camera);
+        let known = growing.cameras.known(&growing.exposures[c].camera);
         let newest = places.iter().map(|&(k, l)| growing.lines[k][l].1.time).max();
         let (Some(known), Some(reference), Some((_, first))) = (known, newest, growing.lines[c].first())
         else {
@@ -279,7 +275,7 @@ impl SeedFinder {
             missed
                 && growing
                     .cameras
-                    .get(&exposure.camera)
+                    .known(&exposure.camera)
                     .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
         });
         let false_alarms: f64 = places.iter().map(|&(k, _)| growing.exposures[k].clutter_per_sr.ln()).sum();

@@ -1,12 +1,10 @@
 //! The fixes of one period: what the papers' spatial processing answers.
 
-use std::collections::BTreeMap;
-
-use crossfix_message::{CameraName, Solver, Timestamp};
+use crossfix_message::{Solver, Timestamp};
 
 use super::grouping::PeriodFix;
 use super::{RangeSolution, pair, stacked, triple};
-use crate::ingress::KnownCamera;
+use crate::cameras::Cameras;
 use crate::initiation::{NamedLine, SeedFinder, lines_of};
 use crate::spatial::{Fix, MapSolution, TimedLine, VelocityKnowledge, map};
 use crate::{Exposure, FusionConfig, Initiation, SpatialSolver};
@@ -32,11 +30,7 @@ impl FixFinder {
     }
 
     /// Every fix that the exposures of one period can make.
-    pub(super) fn fixes(
-        &self,
-        exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, KnownCamera>,
-    ) -> Vec<PeriodFix> {
+    pub(super) fn fixes(&self, exposures: &[&Exposure], cameras: &Cameras) -> Vec<PeriodFix> {
         match self.config.solver {
             SpatialSolver::Pair => self.pair_fixes(exposures),
             SpatialSolver::Triple => self.triple_fixes(exposures),

@@ -1,12 +1,10 @@
 //! 002's temporal processing on the fixes of each period.
 
-use std::collections::{BTreeMap, BTreeSet};
-
-use crossfix_message::CameraName;
+use std::collections::BTreeSet;
 
 use super::fixes::{FixFinder, SPEED_SIGMAS};
 use super::grouping::{Group, Grouping, GroupingRules, TemporalGate};
-use crate::ingress::KnownCamera;
+use crate::cameras::Cameras;
 use crate::initiation::{NamedLine, Start};
 use crate::motion::Motion;
 use crate::spatial::{Fix, VAGUE_VELOCITY_SD, VelocityKnowledge, chi_square};
@@ -45,7 +43,7 @@ impl Grouped {
     pub(crate) fn advance(
         &mut self,
         exposures: &[&Exposure],
-        cameras: &BTreeMap<CameraName, KnownCamera>,
+        cameras: &Cameras,
         motion: &Motion,
     ) -> Vec<Start> {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));

@@ -5,12 +5,11 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x3, Unit, Vector2};
 
 use super::{Innovation, Track};
+use crate::cameras::{ClockChange, LastThree, Sample};
 use crate::motion::Motion;
-use crate::noise::LastThree;
-use crate::pose_scale::Sample;
 use crate::uncertainty::CameraUncertainty;
 use crate::update::Updated;
-use crate::watch::Visibility;
+use crate::visibility::Visibility;
 
 /// Bearings further apart than this share of the time for which one holds a track tell no noise from jerks.
 const CLOSE_BEARINGS: f64 = 0.1;
@@ -230,7 +229,7 @@ impl Track {
     /// times, and its variance to be `ratio` times what it was: the track lies by as much beside where it was
     /// thought to be. What makes a variance smaller has been learnt of the error that the track holds; what makes
     /// it larger is an error that has come since, of which the track holds nothing.
-    pub(crate) fn set_clock(&mut self, camera: &CameraName, ahead: f64, ratio: f64) {
+    pub(crate) fn set_clock(&mut self, camera: &CameraName, ClockChange { ahead, ratio }: ClockChange) {
         let Some(ties) = self.ties.get_mut(camera) else {
             return;
         };

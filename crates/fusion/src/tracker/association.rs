@@ -6,9 +6,9 @@ use crossfix_message::TrackEventKind;
 
 use super::{Happening, Noted, Tracker, log_likelihood_ratio, missed};
 use crate::assignment::{Candidate, assign};
-use crate::ingress::KnownCamera;
+use crate::cameras::Fitting;
+use crate::cameras::KnownCamera;
 use crate::reacquisition::FOUND_AGAIN_MARGIN;
-use crate::standing::Fitting;
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::{Exposure, Sighting};
 

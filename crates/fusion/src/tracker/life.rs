@@ -3,10 +3,14 @@
 use crossfix_message::{Timestamp, TrackEventKind, track_id};
 
 use super::{Happening, Tracker, mahalanobis_squared, same_target};
+use crate::cameras::Cameras;
 use crate::initiation::Start;
 use crate::motion::Motion;
 use crate::track::{Track, TrackId, TrackStatus};
 
+/// The smallest target that is found, px: what lies closer together for every camera is one. With half of it the two
+/// ends of a target make two tracks, with twice as much targets in formation are one.
+const SMALLEST_TARGET_PX: f64 = 7.0;
 /// A track whose score falls below this is dropped: a chance of 1 in 100 against clutter.
 const DROP_SCORE: f64 = -4.6;
 /// A new track is compared with the older ones this often, s, ...
@@ -77,7 +81,7 @@ impl Tracker {
 
     /// Compares each track a few times while it is young with those that were there before it: a detector that
     /// reports the two ends of a target makes two tracks.
-    pub(super) fn prove(&mut self, now: Timestamp) -> Vec<Happening> {
+    pub(super) fn prove(&mut self, now: Timestamp, cameras: &Cameras) -> Vec<Happening> {
         let is_due = |track: &&Track| {
             let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
             track.status == TrackStatus::Confirmed
@@ -91,7 +95,7 @@ impl Tracker {
             let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
             // Two targets that cross part again.
             let stays = |old: &Track, new: &Track| {
-                [0.0, COMPARED_EVERY_S].iter().all(|&s| self.is_one_image(old, new, now.plus_seconds(s)))
+                [0.0, COMPARED_EVERY_S].iter().all(|&s| is_one_image(old, new, now.plus_seconds(s), cameras))
             };
             let same = self.tracks.get(&id).and_then(|new| older.find(|old| stays(old, new)));
             let same = same.map(|old| old.id);
@@ -114,7 +118,8 @@ impl Tracker {
     /// is the same target found again: it goes on under the old number. Where it lies elsewhere, the
     /// old one was wrong and is given up; but two cameras are not enough to say so, as their lines
     /// cross anywhere.
-    pub(crate) fn adopt(&mut self, Start { mut track, cameras, claimed_by }: Start) -> Vec<Happening> {
+    pub(crate) fn adopt(&mut self, start: Start, cameras: &Cameras) -> Vec<Happening> {
+        let Start { mut track, cameras: seen_by, claimed_by } = start;
         let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
         let unheld: Vec<&Track> = owners.filter(|old| old.is_confirmed() && !old.is_held()).collect();
         let same = unheld.iter().find(|old| {
@@ -131,12 +136,12 @@ impl Tracker {
         if self.tracks.values().any(|old| {
             old.status == TrackStatus::Confirmed
                 && old.is_held()
-                && self.is_one_image(old, &track, track.updated)
+                && is_one_image(old, &track, track.updated, cameras)
         }) {
             return Vec::new();
         }
         let wrong: Vec<TrackId> = unheld.iter().map(|old| old.id).collect();
-        if !wrong.is_empty() && cameras < 3 {
+        if !wrong.is_empty() && seen_by < 3 {
             return Vec::new();
         }
         let id = TrackId(track_id(self.began.unwrap_or(track.updated), self.next_number));
@@ -155,18 +160,21 @@ impl Tracker {
         self.tracks.insert(id, track);
         happenings
     }
+}
 
-    /// Whether two tracks lie so close together at a time for every camera that sees the new one that they are parts
-    /// of one target: a detector may report its two ends.
-    fn is_one_image(&self, old: &Track, new: &Track, time: Timestamp) -> bool {
-        let [there, here] = [old.position_at(time), new.position_at(time)];
-        // What was split once is split again, and where a track begins it is less sure where.
-        let times = if old.has_ends { 2.0 } else { 1.0 };
-        let mut eyes = new.residuals.keys().map(|camera| self.eyes.get(camera));
-        eyes.all(|eye| {
-            eye.is_some_and(|(origin, smallest)| (there - origin).angle(&(here - origin)) < times * smallest)
+/// Whether two tracks lie so close together at a time for every camera that sees the new one that they are parts
+/// of one target: a detector may report its two ends.
+fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) -> bool {
+    let [there, here] = [old.position_at(time), new.position_at(time)];
+    // What was split once is split again, and where a track begins it is less sure where.
+    let times = if old.has_ends { 2.0 } else { 1.0 };
+    new.residuals.keys().all(|name| {
+        cameras.known(name).is_some_and(|known| {
+            let smallest = SMALLEST_TARGET_PX / known.camera.model().intrinsics().fx;
+            let origin = known.camera.pose().position();
+            (there - origin).angle(&(here - origin)) < times * smallest
         })
-    }
+    })
 }
 
 /// Root of the sum of the position's variances, m: not less than the standard deviation along any axis.

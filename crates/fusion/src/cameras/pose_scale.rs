@@ -6,10 +6,10 @@
 //! components), a step a draw. Where nobody has declared a pose's deviation, a careful survey's is where it begins.
 //! A clock that is off by more than its camera says looks like a pose that is.
 
-use std::collections::BTreeMap;
-
 use crossfix_message::CameraName;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+use super::Cameras;
 
 /// The share of a draw in the running means, once there are enough. A draw lasts a third of a second: they
 /// remember some three seconds of one target. With half of it a site would be a minute in learning what it is
@@ -55,8 +55,9 @@ pub(crate) struct Sample {
     pub(crate) pose: Matrix2<f64>,
 }
 
+/// What a camera's pose covariance is to be multiplied with.
 #[derive(Clone, Copy, Debug)]
-struct Scale {
+pub(super) struct PoseScale {
     value: f64,
     /// What the tracks know of it.
     told: f64,
@@ -69,79 +70,83 @@ struct Scale {
     expected: f64,
 }
 
-/// What each camera's pose covariance is to be multiplied with.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct PoseScales {
-    scales: BTreeMap<CameraName, Scale>,
+impl PoseScale {
+    /// Of a camera whose pose's deviation somebody has declared, or not, and of which nothing is learnt yet.
+    pub(super) fn new(is_declared: bool) -> Self {
+        let (least, greatest) = if is_declared { (1.0, DECLARED_MOST) } else { (LEAST, MOST) };
+        Self { value: 1.0, told: 1.0, least, greatest, draws: 0.0, found: 0.0, expected: 0.0 }
+    }
+
+    /// The factor on the pose's covariance, as the tracks know it.
+    pub(super) fn factor(&self) -> f64 {
+        self.told
+    }
+
+    /// Whether the camera's lines miss the others' by far more than is declared of it.
+    pub(super) fn is_doubted(&self) -> bool {
+        self.told > DOUBTED
+    }
+
+    /// Takes in what the camera's errors are by a draw of so many cameras, and what they should be, where the site's
+    /// cameras have a typical factor; returns by how much the tracks' factor changes, if it does.
+    fn learn(&mut self, (found, expected): (f64, f64), accusers: usize, typical: f64) -> Option<f64> {
+        if !(found.is_finite() && expected.is_finite() && expected > 0.0) {
+            return None;
+        }
+        self.draws += 1.0;
+        let share = self.draws.recip().max(DRAW_SHARE);
+        // No one draw says that a camera is far worse than it was.
+        let found = found.min(expected * MOST_OF_A_DRAW);
+        self.found += (found - self.found) * share;
+        self.expected += (expected - self.expected) * share;
+        let step = (self.found / self.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
+        let most = if accusers < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
+        let own = self.value * step.min(most);
+        let next = own + (typical - own) * ALIKE;
+        let next = next.clamp(self.value / LARGEST_STEP, self.value * LARGEST_STEP);
+        let next = next.clamp(self.least, self.greatest);
+        // What has been found so far is less by the new factor: not at all where noise hides the pose, and
+        // inversely to it where the pose is all. Held against the old one, an error would count ten times; a
+        // declared pose's factor is bounded, and real flights are better for counting it so.
+        if self.greatest > DECLARED_MOST {
+            self.found /= (next / self.value).max(1.0).sqrt();
+        }
+        self.value = next;
+        let ratio = self.value / self.told;
+        (ratio.ln().abs() > NOTICED).then(|| {
+            self.told = self.value;
+            ratio
+        })
+    }
 }
 
-impl PoseScales {
-    /// Makes a camera known, or known anew where it has been moved.
-    pub(crate) fn calibrate(&mut self, camera: &CameraName, is_declared: bool) {
-        let (least, greatest) = if is_declared { (1.0, DECLARED_MOST) } else { (LEAST, MOST) };
-        self.scales.insert(
-            camera.clone(),
-            Scale { value: 1.0, told: 1.0, least, greatest, draws: 0.0, found: 0.0, expected: 0.0 },
-        );
-    }
-
-    /// The factor on a camera's pose covariance.
-    pub(crate) fn of(&self, camera: &CameraName) -> f64 {
-        self.scales.get(camera).map_or(1.0, |scale| scale.told)
-    }
-
-    /// Whether a camera's lines miss the others' by far more than is declared of it.
-    pub(crate) fn is_doubted(&self, camera: &CameraName) -> bool {
-        self.of(camera) > DOUBTED
-    }
-
-    /// Takes a draw in; returns the cameras whose factor has changed, each with the ratio.
-    pub(crate) fn learn(&mut self, samples: &[Sample]) -> Vec<(CameraName, f64)> {
+impl Cameras {
+    /// Takes in what cameras have seen of a target; returns those whose pose's factor has changed, each with the ratio.
+    pub(crate) fn learn_poses(&mut self, samples: &[Sample]) -> Vec<(CameraName, f64)> {
         let Some(found) = self.found_and_expected(samples) else {
             return Vec::new();
         };
-        let mut logarithms: Vec<f64> =
-            samples.iter().filter_map(|sample| Some(self.scales.get(&sample.camera)?.value.ln())).collect();
+        let typical = self.typical_scale(samples);
+        let drawn = samples.iter().zip(found);
+        let changed = drawn.filter_map(|(sample, found)| {
+            let scale = &mut self.get_mut(&sample.camera)?.pose_scale;
+            Some((sample.camera.clone(), scale.learn(found, samples.len(), typical)?))
+        });
+        changed.collect()
+    }
+
+    /// The median of the factors, in their logarithms.
+    fn typical_scale(&self, samples: &[Sample]) -> f64 {
+        let logarithm = |sample: &Sample| Some(self.get(&sample.camera)?.pose_scale.value.ln());
+        let mut logarithms: Vec<f64> = samples.iter().filter_map(logarithm).collect();
         logarithms.sort_unstable_by(f64::total_cmp);
         let middle = |k: usize| logarithms.get(k).copied().unwrap_or(0.0);
-        let typical = (middle(logarithms.len() / 2) + middle(logarithms.len().saturating_sub(1) / 2)) / 2.0;
-        let mut changed = Vec::new();
-        for (sample, (found, expected)) in samples.iter().zip(found) {
-            let scale = self.scales.get_mut(&sample.camera);
-            if let Some(scale) = scale.filter(|_| found.is_finite() && expected.is_finite() && expected > 0.0)
-            {
-                scale.draws += 1.0;
-                let share = scale.draws.recip().max(DRAW_SHARE);
-                // No one draw says that a camera is far worse than it was.
-                let found = found.min(expected * MOST_OF_A_DRAW);
-                scale.found += (found - scale.found) * share;
-                scale.expected += (expected - scale.expected) * share;
-                let step = (scale.found / scale.expected).sqrt().clamp(LARGEST_STEP.recip(), LARGEST_STEP);
-                let most = if samples.len() < LEAST_ACCUSERS { 1.0 } else { LARGEST_STEP };
-                let own = scale.value * step.min(most);
-                let next = own + (typical.exp() - own) * ALIKE;
-                let next = next.clamp(scale.value / LARGEST_STEP, scale.value * LARGEST_STEP);
-                let next = next.clamp(scale.least, scale.greatest);
-                // What has been found so far is less by the new factor: not at all where noise hides the pose, and
-                // inversely to it where the pose is all. Held against the old one, an error would count ten times; a
-                // declared pose's factor is bounded, and real flights are better for counting it so.
-                if scale.greatest > DECLARED_MOST {
-                    scale.found /= (next / scale.value).max(1.0).sqrt();
-                }
-                scale.value = next;
-                let ratio = scale.value / scale.told;
-                if ratio.ln().abs() > NOTICED {
-                    scale.told = scale.value;
-                    changed.push((sample.camera.clone(), ratio));
-                }
-            }
-        }
-        changed
+        ((middle(logarithms.len() / 2) + middle(logarithms.len().saturating_sub(1) / 2)) / 2.0).exp()
     }
 
     /// By each camera's factor: what of a draw its pose error explains, and what it should explain.
     fn found_and_expected(&self, samples: &[Sample]) -> Option<Vec<(f64, f64)>> {
-        let scale = |sample: &Sample| self.scales.get(&sample.camera).map_or(1.0, |scale| scale.value);
+        let scale = |sample: &Sample| self.get(&sample.camera).map_or(1.0, |camera| camera.pose_scale.value);
         let weight = |s: &Sample| (s.noise + s.pose * s.pose.transpose() * scale(s)).try_inverse();
         let weights: Vec<Matrix2<f64>> = samples.iter().map(weight).collect::<Option<_>>()?;
         let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());

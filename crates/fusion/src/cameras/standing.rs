@@ -1,13 +1,11 @@
 //! How far each camera can be believed.
 //!
-//! How large a camera's errors are is found from all lines together ([`crate::pose_scale`]), and such a camera
+//! How large a camera's errors are is found from all lines together ([`super::pose_scale`]), and such a camera
 //! counts less; here is what that cannot find: a camera whose lines miss the targets by so much that no track
 //! takes them, and one whose frames come at impossible times. A target that a camera does not report accuses
 //! nobody: something may stand in between. Only a line beside a target that three other cameras see does.
 
-use std::collections::BTreeMap;
-
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::Timestamp;
 
 /// What is remembered of a camera, s: long enough for a bird beside a target to pass, short enough for a
 /// camera that has been put right to come back.
@@ -65,72 +63,73 @@ impl Fittings {
     }
 }
 
+/// What a verdict on a camera is made of.
 #[derive(Clone, Copy, Debug)]
-struct Record {
+struct Evidence {
     /// Share of the time in which it has been wrong.
     wrong: f64,
-    /// Evidence so far, s.
-    evidence_s: f64,
+    /// How long it has been compared, s.
+    compared_s: f64,
     last: Timestamp,
     excluded: bool,
 }
 
-/// The standing of every camera, by one kind of evidence.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Standings {
-    records: BTreeMap<CameraName, Record>,
+impl Evidence {
+    fn beginning(time: Timestamp) -> Self {
+        Self { wrong: 0.0, compared_s: 0.0, last: time, excluded: false }
+    }
 }
 
-impl Standings {
+/// The standing of a camera, by one kind of evidence; none as long as there was nothing to compare it with.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Standing(Option<Evidence>);
+
+impl Standing {
     /// Takes in how an exposure fits, by its camera's own clock. All targets of one exposure are one piece of
     /// evidence: they share its pose and time.
-    pub(crate) fn learn(&mut self, camera: &CameraName, time: Timestamp, fittings: &[Fitting]) {
+    pub(super) fn learn(&mut self, time: Timestamp, fittings: &[Fitting]) {
         if fittings.is_empty() {
             return;
         }
-        let new = Record { wrong: 0.0, evidence_s: 0.0, last: time, excluded: false };
-        let record = self.records.entry(camera.clone()).or_insert(new);
-        let step_s = time.seconds_since(record.last).abs().min(LONGEST_STEP_S);
-        record.last = time;
-        record.evidence_s = (record.evidence_s + step_s).min(MEMORY_S);
+        let evidence = self.0.get_or_insert(Evidence::beginning(time));
+        let step_s = time.seconds_since(evidence.last).abs().min(LONGEST_STEP_S);
+        evidence.last = time;
+        evidence.compared_s = (evidence.compared_s + step_s).min(MEMORY_S);
         let wrong = fittings.iter().filter(|fitting| **fitting != Fitting::Fits).count();
         let share = wrong as f64 / fittings.len() as f64;
-        record.wrong += (share - record.wrong) * (step_s / record.evidence_s.max(step_s)).min(1.0);
+        evidence.wrong += (share - evidence.wrong) * (step_s / evidence.compared_s.max(step_s)).min(1.0);
     }
 
-    /// A camera has been left out: what was held against the others was found beside what it said.
-    pub(crate) fn acquit_others(&mut self, camera: &CameraName) {
-        for (_, record) in
-            self.records.iter_mut().filter(|(name, record)| *name != camera && !record.excluded)
-        {
-            (record.wrong, record.evidence_s) = (0.0, 0.0);
+    /// Another camera has been left out: what was held against this one was found beside what that one said.
+    pub(super) fn acquit(&mut self) {
+        if let Some(evidence) = self.0.as_mut().filter(|evidence| !evidence.excluded) {
+            (evidence.wrong, evidence.compared_s) = (0.0, 0.0);
         }
     }
 
-    /// A camera's exposure at a time says nothing for or against it. Where that goes on for long, as there is no
+    /// An exposure at a time says nothing for or against the camera. Where that goes on for long, as there is no
     /// target left to compare it with, a verdict lapses: returns whether one has.
-    pub(crate) fn lapse(&mut self, camera: &CameraName, time: Timestamp) -> bool {
-        let lapsed = self
-            .records
-            .get_mut(camera)
-            .filter(|record| record.excluded && time.seconds_since(record.last).abs() > MEMORY_S);
-        lapsed.is_some_and(|record| {
-            *record = Record { wrong: 0.0, evidence_s: 0.0, last: time, excluded: false };
+    pub(super) fn lapse(&mut self, time: Timestamp) -> bool {
+        let is_old = |evidence: &&mut Evidence| time.seconds_since(evidence.last).abs() > MEMORY_S;
+        let lapsed = self.0.as_mut().filter(|evidence| evidence.excluded).filter(is_old);
+        lapsed.is_some_and(|evidence| {
+            *evidence = Evidence::beginning(time);
             true
         })
     }
 
-    /// Whether a camera is left out.
-    pub(crate) fn is_excluded(&self, camera: &CameraName) -> bool {
-        self.records.get(camera).is_some_and(|record| record.excluded)
+    /// Whether the camera is left out.
+    pub(super) fn is_excluded(&self) -> bool {
+        self.0.is_some_and(|evidence| evidence.excluded)
     }
 
-    /// Leaves a camera out or lets it back in; returns the new standing if that has changed.
-    pub(crate) fn review(&mut self, camera: &CameraName) -> Option<CameraStanding> {
-        let record = self.records.get_mut(camera).filter(|r| r.evidence_s >= LEAST_EVIDENCE_S)?;
-        let excluded = if record.excluded { record.wrong > RETURN } else { record.wrong > EXCLUSION };
-        let changed = excluded != record.excluded;
-        record.excluded = excluded;
+    /// Leaves the camera out or lets it back in; returns the new standing if that has changed.
+    pub(super) fn review(&mut self) -> Option<CameraStanding> {
+        let evidence = self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
+        let limit = if evidence.excluded { RETURN } else { EXCLUSION };
+        let excluded = evidence.wrong > limit;
+        let changed = excluded != evidence.excluded;
+        evidence.excluded = excluded;
         let standing = if excluded { CameraStanding::Excluded } else { CameraStanding::Good };
         changed.then_some(standing)
     }
@@ -140,20 +139,16 @@ impl Standings {
 mod tests {
     use super::*;
 
-    fn name(text: &str) -> CameraName {
-        text.parse().unwrap()
-    }
-
     /// The verdicts on a camera that gives the same evidence `rate` times a second.
     fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraStanding> {
-        let (mut standings, camera) = (Standings::default(), name("a"));
+        let mut standing = Standing::default();
         let mut verdicts = Vec::new();
         let mut time = Timestamp::EPOCH;
         for fitting in fittings {
             for _ in 0..(8.0 * rate) as usize {
                 time = time.plus_seconds(rate.recip());
-                standings.learn(&camera, time, fitting);
-                verdicts.extend(standings.review(&camera));
+                standing.learn(time, fitting);
+                verdicts.extend(standing.review());
             }
         }
         verdicts
@@ -174,29 +169,30 @@ mod tests {
 
     #[test]
     fn a_verdict_lapses_where_nothing_is_left_to_compare_with() {
-        let (mut standings, camera) = (Standings::default(), name("a"));
+        let mut standing = Standing::default();
         let at = |seconds: f64| Timestamp::EPOCH.plus_seconds(seconds);
         for k in 0..50 {
-            standings.learn(&camera, at(0.1 * f64::from(k)), &[Fitting::Beside]);
+            standing.learn(at(0.1 * f64::from(k)), &[Fitting::Beside]);
         }
-        assert_eq!(standings.review(&camera), Some(CameraStanding::Excluded));
-        assert!(!standings.lapse(&camera, at(9.0)));
-        assert!(standings.lapse(&camera, at(10.0)));
-        assert!(!standings.is_excluded(&camera) && !standings.lapse(&camera, at(20.0)));
+        assert_eq!(standing.review(), Some(CameraStanding::Excluded));
+        assert!(!standing.lapse(at(9.0)));
+        assert!(standing.lapse(at(10.0)));
+        assert!(!standing.is_excluded() && !standing.lapse(at(20.0)));
     }
 
     #[test]
     fn what_was_held_against_others_beside_a_camera_that_is_left_out_is_void() {
-        let (mut standings, [one, other]) = (Standings::default(), ["a", "b"].map(name));
+        let mut both = [Standing::default(); 2];
         for k in 0..50 {
             let time = Timestamp::EPOCH.plus_seconds(0.1 * f64::from(k));
-            standings.learn(&one, time, &[Fitting::Beside]);
-            standings.learn(&other, time, &[Fitting::Beside]);
+            both.iter_mut().for_each(|standing| standing.learn(time, &[Fitting::Beside]));
         }
-        assert_eq!(standings.review(&one), Some(CameraStanding::Excluded));
-        standings.acquit_others(&one);
-        assert_eq!(standings.review(&other), None);
-        assert!(standings.is_excluded(&one) && !standings.is_excluded(&other));
+        let [mut one, mut other] = both;
+        assert_eq!(one.review(), Some(CameraStanding::Excluded));
+        one.acquit();
+        other.acquit();
+        assert_eq!(other.review(), None);
+        assert!(one.is_excluded() && !other.is_excluded());
     }
 
     #[test]

@@ -1,17 +1,6 @@
-//! What a camera reports beside the targets that are followed.
-
-use std::f64::consts::PI;
+//! Whether a target can be seen at all: what hides it from a camera.
 
 use crossfix_message::Timestamp;
-
-use crate::ingress::KnownCamera;
-
-/// How long the strangers of a camera are averaged over, in times for which a bearing holds a track.
-const MEMORY: f64 = 2.0;
-/// Strangers in an exposure that may always be, however few there were.
-const LEAST_STRANGERS: f64 = 0.02;
-/// No image covers less than this, sr: a microradian squared, which keeps densities finite for any lens.
-const LEAST_VIEW_SR: f64 = 1e-12;
 
 /// What hides a target from cameras hides it for about so long, s.
 const HIDDEN_S: f64 = 0.25;
@@ -74,39 +63,4 @@ impl Visibility {
         self.visible = if seen { 1.0 } else { missed / (missed + 1.0 - before) };
         self.time = time;
     }
-}
-
-/// A camera's exposures so far.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Watch {
-    time: Timestamp,
-    /// Bearings in an exposure that belong to no track that is held in its place.
-    strangers: f64,
-}
-
-impl Watch {
-    /// A camera's first exposure.
-    pub(crate) fn first(time: Timestamp, strangers: usize) -> Self {
-        Self { time, strangers: strangers as f64 }
-    }
-
-    /// Its next one.
-    pub(crate) fn see(&mut self, time: Timestamp, strangers: usize, holding_s: f64) {
-        let weight = (time.seconds_since(self.time) / (MEMORY * holding_s)).clamp(0.0, 1.0);
-        self.strangers += (strangers as f64 - self.strangers) * weight;
-        self.time = time;
-    }
-
-    /// How many bearings are nobody's, 1/sr about the optical axis.
-    pub(crate) fn strangers_per_sr(&self, known: &KnownCamera) -> f64 {
-        (self.strangers + LEAST_STRANGERS) / view_sr(known)
-    }
-}
-
-/// How much a camera sees, sr about the optical axis.
-pub(crate) fn view_sr(known: &KnownCamera) -> f64 {
-    let lens = known.camera.model().intrinsics();
-    let [width, height] = [lens.size.width, lens.size.height].map(f64::from);
-    // Whatever a calibration says, no camera sees more than all directions or less than a point.
-    ((width / lens.fx) * (height / lens.fy)).clamp(LEAST_VIEW_SR, 4.0 * PI)
 }

@@ -64,6 +64,11 @@ impl View {
         Self { rooted_s, places: Vec::new(), began: None, exposures: 0.0 }
     }
 
+    /// Of a camera that begins to look once more.
+    pub(super) fn anew(&self) -> Self {
+        Self::new(self.rooted_s)
+    }
+
     /// Takes an exposure's lines in; says of each whether it is rooted.
     pub(crate) fn see<'a>(
         &mut self,
