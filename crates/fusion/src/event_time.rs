@@ -1,34 +1,23 @@
 //! Event time with a bounded wait: frames go in as they arrive and come out in the order of their
 //! capture times, so that the order of arrival changes nothing.
 
+mod queue;
+mod stream;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_message::{CameraName, Timestamp};
 
-use crate::ingress::Load;
-use crate::{EventTime, Exposure, RejectionReason};
+use crate::{EventTime, Exposure, Rejection, RejectionReason};
+use stream::Stream;
+
+pub(crate) use queue::ReorderQueue;
 
 /// More exposures than this are not remembered of those that came out: memory is bounded.
 const MAX_TAKEN: usize = 20_000;
 
 /// A camera that has been silent for so many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
-
-/// For so many times the lateness a camera is waited for as one whose frames overtake each other.
-const DISORDER_LASTS: f64 = 20.0;
-
-/// So many frames of a camera one after the other far behind its newest say that its clock was ahead,
-/// even where they come too late.
-const MOST_FAR_BEHIND: u32 = 3;
-
-type Order = (Timestamp, CameraName);
-
-/// An exposure that waits, and whether its time has been compared with another camera's.
-#[derive(Debug)]
-struct Held {
-    exposure: Exposure,
-    compared: bool,
-}
 
 /// How an exposure arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,51 +28,11 @@ pub(crate) enum Arrival {
     OutOfOrder,
 }
 
-/// How one camera's frames come.
-#[derive(Clone, Copy, Debug)]
-struct Stream {
-    newest: Timestamp,
-    /// From the last but one to the newest, s, as far as that is no jump.
-    step_s: f64,
-    /// [`EventBuffer::run_s`] when it was heard last.
-    heard_s: f64,
-    /// Frames far behind the newest, one after the other.
-    far_behind: u32,
-    /// How far behind the newest others came, at most, s, and the newest when one did last; from a
-    /// frame on that came too late for it.
-    disorder: Option<(f64, Timestamp)>,
-}
-
-impl Stream {
-    fn beginning(newest: Timestamp) -> Self {
-        Self { newest, step_s: 0.0, heard_s: 0.0, far_behind: 0, disorder: None }
-    }
-
-    /// Takes note of a frame that came `late_s` too late.
-    fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
-        let behind_s = self.newest.seconds_since(time);
-        let known_s = self.disorder_s(lateness_s);
-        let far_behind = if behind_s > lateness_s { self.far_behind + 1 } else { 0 };
-        self.far_behind = far_behind;
-        if behind_s <= 0.0 {
-            self.newest = time;
-            self.step_s = (-behind_s).min(PATIENCES * lateness_s);
-        } else if behind_s <= lateness_s {
-            if late_s.is_some() || known_s > 0.0 {
-                self.disorder = Some((behind_s.max(known_s), self.newest));
-            }
-        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s) {
-            // No network reorders so far: the clock was ahead, and now it is not.
-            *self = Self::beginning(time);
-        }
-    }
-
-    /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the order.
-    fn disorder_s(&self, lateness_s: f64) -> f64 {
-        let lasts_s = DISORDER_LASTS * lateness_s;
-        let lately = |(_, then): &(f64, Timestamp)| self.newest.seconds_since(*then) <= lasts_s;
-        self.disorder.filter(lately).map_or(0.0, |(behind_s, _)| behind_s)
-    }
+/// A camera that should be heard: its frames, once it has been, and whether it has come to its end.
+#[derive(Clone, Copy, Debug, Default)]
+struct Source {
+    stream: Option<Stream>,
+    ended: bool,
 }
 
 /// The buffer that puts exposures into order.
@@ -109,14 +58,11 @@ impl Stream {
 #[derive(Debug)]
 pub(crate) struct EventBuffer {
     config: EventTime,
-    held: BTreeMap<Order, Held>,
-    load: Load,
+    /// Each with whether its time has been compared with another camera's.
+    waiting: ReorderQueue<bool>,
     /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
-    taken: BTreeSet<Order>,
-    streams: BTreeMap<CameraName, Stream>,
-    /// The newest time of each camera that agreed with another camera's.
-    trusted: BTreeMap<CameraName, Timestamp>,
-    ended: BTreeSet<CameraName>,
+    taken: BTreeSet<(Timestamp, CameraName)>,
+    sources: BTreeMap<CameraName, Source>,
     /// How far all cameras together have gone on, each by its own clock and without jumps, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
@@ -124,11 +70,9 @@ pub(crate) struct EventBuffer {
     /// [`Self::run_s`] since when most live cameras have been behind what was released.
     behind_since_s: Option<f64>,
     /// What was held when the order was taken up anew.
-    dropped: Vec<(Exposure, RejectionReason)>,
+    dropped: Vec<Rejection>,
     /// Where the order was taken up anew, until somebody asks.
     restarted: Option<Timestamp>,
-    /// Cameras that should be heard soon.
-    expected: BTreeSet<CameraName>,
     /// The oldest time heard.
     first: Option<Timestamp>,
     /// The newest time that came out.
@@ -148,18 +92,14 @@ impl EventBuffer {
     pub(crate) fn new(config: EventTime) -> Self {
         Self {
             config,
-            held: BTreeMap::new(),
-            load: Load::default(),
+            waiting: ReorderQueue::default(),
             taken: BTreeSet::new(),
-            streams: BTreeMap::new(),
-            trusted: BTreeMap::new(),
-            ended: BTreeSet::new(),
+            sources: BTreeMap::new(),
             run_s: 0.0,
             reference: None,
             behind_since_s: None,
             dropped: Vec::new(),
             restarted: None,
-            expected: BTreeSet::new(),
             first: None,
             released: Timestamp::MIN,
             passed: Timestamp::MIN,
@@ -168,43 +108,60 @@ impl EventBuffer {
 
     /// Says that a camera should be heard soon: in the beginning it is waited for as for the others.
     pub(crate) fn expect(&mut self, camera: &CameraName) {
-        self.expected.insert(camera.clone());
+        self.sources.entry(camera.clone()).or_default();
     }
 
     /// Takes an exposure in; nothing comes out before [`Self::release`] says so.
     pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<Arrival, RejectionReason> {
-        let time = exposure.time;
-        self.ended.remove(&exposure.camera);
-        let order = (time, exposure.camera.clone());
-        if self.held.contains_key(&order) || self.taken.contains(&order) {
+        let (time, max_ahead_s) = (exposure.time, self.config.max_ahead_s);
+        if let Some(source) = self.sources.get_mut(&exposure.camera) {
+            source.ended = false;
+        }
+        let is_taken = self.taken.contains(&(time, exposure.camera.clone()));
+        if is_taken || self.waiting.holds(&exposure, time) {
             return Err(RejectionReason::Duplicate);
         }
         let arrival = self.hear(&exposure);
         let compared = self.reference.is_some_and(|reference| reference.live > 1);
-        if let Some(reference) = self.reference {
+        if let Some(reference) = self.reference
+            && let Some(stream) = self.stream_mut(&exposure.camera)
+        {
             // A camera that goes on by itself, step by step, is not from the future.
-            let trusted = self.trusted.get(&exposure.camera).copied().unwrap_or(Timestamp::MIN);
-            let by_s = time.seconds_since(reference.time.max(trusted));
-            if by_s > self.config.max_ahead_s {
+            let by_s = time.seconds_since(reference.time.max(stream.trusted));
+            if by_s > max_ahead_s {
                 return Err(RejectionReason::Future { by_s });
             }
-            if compared || time.seconds_since(trusted) <= self.config.max_ahead_s {
-                self.trusted.insert(exposure.camera.clone(), trusted.max(time));
+            if compared || time.seconds_since(stream.trusted) <= max_ahead_s {
+                stream.trusted = stream.trusted.max(time);
             }
         }
         if let Some(by_s) = self.late_s(&exposure) {
             return Err(RejectionReason::Late { by_s });
         }
-        self.load.add(&exposure);
-        self.held.insert(order, Held { exposure, compared });
+        self.waiting.insert(exposure, time, compared);
         Ok(arrival)
+    }
+
+    fn stream_mut(&mut self, camera: &CameraName) -> Option<&mut Stream> {
+        self.sources.get_mut(camera)?.stream.as_mut()
+    }
+
+    /// The streams of all cameras that have been heard, each with whether it has come to its end.
+    fn streams(&self) -> impl Iterator<Item = (&Stream, bool)> {
+        self.sources.values().filter_map(|source| Some((source.stream.as_ref()?, source.ended)))
+    }
+
+    /// Those that have not come to their end.
+    fn going_on(&self) -> impl Iterator<Item = &Stream> {
+        self.streams().filter(|(_, ended)| !ended).map(|(stream, _)| stream)
     }
 
     /// Takes note of an exposure's time, whatever becomes of it.
     fn hear(&mut self, exposure: &Exposure) -> Arrival {
         let (time, lateness_s) = (exposure.time, self.config.lateness_s);
         let late_s = self.late_s(exposure);
-        let stream = self.streams.entry(exposure.camera.clone()).or_insert(Stream::beginning(time));
+        let source = self.sources.entry(exposure.camera.clone()).or_default();
+        let stream = source.stream.get_or_insert(Stream::beginning(time));
         let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
         // A clock that races makes nobody else look silent.
         self.run_s += time.seconds_since(stream.newest).clamp(0.0, lateness_s);
@@ -218,8 +175,7 @@ impl EventBuffer {
     /// Asks the live cameras for the time.
     fn refer(&mut self) {
         let patience_s = PATIENCES * self.config.lateness_s;
-        let heard = self.streams.iter().filter(|(camera, _)| !self.ended.contains(*camera));
-        let mut heard: Vec<&Stream> = heard.map(|(_, stream)| stream).collect();
+        let mut heard: Vec<&Stream> = self.going_on().collect();
         heard.sort_by(|one, other| other.heard_s.total_cmp(&one.heard_s));
         let is_live = |(since, stream): &(usize, &Stream)| {
             self.run_s - stream.heard_s <= patience_s * (*since).max(1) as f64
@@ -253,13 +209,13 @@ impl EventBuffer {
 
     /// Takes the order up anew from a time before what was released.
     fn restart(&mut self, time: Timestamp) {
-        for (_, Held { exposure, .. }) in std::mem::take(&mut self.held) {
+        while let Some((exposure, _)) = self.waiting.pop() {
             let by_s = exposure.time.seconds_since(time);
-            self.dropped.push((exposure, RejectionReason::Future { by_s }));
+            self.dropped.push(exposure.refused(RejectionReason::Future { by_s }));
         }
-        self.load = Load::default();
         self.taken.clear();
-        self.trusted.clear();
+        let streams = self.sources.values_mut().filter_map(|source| source.stream.as_mut());
+        streams.for_each(|stream| stream.trusted = Timestamp::MIN);
         self.behind_since_s = None;
         (self.released, self.passed) = (Timestamp::MIN, Timestamp::MIN);
         self.restarted = Some(time);
@@ -267,10 +223,10 @@ impl EventBuffer {
 
     /// Forgets all times: the clocks of all cameras have stepped. Nothing is held.
     pub(crate) fn begin_anew(&mut self) {
-        let ended = std::mem::take(&mut self.ended);
-        let heard = self.streams.keys().filter(|camera| !ended.contains(*camera)).cloned();
-        let expected = heard.collect();
-        *self = Self { expected, ended, ..Self::new(self.config.clone()) };
+        let mut sources = std::mem::take(&mut self.sources);
+        sources.retain(|_, source| source.ended || source.stream.is_some());
+        sources.values_mut().for_each(|source| source.stream = None);
+        *self = Self { sources, ..Self::new(self.config.clone()) };
     }
 
     /// The time at which the order was taken up anew with the last frame, if it was: what has been made of
@@ -300,41 +256,42 @@ impl EventBuffer {
 
     /// Marks a camera as come to its end: nobody waits for it any more.
     pub(crate) fn end(&mut self, camera: &CameraName) {
-        self.ended.insert(camera.clone());
+        self.sources.entry(camera.clone()).or_default().ended = true;
     }
 
     /// The next exposure that nothing can overtake any more.
-    pub(crate) fn release(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
+    pub(crate) fn release(&mut self) -> Option<Result<Exposure, Rejection>> {
         if let Some(dropped) = self.dropped.pop() {
             return Some(Err(dropped));
         }
-        let (order, _) = self.held.first_key_value()?;
-        if !self.load.is_too_much() && !self.everyone_ended() && order.0 > self.watermark()? {
-            return None;
-        }
-        self.pop()
+        let next = self.waiting.pop_settled(self.watermark())?;
+        Some(self.take(next))
     }
 
     /// The next exposure, whatever may still come.
-    pub(crate) fn pop(&mut self) -> Option<Result<Exposure, (Exposure, RejectionReason)>> {
+    pub(crate) fn pop(&mut self) -> Option<Result<Exposure, Rejection>> {
         if let Some(dropped) = self.dropped.pop() {
             return Some(Err(dropped));
         }
-        let (order, Held { exposure, compared }) = self.held.pop_first()?;
-        self.load.remove(&exposure);
+        let next = self.waiting.pop()?;
+        Some(self.take(next))
+    }
+
+    /// Takes an exposure out for good.
+    fn take(&mut self, (exposure, compared): (Exposure, bool)) -> Result<Exposure, Rejection> {
         // A frame taken in before a second camera was heard may turn out to be from the future.
         if !compared && let Some(reference) = self.reference {
             let ahead = exposure.time.seconds_since(reference.time);
             if ahead > self.config.max_ahead_s {
-                return Some(Err((exposure, RejectionReason::Future { by_s: ahead })));
+                return Err(exposure.refused(RejectionReason::Future { by_s: ahead }));
             }
         }
         self.released = self.released.max(exposure.time);
-        self.remember(order);
-        Some(Ok(exposure))
+        self.remember((exposure.time, exposure.camera.clone()));
+        Ok(exposure)
     }
 
-    fn remember(&mut self, order: Order) {
+    fn remember(&mut self, order: (Timestamp, CameraName)) {
         self.taken.insert(order);
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
         while self.taken.len() > MAX_TAKEN || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
@@ -342,27 +299,26 @@ impl EventBuffer {
         }
     }
 
-    fn everyone_ended(&self) -> bool {
-        self.streams.len() > 1 && self.streams.keys().all(|camera| self.ended.contains(camera))
-    }
-
+    /// Nothing before this time comes any more.
     fn watermark(&self) -> Option<Timestamp> {
+        let heard = self.streams().count();
+        if heard > 1 && self.going_on().next().is_none() {
+            return Some(Timestamp::MAX);
+        }
         let lateness_s = self.config.lateness_s;
         let Reference { time: reference, live } = self.reference?;
         let patience = reference.plus_seconds(-lateness_s);
         let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
-        let never_heard = |camera: &CameraName| !self.streams.contains_key(camera);
-        let waits_for_new = self.first.is_some_and(|first| first > forgotten)
-            && self.expected.iter().any(|camera| never_heard(camera) && !self.ended.contains(camera));
-        let going_on = self.streams.keys().filter(|camera| !self.ended.contains(*camera)).count();
+        let is_expected = |source: &Source| source.stream.is_none() && !source.ended;
+        let waits_for_new =
+            self.first.is_some_and(|first| first > forgotten) && self.sources.values().any(is_expected);
         // A camera alone is not followed at once: the others may come back, or be heard at last.
-        let is_alone = live == 1 && (going_on > 1 || self.streams.len() == 1);
+        let is_alone = live == 1 && (heard == 1 || self.going_on().count() > 1);
         if waits_for_new || is_alone {
             return Some(patience);
         }
-        let heard = self.streams.iter().filter(|(camera, _)| !self.ended.contains(camera));
-        let heard = heard.map(|(_, stream)| stream).filter(|stream| stream.newest > forgotten);
-        let slowest = heard.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
+        let lately = self.going_on().filter(|stream| stream.newest > forgotten);
+        let slowest = lately.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before `slowest`.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }

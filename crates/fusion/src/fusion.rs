@@ -1,15 +1,13 @@
 mod jumps;
 
-use std::collections::BTreeMap;
-
 use crossfix_message::{
     BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent, TrackFrame,
 };
 
 use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera};
 use crate::clocks::{ClockEstimate, ClockEstimator};
-use crate::event_time::{Arrival, EventBuffer};
-use crate::ingress::{self, Exposure, Load, Rejection, RejectionReason};
+use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
+use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::site_time::{SiteTime, Turn};
@@ -56,10 +54,8 @@ pub struct Fusion {
     clocks: ClockEstimator,
     unmet: Unmet,
     site_time: SiteTime,
-    /// Exposures in the order of their corrected times, until nothing can come before them. Two of a
-    /// camera may be corrected to the same time: their reported times tell them apart.
-    corrected: BTreeMap<(Timestamp, CameraName, Timestamp), Exposure>,
-    corrected_load: Load,
+    /// Exposures in the order of their times less what their clocks are ahead.
+    corrected: ReorderQueue<()>,
     counters: Counters,
     sequence: u64,
     now: Option<Timestamp>,
@@ -81,8 +77,7 @@ impl Fusion {
             clocks: ClockEstimator::new(config.clocks.clone()),
             unmet: Unmet::new(&config.initiation),
             site_time: SiteTime::new(config.event_time.lateness_s),
-            corrected: BTreeMap::new(),
-            corrected_load: Load::default(),
+            corrected: ReorderQueue::default(),
             counters: Counters::default(),
             sequence: 0,
             now: None,
@@ -125,25 +120,25 @@ impl Fusion {
         match self.read(frame) {
             Ok((mut exposure, left_out)) => {
                 for reason in left_out {
-                    outputs.push(self.reject(frame, reason));
+                    self.refuse(refused(frame, reason), outputs);
                 }
                 // As far as is known by now: it is settled when the exposure's turn comes.
                 exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
                 let (camera, time) = (exposure.camera.clone(), exposure.time);
                 let arrival = self.buffer.insert(exposure);
-                let refused =
-                    matches!(arrival, Err(RejectionReason::Late { .. } | RejectionReason::Future { .. }));
-                self.note_time(&camera, time, !refused, outputs);
+                let in_time =
+                    !matches!(arrival, Err(RejectionReason::Late { .. } | RejectionReason::Future { .. }));
+                self.note_time(&camera, time, in_time, outputs);
                 if let Some(time) = self.buffer.take_restart() {
                     self.restart(time, outputs);
                 }
                 match arrival {
                     Ok(Arrival::InOrder) => {}
                     Ok(Arrival::OutOfOrder) => self.counters.count("frames_out_of_order"),
-                    Err(reason) => outputs.push(self.reject(frame, reason)),
+                    Err(reason) => self.refuse(refused(frame, reason), outputs),
                 }
             }
-            Err(reason) => outputs.push(self.reject(frame, reason)),
+            Err(reason) => self.refuse(refused(frame, reason), outputs),
         }
     }
 
@@ -202,29 +197,22 @@ impl Fusion {
         ingress::read(frame, &name, camera, &self.config.bearings, &mut self.counters)
     }
 
-    fn reject(&mut self, frame: &BearingFrame, reason: RejectionReason) -> Output {
-        self.counters.count(reason.counter());
-        Output::Rejected(Rejection { camera: frame.camera.clone(), sequence: frame.sequence, reason })
-    }
-
     fn drain(&mut self, outputs: &mut Vec<Output>) {
         while let Some(next) = self.buffer.release() {
             self.handle(next, outputs);
         }
     }
 
-    fn handle(&mut self, next: Result<Exposure, (Exposure, RejectionReason)>, outputs: &mut Vec<Output>) {
+    fn handle(&mut self, next: Result<Exposure, Rejection>, outputs: &mut Vec<Output>) {
         match next {
             Ok(exposure) => self.correct(exposure, outputs),
-            Err((exposure, reason)) => {
-                self.counters.count(reason.counter());
-                outputs.push(Output::Rejected(Rejection {
-                    camera: exposure.camera.to_string(),
-                    sequence: exposure.sequence,
-                    reason,
-                }));
-            }
+            Err(rejection) => self.refuse(rejection, outputs),
         }
+    }
+
+    fn refuse(&mut self, rejection: Rejection, outputs: &mut Vec<Output>) {
+        self.counters.count(rejection.reason.counter());
+        outputs.push(Output::Rejected(rejection));
     }
 
     /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
@@ -240,27 +228,16 @@ impl Fusion {
         let said = exposure.uncertainty.time_sd_s;
         exposure.uncertainty.time_sd_s = self.clocks.time_sd_s(&exposure.camera, &clock, said);
         if let Some(by_s) = self.buffer.passed_by_s(exposure.time) {
-            return self.handle(Err((exposure, RejectionReason::Late { by_s })), outputs);
+            return self.refuse(exposure.refused(RejectionReason::Late { by_s }), outputs);
         }
-        let order = (exposure.time, exposure.camera.clone(), reported);
-        if self.corrected.contains_key(&order) {
-            return self.handle(Err((exposure, RejectionReason::Duplicate)), outputs);
+        if self.corrected.holds(&exposure, reported) {
+            return self.refuse(exposure.refused(RejectionReason::Duplicate), outputs);
         }
-        self.corrected_load.add(&exposure);
-        self.corrected.insert(order, exposure);
+        self.corrected.insert(exposure, reported, ());
         let settled = reported.plus_seconds(-self.clocks.largest_offset());
-        while let Some(next) = self.next_corrected(settled) {
+        while let Some((next, ())) = self.corrected.pop_settled(Some(settled)) {
             self.process(&next, outputs);
         }
-    }
-
-    /// The next of the corrected exposures up to a time, or if more wait than may.
-    fn next_corrected(&mut self, settled: Timestamp) -> Option<Exposure> {
-        let crowded = self.corrected_load.is_too_much();
-        let entry = self.corrected.first_entry().filter(|entry| crowded || entry.key().0 <= settled)?;
-        let exposure = entry.remove();
-        self.corrected_load.remove(&exposure);
-        Some(exposure)
     }
 
     /// What is known of a camera's clock, if clocks are in doubt.
@@ -365,8 +342,8 @@ impl Fusion {
     }
 
     /// Takes in whether a frame of a camera came in time.
-    fn note_time(&mut self, camera: &CameraName, time: Timestamp, accepted: bool, outputs: &mut Vec<Output>) {
-        let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, accepted));
+    fn note_time(&mut self, camera: &CameraName, time: Timestamp, in_time: bool, outputs: &mut Vec<Output>) {
+        let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_out_of_time",
@@ -412,4 +389,9 @@ impl Fusion {
             outputs.push(Output::Tracks(frame.stamped()));
         }
     }
+}
+
+/// A frame is not used, or a part of it, and why.
+fn refused(frame: &BearingFrame, reason: RejectionReason) -> Rejection {
+    Rejection { camera: frame.camera.clone(), sequence: frame.sequence, reason }
 }

@@ -13,13 +13,6 @@ use crate::{Bearings, Counters, Weighting};
 /// Bearings of one frame that are read: more is no picture, and memory is bounded.
 const MAX_BEARINGS: usize = 10_000;
 
-/// Exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default lateness, three of
-/// 30 Hz 5400 within the longest.
-const MAX_WAITING: usize = 6_000;
-
-/// Sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in all.
-const MAX_SIGHTINGS_WAITING: usize = 100_000;
-
 /// One measured target in one exposure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sighting {
@@ -50,27 +43,10 @@ pub struct Exposure {
     pub sightings: Vec<Sighting>,
 }
 
-/// What waits in a queue of exposures.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Load {
-    exposures: usize,
-    sightings: usize,
-}
-
-impl Load {
-    pub(crate) fn add(&mut self, exposure: &Exposure) {
-        self.exposures += 1;
-        self.sightings += exposure.sightings.len();
-    }
-
-    pub(crate) fn remove(&mut self, exposure: &Exposure) {
-        self.exposures = self.exposures.saturating_sub(1);
-        self.sightings = self.sightings.saturating_sub(exposure.sightings.len());
-    }
-
-    /// Whether it is more than may wait, whatever the clocks say.
-    pub(crate) fn is_too_much(self) -> bool {
-        self.exposures > MAX_WAITING || self.sightings > MAX_SIGHTINGS_WAITING
+impl Exposure {
+    /// It is not used, and why.
+    pub(crate) fn refused(&self, reason: RejectionReason) -> Rejection {
+        Rejection { camera: self.camera.to_string(), sequence: self.sequence, reason }
     }
 }
 

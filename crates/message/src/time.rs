@@ -20,6 +20,8 @@ pub struct Timestamp(i64);
 impl Timestamp {
     /// The earliest instant that can be said.
     pub const MIN: Self = Self(i64::MIN);
+    /// The latest one.
+    pub const MAX: Self = Self(i64::MAX);
     /// The Unix epoch.
     pub const EPOCH: Self = Self(0);
 
@@ -80,7 +82,7 @@ mod tests {
     #[test]
     fn the_ends_of_the_range_do_not_overflow() {
         let first = Timestamp::MIN;
-        let last = Timestamp::from_nanos(i64::MAX);
+        let last = Timestamp::MAX;
         assert!(last.seconds_since(first) > 1.8e10);
         assert_eq!(first.plus_seconds(-1.0), first);
         assert_eq!(last.plus_seconds(1e300), last);

@@ -163,8 +163,8 @@ impl CameraState {
 
     /// Takes in whether a frame came in time, one that was refused says nothing else; returns the new standing if
     /// that has changed.
-    pub(crate) fn note_time(&mut self, time: Timestamp, accepted: bool) -> Option<CameraStanding> {
-        let fitting = if accepted { Fitting::Fits } else { Fitting::Refused };
+    pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraStanding> {
+        let fitting = if in_time { Fitting::Fits } else { Fitting::Refused };
         self.punctuality.learn(time, &[fitting]);
         self.punctuality.review()
     }

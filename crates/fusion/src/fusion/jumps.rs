@@ -22,7 +22,7 @@ impl Fusion {
         while let Some(next) = self.buffer.pop() {
             self.handle(next, outputs);
         }
-        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
+        while let Some((exposure, ())) = self.corrected.pop() {
             self.process(&exposure, outputs);
         }
     }
@@ -31,9 +31,9 @@ impl Fusion {
     /// is forgotten.
     pub(super) fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
-        while let Some(exposure) = self.next_corrected(Timestamp::from_nanos(i64::MAX)) {
+        while let Some((exposure, ())) = self.corrected.pop() {
             let by_s = exposure.time.seconds_since(time);
-            self.handle(Err((exposure, RejectionReason::Future { by_s })), outputs);
+            self.refuse(exposure.refused(RejectionReason::Future { by_s }), outputs);
         }
         let happenings = self.tracker.restart(time);
         self.cameras.forget_strangers();

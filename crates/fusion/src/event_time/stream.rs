@@ -1,0 +1,59 @@
+use crossfix_message::Timestamp;
+
+use super::PATIENCES;
+
+/// For so many times the lateness a camera is waited for as one whose frames overtake each other.
+const DISORDER_LASTS: f64 = 20.0;
+
+/// So many frames of a camera one after the other far behind its newest say that its clock was ahead,
+/// even where they come too late.
+const MOST_FAR_BEHIND: u32 = 3;
+
+/// How one camera's frames come.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stream {
+    pub(super) newest: Timestamp,
+    /// The newest time that agreed with another camera's.
+    pub(super) trusted: Timestamp,
+    /// From the last but one to the newest, s, as far as that is no jump.
+    pub(super) step_s: f64,
+    /// How far all cameras together had gone on when it was heard last, s.
+    pub(super) heard_s: f64,
+    /// Frames far behind the newest, one after the other.
+    far_behind: u32,
+    /// How far behind the newest others came, at most, s, and the newest when one did last; from a
+    /// frame on that came too late for it.
+    disorder: Option<(f64, Timestamp)>,
+}
+
+impl Stream {
+    pub(super) fn beginning(newest: Timestamp) -> Self {
+        Self { newest, trusted: Timestamp::MIN, step_s: 0.0, heard_s: 0.0, far_behind: 0, disorder: None }
+    }
+
+    /// Takes note of a frame that came `late_s` too late.
+    pub(super) fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
+        let behind_s = self.newest.seconds_since(time);
+        let known_s = self.disorder_s(lateness_s);
+        let far_behind = if behind_s > lateness_s { self.far_behind + 1 } else { 0 };
+        self.far_behind = far_behind;
+        if behind_s <= 0.0 {
+            self.newest = time;
+            self.step_s = (-behind_s).min(PATIENCES * lateness_s);
+        } else if behind_s <= lateness_s {
+            if late_s.is_some() || known_s > 0.0 {
+                self.disorder = Some((behind_s.max(known_s), self.newest));
+            }
+        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s) {
+            // No network reorders so far: the clock was ahead, and now it is not.
+            *self = Self { trusted: self.trusted, ..Self::beginning(time) };
+        }
+    }
+
+    /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the order.
+    pub(super) fn disorder_s(&self, lateness_s: f64) -> f64 {
+        let lasts_s = DISORDER_LASTS * lateness_s;
+        let lately = |(_, then): &(f64, Timestamp)| self.newest.seconds_since(*then) <= lasts_s;
+        self.disorder.filter(lately).map_or(0.0, |(behind_s, _)| behind_s)
+    }
+}
