@@ -20,14 +20,21 @@ const POSE_FLOOR: f64 = 1e-6;
 /// Offsets beyond this are no offsets any more, s.
 const MAX_OFFSET_S: f64 = 2.0;
 
+/// A camera's pose that is uncertain: the place of its error in the state, and its covariance as it was reported.
+#[derive(Clone, Copy, Debug)]
+struct UnsurePose {
+    place: usize,
+    reported: Matrix6<f64>,
+}
+
 /// A camera's clock: where its offset stands, and what was reported of it.
 #[derive(Clone, Copy, Debug)]
 struct Clock {
     /// The place of its offset against the reference; its drift is the next. The reference, the
     /// first camera heard, has no place.
     place: Option<usize>,
-    /// The place of its camera's pose in the state, where that is uncertain.
-    pose: Option<usize>,
+    /// Its camera's pose, where that is uncertain.
+    pose: Option<UnsurePose>,
     /// Variance of its offset against true time before anything is seen, s^2; 0 where the camera is
     /// taken at its word.
     prior: f64,
@@ -49,8 +56,6 @@ pub(super) struct Belief {
     /// By how much the common time of all clocks, offset and drift, is not what the clocks' reported
     /// deviations make of them now: it does not step when a clock becomes worse known than it was.
     site: [f64; 2],
-    /// The poses' covariances as they were reported.
-    poses: BTreeMap<CameraName, Matrix6<f64>>,
     /// What all clocks say together: made anew whenever one of them is known otherwise, and not as time goes on,
     /// which steps nobody's time.
     common: Common,
@@ -94,18 +99,17 @@ impl Belief {
         let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
             return;
         };
-        let place = pose.map(|covariance| {
-            let first = before.unwrap_or_else(|| self.grow(6));
+        let pose = pose.map(|covariance| {
+            let first = before.map_or_else(|| self.grow(6), |before| before.place);
             self.mean.fixed_rows_mut::<6>(first).fill(0.0);
             self.covariance.fixed_rows_mut::<6>(first).fill(0.0);
             self.covariance.fixed_columns_mut::<6>(first).fill(0.0);
             let regular = covariance + Matrix6::identity() * POSE_FLOOR.powi(2);
             self.covariance.fixed_view_mut::<6, 6>(first, first).copy_from(&regular);
-            self.poses.insert(camera.clone(), covariance);
-            first
+            UnsurePose { place: first, reported: covariance }
         });
         if let Some(known) = self.cameras.get_mut(camera) {
-            known.pose = place;
+            known.pose = pose;
         }
     }
 
@@ -133,7 +137,7 @@ impl Belief {
 
     /// The place of a camera's pose in the state, of six components; `None` where it is exact.
     pub(super) fn pose(&self, camera: &CameraName) -> Option<usize> {
-        self.cameras.get(camera)?.pose
+        Some(self.cameras.get(camera)?.pose?.place)
     }
 
     /// The standard deviation that a camera has reported of its clock, s.
@@ -265,7 +269,7 @@ impl Belief {
         // In the order in which they were heard: the reference first.
         cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
         for (camera, clock) in cameras {
-            let pose = self.poses.get(camera).filter(|_| clock.pose.is_some()).copied();
+            let pose = clock.pose.map(|pose| pose.reported);
             anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], pose);
         }
         *self = anew;

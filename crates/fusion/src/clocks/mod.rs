@@ -64,6 +64,23 @@ pub struct ClockEstimate {
     pub drift_sd: f64,
 }
 
+/// What is said of a clock beside what is learnt of it.
+#[derive(Clone, Copy, Debug)]
+struct Reported {
+    /// The standard deviation that its camera reports, which the belief begins with, s.
+    sd_s: f64,
+    /// It may have jumped, ...
+    suspected: bool,
+    /// ... but the open windows tell of it.
+    cleared: bool,
+}
+
+impl Reported {
+    fn new(sd_s: f64) -> Self {
+        Self { sd_s, suspected: false, cleared: false }
+    }
+}
+
 /// A look at the open windows, one window an exposure: an adjustment takes milliseconds.
 #[derive(Clone, Debug, Default)]
 struct Round {
@@ -86,12 +103,8 @@ pub(crate) struct ClockEstimator {
     windows: Vec<Window>,
     /// How badly the worst clock was known when the last window was closed, s.
     worst_sd_s: f64,
-    /// The standard deviations reported of the clocks, s, that the belief begins with.
-    reported: BTreeMap<CameraName, f64>,
-    /// Cameras whose clocks may have jumped, ...
-    suspects: BTreeSet<CameraName>,
-    /// ... and those of which the open windows tell all the same.
-    cleared: BTreeSet<CameraName>,
+    /// What is said of each clock.
+    reported: BTreeMap<CameraName, Reported>,
     now: Timestamp,
     next_look: Timestamp,
     /// When the next window may be adjusted.
@@ -112,8 +125,6 @@ impl ClockEstimator {
             windows: Vec::new(),
             worst_sd_s: 0.0,
             reported: BTreeMap::new(),
-            suspects: BTreeSet::new(),
-            cleared: BTreeSet::new(),
             now: Timestamp::MIN,
             next_look: Timestamp::MIN,
             next_adjustment: Timestamp::MIN,
@@ -137,16 +148,16 @@ impl ClockEstimator {
         }
         let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
-        let Some(before) = self.reported.get(camera) else {
+        let Some(before) = self.reported.get_mut(camera) else {
             self.needed |= uncertain;
-            self.reported.insert(camera.clone(), reported_sd_s);
+            self.reported.insert(camera.clone(), Reported::new(reported_sd_s));
             self.belief.add(camera, deviations, reported.pose.map(|pose| *pose.covariance()));
             self.forget_provisional();
             return;
         };
-        if uncertain && reported_sd_s >= WORSE * before {
+        if uncertain && reported_sd_s >= WORSE * before.sd_s {
             self.needed = true;
-            self.reported.insert(camera.clone(), reported_sd_s);
+            before.sd_s = reported_sd_s;
             self.belief.reopen(camera, deviations);
             self.forget_provisional();
             self.suspect(camera);
@@ -186,10 +197,10 @@ impl ClockEstimator {
     /// The estimate of a camera's clock.
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
         let estimate = self.newest().estimate(camera, self.now)?;
-        let suspected = self.suspects.contains(camera) && !self.cleared.contains(camera);
         let at_its_word = self.is_at_its_word(camera);
-        let reported = self.reported.get(camera).copied().filter(|_| suspected || at_its_word);
-        let widened = |sd: f64| reported.map_or(sd, |reported| reported.max(sd));
+        let widens = |reported: &&Reported| at_its_word || (reported.suspected && !reported.cleared);
+        let reported = self.reported.get(camera).filter(widens);
+        let widened = |sd: f64| reported.map_or(sd, |reported| reported.sd_s.max(sd));
         let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
         Some(ClockEstimate { sd_s, relative_sd_s, ..estimate })
     }
@@ -267,7 +278,7 @@ impl ClockEstimator {
     fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
         let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
-        let is_bad = self.suspects.contains(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
+        let is_bad = self.is_suspected(camera) || sd > SURE_S.max(self.worst_sd_s / 2.0);
         is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
@@ -275,8 +286,9 @@ impl ClockEstimator {
     /// as it was in the beginning, until a window tells.
     pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
-            self.suspects.insert(camera.clone());
-            self.cleared.remove(camera);
+            if let Some(reported) = self.reported.get_mut(camera) {
+                (reported.suspected, reported.cleared) = (true, false);
+            }
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
             // Up to now its bearings may be by the clock as it was.
             self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
@@ -291,7 +303,9 @@ impl ClockEstimator {
                 self.belief = *belief;
                 self.refused = 0;
                 for camera in window.checked_cameras() {
-                    self.suspects.remove(&camera);
+                    if let Some(reported) = self.reported.get_mut(&camera) {
+                        reported.suspected = false;
+                    }
                 }
             }
             Lesson::Nothing => {}
@@ -305,6 +319,10 @@ impl ClockEstimator {
         }
     }
 
+    fn is_suspected(&self, camera: &CameraName) -> bool {
+        self.reported.get(camera).is_some_and(|reported| reported.suspected)
+    }
+
     /// Whether the clock of a camera that sees one of the targets is not well known.
     fn is_unsure(&self) -> bool {
         self.windows.iter().flat_map(|window| &window.cameras).any(|camera| self.is_unsure_of(camera))
@@ -312,7 +330,7 @@ impl ClockEstimator {
 
     fn is_unsure_of(&self, camera: &CameraName) -> bool {
         let clock = self.belief.estimate(camera, self.now);
-        self.suspects.contains(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
+        self.is_suspected(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
     }
 
     /// Looks at what the next open window tells so far; after the last it counts.
@@ -328,7 +346,10 @@ impl ClockEstimator {
             self.round = Some(round);
             return;
         }
-        (self.provisional, self.cleared) = (round.belief, round.cleared);
+        for (camera, reported) in &mut self.reported {
+            reported.cleared = round.cleared.contains(camera);
+        }
+        self.provisional = round.belief;
         let pause = if self.is_unsure() { LOOK_EVERY_S } else { CHECK_EVERY_S };
         self.next_look = self.now.plus_seconds(pause);
     }
