@@ -3,6 +3,7 @@
 use crossfix_correlation::Plane;
 use nalgebra::Matrix2;
 
+use crate::scene::Scene;
 use crate::{ImagePoint, TrackerConfig};
 
 /// The frame interval to which shares a frame refer, s.
@@ -16,6 +17,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) interval: f64,
     /// A picture of a moment ago, in which every target was seen.
     pub(crate) keepsake: Option<&'a Plane>,
+    /// What the scene looked like lately.
+    pub(crate) scene: &'a Scene,
     pub(crate) config: &'a TrackerConfig,
 }
 

@@ -26,9 +26,11 @@
 //! ```
 
 mod appearance;
+mod arrival;
 mod config;
 mod detector;
 mod frame;
+mod identity;
 mod lanes;
 mod likelihood;
 mod look;
@@ -37,6 +39,7 @@ mod noise;
 mod paper;
 mod posterior;
 mod reference;
+mod scene;
 mod search;
 mod target;
 mod tracker;

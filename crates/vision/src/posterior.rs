@@ -38,6 +38,14 @@ pub(crate) struct Posterior {
     pub(crate) unseen: f64,
 }
 
+impl Posterior {
+    /// What is near the peak is the target with a probability only; else it is not to be seen.
+    pub(crate) fn doubted(&self, is_there: f64) -> Self {
+        let near = Part { mass: self.near.mass * is_there, ..self.near };
+        Self { near, unseen: self.unseen + self.near.mass - near.mass, ..*self }
+    }
+}
+
 /// Turns a map of log likelihood ratios into a posterior (the soft weighting of all peaks). Keeps its
 /// memory.
 #[derive(Debug, Default)]

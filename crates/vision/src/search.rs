@@ -19,6 +19,8 @@ const MOST_COARSE: usize = 4;
 const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
+/// Variance of the noise of what has changed over the image's: its own, and what interpolation leaves of the picture's.
+const NOISE_OF_CHANGE: f32 = 1.6;
 
 /// What the scene itself looks like to a target's reference: the log ratios in a picture in which the
 /// target was elsewhere.
@@ -33,6 +35,7 @@ pub(crate) struct Background {
 pub(crate) struct Search {
     coarse: Plane,
     fine: Plane,
+    change: Plane,
 }
 
 /// The best place of a search.
@@ -89,6 +92,7 @@ impl Coarse {
     fn ratios(
         &self,
         target: &Target,
+        noise: f32,
         picture: &Plane,
         [columns, rows]: &[Range<usize>; 2],
         bench: &mut Workbench,
@@ -100,16 +104,40 @@ impl Coarse {
         picture.crop_into(left, top, columns.len() + width - 1, rows.len() + height - 1, &mut bench.gate);
         bench.correlator.statistics(&bench.gate, &self.reference, &mut bench.statistics);
         let pixels = (width * height) as f32;
-        let noise = target.noise / (self.coarseness * self.coarseness) as f32;
+        let noise = noise / (self.coarseness * self.coarseness) as f32;
         let noise = noise.max((config.noise_floor * config.noise_floor) as f32);
         let expected = target.expectation(noise, self.reference.variance() * pixels, pixels, config);
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
     }
 }
 
-/// Looks for a lost target.
+/// What is searched through.
+#[derive(Clone, Copy, Debug)]
+struct Searched<'a> {
+    picture: &'a Plane,
+    /// Variance of its noise.
+    noise: f32,
+    /// Whether it is what has changed, and not the image.
+    is_change: bool,
+}
+
+/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image, where it may hover.
 pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench) -> Found {
-    let Frame { image, config, .. } = frame;
+    let mut change = std::mem::take(&mut bench.search.change);
+    let is_change = target.missed % 2 == 1 && frame.scene.change(frame.image, &mut change);
+    let searched = if is_change {
+        Searched { picture: &change, noise: NOISE_OF_CHANGE * target.noise, is_change }
+    } else {
+        Searched { picture: frame.image, noise: target.noise, is_change }
+    };
+    let found = find_in(target, frame, searched, bench);
+    bench.search.change = change;
+    found
+}
+
+fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench: &mut Workbench) -> Found {
+    let config = frame.config;
+    let Searched { picture: image, noise, is_change } = searched;
     let working = target.appearance.working.image();
     let sides = [working.width(), working.height()];
     let coarseness = (sides[0].min(sides[1]) / COARSE_SIDE).clamp(1, MOST_COARSE);
@@ -128,25 +156,28 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     });
     let coarse =
         Coarse { reference: coarse_reference(target, coarseness, &mut bench.workshop.resampler), coarseness };
-    remember_background(target, frame, &coarse, bench);
+    if !is_change {
+        remember_background(target, frame, &coarse, bench);
+    }
 
     let mut picture = std::mem::take(&mut bench.search.coarse);
     coarsened(image, coarseness, &mut picture);
     mend(&mut picture);
-    coarse.ratios(target, &picture, &ranges, bench, config);
+    coarse.ratios(target, noise, &picture, &ranges, bench, config);
     bench.search.coarse = picture;
-    let area = Area { ranges, predicted: at, half, sides, coarseness };
+    let area = Area { ranges, predicted: at, half, sides, coarseness, is_change };
     let best = area.best_place(target, bench, config);
 
     // Once more at full resolution, where the coarse search says.
     let reach = coarseness + 1;
     let origin = [0, 1].map(|i| best.place[i].round() - reach as f64);
     let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
-    image.crop_into(corner[0], corner[1], 2 * reach + sides[0], 2 * reach + sides[1], &mut bench.gate);
+    let gate = sides.map(|side| 2 * reach + side);
+    image.crop_into(corner[0], corner[1], gate[0], gate[1], &mut bench.gate);
     mend(&mut bench.gate);
     bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
     let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
-    let expected = target.expectation(target.noise, energy, pixels, config);
+    let expected = target.expectation(noise, energy, pixels, config);
     let mut fine = std::mem::take(&mut bench.search.fine);
     log_ratios(&bench.statistics, expected, &mut fine);
     let peak = fine.peak();
@@ -154,12 +185,18 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     let contrast =
         f64::from(bench.statistics.covariance.row(peak.row)[peak.column] * pixels / energy.max(1e-12))
             .max(0.0);
+    if is_change {
+        // Where it is the image says best: the change has the noise of two.
+        frame.image.crop_into(corner[0], corner[1], gate[0], gate[1], &mut bench.gate);
+        mend(&mut bench.gate);
+    }
     let look = target.look(peak.column, peak.row, origin, bench, config);
-    let above_chance = contrast * contrast * f64::from(energy / (2.0 * target.noise));
+    let above_chance = contrast * contrast * f64::from(energy / (2.0 * noise));
     let placements = (2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0);
     let accepted = peak.score - best.background > LEAST_RATIO
         && best.margin > MARGIN
-        && above_chance > placements.ln() + ABOVE_CHANCE;
+        && above_chance > placements.ln() + ABOVE_CHANCE
+        && target.arrival_log_ratio(frame, look.place, bench) >= 0.0;
     Found { look: Some(look), accepted }
 }
 
@@ -180,7 +217,7 @@ fn remember_background(target: &mut Target, frame: Frame<'_>, coarse: &Coarse, b
     coarsened(keepsake, coarseness, &mut picture);
     mend(&mut picture);
     let whole = [0..picture.width(), 0..picture.height()];
-    coarse.ratios(target, &picture, &whole, bench, frame.config);
+    coarse.ratios(target, target.noise, &picture, &whole, bench, frame.config);
     bench.search.coarse = picture;
     target.background = Some(Background { coarseness, ratios: bench.ratios.clone() });
 }
@@ -205,11 +242,13 @@ struct Area {
     /// Sides of the reference, px.
     sides: [usize; 2],
     coarseness: usize,
+    /// Whether it is looked for in what has changed.
+    is_change: bool,
 }
 
 impl Area {
     fn best_place(&self, target: &Target, bench: &mut Workbench, config: &TrackerConfig) -> Best {
-        let Self { ranges, predicted, half, sides, coarseness } = self;
+        let Self { ranges, predicted, half, sides, coarseness, is_change } = self;
         let (sides, coarseness) = (*sides, *coarseness);
         let side = coarseness as f64;
         let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
@@ -218,6 +257,9 @@ impl Area {
         let anywhere = target.anywhere(config);
         let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));
         let background_at = |column: usize, row: usize| -> f32 {
+            if *is_change {
+                return 0.0;
+            }
             let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else { return 0.0 };
             let near = (middle(column) - seen.x).abs() <= sides[0] as f64
                 && (middle(row) - seen.y).abs() <= sides[1] as f64;

@@ -7,8 +7,10 @@ use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 use nalgebra::Matrix2;
 
 use crate::appearance::{Appearance, Workshop};
+use crate::arrival::Comparison;
 use crate::config::GateRule;
 use crate::frame::{FRAME_INTERVAL, Frame, Measurement, Step};
+use crate::identity::Identity;
 use crate::likelihood::{Expectation, log_ratios};
 use crate::look::Look;
 use crate::mend::mend;
@@ -27,6 +29,10 @@ const NARROW: f64 = 0.5;
 const MANOEUVRE: f64 = 25.0;
 /// Certainty above which a target counts as seen.
 const SEEN: f64 = 0.5;
+/// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
+const USUAL_S: f64 = 3.0;
+/// Within so long a lost target's contrast is what it usually is again, s.
+const FADES_S: f64 = 0.5;
 /// Log ratio of a placement outside the image.
 const IMPOSSIBLE: f32 = -50.0;
 /// Floor of a measurement's standard deviation, px.
@@ -56,17 +62,20 @@ pub(crate) struct Workbench {
     pub(crate) ratios: Plane,
     pub(crate) search: Search,
     map: PosteriorMap,
+    pub(crate) comparison: Comparison,
 }
 
 /// A target under track.
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
     pub(crate) appearance: Appearance,
-    axes: [AxisFilter; 2],
+    pub(crate) axes: [AxisFilter; 2],
     /// Variance of the image's noise.
     pub(crate) noise: f32,
     pub(crate) contrast: f64,
     pub(crate) contrast_variance: f64,
+    /// What the contrast is over seconds, as long as the target is seen.
+    pub(crate) usual_contrast: f64,
     shape_variances: [f64; 2],
     /// Variance of the reference's own place, x and y, px^2.
     common: [f64; 2],
@@ -80,6 +89,7 @@ pub(crate) struct Target {
     /// Where it was in the tracker's keepsake picture.
     pub(crate) in_keepsake: Option<ImagePoint>,
     pub(crate) background: Option<Background>,
+    pub(crate) identity: Identity,
 }
 
 /// 0 below the first value, 1 above the second, linear between.
@@ -120,6 +130,7 @@ impl Target {
             noise,
             contrast: 1.0,
             contrast_variance: 0.0,
+            usual_contrast: 1.0,
             shape_variances: [1e-6; 2],
             common: [0.0; 2],
             centre_variance: config.centre_sd_px.powi(2),
@@ -129,6 +140,7 @@ impl Target {
             last_seen: centre,
             in_keepsake: None,
             background: None,
+            identity: Identity::new(),
         }
     }
 
@@ -195,7 +207,13 @@ impl Target {
         let [scale, turn] = &mut self.shape_variances;
         *scale = (*scale + SCALE_WALK.powi(2) * frames).min(0.09);
         *turn = (*turn + TURN_WALK.powi(2) * frames).min(0.25);
-        if self.is_searching() { self.search(frame, bench) } else { self.follow(frame, bench) }
+        if self.is_searching() {
+            self.search(frame, bench)
+        } else if self.identity.is_on_probation() {
+            self.follow_on_probation(frame, bench)
+        } else {
+            self.follow(frame, bench)
+        }
     }
 
     /// Takes a place in the next image from somebody who knows it, instead of measuring it: with the
@@ -224,6 +242,7 @@ impl Target {
         }
         self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.seen(place);
+        self.identity.is_given();
         let covariance = Matrix2::identity() * (variance + self.centre_variance);
         let measured = Measurement { place, covariance };
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
@@ -251,7 +270,7 @@ impl Target {
         (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5)
     }
 
-    fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+    pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
         let predicted = self.position();
         let half = self.half_gate(image, config);
@@ -294,6 +313,8 @@ impl Target {
         origin: [f64; 2],
         bench: &mut Workbench,
     ) -> Step {
+        let is_there = self.doubt(frame, look.place, bench);
+        let posterior = &posterior.doubted(is_there);
         let certainty = posterior.near.mass;
         let at = [look.place.x, look.place.y];
         let variances = [look.covariance.m11, look.covariance.m22].map(|v| OWN_SHARE * v);
@@ -388,9 +409,11 @@ impl Target {
             let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
             self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
             self.contrast_variance *= 1.0 - gain;
+            let share = (certainty * interval / USUAL_S).min(1.0);
+            self.usual_contrast += share * (self.contrast - self.usual_contrast);
         }
         let certainty = certainty * ramp(look.score, LEARNING_SCORES);
-        if certainty >= 0.02 {
+        if certainty >= 0.02 && !self.identity.is_on_probation() {
             // Size and direction take effect with the learning; without it they would run away.
             if seen {
                 self.follow_shape(look);
@@ -417,12 +440,17 @@ impl Target {
 
     fn search(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let config = frame.config;
+        // Nothing is known of its contrast any more but what it usually is.
+        let share = (frame.interval / FADES_S).min(1.0);
+        self.contrast += share * (self.usual_contrast - self.contrast);
+        self.contrast_variance += share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
         let found = crate::search::find(self, frame, bench);
         let Some(look) = found.look.filter(|_| found.accepted) else {
             self.missed += 1;
             let score = found.look.map_or(0.0, |look| look.score);
             return Step { measured: None, score, certainty: 0.0, nis: None };
         };
+        self.begin_probation(frame.scene);
         let at = [look.place.x, look.place.y];
         let variances = [look.covariance.m11, look.covariance.m22];
         for i in 0..2 {

@@ -8,6 +8,7 @@ use crate::config::Algorithm;
 use crate::detector::Detector;
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
+use crate::scene::Scene;
 use crate::target::{Target, Workbench};
 use crate::{ConfigError, ImagePoint, PixelBox, TrackerConfig};
 
@@ -187,6 +188,7 @@ pub struct ImageTracker {
     config: TrackerConfig,
     bench: Workbench,
     keepsake: Option<Keepsake>,
+    scene: Scene,
     detector: Option<Detector>,
     waiting: Vec<PixelBox>,
     followed: Vec<Followed>,
@@ -210,6 +212,7 @@ impl ImageTracker {
             config,
             bench: Workbench::default(),
             keepsake: None,
+            scene: Scene::default(),
             detector,
             waiting: Vec::new(),
             followed: Vec::new(),
@@ -257,7 +260,11 @@ impl ImageTracker {
 
         self.tracks.clear();
         let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
-        let frame = Frame { image, interval, keepsake, config: &self.config };
+        let posterior = self.config.algorithm == Algorithm::Posterior;
+        if posterior {
+            self.scene.register(image, interval);
+        }
+        let frame = Frame { image, interval, keepsake, scene: &self.scene, config: &self.config };
         for followed in &mut self.followed {
             let step = followed.target.step(frame, followed.cue.take(), &mut self.bench);
             if step.measured.is_some() {
@@ -274,6 +281,13 @@ impl ImageTracker {
         self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
         self.take_up_new(image, time);
         self.keep(image, time);
+        if posterior && let Some(number) = self.scene.keep(image) {
+            for followed in &mut self.followed {
+                if let Follower::Posterior(target) = &mut followed.target {
+                    target.note_picture(number);
+                }
+            }
+        }
         &self.tracks
     }
 
@@ -298,6 +312,7 @@ impl ImageTracker {
             self.followed.clear();
         }
         self.keepsake = None;
+        self.scene.clear();
         self.last = None;
         self.detector = self.config.detector.clone().map(Detector::new);
         true

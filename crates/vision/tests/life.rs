@@ -6,6 +6,9 @@ use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 use crossfix_vision::{DetectorConfig, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
 use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 fn spots(places: &[(f32, f32)]) -> Plane {
     Plane::from_fn(160, 120, |column, row| {
@@ -99,6 +102,48 @@ fn a_target_half_hidden_is_still_followed() {
         let image = over_sky(x, 60.0, |column| (60..63).contains(&column));
         let track = tracker.step(&image, at(frame))[0];
         assert!((track.position.x - f64::from(x)).abs() < 2.0, "frame {frame}: {track:?}");
+    }
+}
+
+/// A sky that the camera drifts over, with a cloud that looks like the target and is two thirds as bright.
+fn drifting(frame: u32, target: Option<(f32, f32)>, noise: &mut impl FnMut() -> f32) -> Plane {
+    let drift = 0.3 * frame as f32;
+    let spot =
+        |x: f32, y: f32, column: f32, row: f32| (-((column - x).powi(2) + (row - y).powi(2)) / 8.0).exp();
+    Plane::from_fn(320, 240, |column, row| {
+        let (column, row) = (column as f32, row as f32);
+        let sky = 12.0 * (((column + drift) / 31.0).sin() + (row / 23.0).cos());
+        let cloud = 40.0 * spot(148.0 - drift, 118.0, column, row);
+        let target = target.map_or(0.0, |(x, y)| 60.0 * spot(x, y, column, row));
+        80.0 + sky + cloud + target + noise()
+    })
+}
+
+#[test]
+fn a_cloud_that_looks_like_the_target_is_not_followed_in_its_place() {
+    for seed in 0..6 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut noise = || -> f32 {
+            let normal: f32 = StandardNormal.sample(&mut rng);
+            3.0 * normal
+        };
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.take_up(PixelBox { x: 36.0, y: 116.0, width: 9.0, height: 9.0 });
+        let (mut longest, mut running) = (0, 0);
+        for frame in 0..150 {
+            let place = (40.0 + 1.5 * frame as f32, 120.0);
+            // Hidden for half a second where the cloud is, and for good nowhere.
+            let hidden = (66..81).contains(&frame);
+            let image = drifting(frame, (!hidden).then_some(place), &mut noise);
+            let track = tracker.step(&image, at(frame))[0];
+            let off = (track.position.x - f64::from(place.0)).hypot(track.position.y - f64::from(place.1));
+            running = if track.phase != TrackPhase::Searching && off > 10.0 { running + 1 } else { 0 };
+            longest = longest.max(running);
+            if frame > 120 {
+                assert!(off < 1.0, "seed {seed}, frame {frame}: {off} px off");
+            }
+        }
+        assert!(longest <= 10, "seed {seed}: {longest} frames on something else");
     }
 }
 

@@ -1,0 +1,179 @@
+//! Whether what a target's reference is found on has come there, or was there before.
+//!
+//! A reference alone cannot tell: in a cloud it becomes cloud, and finds it again with certainty. What tells is the
+//! scene's own pictures ([`crate::scene`]): under a target that has come from elsewhere one of them shows what it hides.
+
+use crossfix_correlation::{Plane, Resampler, View};
+
+use crate::ImagePoint;
+use crate::mend::mend;
+use crate::scene::Picture;
+
+/// What has not changed may seem to have by this share of the reference: registration, compression. With half of it
+/// textured scenes count for targets, with twice as much faint targets for scene.
+const UNCHANGED: f64 = 0.1;
+/// How much of a target's usual contrast the scene itself may have in its place: as much as half, often.
+const SCENE_SHARE: f64 = 0.5;
+/// How well the pictures are registered, px an axis.
+const REGISTERED_PX: f64 = 0.25;
+/// Pixels that are one look: neighbours are blurred and compressed together, ...
+const PIXELS_A_LOOK: f64 = 4.0;
+/// ... and a target is no more looks than these, however large: its parts change together.
+const MOST_LOOKS: f64 = 12.0;
+/// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model must be able to be.
+const MOST: f64 = 8.0;
+/// So much of the reference's energy must lie where the target was not before.
+const LEAST_FREE: f64 = 0.25;
+/// Fewer pixels tell nothing.
+const LEAST_PIXELS: f64 = 4.0;
+
+/// The reference in a place, now and in a picture of the scene without the target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Arrival {
+    /// Contrast with which the reference is there now, and was before, over its own.
+    now: f64,
+    before: f64,
+    /// The variance of each by noise.
+    variance: f64,
+    /// Mean squared change of the pixels over what noise and registration make of an unchanged scene.
+    change: f64,
+    /// Looks that this is the mean of.
+    looks: f64,
+}
+
+/// Memory for the comparison.
+#[derive(Debug, Default)]
+pub(crate) struct Comparison {
+    now: Plane,
+    before: Plane,
+}
+
+/// What is compared: a reference in a place of an image with noise of a variance.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Placed<'a> {
+    pub(crate) reference: &'a Plane,
+    /// Energy of the reference, its mean removed.
+    pub(crate) energy: f64,
+    pub(crate) place: ImagePoint,
+    pub(crate) noise: f64,
+}
+
+impl Arrival {
+    /// Log-likelihood ratio of the target's having come there against what is there having been there before; `usual`
+    /// is the contrast that the target has otherwise.
+    ///
+    /// Before, the scene had any contrast c there, `c ~ N(0, (usual / 2)^2)`, or the one that is there now; and where the
+    /// scene has not changed, no pixel has.
+    pub(crate) fn log_ratio(self, usual: f64) -> f64 {
+        let Self { now, before, variance, change, looks } = self;
+        let normal = |off: f64, variance: f64| -0.5 * (off * off / variance + variance.ln());
+        let scene = normal(before, variance + (SCENE_SHARE * usual).powi(2));
+        let unchanged = normal(before - now, 2.0 * variance + UNCHANGED.powi(2));
+        let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
+        (scene - unchanged + changed.min(MOST)).clamp(-MOST, MOST)
+    }
+}
+
+impl Comparison {
+    /// Looks at the reference's place in the image.
+    pub(crate) fn look(&mut self, image: &Plane, placed: Placed<'_>, resampler: &mut Resampler) {
+        self.now.reshape(placed.reference.width(), placed.reference.height());
+        let ImagePoint { x, y } = placed.place;
+        resampler.look(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
+        mend(&mut self.now);
+    }
+
+    /// Compares what was looked at with what a picture of the scene has there. Where the target was `seen` in that picture
+    /// it does not count; `None` if that is nearly everywhere, or the place was outside.
+    pub(crate) fn with(
+        &mut self,
+        picture: &Picture,
+        seen: Option<ImagePoint>,
+        placed: Placed<'_>,
+        resampler: &mut Resampler,
+    ) -> Option<Arrival> {
+        let Placed { reference, energy, place, noise } = placed;
+        let then = picture.then(place);
+        if !picture.holds(then) {
+            return None;
+        }
+        let (width, height) = (reference.width(), reference.height());
+        self.before.reshape(width, height);
+        resampler.look(
+            picture.image(),
+            View { x: then.x, y: then.y, scale: 1.0, turn_rad: 0.0 },
+            &mut self.before,
+        );
+        // Where the reference lay when the target was seen in the picture, one pixel about it.
+        let covered = |at: usize, side: usize, then: f64, seen: f64| {
+            (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
+        };
+        let mut sums = Sums::default();
+        for y in 0..height {
+            let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));
+            let above = self.before.row(y.saturating_sub(1));
+            let rows = reference.row(y).iter().zip(self.now.row(y)).zip(self.before.row(y)).zip(above);
+            let mut left = self.before.row(y)[0];
+            for (x, (((reference, now), before), above)) in rows.enumerate() {
+                let slope = (before - left).powi(2) + (before - above).powi(2);
+                left = *before;
+                if !(row_covered && seen.is_some_and(|seen| covered(x, width, then.x, seen.x))) {
+                    sums.add(*reference, *now, *before, slope);
+                }
+            }
+        }
+        sums.arrival(energy, noise)
+    }
+}
+
+/// Sums over the pixels that count.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sums {
+    pixels: f64,
+    reference: f64,
+    now: f64,
+    before: f64,
+    reference_squared: f64,
+    reference_now: f64,
+    reference_before: f64,
+    change_squared: f64,
+    slope_squared: f64,
+}
+
+impl Sums {
+    fn add(&mut self, reference: f32, now: f32, before: f32, slope_squared: f32) {
+        let [reference, now, before] = [reference, now, before].map(f64::from);
+        self.pixels += 1.0;
+        self.reference += reference;
+        self.now += now;
+        self.before += before;
+        self.reference_squared += reference * reference;
+        self.reference_now += reference * now;
+        self.reference_before += reference * before;
+        self.change_squared += (now - before).powi(2);
+        self.slope_squared += f64::from(slope_squared);
+    }
+
+    fn arrival(self, whole: f64, noise: f64) -> Option<Arrival> {
+        let n = self.pixels;
+        if n < LEAST_PIXELS {
+            return None;
+        }
+        let energy = self.reference_squared - self.reference * self.reference / n;
+        if energy <= (LEAST_FREE * whole).max(f64::from(f32::MIN_POSITIVE)) {
+            return None;
+        }
+        let contrast = |product: f64, sum: f64| (product - self.reference * sum / n) / energy;
+        // Two differences of noisy pixels are in each slope.
+        let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
+        let unchanged = (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
+        let brighter = self.now - self.before;
+        Some(Arrival {
+            now: contrast(self.reference_now, self.now),
+            before: contrast(self.reference_before, self.before),
+            variance: noise / energy,
+            change: (self.change_squared - brighter * brighter / n) / n / unchanged,
+            looks: (n / PIXELS_A_LOOK).min(MOST_LOOKS),
+        })
+    }
+}

@@ -1,0 +1,168 @@
+//! Whether what is followed is the target: it has come to where it is, and the scene was there before.
+
+use crossfix_filter::AxisFilter;
+
+use crate::ImagePoint;
+use crate::arrival::Placed;
+use crate::frame::{Frame, Step};
+use crate::scene::Scene;
+use crate::target::{Target, Workbench, predict};
+
+/// A target that was found again is believed after so long, s: until then a mistake costs what is known of where it went,
+/// and nothing is learnt of it.
+const PROBATION_S: f64 = 0.5;
+/// How often the scene takes the place of a target that is followed, 1/s, and how often that is over. With ten times the
+/// first, certainty falls where nothing is known against the target; with a tenth, a cloud is followed for seconds.
+const GOES_PER_S: f64 = 0.1;
+const COMES_PER_S: f64 = 2.0;
+/// The probability that what a search has found is the target: the search has asked more of it than of what is followed.
+const FOUND: f64 = 0.9;
+/// The scene is asked this often whether it is the scene that is followed, s, and in every image where it may be: one
+/// image says what the next does, and half of a step's time is spared.
+const ASKED_EVERY_S: f64 = 0.1;
+const SURE: f64 = 0.9;
+/// Pictures of the scene that a target remembers its place in: more than there are.
+const MOST_PICTURES: usize = 8;
+
+/// What is known of whether it is the target that is followed.
+#[derive(Clone, Debug)]
+pub(crate) struct Identity {
+    /// The probability.
+    is_there: f64,
+    /// For how long the scene has not been asked, s.
+    unasked_s: f64,
+    /// Where the target was seen in the scene's pictures, by their numbers.
+    in_pictures: Vec<(u64, ImagePoint)>,
+    /// What was known before it was found again, as long as that is not sure.
+    probation: Option<Probation>,
+}
+
+/// What was known of a target before it was found again.
+#[derive(Clone, Debug)]
+struct Probation {
+    axes: [AxisFilter; 2],
+    unseen_s: f64,
+    last_seen: ImagePoint,
+    /// The newest picture of the scene then.
+    picture: u64,
+    /// How long it has been seen since, s.
+    seen_s: f64,
+}
+
+impl Identity {
+    /// Of a target that somebody has shown.
+    pub(crate) fn new() -> Self {
+        Self {
+            is_there: 1.0,
+            unasked_s: 0.0,
+            in_pictures: Vec::with_capacity(MOST_PICTURES),
+            probation: None,
+        }
+    }
+
+    /// Somebody has said where it is.
+    pub(crate) fn is_given(&mut self) {
+        (self.is_there, self.probation) = (1.0, None);
+    }
+
+    /// Whether it has been found again, and that is not sure.
+    pub(crate) fn is_on_probation(&self) -> bool {
+        self.probation.is_some()
+    }
+}
+
+impl Target {
+    /// Notes where it was when a picture of the scene was taken, if it was seen.
+    pub(crate) fn note_picture(&mut self, number: u64) {
+        let in_pictures = &mut self.identity.in_pictures;
+        if self.missed == 0 {
+            if in_pictures.len() >= MOST_PICTURES {
+                in_pictures.remove(0);
+            }
+            in_pictures.push((number, self.last_seen));
+        }
+    }
+
+    /// Log-likelihood ratio of the target's having come to a place against what is there having been there before, by the
+    /// first picture of the scene that tells; 0 if none does.
+    ///
+    /// In a picture in which it was not seen, as it was lost, the target was elsewhere, or it would have been found.
+    pub(crate) fn arrival_log_ratio(
+        &self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        bench: &mut Workbench,
+    ) -> f64 {
+        let placed = Placed {
+            reference: self.appearance.working.image(),
+            energy: f64::from(self.appearance.energy()),
+            place,
+            noise: f64::from(self.noise),
+        };
+        let lost_since = self.identity.probation.as_ref().map(|probation| probation.picture);
+        let Workbench { workshop, comparison, .. } = bench;
+        comparison.look(frame.image, placed, &mut workshop.resampler);
+        let arrival = frame.scene.pictures().find_map(|picture| {
+            let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
+            let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
+            let seen = seen.map(|(_, seen)| *seen);
+            if seen.is_none() && !was_lost {
+                return None;
+            }
+            comparison.with(picture, seen, placed, &mut workshop.resampler)
+        });
+        let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
+        arrival.map_or(0.0, |arrival| arrival.log_ratio(usual))
+    }
+
+    /// The probability that what is followed is the target and not the scene: a chain of two states that sees whether
+    /// what is at a place has come there.
+    pub(crate) fn doubt(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> f64 {
+        self.identity.unasked_s += frame.interval;
+        let asks = self.identity.unasked_s >= ASKED_EVERY_S || self.identity.is_there < SURE;
+        let log_ratio = if asks { self.arrival_log_ratio(frame, place, bench) } else { 0.0 };
+        if asks {
+            self.identity.unasked_s = 0.0;
+        }
+        let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
+        let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
+        let before = settled + (self.identity.is_there - settled) * kept;
+        self.identity.is_there = before / (before + (1.0 - before) * (-log_ratio).exp());
+        self.identity.is_there
+    }
+
+    /// A search has found something.
+    pub(crate) fn begin_probation(&mut self, scene: &Scene) {
+        self.identity.probation = Some(Probation {
+            axes: self.axes.clone(),
+            unseen_s: self.unseen_s,
+            last_seen: self.last_seen,
+            picture: scene.newest(),
+            seen_s: 0.0,
+        });
+        self.identity.is_there = FOUND;
+    }
+
+    /// Follows what a search has found. If it is lost again soon it was something else, and the search goes on from what
+    /// was known before.
+    pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+        if let Some(probation) = &mut self.identity.probation {
+            predict(&mut probation.axes, frame.interval, frame.image);
+            probation.unseen_s += frame.interval;
+        }
+        let step = self.follow(frame, bench);
+        if self.is_searching()
+            && let Some(before) = self.identity.probation.take()
+        {
+            (self.axes, self.unseen_s, self.last_seen) = (before.axes, before.unseen_s, before.last_seen);
+            return step;
+        }
+        if let Some(probation) = &mut self.identity.probation {
+            probation.seen_s += step.certainty * frame.interval;
+            if probation.seen_s >= PROBATION_S {
+                self.identity.probation = None;
+            }
+        }
+        step
+    }
+}

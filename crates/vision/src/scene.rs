@@ -1,0 +1,372 @@
+//! What the scene looks like without the targets: a few pictures of the last seconds, and by how much the camera has
+//! turned since each.
+//!
+//! What a target hides shows in a picture in which it was elsewhere. A place where the image is what it was then shows
+//! the scene and no target, whatever a reference makes of it.
+
+use crossfix_correlation::Plane;
+
+use crate::ImagePoint;
+use crate::mend::mend;
+
+/// Pictures that are kept. With half as many a target that flies slowly covers what it hides in all of them.
+const PICTURES: usize = 4;
+/// Age of the newest when another is taken, s: each is older than the next by this or more, so that they reach back a
+/// few seconds. With half of it they reach back half as far.
+const SPACING_S: f64 = 0.3;
+/// About how old the picture is against which a change is asked for, s: a target has moved by its own size by then.
+const CHANGED_S: f64 = 1.0;
+/// Blocks of so many pixels a side are one pixel of the coarse picture by which the camera's turn is found: in single
+/// pixels the noise has more slope than clouds have, and the turn is taken for nothing.
+const COARSENESS: usize = 8;
+/// How often the coarse picture is smoothed, by a quarter, a half and a quarter of neighbours.
+const SMOOTHED: usize = 3;
+/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between tell the same.
+const STRIDE: usize = 2;
+/// Steps of the registration, at most, and the step that ends it, coarse pixels.
+const STEPS: usize = 6;
+const SETTLED: f32 = 0.003;
+/// A longer step is a mistake, coarse pixels: it is taken so far.
+const LONGEST_STEP: f32 = 2.0;
+/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves is no turn.
+const OUTLYING: f32 = 5.0;
+/// Fewer pixels in common tell no turn.
+const LEAST_COMMON: f32 = 50.0;
+
+/// A picture of the scene.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Picture {
+    image: Plane,
+    coarse: Plane,
+    age_s: f64,
+    number: u64,
+    /// What is at (x, y) now was at (x, y) plus this then, px.
+    shift: [f64; 2],
+}
+
+impl Picture {
+    pub(crate) fn image(&self) -> &Plane {
+        &self.image
+    }
+
+    /// Pictures are counted.
+    pub(crate) fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// Where what is at a place now was then.
+    pub(crate) fn then(&self, place: ImagePoint) -> ImagePoint {
+        ImagePoint { x: place.x + self.shift[0], y: place.y + self.shift[1] }
+    }
+
+    /// Whether a place was in the picture then.
+    pub(crate) fn holds(&self, then: ImagePoint) -> bool {
+        let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
+        inside(then.x, self.image.width()) && inside(then.y, self.image.height())
+    }
+}
+
+/// The last seconds' pictures.
+#[derive(Debug, Default)]
+pub(crate) struct Scene {
+    /// The newest first.
+    pictures: Vec<Picture>,
+    coarse: Plane,
+    between: Plane,
+    sums: Vec<f32>,
+    taken: u64,
+}
+
+impl Scene {
+    /// The pictures, the newest first.
+    pub(crate) fn pictures(&self) -> impl Iterator<Item = &Picture> {
+        self.pictures.iter()
+    }
+
+    /// The number of the newest picture; 0 before the first.
+    pub(crate) fn newest(&self) -> u64 {
+        self.taken
+    }
+
+    /// Forgets all pictures.
+    pub(crate) fn clear(&mut self) {
+        self.pictures.clear();
+    }
+
+    /// Finds out how the camera has turned, by the newest picture: the others turned as much against that one as when
+    /// it was taken.
+    pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
+        coarsened(image, &mut self.coarse, &mut self.sums);
+        mend(&mut self.coarse);
+        smooth(&mut self.coarse, &mut self.between);
+        let Some((newest, others)) = self.pictures.split_first_mut() else { return };
+        let before = newest.shift;
+        newest.age_s += interval;
+        newest.shift = registered(&self.coarse, &newest.coarse, before);
+        for picture in others {
+            picture.age_s += interval;
+            for (shift, (now, before)) in picture.shift.iter_mut().zip(newest.shift.iter().zip(before)) {
+                *shift += now - before;
+            }
+        }
+    }
+
+    /// Keeps a picture where it is time to, and returns its number.
+    pub(crate) fn keep(&mut self, image: &Plane) -> Option<u64> {
+        if self.pictures.first().is_some_and(|newest| newest.age_s < SPACING_S) {
+            return None;
+        }
+        // Errors must not add up from picture to picture.
+        for picture in &mut self.pictures {
+            picture.shift = registered(&self.coarse, &picture.coarse, picture.shift);
+        }
+        let mut kept = if self.pictures.len() < PICTURES {
+            Picture::default()
+        } else {
+            self.pictures.remove(self.least_missed())
+        };
+        self.taken += 1;
+        kept.image.copy_from(image);
+        mend(&mut kept.image);
+        kept.coarse.copy_from(&self.coarse);
+        (kept.age_s, kept.shift, kept.number) = (0.0, [0.0; 2], self.taken);
+        self.pictures.insert(0, kept);
+        Some(self.taken)
+    }
+
+    /// The picture between whose neighbours least time would pass without it, for its age: so their ages double.
+    fn least_missed(&self) -> usize {
+        let gap = |i: usize| self.pictures[i + 1].age_s / (self.pictures[i - 1].age_s + SPACING_S);
+        let inner = 1..self.pictures.len() - 1;
+        inner.min_by(|&one, &other| gap(one).total_cmp(&gap(other))).unwrap_or(0)
+    }
+
+    /// What has changed since about a second ago: the image less what was there then, 0 where nothing is known. False
+    /// without such a picture.
+    pub(crate) fn change(&self, image: &Plane, change: &mut Plane) -> bool {
+        let of_age = |picture: &&Picture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
+        let off = |picture: &Picture| (picture.age_s - CHANGED_S).abs();
+        let nearest =
+            self.pictures.iter().filter(of_age).min_by(|one, other| off(one).total_cmp(&off(other)));
+        let Some(Picture { image: before, shift, .. }) = nearest else { return false };
+        let (width, height) = (image.width(), image.height());
+        let whole = shift.map(f64::floor);
+        let [right, down] = [0, 1].map(|i| (shift[i] - whole[i]) as f32);
+        let [left, top] = whole.map(|s| s as isize);
+        change.reshape(width, height);
+        let known = overlap(width, left);
+        for y in 0..height {
+            let out = change.row_mut(y);
+            out.fill(0.0);
+            if !overlap(height, top).contains(&y) {
+                continue;
+            }
+            let [above, below] = [0, 1].map(|k| before.row((y as isize + top) as usize + k));
+            for (x, out) in out.iter_mut().enumerate().take(known.end).skip(known.start) {
+                let i = (x as isize + left) as usize;
+                let along = |row: &[f32]| row[i] + right * (row[i + 1] - row[i]);
+                *out = image.row(y)[x] - along(above) - down * (along(below) - along(above));
+            }
+        }
+        true
+    }
+}
+
+/// The places of a row that, moved by so many, are in the row, and the next one too.
+fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
+    let side = side as isize;
+    let first = (-by).clamp(0, side);
+    first as usize..(side - 1 - by).clamp(first, side) as usize
+}
+
+/// The means of blocks. `sums` is memory for a row of them.
+fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
+    to.reshape(from.width() / COARSENESS, from.height() / COARSENESS);
+    let share = 1.0 / (COARSENESS * COARSENESS) as f32;
+    for y in 0..to.height() {
+        // Down the columns first: that is many at a time. Of a picture of less than a block the last row counts again.
+        sums.clear();
+        sums.resize(from.width(), 0.0);
+        for row in y * COARSENESS..(y + 1) * COARSENESS {
+            for (sum, sample) in sums.iter_mut().zip(from.row(row.min(from.height() - 1))) {
+                *sum += sample;
+            }
+        }
+        for (mean, block) in to.row_mut(y).iter_mut().zip(sums.chunks(COARSENESS)) {
+            *mean = share * block.iter().sum::<f32>();
+        }
+    }
+}
+
+/// Smooths a picture, in rows and in columns.
+fn smooth(plane: &mut Plane, between: &mut Plane) {
+    let (width, height) = (plane.width(), plane.height());
+    between.reshape(width, height);
+    let neighbours = |at: usize, side: usize| (at.saturating_sub(1), (at + 1).min(side - 1));
+    for _ in 0..SMOOTHED {
+        for y in 0..height {
+            let row = plane.row(y);
+            for (x, out) in between.row_mut(y).iter_mut().enumerate() {
+                let (left, right) = neighbours(x, width);
+                *out = 0.25 * row[left] + 0.5 * row[x] + 0.25 * row[right];
+            }
+        }
+        for y in 0..height {
+            let (up, down) = neighbours(y, height);
+            let rows = between.row(up).iter().zip(between.row(y)).zip(between.row(down));
+            for (out, ((up, at), down)) in plane.row_mut(y).iter_mut().zip(rows) {
+                *out = 0.25 * up + 0.5 * at + 0.25 * down;
+            }
+        }
+    }
+}
+
+/// The normal equations of a step of registration, with the change of brightness taken out.
+#[derive(Clone, Copy, Debug, Default)]
+struct Normal {
+    weight: f32,
+    slope: [f32; 2],
+    off: f32,
+    slope_slope: [f32; 3],
+    slope_off: [f32; 2],
+}
+
+impl Normal {
+    fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
+        let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
+        self.weight += weight;
+        self.slope[0] += weight * gx;
+        self.slope[1] += weight * gy;
+        self.off += weight * off;
+        self.slope_slope[0] += weight * gx * gx;
+        self.slope_slope[1] += weight * gx * gy;
+        self.slope_slope[2] += weight * gy * gy;
+        self.slope_off[0] += weight * gx * off;
+        self.slope_off[1] += weight * gy * off;
+    }
+
+    /// The step, coarse pixels; `None` where nothing tells it.
+    fn step(self) -> Option<[f32; 2]> {
+        let Self { weight: n, slope: [sx, sy], off, .. } = self;
+        if n < LEAST_COMMON / 2.0 {
+            return None;
+        }
+        let [xx, xy, yy] = self.slope_slope;
+        let [xx, xy, yy] = [xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n];
+        let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
+        let determinant = xx * yy - xy * xy;
+        let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
+        let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
+        told.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
+    }
+}
+
+/// By how much a coarse picture of now is shifted against one of then, px of the image, from a first guess on (Lucas
+/// and Kanade 1981).
+fn registered(now: &Plane, then: &Plane, start: [f64; 2]) -> [f64; 2] {
+    let (width, height) = (now.width(), now.height());
+    if (then.width(), then.height()) != (width, height) {
+        return start;
+    }
+    let mut shift = start.map(|s| (s / COARSENESS as f64) as f32);
+    for _ in 0..STEPS {
+        let whole = shift.map(f32::floor);
+        let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
+        let [left, top] = whole.map(|s| s as isize);
+        let mut normal = Normal::default();
+        for y in overlap(height, top).step_by(STRIDE) {
+            let line = now.row(y);
+            let [above, below] = [0, 1].map(|k| then.row((y as isize + top) as usize + k));
+            for x in overlap(width, left).step_by(STRIDE) {
+                let i = (x as isize + left) as usize;
+                let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
+                let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
+                let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
+                normal.add(slope, line[x] - upper - down * (lower - upper));
+            }
+        }
+        let Some([x, y]) = normal.step() else { break };
+        shift = [shift[0] + x, shift[1] + y];
+        if x.abs() + y.abs() < SETTLED {
+            break;
+        }
+    }
+    shift.map(|s| f64::from(s) * COARSENESS as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    /// Clouds seen by a camera that has turned by so many pixels, with noise.
+    fn clouds([right, down]: [f64; 2], noise: f32, seed: u64) -> Plane {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let normal = Normal::new(0.0, noise).unwrap();
+        Plane::from_fn(320, 240, |x, y| {
+            let (x, y) = (x as f64 + right, y as f64 + down);
+            let waves = (x / 37.0).sin() * (y / 29.0).cos() + 0.6 * ((x + 0.7 * y) / 19.0).sin();
+            130.0 + 25.0 * waves as f32 + normal.sample(&mut rng)
+        })
+    }
+
+    #[test]
+    fn a_turn_of_the_camera_is_found_in_noise_and_adds_up() {
+        for noise in [0.5, 25.0] {
+            let mut scene = Scene::default();
+            let turned = |frame: u32| [0.8 * f64::from(frame), -0.5 * f64::from(frame)];
+            for frame in 0..60 {
+                let image = clouds(turned(frame), noise, u64::from(frame));
+                scene.register(&image, 1.0 / 30.0);
+                scene.keep(&image);
+            }
+            let oldest = scene.pictures().last().unwrap();
+            let frames = (oldest.age_s * 30.0).round();
+            assert!(frames > 30.0, "{frames}");
+            let off = [oldest.shift[0] - 0.8 * frames, oldest.shift[1] + 0.5 * frames];
+            assert!(off.iter().all(|off| off.abs() < 0.6), "{off:?} of {frames} frames, noise {noise}");
+        }
+    }
+
+    #[test]
+    fn what_has_changed_is_what_has_come_and_what_has_gone() {
+        let mut scene = Scene::default();
+        let with_blob = |mut image: Plane, column: usize| {
+            for y in 100..106 {
+                image.row_mut(y)[column..column + 8].fill(250.0);
+            }
+            image
+        };
+        let mut change = Plane::default();
+        assert!(!scene.change(&clouds([0.0; 2], 0.5, 1), &mut change));
+        for frame in 0..40_usize {
+            let image = with_blob(clouds([0.4 * frame as f64, 0.0], 0.5, frame as u64), 60 + 3 * frame);
+            scene.register(&image, 1.0 / 30.0);
+            let is_known = scene.change(&image, &mut change);
+            assert!(is_known || frame < 17, "frame {frame}");
+            scene.keep(&image);
+        }
+        let column = 60 + 3 * 39 + 4;
+        assert!(change.row(103)[column] > 60.0);
+        let elsewhere = (20..220).filter(|y| !(95..112).contains(y));
+        let worst =
+            elsewhere.flat_map(|y| &change.row(y)[20..290]).fold(0.0, |most: f32, c| most.max(c.abs()));
+        assert!(worst < 8.0, "{worst}");
+    }
+
+    #[test]
+    fn pictures_reach_back_for_seconds_and_are_few() {
+        let mut scene = Scene::default();
+        for frame in 0..300 {
+            let image = clouds([0.0; 2], 1.0, frame);
+            scene.register(&image, 1.0 / 30.0);
+            scene.keep(&image);
+        }
+        let ages: Vec<f64> = scene.pictures().map(|picture| picture.age_s).collect();
+        assert_eq!(ages.len(), PICTURES);
+        assert!(ages.is_sorted() && ages[3] > 4.0 * SPACING_S, "{ages:?}");
+    }
+}
