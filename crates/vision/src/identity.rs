@@ -4,7 +4,7 @@ use crossfix_filter::AxisFilter;
 
 use crate::ImagePoint;
 use crate::arrival::Placed;
-use crate::frame::{Frame, Step};
+use crate::frame::{FRAME_INTERVAL, Frame, Step};
 use crate::scene::Scene;
 use crate::target::{Target, Workbench, predict};
 
@@ -17,22 +17,18 @@ const GOES_PER_S: f64 = 0.1;
 const COMES_PER_S: f64 = 2.0;
 /// The probability that what a search has found is the target: the search has asked more of it than of what is followed.
 const FOUND: f64 = 0.9;
-/// The scene is asked this often whether it is the scene that is followed, s, and in every image where it may be: one
-/// image says what the next does, and half of a step's time is spared.
-const ASKED_EVERY_S: f64 = 0.1;
-const SURE: f64 = 0.9;
 /// Pictures of the scene that a target remembers its place in: more than there are.
-const MOST_PICTURES: usize = 8;
+const MOST_PICTURES: usize = 16;
 
 /// What is known of whether it is the target that is followed.
 #[derive(Clone, Debug)]
 pub(crate) struct Identity {
     /// The probability.
     is_there: f64,
-    /// For how long the scene has not been asked, s.
-    unasked_s: f64,
     /// Where the target was seen in the scene's pictures, by their numbers.
     in_pictures: Vec<(u64, ImagePoint)>,
+    /// How fast it went when it was last seen for sure, px/s.
+    speed_px_s: f64,
     /// What was known before it was found again, as long as that is not sure.
     probation: Option<Probation>,
 }
@@ -43,6 +39,7 @@ struct Probation {
     axes: [AxisFilter; 2],
     unseen_s: f64,
     last_seen: ImagePoint,
+    missed: u32,
     /// The newest picture of the scene then.
     picture: u64,
     /// How long it has been seen since, s.
@@ -54,8 +51,8 @@ impl Identity {
     pub(crate) fn new() -> Self {
         Self {
             is_there: 1.0,
-            unasked_s: 0.0,
             in_pictures: Vec::with_capacity(MOST_PICTURES),
+            speed_px_s: 0.0,
             probation: None,
         }
     }
@@ -63,6 +60,7 @@ impl Identity {
     /// Somebody has said where it is.
     pub(crate) fn is_given(&mut self) {
         (self.is_there, self.probation) = (1.0, None);
+        self.in_pictures.clear();
     }
 
     /// Whether it has been found again, and that is not sure.
@@ -74,19 +72,24 @@ impl Identity {
 impl Target {
     /// Notes where it was when a picture of the scene was taken, if it was seen.
     pub(crate) fn note_picture(&mut self, number: u64) {
-        let in_pictures = &mut self.identity.in_pictures;
-        if self.missed == 0 {
-            if in_pictures.len() >= MOST_PICTURES {
-                in_pictures.remove(0);
-            }
-            in_pictures.push((number, self.last_seen));
+        if self.missed > 0 {
+            return;
         }
+        if self.identity.probation.is_none() {
+            self.identity.speed_px_s = self.velocity().x.hypot(self.velocity().y);
+        }
+        let in_pictures = &mut self.identity.in_pictures;
+        if in_pictures.len() >= MOST_PICTURES {
+            in_pictures.remove(0);
+        }
+        in_pictures.push((number, self.last_seen));
     }
 
     /// Log-likelihood ratio of the target's having come to a place against what is there having been there before, by the
     /// first picture of the scene that tells; 0 if none does.
     ///
-    /// In a picture in which it was not seen, as it was lost, the target was elsewhere, or it would have been found.
+    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as it did when it was last
+    /// seen; one that hovered may be in all of them.
     pub(crate) fn arrival_log_ratio(
         &self,
         frame: Frame<'_>,
@@ -99,14 +102,16 @@ impl Target {
             place,
             noise: f64::from(self.noise),
         };
+        let longest = placed.reference.width().max(placed.reference.height()) as f64;
         let lost_since = self.identity.probation.as_ref().map(|probation| probation.picture);
         let Workbench { workshop, comparison, .. } = bench;
         comparison.look(frame.image, placed, &mut workshop.resampler);
         let arrival = frame.scene.pictures().find_map(|picture| {
             let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
-            let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
             let seen = seen.map(|(_, seen)| *seen);
-            if seen.is_none() && !was_lost {
+            let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
+            let has_moved_on = self.identity.speed_px_s * picture.age_s() > longest;
+            if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
             }
             comparison.with(picture, seen, placed, &mut workshop.resampler)
@@ -118,12 +123,9 @@ impl Target {
     /// The probability that what is followed is the target and not the scene: a chain of two states that sees whether
     /// what is at a place has come there.
     pub(crate) fn doubt(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> f64 {
-        self.identity.unasked_s += frame.interval;
-        let asks = self.identity.unasked_s >= ASKED_EVERY_S || self.identity.is_there < SURE;
-        let log_ratio = if asks { self.arrival_log_ratio(frame, place, bench) } else { 0.0 };
-        if asks {
-            self.identity.unasked_s = 0.0;
-        }
+        // Images that follow each other sooner tell no more together than one.
+        let share = (frame.interval / FRAME_INTERVAL).min(1.0);
+        let log_ratio = share * self.arrival_log_ratio(frame, place, bench);
         let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
         let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
         let before = settled + (self.identity.is_there - settled) * kept;
@@ -137,6 +139,7 @@ impl Target {
             axes: self.axes.clone(),
             unseen_s: self.unseen_s,
             last_seen: self.last_seen,
+            missed: self.missed,
             picture: scene.newest(),
             seen_s: 0.0,
         });
@@ -155,6 +158,8 @@ impl Target {
             && let Some(before) = self.identity.probation.take()
         {
             (self.axes, self.unseen_s, self.last_seen) = (before.axes, before.unseen_s, before.last_seen);
+            self.missed = self.missed.max(before.missed);
+            self.identity.in_pictures.retain(|(number, _)| *number <= before.picture);
             return step;
         }
         if let Some(probation) = &mut self.identity.probation {

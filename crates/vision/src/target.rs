@@ -400,7 +400,7 @@ impl Target {
             return;
         }
         let seen = certainty > SEEN;
-        if seen {
+        if seen && !self.identity.is_on_probation() {
             let clear = f64::from(self.appearance.clear_share());
             let measured = look.contrast / clear;
             let variance = f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)

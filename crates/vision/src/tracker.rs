@@ -137,7 +137,7 @@ impl Follower {
     }
 
     fn is_seen(&self) -> bool {
-        !matches!(self, Self::Posterior(target) if target.missed > 0)
+        !matches!(self, Self::Posterior(target) if target.missed > 0 || target.identity.is_on_probation())
     }
 }
 
@@ -256,6 +256,9 @@ impl ImageTracker {
         }
         let since = |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
         let interval = self.last.map_or(LONGEST_INTERVAL, since);
+        if self.last.is_some_and(|last| time.seconds_since(last.time) > LONGEST_INTERVAL) {
+            self.scene.clear();
+        }
         self.last = Some(shot);
 
         self.tracks.clear();
