@@ -67,10 +67,10 @@ impl Arrival {
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
         let Self { now, before, variance, change, looks } = self;
         let normal = |off: f64, variance: f64| -0.5 * (off * off / variance + variance.ln());
-        let scene = normal(before, variance + (SCENE_SHARE * usual).powi(2));
+        let arrived = normal(before, variance + (SCENE_SHARE * usual).powi(2));
         let unchanged = normal(before - now, 2.0 * variance + UNCHANGED.powi(2));
         let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
-        (scene - unchanged + changed.min(MOST)).clamp(-MOST, MOST)
+        (arrived - unchanged + changed.min(MOST)).clamp(-MOST, MOST)
     }
 }
 

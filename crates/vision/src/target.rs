@@ -31,7 +31,7 @@ const MANOEUVRE: f64 = 25.0;
 const SEEN: f64 = 0.5;
 /// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
 const USUAL_S: f64 = 3.0;
-/// Within so long a lost target's contrast is what it usually is again, s.
+/// Time constant with which a lost target's contrast is taken for what it usually is again, s: about a cloud's edge.
 const FADES_S: f64 = 0.5;
 /// Log ratio of a placement outside the image.
 const IMPOSSIBLE: f32 = -50.0;

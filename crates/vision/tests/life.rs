@@ -148,6 +148,30 @@ fn a_cloud_that_looks_like_the_target_is_not_followed_in_its_place() {
 }
 
 #[test]
+fn a_target_that_hovers_is_found_again_where_it_was() {
+    for seed in 0..4 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut noise = || -> f32 {
+            let normal: f32 = StandardNormal.sample(&mut rng);
+            3.0 * normal
+        };
+        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        tracker.take_up(PixelBox { x: 216.0, y: 76.0, width: 9.0, height: 9.0 });
+        for frame in 0..240 {
+            // Hidden for half a second now and then, and for longer than any picture of the scene is kept.
+            let hidden = (60..75).contains(&frame) || (100..220).contains(&frame);
+            let image = drifting(frame, (!hidden).then_some((220.0, 80.0)), &mut noise);
+            let track = tracker.step(&image, at(frame))[0];
+            if (90..100).contains(&frame) || frame >= 235 {
+                let off = (track.position.x - 220.0).hypot(track.position.y - 80.0);
+                let is_seen = track.phase == TrackPhase::Tracking && off < 1.0;
+                assert!(is_seen, "seed {seed}, frame {frame}: {:?}, {off} px off", track.phase);
+            }
+        }
+    }
+}
+
+#[test]
 fn images_of_another_size_or_out_of_order_are_refused() {
     let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
     tracker.take_up(PixelBox { x: 16.0, y: 56.0, width: 9.0, height: 9.0 });
