@@ -164,37 +164,22 @@ impl TrackerConfig {
     }
 }
 
-/// How targets are found: difference from a slow background, threshold, connected regions.
+/// How targets are found: what stands out of its surroundings, and did not before.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DetectorConfig {
-    /// Share of the old background kept in a frame. Default 0.98.
-    pub background_memory: f64,
-    /// Frames that make the first background. Default 10.
-    pub warm_up_frames: u32,
-    /// Difference that counts, in standard deviations of the image's noise. Default 6.
-    pub threshold_sigmas: f64,
-    /// Least and greatest number of pixels of a region. Default 6 and 2500.
-    pub area_px: [usize; 2],
-    /// Frames in a row in which a region must be seen near its place. Default 3.
-    pub confirm_frames: u32,
-    /// How far a region may move in a frame, px. Default 20.
-    pub max_step_px: f64,
-    /// Most targets followed at once. Default 16.
+    /// How often something may be found that is none, 1/min. Default 1.
+    pub false_tracks_a_minute: f64,
+    /// Over how long the background is a mean, s. Default 5: clouds are others by then, and what hovers for as long is
+    /// background unless it was found before.
+    pub background_s: f64,
+    /// Most targets followed at once. Default 50.
     pub max_targets: usize,
 }
 
 impl Default for DetectorConfig {
     fn default() -> Self {
-        Self {
-            background_memory: 0.98,
-            warm_up_frames: 10,
-            threshold_sigmas: 6.0,
-            area_px: [6, 2500],
-            confirm_frames: 3,
-            max_step_px: 20.0,
-            max_targets: 16,
-        }
+        Self { false_tracks_a_minute: 1.0, background_s: 5.0, max_targets: 50 }
     }
 }
 
@@ -256,19 +241,15 @@ impl TrackerConfig {
         }
         self.validate_gate_and_reference()?;
         if let Some(detector) = &self.detector {
-            let memory = detector.background_memory;
-            check("detector.background_memory", memory, (0.0..1.0).contains(&memory), "from 0 to 1")?;
-            let sigmas = detector.threshold_sigmas;
+            let rate = detector.false_tracks_a_minute;
             check(
-                "detector.threshold_sigmas",
-                sigmas,
-                (1e-3..=1e6).contains(&sigmas),
-                "from 0.001 to 1000000",
+                "detector.false_tracks_a_minute",
+                rate,
+                (1e-6..=1e6).contains(&rate),
+                "from 0.000001 to 1000000",
             )?;
-            let step = detector.max_step_px;
-            check("detector.max_step_px", step, (0.0..=1e6).contains(&step), "from 0 to 1000000 px")?;
-            let [least, most] = detector.area_px;
-            check("detector.area_px", least as f64, least <= most, "at most the second of the two")?;
+            let memory = detector.background_s;
+            check("detector.background_s", memory, (0.1..=1e4).contains(&memory), "from 0.1 to 10000 s")?;
         }
         Ok(())
     }

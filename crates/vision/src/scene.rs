@@ -83,6 +83,8 @@ pub(crate) struct Scene {
     between: Plane,
     sums: Vec<f32>,
     taken: u64,
+    /// How far the scene had moved when the newest picture was taken, px.
+    turned: [f64; 2],
 }
 
 impl Scene {
@@ -94,6 +96,12 @@ impl Scene {
     /// The number of the newest picture; 0 before the first.
     pub(crate) fn newest(&self) -> u64 {
         self.taken
+    }
+
+    /// By how much the scene has moved since the beginning: what is at (x, y) was at (x, y) plus this, px.
+    pub(crate) fn turned(&self) -> [f64; 2] {
+        let since = self.pictures.first().map_or([0.0; 2], |newest| newest.shift);
+        [0, 1].map(|i| self.turned[i] + since[i])
     }
 
     /// Forgets all pictures.
@@ -130,6 +138,7 @@ impl Scene {
         for picture in &mut self.pictures {
             picture.shift = registered(&self.coarse, &picture.coarse, picture.shift);
         }
+        self.turned = self.turned();
         let mut kept = if self.pictures.len() < PICTURES {
             Picture::default()
         } else {

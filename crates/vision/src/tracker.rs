@@ -5,7 +5,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
-use crate::detector::Detector;
+use crate::detector::{Detector, Known};
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
@@ -69,12 +69,17 @@ pub struct ImageTrack {
 }
 
 /// Who took a target up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 enum Origin {
     /// A person or a configuration: it is never given up.
     Given,
     /// The detector.
-    Detected,
+    Detected {
+        /// Where it was found.
+        first: ImagePoint,
+        /// Whether it has been elsewhere since or before, so that the background of its place is known without it.
+        has_moved: bool,
+    },
 }
 
 /// A target as one of the algorithms follows it.
@@ -282,7 +287,7 @@ impl ImageTracker {
         }
         self.give_up(time);
         self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
-        self.take_up_new(image, time);
+        self.take_up_new(image, time, interval);
         self.keep(image, time);
         if posterior && let Some(number) = self.scene.keep(image) {
             for followed in &mut self.followed {
@@ -354,7 +359,7 @@ impl ImageTracker {
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
             let doubled =
-                rest[0].origin == Origin::Detected && older.iter().any(|o| same(&o.target, &rest[0].target));
+                rest[0].origin != Origin::Given && older.iter().any(|o| same(&o.target, &rest[0].target));
             if doubled {
                 self.followed.remove(index);
             } else {
@@ -363,16 +368,50 @@ impl ImageTracker {
         }
     }
 
-    fn take_up_new(&mut self, image: &Plane, time: Timestamp) {
+    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for the scene is given up.
+    fn detect(
+        &mut self,
+        image: &Plane,
+        interval: f64,
+        given: &[(PixelBox, Origin)],
+    ) -> Vec<(PixelBox, Origin)> {
+        let (Some(detector), Some(config)) = (&mut self.detector, &self.config.detector) else {
+            return Vec::new();
+        };
+        for followed in &mut self.followed {
+            let place = box_of(&followed.target);
+            let (at, side) = (place.centre(), place.width.max(place.height));
+            if let Origin::Detected { first, has_moved } = &mut followed.origin {
+                *has_moved |= (at.x - first.x).hypot(at.y - first.y) > side;
+            }
+        }
+        let known = self.followed.iter().map(|followed| Known {
+            id: followed.id,
+            place: box_of(&followed.target),
+            is_watched: matches!(followed.origin, Origin::Detected { has_moved: true, .. }),
+        });
+        // The number of a track to be is nobody's.
+        let given = given.iter().map(|(place, _)| Known {
+            id: ImageTrackId(u64::MAX),
+            place: *place,
+            is_watched: false,
+        });
+        let known: Vec<Known> = known.chain(given).collect();
+        let findings = detector.step(image, interval, self.scene.turned(), &known);
+        self.followed.retain(|followed| !findings.scene.contains(&followed.id));
+        self.tracks.retain(|track| !findings.scene.contains(&track.id));
+        let room = config.max_targets.saturating_sub(known.len());
+        let found = findings.found.into_iter().take(room).map(|found| {
+            let has_moved = found.gone_px > found.place.width.max(found.place.height);
+            (found.place, Origin::Detected { first: found.place.centre(), has_moved })
+        });
+        found.collect()
+    }
+
+    fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting).into_iter().map(|place| (place, Origin::Given));
         let mut new: Vec<(PixelBox, Origin)> = given.collect();
-        if let Some(detector) = &mut self.detector {
-            let mut known: Vec<PixelBox> = self.followed.iter().map(|f| box_of(&f.target)).collect();
-            known.extend(new.iter().map(|(place, _)| *place));
-            let room = self.config.detector.as_ref().map_or(0, |d| d.max_targets.saturating_sub(known.len()));
-            let found = detector.step(image, &known).into_iter().take(room);
-            new.extend(found.map(|place| (place, Origin::Detected)));
-        }
+        new.extend(self.detect(image, interval, &new));
         for (place, origin) in new {
             let id = ImageTrackId(self.next_id);
             self.next_id += 1;

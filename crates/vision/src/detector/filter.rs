@@ -1,0 +1,176 @@
+//! What the detector does to whole images, and to parts of them.
+
+use crossfix_correlation::Plane;
+use pulp::Arch;
+
+/// Half side of the surroundings of a cell, cells: four times a target's side, which is two or three.
+pub(super) const SURROUNDINGS: usize = 4;
+
+/// Means of two by two; an odd last row or column is left out.
+pub(super) fn halve(from: &Plane, to: &mut Plane) {
+    to.reshape(from.width() / 2, from.height() / 2);
+    Arch::new().dispatch(|| {
+        for y in 0..to.height() {
+            let blocks = from.row(2 * y).chunks_exact(2).zip(from.row(2 * y + 1).chunks_exact(2));
+            for (out, (above, below)) in to.row_mut(y).iter_mut().zip(blocks) {
+                *out = 0.25 * (above[0] + above[1] + below[0] + below[1]);
+            }
+        }
+    });
+}
+
+/// Memory for [`stand_out`].
+#[derive(Debug, Default)]
+pub(super) struct Lines {
+    /// Sums down the columns of the surroundings.
+    sums: Vec<f32>,
+    /// One row, smoothed down the columns.
+    smoothed: Vec<f32>,
+    /// The surroundings' means along a row.
+    means: Vec<f32>,
+}
+
+/// By how much each cell, smoothed by a quarter, a half and a quarter of its neighbours, is brighter than the square
+/// about it; beyond the border the border goes on.
+pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
+    let (width, height) = (from.width(), from.height());
+    to.reshape(width, height);
+    let reach = SURROUNDINGS as isize;
+    let row = |y: isize| from.row(y.clamp(0, height as isize - 1) as usize);
+    let Lines { sums, smoothed, means } = lines;
+    for line in [&mut *sums, &mut *smoothed, &mut *means] {
+        line.clear();
+        line.resize(width, 0.0);
+    }
+    for y in -reach..=reach {
+        sums.iter_mut().zip(row(y)).for_each(|(sum, sample)| *sum += sample);
+    }
+    Arch::new().dispatch(|| {
+        for y in 0..height as isize {
+            let rows = row(y - 1).iter().zip(row(y)).zip(row(y + 1));
+            for (out, ((above, here), below)) in smoothed.iter_mut().zip(rows) {
+                *out = 0.25 * above + 0.5 * here + 0.25 * below;
+            }
+            means_along(sums, means);
+            let out = to.row_mut(y as usize);
+            for (out, (near, mean)) in out[1..].iter_mut().zip(smoothed.windows(3).zip(&means[1..])) {
+                *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
+            }
+            let last = width - 1;
+            out[0] = 0.75 * smoothed[0] + 0.25 * smoothed[1.min(last)] - means[0];
+            out[last] = 0.75 * smoothed[last] + 0.25 * smoothed[last.saturating_sub(1)] - means[last];
+            let ends = row(y + reach + 1).iter().zip(row(y - reach));
+            sums.iter_mut().zip(ends).for_each(|(sum, (next, last))| *sum += next - last);
+        }
+    });
+}
+
+/// Means of the surroundings along a row, from the sums down the columns.
+fn means_along(sums: &[f32], means: &mut [f32]) {
+    const SIDE: usize = 2 * SURROUNDINGS + 1;
+    let share = 1.0 / (SIDE * SIDE) as f32;
+    let last = sums.len() - 1;
+    let clamped = |x: usize| {
+        let places = x..x + SIDE;
+        share * places.map(|x| sums[x.saturating_sub(SURROUNDINGS).min(last)]).sum::<f32>()
+    };
+    let inner = sums.len().saturating_sub(SIDE - 1);
+    for x in (0..SURROUNDINGS.min(sums.len())).chain(SURROUNDINGS + inner..sums.len()) {
+        means[x] = clamped(x);
+    }
+    for (mean, window) in means.iter_mut().skip(SURROUNDINGS).zip(sums.windows(SIDE)) {
+        *mean = share * window.iter().sum::<f32>();
+    }
+}
+
+/// What is at each place and less than a cell further.
+pub(super) fn resample(from: &Plane, by: [f32; 2], to: &mut Plane) {
+    let (width, height) = (from.width(), from.height());
+    to.reshape(width, height);
+    let [right, down] = by.map(|by| if by < 0.0 { -1_isize } else { 1 });
+    let [along, across] = by.map(f32::abs);
+    Arch::new().dispatch(|| {
+        for y in 0..height {
+            let other = (y as isize + down).clamp(0, height as isize - 1) as usize;
+            let (here, there) = (from.row(y), from.row(other));
+            let blend = |x: usize| here[x] + across * (there[x] - here[x]);
+            let out = to.row_mut(y);
+            for (x, out) in out.iter_mut().enumerate().take(width - 1).skip(1) {
+                let (at, next) = (blend(x), blend(x.wrapping_add_signed(right)));
+                *out = at + along * (next - at);
+            }
+            (out[0], out[width - 1]) = (blend(0), blend(width - 1));
+        }
+    });
+}
+
+/// The plane moved by whole cells; beyond the border the border goes on.
+pub(super) fn moved(from: &Plane, [right, down]: [isize; 2], to: &mut Plane) {
+    let (width, height) = (from.width() as isize, from.height() as isize);
+    to.reshape(from.width(), from.height());
+    for y in 0..height {
+        let row = from.row((y + down).clamp(0, height - 1) as usize);
+        for (x, out) in (0..width).zip(to.row_mut(y as usize)) {
+            *out = row[(x + right).clamp(0, width - 1) as usize];
+        }
+    }
+}
+
+/// The value at a place between the cells; beyond the border the border goes on.
+pub(super) fn between(plane: &Plane, [x, y]: [f64; 2]) -> f32 {
+    let (left, top) = (x.floor(), y.floor());
+    let [right, down] = [x - left, y - top].map(|rest| rest as f32);
+    let row = |y: isize| {
+        let [a, b] = [0, 1].map(|k| plane.clamped(left as isize + k, y));
+        a + right * (b - a)
+    };
+    let [above, below] = [0, 1].map(|k| row(top as isize + k));
+    above + down * (below - above)
+}
+
+/// The middle of values in their order, which is lost; 0 of none.
+pub(super) fn median(values: &mut [f32]) -> f32 {
+    let middle = values.len() / 2;
+    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
+}
+
+/// Standard deviation of a normal distribution over its median absolute deviation.
+pub(super) const OF_MEDIAN: f32 = 1.4826;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_stands_out_is_bright_and_what_is_about_it_is_darker() {
+        let from =
+            Plane::from_fn(
+                41,
+                31,
+                |x, y| if (19..=21).contains(&x) && (14..=16).contains(&y) { 81.0 } else { 0.0 },
+            );
+        let mut to = Plane::default();
+        stand_out(&from, &mut to, &mut Lines::default());
+        // The middle has 81 less nine cells of 81 of the square of 81 cells.
+        assert!((to.row(15)[20] - 72.0).abs() < 1e-3, "{}", to.row(15)[20]);
+        assert!((to.row(15)[23] + 9.0).abs() < 1e-3, "{}", to.row(15)[23]);
+        assert!(to.row(3).iter().all(|out| out.abs() < 1e-4));
+        let flat = Plane::from_fn(12, 5, |_, _| 7.0);
+        stand_out(&flat, &mut to, &mut Lines::default());
+        assert!(
+            to.samples().iter().all(|out| out.abs() < 1e-4),
+            "borders and narrow pictures stand out of nothing"
+        );
+    }
+
+    #[test]
+    fn a_slope_moves_by_parts_of_a_cell_and_by_whole_ones() {
+        let slope = Plane::from_fn(20, 10, |x, y| 2.0 * x as f32 + 3.0 * y as f32);
+        let mut to = Plane::default();
+        resample(&slope, [0.25, -0.5], &mut to);
+        assert!((to.row(5)[7] - (slope.row(5)[7] + 0.5 - 1.5)).abs() < 1e-4);
+        moved(&slope, [2, -1], &mut to);
+        assert_eq!(to.row(5)[7], slope.row(4)[9]);
+        assert!((between(&slope, [3.5, 2.25]) - 13.75).abs() < 1e-4);
+    }
+}

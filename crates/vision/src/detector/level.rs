@@ -1,0 +1,423 @@
+//! One scale of the image: by how much each cell stands out of its surroundings, how that has been over the last
+//! seconds, and how unlike that it is now.
+
+use crossfix_correlation::Plane;
+use pulp::Arch;
+
+use super::filter::{Lines, OF_MEDIAN, between, median, moved, resample, stand_out};
+
+/// Of a squared change beyond this many variances only so much is learnt: what comes by is no noise of the place. With
+/// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind.
+const OUTLYING: f32 = 16.0;
+/// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a level, and with half of it
+/// each such step is two standard deviations.
+const LEAST_SPREAD: f32 = 0.5;
+/// By how much a contrast is taken to vary from place to place when light changes, a share of it.
+const CONTRAST_SPREAD: f32 = 0.03;
+/// Bounds of the sway, px: no scene is stiller than the first, and beyond the second it is not sway but another scene.
+const SWAY_PX: [f32; 2] = [0.05, 1.0];
+/// Share of what has texture that changes at most, if it is the scene of the background that is seen: targets cover less,
+/// and another scene has hardly a cell in common.
+const MOST_CHANGED: f32 = 0.3;
+/// The sway is told by the cells that a sway by so much changes by more than noise, px; with half of it fewer scenes tell
+/// theirs, with twice as much noise does.
+const PROBE_PX: f32 = 0.25;
+/// What the sway is taken for before there is an image to tell, px.
+const FIRST_SWAY_PX: f32 = 0.5;
+/// Time constant with which a scene that has swayed is believed to be still again, s.
+const STILL_AGAIN_S: f64 = 0.3;
+/// Images over which the changes' persistence is a mean.
+const PERSISTENCE_IMAGES: f32 = 10.0;
+/// Least change of a plot, standard deviations. With 4 a target in noise as bright as itself is found in half of the
+/// images in which 3 finds it; with 2 plots of noise alone are hundreds in an image.
+pub(super) const LEAST_CHANGE: f32 = 3.5;
+/// Noise that lasts is not less by being looked at again: what stands out of it must do so by the root of this more, at
+/// most. That is a persistence of 0.7; compressed video has 0.9, and what is as faint in it is given up.
+const MOST_LASTING: f32 = 6.0;
+/// Cells that tell a spread, a contrast or a persistence to two per cent, ...
+const SAMPLES: usize = 4096;
+/// ... and the fewest that tell a contrast.
+const LEAST_SAMPLES: usize = 100;
+
+/// Where and when an image was taken, for the background.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Moment {
+    /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y) plus this.
+    pub(super) turned: [f64; 2],
+    /// Time since the image before, s.
+    pub(super) interval: f64,
+    /// Share of this image in the background.
+    pub(super) share: f32,
+    pub(super) is_first: bool,
+}
+
+/// Cells from the first to before the second, in columns and in rows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Cells {
+    pub(super) columns: [usize; 2],
+    pub(super) rows: [usize; 2],
+}
+
+/// One scale.
+///
+/// The background's cells stay with the scene: when the camera turns they move over the image, by whole cells, and the
+/// image is sampled between its own.
+#[derive(Debug)]
+pub(super) struct Level {
+    /// Side of a cell, px.
+    cell: usize,
+    /// The image's means over the cells.
+    pub(super) reduced: Plane,
+    stands_out: Plane,
+    lines: Lines,
+    /// By how much the background's cells stand out in this image, levels.
+    pub(super) now: Plane,
+    /// Mean and variance of that over the last seconds.
+    mean: Plane,
+    variance: Plane,
+    /// Change of this image against the mean, standard deviations; 0 where something known is.
+    pub(super) change: Plane,
+    /// By how many cells the background has moved against the image: whole ones, and the rest.
+    whole: [isize; 2],
+    rest: [f32; 2],
+    /// How much stronger the background's contrast is in this image than in the mean.
+    contrast: f32,
+    /// Standard deviation of this image's changes where nothing comes, levels.
+    pub(super) spread: f32,
+    /// Mean square by which the scene sways, cells^2.
+    sway: f32,
+    /// Correlation of an image's changes with the next one's, 0 to 1: that of a sensor's noise is 0, and of compressed
+    /// video's 0.9.
+    pub(super) persistence: f32,
+    /// Whether too many of the cells have changed for the scene to be that of the background.
+    is_lost: bool,
+    /// This image's changes and the last one's at some cells.
+    samples: [Vec<f32>; 2],
+    scratch: Vec<f32>,
+}
+
+impl Level {
+    pub(super) fn new(cell: usize) -> Self {
+        Self {
+            cell,
+            reduced: Plane::default(),
+            stands_out: Plane::default(),
+            lines: Lines::default(),
+            now: Plane::default(),
+            mean: Plane::default(),
+            variance: Plane::default(),
+            change: Plane::default(),
+            whole: [0; 2],
+            rest: [0.0; 2],
+            contrast: 1.0,
+            spread: LEAST_SPREAD,
+            sway: (FIRST_SWAY_PX / cell as f32).powi(2),
+            persistence: 0.0,
+            is_lost: false,
+            samples: [Vec::new(), Vec::new()],
+            scratch: Vec::new(),
+        }
+    }
+
+    /// Side of a cell, px.
+    pub(super) fn cell(&self) -> usize {
+        self.cell
+    }
+
+    /// How far what has texture sways, px (root of the mean square).
+    pub(super) fn sway_px(&self) -> f64 {
+        f64::from(self.sway.sqrt()) * self.cell as f64
+    }
+
+    /// Whether what is seen is no longer the scene of the background.
+    pub(super) fn has_lost_scene(&self) -> bool {
+        self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]) || self.is_lost
+    }
+
+    /// Where the middle of a background's cell is in the image, px.
+    pub(super) fn place_of(&self, cell: [f64; 2]) -> [f64; 2] {
+        let side = self.cell as f64;
+        [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5)
+    }
+
+    /// Which of the background's cells a place of the image is in.
+    pub(super) fn cell_of(&self, place: [f64; 2]) -> [f64; 2] {
+        [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
+    }
+
+    /// By how much the background is expected to stand out at a place of this image, levels.
+    pub(super) fn background(&self, place: [f64; 2]) -> f32 {
+        self.contrast * between(&self.mean, self.cell_of(place))
+    }
+
+    /// What has come of what stands out at a cell: 1 if the background has nothing there, 0 if it has the same.
+    pub(super) fn share_come(&self, [x, y]: [usize; 2]) -> f32 {
+        let now = self.now.row(y)[x];
+        if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
+    }
+
+    /// The least by which something stands out that is not noise, in spreads.
+    pub(super) fn least_strength(&self) -> f32 {
+        let lasting = (1.0 + self.persistence) / (1.0 - self.persistence).max(1e-3);
+        LEAST_CHANGE * lasting.min(MOST_LASTING).sqrt()
+    }
+
+    /// How much the scene about a cell stands out by itself, in spreads: the median over the ring from the end of the
+    /// cell's surroundings to twice that.
+    pub(super) fn texture_about(&mut self, [x, y]: [usize; 2]) -> f32 {
+        let reach = 2 * super::filter::SURROUNDINGS as isize + 1;
+        self.scratch.clear();
+        for down in (-reach..=reach).step_by(2) {
+            for right in (-reach..=reach).step_by(2) {
+                if right.abs().max(down.abs()) > reach / 2 {
+                    self.scratch.push(self.now.clamped(x as isize + right, y as isize + down).abs());
+                }
+            }
+        }
+        OF_MEDIAN * median(&mut self.scratch) / self.spread
+    }
+
+    /// Takes in the image whose means are in `reduced`, and learns it, but for what `known` covers.
+    pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
+        stand_out(&self.reduced, &mut self.stands_out, &mut self.lines);
+        self.turn(moment);
+        if moment.is_first {
+            self.mean.copy_from(&self.now);
+            self.variance.reshape(self.now.width(), self.now.height());
+            self.variance.samples_mut().fill(0.0);
+        }
+        self.compare(moment.interval);
+        self.learn(moment.share, known);
+        self.remember_changes();
+    }
+
+    /// Moves the background with the scene.
+    fn turn(&mut self, Moment { turned, is_first, .. }: Moment) {
+        let cells = turned.map(|turned| turned / self.cell as f64);
+        let whole = cells.map(|cells| cells.round() as isize);
+        self.rest = [0, 1].map(|i| (cells[i] - whole[i] as f64) as f32);
+        if self.rest == [0.0; 2] {
+            std::mem::swap(&mut self.now, &mut self.stands_out);
+        } else {
+            resample(&self.stands_out, self.rest.map(|rest| -rest), &mut self.now);
+        }
+        let by = [0, 1].map(|i| whole[i] - self.whole[i]);
+        if !is_first && by != [0, 0] {
+            for plane in [&mut self.mean, &mut self.variance] {
+                moved(plane, by, &mut self.change);
+                std::mem::swap(plane, &mut self.change);
+            }
+        }
+        self.whole = whole;
+    }
+
+    /// Takes this image's changes, and what they tell of the light, the noise and the sway.
+    fn compare(&mut self, interval: f64) {
+        let (width, height) = (self.now.width(), self.now.height());
+        let step = (width * height / SAMPLES) | 1;
+        let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
+        self.scratch.clear();
+        self.scratch
+            .extend(cells().filter(|(mean, _)| mean.abs() > 4.0 * self.spread).map(|(mean, now)| now / mean));
+        let told = self.scratch.len() >= LEAST_SAMPLES;
+        self.contrast = if told { median(&mut self.scratch).clamp(0.5, 2.0) } else { 1.0 };
+        self.scratch.clear();
+        self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
+        self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
+
+        let (mut slopes, mut changes, mut told_by, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
+        let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
+        let probe = (PROBE_PX / self.cell as f32).powi(2);
+        let mean = self.mean.samples();
+        let noise = self.spread * self.spread;
+        for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
+            let slope = slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
+            if probe * slope > noise {
+                let usual = self.variance.samples()[i].max(noise);
+                let expected = probe * slope + usual;
+                let change = self.now.samples()[i] - self.contrast * mean[i];
+                told_by += 1;
+                changed += usize::from(change * change > LEAST_CHANGE * LEAST_CHANGE * expected);
+                slopes += slope / expected;
+                changes += ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
+            }
+        }
+        // Fewer cells may be those of a target.
+        let is_told = told_by >= SAMPLES / 100;
+        self.is_lost = is_told && changed as f32 > MOST_CHANGED * told_by as f32;
+        if is_told {
+            let told = (changes / slopes).clamp(least, most);
+            // A camera that is shaken shakes at once; a still one is believed later.
+            let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
+            self.sway = told.max(self.sway + share * (told - self.sway));
+        }
+    }
+
+    /// Makes the changes ones in standard deviations, and learns the background.
+    fn learn(&mut self, share: f32, known: &[Cells]) {
+        let (width, height) = (self.now.width(), self.now.height());
+        self.change.reshape(width, height);
+        let lesson =
+            Lesson { share, noise: self.spread * self.spread, sway: self.sway, contrast: self.contrast };
+        for y in 0..height {
+            let (above, below) = (self.mean.row(y.saturating_sub(1)), self.mean.row((y + 1).min(height - 1)));
+            lesson.textures(above, self.mean.row(y), below, &mut self.scratch);
+            let change = self.change.row_mut(y);
+            change.fill(0.0);
+            for [from, to] in free_of(known, y, width) {
+                lesson.learn(Row {
+                    now: &self.now.row(y)[from..to],
+                    textures: &self.scratch[from..to],
+                    mean: &mut self.mean.row_mut(y)[from..to],
+                    variance: &mut self.variance.row_mut(y)[from..to],
+                    change: &mut change[from..to],
+                });
+            }
+        }
+    }
+
+    /// How much of the changes lasts from image to image.
+    fn remember_changes(&mut self) {
+        let changes = self.change.samples();
+        let step = (changes.len() / SAMPLES) | 1;
+        self.samples.swap(0, 1);
+        let [before, now] = &mut self.samples;
+        now.clear();
+        now.extend(changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)));
+        if before.len() == now.len() {
+            let product: f32 = now.iter().zip(before.iter()).map(|(now, before)| now * before).sum();
+            let squares: f32 = now.iter().chain(before.iter()).map(|change| change * change).sum();
+            let told = (2.0 * product / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
+            self.persistence += (told - self.persistence) / PERSISTENCE_IMAGES;
+        }
+    }
+}
+
+/// Square of the slope, levels a cell, from what is left and right and what is above and below.
+#[inline(always)]
+fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -> f32 {
+    0.25 * ((right - left) * (right - left) + (below - above) * (below - above))
+}
+
+/// What one image teaches the background.
+#[derive(Clone, Copy, Debug)]
+struct Lesson {
+    share: f32,
+    noise: f32,
+    sway: f32,
+    contrast: f32,
+}
+
+/// One row of the background, or a part of it.
+#[derive(Debug)]
+struct Row<'a> {
+    now: &'a [f32],
+    textures: &'a [f32],
+    mean: &'a mut [f32],
+    variance: &'a mut [f32],
+    change: &'a mut [f32],
+}
+
+impl Lesson {
+    /// Variances by which a row changes where the scene sways and the light varies.
+    fn textures(self, above: &[f32], here: &[f32], below: &[f32], to: &mut Vec<f32>) {
+        let Self { sway, .. } = self;
+        to.clear();
+        to.resize(here.len(), 0.0);
+        Arch::new().dispatch(|| {
+            let columns = here.windows(3).zip(&above[1..]).zip(&below[1..]);
+            for (out, ((near, above), below)) in to[1..].iter_mut().zip(columns) {
+                let lit = CONTRAST_SPREAD * near[1];
+                *out = sway * slope_squared([near[0], near[2]], [*above, *below]) + lit * lit;
+            }
+        });
+    }
+
+    fn learn(self, row: Row<'_>) {
+        let Self { share, noise, contrast, .. } = self;
+        Arch::new().dispatch(|| {
+            let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);
+            for (((mean, variance), change), (now, texture)) in learnt.zip(row.now.iter().zip(row.textures)) {
+                let off = now - contrast * *mean;
+                let usual = variance.max(noise);
+                *change = off / (usual + texture).sqrt();
+                *mean += share * off;
+                *variance += share * ((off * off).min(OUTLYING * usual) - *variance);
+            }
+        });
+    }
+}
+
+/// The parts of a row that no known thing covers.
+fn free_of(known: &[Cells], row: usize, width: usize) -> Vec<[usize; 2]> {
+    let in_row = known.iter().filter(|cells| (cells.rows[0]..cells.rows[1]).contains(&row));
+    let mut covered: Vec<[usize; 2]> = in_row.map(|cells| cells.columns).collect();
+    covered.sort_unstable();
+    covered.push([width, width]);
+    let mut at = 0;
+    let mut free = Vec::with_capacity(covered.len());
+    for [from, to] in covered {
+        if from.min(width) > at {
+            free.push([at, from.min(width)]);
+        }
+        at = at.max(to);
+    }
+    free
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_free_of_a_row_is_between_what_is_known() {
+        let known = [
+            Cells { columns: [5, 8], rows: [0, 4] },
+            Cells { columns: [2, 6], rows: [3, 9] },
+            Cells { columns: [15, 40], rows: [3, 4] },
+        ];
+        assert_eq!(free_of(&known, 3, 20), [[0, 2], [8, 15]]);
+        assert_eq!(free_of(&known, 2, 20), [[0, 5], [8, 20]]);
+        assert_eq!(free_of(&known, 10, 20), [[0, 20]]);
+    }
+
+    /// Sky above waves, seen by a camera that has turned by so many pixels.
+    fn see_waves(level: &mut Level, turned: [f64; 2], is_first: bool, shaken: f64) {
+        let side = level.cell() as f64;
+        level.reduced = Plane::from_fn(80, 60, |x, y| {
+            let [right, down] = [x as f64 * side + turned[0] + shaken, y as f64 * side + turned[1]];
+            let waves = 20.0 * (right / 4.0).sin() * (down / 5.0).cos();
+            // Sky above: there nothing sways.
+            if down < 72.0 { 0.0 } else { waves as f32 }
+        });
+        level.see(Moment { turned, interval: 1.0 / 30.0, share: 0.1, is_first }, &[]);
+    }
+
+    fn greatest_change(level: &Level) -> f32 {
+        let rows = (6..54).flat_map(|y| &level.change.row(y)[6..74]);
+        rows.fold(0.0, |most, change| most.max(change.abs()))
+    }
+
+    #[test]
+    fn a_scene_that_turns_with_the_camera_does_not_change() {
+        let mut level = Level::new(2);
+        for image in 0..40 {
+            let turned = [0.7 * f64::from(image), -0.4 * f64::from(image)];
+            see_waves(&mut level, turned, image == 0, 0.0);
+            assert!(greatest_change(&level) < 3.0, "image {image}: {}", greatest_change(&level));
+        }
+        assert!(level.sway_px() < 0.2, "{}", level.sway_px());
+    }
+
+    #[test]
+    fn a_shaken_scene_sways_at_once_and_is_still_later() {
+        let mut level = Level::new(2);
+        for image in 0..60 {
+            see_waves(&mut level, [0.0; 2], image == 0, 0.0);
+        }
+        let still = level.sway_px();
+        see_waves(&mut level, [0.0; 2], false, 0.6);
+        assert!(still < 0.1 && level.sway_px() > 0.4, "{still}, {}", level.sway_px());
+        assert!(greatest_change(&level) < 4.0, "{}", greatest_change(&level));
+    }
+}

@@ -1,0 +1,299 @@
+//! Finds what comes into the image, or moves in it, by itself (001, chapter 2).
+//!
+//! The image goes down a pyramid. On each scale ([`level`]) every cell is compared with what it has been over the last
+//! seconds: background, noise, sway of the scene, light. What stands out and did not before makes plots ([`plots`]);
+//! plots of one image after the other make candidates ([`candidates`]), of which those are found that chance, the noise
+//! and the scene's own texture explain less well than a target, by as much as one false find in so long asks for. What
+//! has been found is followed by its image from then on; here it is covered, so that it hides nothing and teaches
+//! nothing, and watched: where the background has the same, it was the scene.
+
+mod candidates;
+mod filter;
+mod level;
+mod outline;
+mod plots;
+
+use crossfix_correlation::Plane;
+
+use crate::mend::mend;
+use crate::tracker::ImageTrackId;
+use crate::{DetectorConfig, ImagePoint, PixelBox};
+use candidates::{Candidate, Candidates};
+use filter::{Lines, between, halve, stand_out};
+use level::{Cells, Level, Moment};
+use plots::Plot;
+
+/// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.
+const CELLS: [usize; 4] = [2, 4, 8, 16];
+/// Fewest cells a side of a scale: its surroundings, and as much again.
+const LEAST_CELLS: usize = 18;
+/// How long the background is learnt before anything is found, s, and in how many images at least.
+const WARM_UP_S: f64 = 0.25;
+const WARM_UP_IMAGES: u32 = 4;
+/// Fewest plots of what is found.
+const LEAST_PLOTS: u32 = 3;
+/// What is found has moved by more than so many times the scene's sway, ...
+const SWAYS: f64 = 3.0;
+/// ... and the error of a plot's place: that of a cell over its strength, twice.
+const PLACE_ERRORS: f64 = 2.0;
+/// Nats asked for above the odds of chance, as images of a minute are not as many as they seem: noise, clouds and leaves
+/// of one image are those of the next. With 2 less, real scenes without targets give three false tracks a minute.
+const NOT_INDEPENDENT: f64 = 4.0;
+/// Fewest chances a minute that are reckoned with: before there has been a minute, nobody knows.
+const LEAST_CHANCES: f64 = 600.0;
+/// A known thing is covered with this much about it: a share of its sides, and px.
+const COVER: [f64; 2] = [0.25, 2.0];
+/// Sides of a target in cells of the scale at which it stands out.
+const TARGET_CELLS: f64 = 2.5;
+/// Half side of the part of the image in which it is told how a target stands out, cells.
+const PART_CELLS: usize = filter::SURROUNDINGS + 2;
+/// What has come must be at least this share of what stands out, and that this share of what a plot has at least; ...
+const COME: f32 = 0.35;
+const STANDS_OUT: f32 = 0.7;
+/// ... what has in less than this share of the images of so long, s, is the scene.
+const LEAST_COME: f64 = 0.3;
+const COME_S: f64 = 0.5;
+
+/// Something that is followed already.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Known {
+    pub(crate) id: ImageTrackId,
+    pub(crate) place: PixelBox,
+    /// Whether the background of its place is that of before it came.
+    pub(crate) is_watched: bool,
+}
+
+/// A new target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Found {
+    pub(crate) place: PixelBox,
+    /// How far it went before it was found, px.
+    pub(crate) gone_px: f64,
+}
+
+/// What an image has told.
+#[derive(Debug, Default)]
+pub(crate) struct Findings {
+    pub(crate) found: Vec<Found>,
+    /// Known things that are the scene itself.
+    pub(crate) scene: Vec<ImageTrackId>,
+}
+
+/// A known thing that may turn out to be the scene.
+#[derive(Clone, Copy, Debug)]
+struct Watch {
+    id: ImageTrackId,
+    /// The scale of its size.
+    level: usize,
+    place: [f64; 2],
+    /// By how much it stands out in this image, levels.
+    stands_out: f32,
+    /// Share of the latest images in which it had come.
+    come: f64,
+}
+
+/// Finds what differs from the background.
+#[derive(Debug)]
+pub(crate) struct Detector {
+    config: DetectorConfig,
+    sides: [usize; 2],
+    levels: Vec<Level>,
+    images: u32,
+    age_s: f64,
+    plots: Vec<Plot>,
+    candidates: Candidates,
+    watches: Vec<Watch>,
+}
+
+impl Detector {
+    pub(crate) fn new(config: DetectorConfig) -> Self {
+        Self {
+            config,
+            sides: [0; 2],
+            levels: Vec::new(),
+            images: 0,
+            age_s: 0.0,
+            plots: Vec::new(),
+            candidates: Candidates::default(),
+            watches: Vec::new(),
+        }
+    }
+
+    /// Takes the next image, `interval` seconds after the last one. `turned` is by how much the scene has moved since the
+    /// first one: what is at (x, y) was at (x, y) plus this, px.
+    pub(crate) fn step(
+        &mut self,
+        image: &Plane,
+        interval: f64,
+        turned: [f64; 2],
+        known: &[Known],
+    ) -> Findings {
+        if self.sides != [image.width(), image.height()] {
+            *self = Self::new(self.config.clone());
+            self.sides = [image.width(), image.height()];
+            let fits = |cell: &&usize| self.sides.iter().all(|side| side / **cell >= LEAST_CELLS);
+            self.levels = CELLS.iter().take_while(fits).map(|cell| Level::new(*cell)).collect();
+        }
+        let Some(finest) = self.levels.first_mut() else { return Findings::default() };
+        halve(image, &mut finest.reduced);
+        mend(&mut finest.reduced);
+        self.watch(known);
+        for known in known {
+            cover(&mut self.levels[0].reduced, &known.place);
+        }
+        self.learn(interval, turned, known);
+        if self.levels[0].has_lost_scene() {
+            self.forget();
+            return Findings::default();
+        }
+        let scene = self.judge(interval);
+        let is_warm = self.age_s >= WARM_UP_S && self.images > WARM_UP_IMAGES;
+        let found = if is_warm { self.find(image, interval, turned, known) } else { Vec::new() };
+        Findings { found, scene }
+    }
+
+    /// Begins again: the camera looks elsewhere.
+    fn forget(&mut self) {
+        for level in &mut self.levels {
+            *level = Level::new(level.cell());
+        }
+        (self.images, self.age_s) = (0, 0.0);
+        self.candidates = Candidates::default();
+        self.watches.clear();
+    }
+
+    /// Notes by how much what is watched stands out, before it is covered.
+    fn watch(&mut self, known: &[Known]) {
+        self.watches.retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
+        for known in known.iter().filter(|known| known.is_watched) {
+            let side = known.place.width.max(known.place.height) / TARGET_CELLS;
+            let off = |level: &Level| (level.cell() as f64 / side).ln().abs();
+            let nearest = (0..self.levels.len())
+                .min_by(|one, other| off(&self.levels[*one]).total_cmp(&off(&self.levels[*other])));
+            let Some(level) = nearest else { return };
+            let centre = known.place.centre();
+            let place = [centre.x, centre.y];
+            let stands_out = stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
+            match self.watches.iter_mut().find(|watch| watch.id == known.id) {
+                Some(watch) => (watch.level, watch.place, watch.stands_out) = (level, place, stands_out),
+                None => self.watches.push(Watch { id: known.id, level, place, stands_out, come: 1.0 }),
+            }
+        }
+    }
+
+    /// Takes the image into the background of every scale, but for what is known.
+    fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[Known]) {
+        // A young background is the mean of what there was; an old one forgets.
+        let young = 1.0 / f64::from(self.images + 1);
+        let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
+        let moment = Moment { turned, interval, share, is_first: self.images == 0 };
+        for index in 0..self.levels.len() {
+            let (finer, rest) = self.levels.split_at_mut(index);
+            let level = &mut rest[0];
+            if let Some(finer) = finer.last() {
+                halve(&finer.reduced, &mut level.reduced);
+            }
+            let covered: Vec<Cells> = known.iter().map(|known| cells_of(level, &known.place)).collect();
+            level.see(moment, &covered);
+        }
+        self.images = self.images.saturating_add(1);
+        self.age_s += interval;
+    }
+
+    /// Which of the watched are the scene.
+    fn judge(&mut self, interval: f64) -> Vec<ImageTrackId> {
+        let share = 1.0 - (-interval / COME_S).exp();
+        for watch in &mut self.watches {
+            let level = &self.levels[watch.level];
+            let come = watch.stands_out - level.background(watch.place);
+            let has_come = watch.stands_out.abs() > STANDS_OUT * level.least_strength() * level.spread
+                && come.abs() >= COME * watch.stands_out.abs();
+            watch.come += share * (f64::from(u8::from(has_come)) - watch.come);
+        }
+        self.watches.extract_if(.., |watch| watch.come < LEAST_COME).map(|watch| watch.id).collect()
+    }
+
+    fn find(&mut self, image: &Plane, interval: f64, turned: [f64; 2], known: &[Known]) -> Vec<Found> {
+        plots::find(&mut self.levels, &mut self.plots);
+        self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
+        self.candidates.step(&self.plots, turned, interval, self.sides);
+        let chances = self.candidates.chances_a_minute().max(LEAST_CHANCES);
+        let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
+        let sway_px = self.levels[0].sway_px();
+        let is_found = |candidate: &Candidate| {
+            let moved =
+                SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
+            candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
+        };
+        let found = self.candidates.take_if(is_found);
+        let found = found.iter().map(|candidate| Found {
+            place: outline::outline(image, &candidate.plot),
+            gone_px: candidate.gone_px,
+        });
+        found.filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place))).collect()
+    }
+}
+
+/// By how much a place stands out on a scale, from the finest scale's means.
+fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> f32 {
+    let corner = place.map(|at| (at / cell as f64).floor() as isize - PART_CELLS as isize);
+    let side = 2 * PART_CELLS + 1;
+    let fine = 1 << level;
+    let mut part =
+        finest.crop(corner[0] * fine as isize, corner[1] * fine as isize, side * fine, side * fine);
+    for _ in 0..level {
+        let mut halved = Plane::default();
+        halve(&part, &mut halved);
+        part = halved;
+    }
+    let mut out = Plane::default();
+    stand_out(&part, &mut out, &mut Lines::default());
+    between(&out, [0, 1].map(|i| (place[i] + 0.5) / cell as f64 - 0.5 - corner[i] as f64))
+}
+
+/// What is covered of a known thing's box, px: left and top, right and bottom.
+fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
+    let [share, more] = COVER;
+    let margin = [place.width, place.height].map(|side| share * side + more);
+    let (left, top) = (place.x - margin[0], place.y - margin[1]);
+    [[left, top], [left + place.width + 2.0 * margin[0], top + place.height + 2.0 * margin[1]]]
+}
+
+/// The cells of a scale's background that a known thing covers.
+fn cells_of(level: &Level, place: &PixelBox) -> Cells {
+    let [first, last] = covered(place).map(|corner| level.cell_of(corner).map(|at| at.max(0.0) as usize));
+    Cells { columns: [first[0], last[0] + 1], rows: [first[1], last[1] + 1] }
+}
+
+/// Paints a known thing over with what is left and right of it, so that it hides nothing about it.
+fn cover(reduced: &mut Plane, place: &PixelBox) {
+    let sides = [reduced.width(), reduced.height()];
+    let cell = CELLS[0] as f64;
+    let [first, last] = covered(place)
+        .map(|corner| [0, 1].map(|i| (corner[i] / cell).round().clamp(0.0, sides[i] as f64) as usize));
+    if first[0] >= last[0] {
+        return;
+    }
+    let columns = (last[0] - first[0]) as f32;
+    for y in first[1]..last[1] {
+        let row = reduced.row_mut(y);
+        let (left, right) = (row[first[0].saturating_sub(1)], row[last[0].min(row.len() - 1)]);
+        for (x, sample) in row[first[0]..last[0]].iter_mut().enumerate() {
+            *sample = left + (right - left) * (x as f32 + 0.5) / columns;
+        }
+    }
+}
+
+/// Whether the middle of either box is in the other.
+fn overlap(one: &PixelBox, other: &PixelBox) -> bool {
+    let (a, b) = (one.centre(), other.centre());
+    (a.x - b.x).abs() <= one.width.max(other.width) / 2.0
+        && (a.y - b.y).abs() <= one.height.max(other.height) / 2.0
+}
+
+/// Whether a plot lies in a box or within its sides of it.
+fn touches(known: &PixelBox, plot: &Plot) -> bool {
+    let ImagePoint { x, y } = known.centre();
+    let reach = |side: f64| side.max(2.0 * plot.cell);
+    (plot.place.x - x).abs() <= reach(known.width) && (plot.place.y - y).abs() <= reach(known.height)
+}

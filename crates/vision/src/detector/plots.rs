@@ -1,0 +1,149 @@
+//! Places of one image where something stands out that did not before.
+
+use crossfix_correlation::Plane;
+
+use super::level::{LEAST_CHANGE, Level};
+use crate::ImagePoint;
+
+/// What stands out by less than this share of the change under it is not what came, but what went.
+const LEAST_OF_CHANGE: f32 = 0.5;
+/// Share of what stands out that has come, least and most: less is the scene itself, and more has come in the place of
+/// something else that went.
+const SHARES: [f32; 2] = [0.02, 1.5];
+/// Within so many cells one thing makes one plot, ...
+const APART: f64 = 3.0;
+/// ... and a darker ring about a bright one (and the other way round) within so many, of at most this share of it.
+const RING: f64 = 7.0;
+const MOST_OF_RING: f32 = 0.4;
+/// Most plots of an image, those that stand out most. Enough for fifty targets and as much noise.
+const MOST_PLOTS: usize = 200;
+
+/// Something that stands out and did not before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Plot {
+    pub(super) place: ImagePoint,
+    /// Whether it is brighter or darker than its surroundings.
+    pub(super) is_brighter: bool,
+    /// The scale at which it stands out most: its number, and the side of its cells, px.
+    pub(super) level: usize,
+    pub(super) cell: f64,
+    /// By how much it stands out, in spreads of the scale.
+    pub(super) strength: f32,
+    /// How much of that has come, in spreads.
+    pub(super) come: f32,
+    /// How much the scene about it stands out by itself beyond noise, in spreads.
+    pub(super) texture: f32,
+    /// How much of the noise lasts from image to image, 0 to 1.
+    pub(super) persistence: f32,
+}
+
+impl Plot {
+    /// A target is as large as two or three cells of the scale at which it stands out most; the noise of larger cells is
+    /// less, which makes up for a part of what they dilute.
+    fn rank(&self) -> f64 {
+        f64::from(self.strength) * self.cell.sqrt()
+    }
+
+    /// Whether a plot that stands out more makes this one.
+    fn is_of(&self, other: &Self) -> bool {
+        let is_ring = self.is_brighter != other.is_brighter && self.strength < MOST_OF_RING * other.strength;
+        let apart = APART * self.cell.max(other.cell);
+        let reach = if is_ring { apart.max(RING * other.cell) } else { apart };
+        (self.place.x - other.place.x).abs() < reach && (self.place.y - other.place.y).abs() < reach
+    }
+
+    /// Variance of its place, px^2 an axis.
+    pub(super) fn variance(&self) -> f64 {
+        // A cell's top is known to a third of it, and a little more where the target's middle is not its top.
+        (0.35 * self.cell).powi(2) + 0.1
+    }
+}
+
+/// The plots of an image, those that stand out most first.
+pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
+    plots.clear();
+    for (index, level) in levels.iter_mut().enumerate() {
+        let side = level.change.width();
+        for y in 1..level.change.height().saturating_sub(1) {
+            let changes = level.change.row(y).iter();
+            if changes.fold(0.0_f32, |most, change| most.max(change.abs())) < LEAST_CHANGE {
+                continue;
+            }
+            for x in 1..side.saturating_sub(1) {
+                if level.change.row(y)[x].abs() >= LEAST_CHANGE {
+                    plots.extend(plot_at(level, index, [x, y]));
+                }
+            }
+        }
+    }
+    plots.sort_by(|a, b| b.rank().total_cmp(&a.rank()));
+    let mut kept = 0;
+    for index in 0..plots.len() {
+        if kept < MOST_PLOTS && !plots[..kept].iter().any(|other| plots[index].is_of(other)) {
+            plots.swap(kept, index);
+            kept += 1;
+        }
+    }
+    plots.truncate(kept);
+}
+
+/// The plot of a change that is the greatest about it, if something stands out there.
+fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
+    let change = level.change.row(at[1])[at[0]];
+    if greatest_about(&level.change, at, f32::abs) != at {
+        return None;
+    }
+    let sign = change.signum();
+    let standing = |value: f32| sign * value;
+    // What moves changes most at its edge: up to its top, two cells further at most.
+    let mut top = at;
+    for _ in 0..2 {
+        top = greatest_about(&level.now, top, standing);
+    }
+    let strength = standing(level.now.row(top[1])[top[0]]) / level.spread;
+    let share = level.share_come(top);
+    if strength < level.least_strength().max(LEAST_OF_CHANGE * change.abs())
+        || !(SHARES[0]..SHARES[1]).contains(&share)
+    {
+        return None;
+    }
+    let refined = [0, 1].map(|axis| {
+        let near = |step: isize| {
+            let mut place = top.map(|at| at as isize);
+            place[axis] += step;
+            standing(level.now.clamped(place[0], place[1]))
+        };
+        let [before, here, after] = [-1, 0, 1].map(near);
+        let bend = before - 2.0 * here + after;
+        let off = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 };
+        top[axis] as f64 + f64::from(off)
+    });
+    let [x, y] = level.place_of(refined);
+    // Texture is measured with the noise in it.
+    let texture = (level.texture_about(top).powi(2) - 1.0).max(0.0).sqrt();
+    Some(Plot {
+        place: ImagePoint { x, y },
+        is_brighter: sign > 0.0,
+        level: index,
+        cell: level.cell() as f64,
+        strength,
+        come: strength * share.min(1.0),
+        texture,
+        persistence: level.persistence,
+    })
+}
+
+/// Where a plane is greatest within a cell of another.
+fn greatest_about(plane: &Plane, [x, y]: [usize; 2], of: impl Fn(f32) -> f32) -> [usize; 2] {
+    let mut best = [x, y];
+    let mut most = of(plane.row(y)[x]);
+    for ny in y.saturating_sub(1)..=(y + 1).min(plane.height() - 1) {
+        for nx in x.saturating_sub(1)..=(x + 1).min(plane.width() - 1) {
+            let value = of(plane.row(ny)[nx]);
+            if value > most {
+                (best, most) = ([nx, ny], value);
+            }
+        }
+    }
+    best
+}

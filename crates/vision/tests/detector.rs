@@ -1,0 +1,304 @@
+//! What the eye finds by itself, and what it does not take for targets.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use crossfix_correlation::Plane;
+use crossfix_message::Timestamp;
+use crossfix_vision::{DetectorConfig, ImageTrack, ImageTracker, TrackPhase, TrackerConfig};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+const RATE_HZ: f64 = 30.0;
+
+/// A spot that is brighter than what it hides: its middle, its standard deviations, its brightness.
+#[derive(Clone, Copy)]
+struct Spot {
+    x: f64,
+    y: f64,
+    spread: [f64; 2],
+    brighter: f64,
+}
+
+/// Brightness of a scene at a place and a time, levels.
+type Scene = fn(f64, f64, f64) -> f64;
+
+/// What a camera sees without targets.
+struct World {
+    width: usize,
+    height: usize,
+    /// Standard deviation of the sensor's noise, levels.
+    noise: f64,
+    scene: Scene,
+    rng: ChaCha8Rng,
+}
+
+impl World {
+    fn new(width: usize, height: usize, noise: f64, scene: Scene, seed: u64) -> Self {
+        Self { width, height, noise, scene, rng: ChaCha8Rng::seed_from_u64(seed) }
+    }
+
+    fn image(&mut self, time_s: f64, spots: &[Spot]) -> Plane {
+        let noise = Normal::new(0.0, self.noise).unwrap();
+        let mut image = Plane::from_fn(self.width, self.height, |x, y| {
+            ((self.scene)(x as f64, y as f64, time_s) + noise.sample(&mut self.rng)) as f32
+        });
+        for Spot { x, y, spread, brighter } in spots {
+            for row in 0..self.height {
+                let v = (row as f64 - y) / spread[1];
+                for (column, sample) in image.row_mut(row).iter_mut().enumerate() {
+                    let u = (column as f64 - x) / spread[0];
+                    if u * u + v * v < 16.0 {
+                        *sample += (brighter * (-0.5 * (u * u + v * v)).exp()) as f32;
+                    }
+                }
+            }
+        }
+        for sample in image.samples_mut() {
+            *sample = sample.round().clamp(0.0, 255.0);
+        }
+        image
+    }
+}
+
+fn sky(_: f64, _: f64, _: f64) -> f64 {
+    120.0
+}
+
+/// Sky above, still and sharp texture below the row 90, a mast.
+fn landscape(x: f64, y: f64, _: f64) -> f64 {
+    let mast = if (x - 200.0).abs() < 1.5 && y > 40.0 { 60.0 } else { 0.0 };
+    let ground = 40.0 * (x * 0.9).sin() * (y * 1.1 + x * 0.2).cos() + 25.0 * (x * 0.23 + y * 0.31).sin();
+    mast + if y < 90.0 { 150.0 + 0.1 * y } else { 90.0 + ground }
+}
+
+/// A landscape whose ground is leaves in the wind.
+fn leaves(x: f64, y: f64, time_s: f64) -> f64 {
+    let by = (2.0 * time_s + 0.05 * x).sin() + 0.7 * (5.1 * time_s + 0.11 * y).sin();
+    if y < 90.0 { landscape(x, y, time_s) } else { landscape(x + by, y + 0.4 * by, time_s) }
+}
+
+/// Clouds that drift.
+fn clouds(x: f64, y: f64, time_s: f64) -> f64 {
+    let x = x + 6.0 * time_s;
+    let large = (x / 31.0).sin() * (y / 23.0).cos() + 0.7 * ((x + y) / 17.0).sin();
+    130.0 + 22.0 * large + 6.0 * ((x - 2.0 * y) / 7.0).sin()
+}
+
+fn tracker() -> ImageTracker {
+    let config = TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
+    ImageTracker::new(config).unwrap()
+}
+
+/// Follows the world for some seconds, and tells each image's tracks with its time.
+fn watch(
+    world: &mut World,
+    seconds: f64,
+    spots: impl Fn(f64) -> Vec<Spot>,
+    mut seen: impl FnMut(f64, &[ImageTrack]),
+) {
+    let mut tracker = tracker();
+    for frame in 0..(seconds * RATE_HZ) as u32 {
+        let time_s = f64::from(frame) / RATE_HZ;
+        let image = world.image(time_s, &spots(time_s));
+        seen(time_s, tracker.step(&image, Timestamp::from_seconds(time_s)));
+    }
+}
+
+fn is_at(track: &ImageTrack, spot: &Spot, within: f64) -> bool {
+    (track.position.x - spot.x).hypot(track.position.y - spot.y) <= within
+}
+
+#[test]
+fn what_comes_is_found_once_within_half_a_second() {
+    // Out of the still ground, past the mast, through leaves and over clouds; bright and dark.
+    for (scene, seed) in [(sky as Scene, 1), (landscape, 2), (leaves, 3), (clouds, 4)] {
+        for brighter in [90.0, -90.0] {
+            let mut world = World::new(320, 240, 3.0, scene, seed);
+            let spot =
+                |time_s: f64| Spot { x: 30.0 + 70.0 * (time_s - 2.0), y: 60.0, spread: [4.0, 2.5], brighter };
+            let (mut found_s, mut numbers) = (None, Vec::new());
+            watch(
+                &mut world,
+                4.0,
+                |time_s| if time_s < 2.0 { Vec::new() } else { vec![spot(time_s)] },
+                |time_s, tracks| {
+                    for track in tracks {
+                        assert!(
+                            time_s >= 2.0 && is_at(track, &spot(time_s), 8.0),
+                            "{seed} at {time_s}: {track:?}"
+                        );
+                        found_s.get_or_insert(time_s);
+                        numbers.push(track.id);
+                    }
+                },
+            );
+            numbers.dedup();
+            assert!(found_s.is_some_and(|found_s| found_s <= 2.5), "{seed}, {brighter}: {found_s:?}");
+            assert_eq!(numbers.len(), 1, "{seed}, {brighter}");
+        }
+    }
+}
+
+#[test]
+fn what_is_as_faint_as_the_noise_is_found_by_looking_for_longer() {
+    // Its brightest pixel is less than a standard deviation of the noise.
+    let mut world = World::new(320, 240, 16.0, sky, 5);
+    let spot = |time_s: f64| Spot {
+        x: 30.0 + 40.0 * time_s,
+        y: 90.0 + 10.0 * time_s,
+        spread: [4.5, 3.0],
+        brighter: 9.0,
+    };
+    let mut seen = 0;
+    watch(
+        &mut world,
+        6.0,
+        |time_s| vec![spot(time_s)],
+        |time_s, tracks| {
+            for track in tracks {
+                assert!(is_at(track, &spot(time_s), 12.0), "at {time_s}: {track:?}");
+            }
+            seen += usize::from(time_s >= 4.0 && !tracks.is_empty());
+        },
+    );
+    assert!(seen > 55, "in {seen} of 60 images");
+}
+
+#[test]
+fn what_hovers_from_the_beginning_is_found_when_it_moves() {
+    let mut world = World::new(320, 240, 2.0, landscape, 6);
+    let spot = |time_s: f64| Spot {
+        x: 100.0 + 8.0 * (time_s - 3.0).max(0.0),
+        y: 50.0,
+        spread: [4.0, 2.5],
+        brighter: 80.0,
+    };
+    let mut found_s = None;
+    watch(
+        &mut world,
+        6.0,
+        |time_s| vec![spot(time_s)],
+        |time_s, tracks| {
+            for track in tracks {
+                assert!(is_at(track, &spot(time_s), 6.0), "at {time_s}: {track:?}");
+                found_s.get_or_insert(time_s);
+            }
+        },
+    );
+    assert!(found_s.is_some_and(|found_s| (3.0..4.0).contains(&found_s)), "{found_s:?}");
+}
+
+#[test]
+fn scenes_without_targets_give_no_more_false_tracks_than_asked() {
+    // One a minute is asked; of a Poisson variable with a mean of 2 in the two minutes 99 % are at most 6.
+    let scenes: [(Scene, f64); 6] =
+        [(sky, 1.0), (sky, 25.0), (landscape, 3.0), (leaves, 3.0), (clouds, 1.0), (clouds, 10.0)];
+    let mut false_tracks = Vec::new();
+    for (seed, (scene, noise)) in (10..).zip(scenes) {
+        let mut world = World::new(240, 180, noise, scene, seed);
+        watch(
+            &mut world,
+            20.0,
+            |_| Vec::new(),
+            |time_s, tracks| {
+                let new = tracks.iter().filter(|track| track.phase == TrackPhase::Tentative);
+                false_tracks.extend(new.map(|track| (seed, time_s, track.position)));
+            },
+        );
+    }
+    assert!(false_tracks.len() <= 6, "{false_tracks:?}");
+}
+
+#[test]
+fn a_shaken_camera_finds_nothing_in_a_still_scene() {
+    fn shaken(x: f64, y: f64, time_s: f64) -> f64 {
+        let mut rng = ChaCha8Rng::seed_from_u64((time_s * RATE_HZ).round() as u64);
+        let [by, down]: [f64; 2] = std::array::from_fn(|_| rng.random_range(-1.5..1.5));
+        landscape(x + by, y + down, time_s)
+    }
+    let mut world = World::new(160, 160, 3.0, shaken, 20);
+    let mut most = 0;
+    watch(&mut world, 6.0, |_| Vec::new(), |_, tracks| most = most.max(tracks.len()));
+    assert_eq!(most, 0);
+}
+
+#[test]
+fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() {
+    fn turning(x: f64, y: f64, time_s: f64) -> f64 {
+        let turned = 60.0 * (time_s - 1.0).clamp(0.0, 1.5);
+        clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
+    }
+    let mut world = World::new(320, 240, 2.0, turning, 21);
+    let spot =
+        |time_s: f64| Spot { x: 20.0 + 50.0 * (time_s - 3.0), y: 120.0, spread: [4.0, 3.0], brighter: 100.0 };
+    let mut seen = 0;
+    watch(
+        &mut world,
+        5.0,
+        |time_s| if time_s < 3.0 { Vec::new() } else { vec![spot(time_s)] },
+        |time_s, tracks| {
+            let on_it = tracks.iter().filter(|track| is_at(track, &spot(time_s), 8.0)).count();
+            assert!(tracks.len() - on_it <= 1, "at {time_s}: {tracks:?}");
+            seen += usize::from(time_s >= 4.0 && on_it == 1);
+        },
+    );
+    assert!(seen >= 28, "in {seen} of 30 images");
+}
+
+#[test]
+fn fifty_at_once_are_found_and_keep_their_numbers() {
+    let mut world = World::new(640, 480, 3.0, sky, 22);
+    let spots = |time_s: f64| -> Vec<Spot> {
+        let spot = |i: u32| {
+            let (column, row) = (f64::from(i % 10), f64::from(i / 10));
+            // Neighbours fly towards each other, past each other at a distance of 12 px, and on.
+            let speed = if i.is_multiple_of(2) { 40.0 } else { -40.0 };
+            let from = 40.0 + 60.0 * column;
+            Spot {
+                x: from + speed * (time_s - 0.8),
+                y: 60.0 + 80.0 * row + 12.0 * f64::from(i % 2),
+                spread: [2.5, 1.8],
+                brighter: 110.0,
+            }
+        };
+        if time_s < 0.8 { Vec::new() } else { (0..50).map(spot).collect() }
+    };
+    let mut numbers: Vec<Option<(u64, bool)>> = vec![None; 50];
+    watch(&mut world, 2.6, spots, |time_s, tracks| {
+        assert!(tracks.len() <= 50);
+        for (spot, number) in spots(time_s).iter().zip(&mut numbers) {
+            let Some(track) = tracks.iter().find(|track| is_at(track, spot, 4.0)) else { continue };
+            let (first, is_kept) = number.get_or_insert((track.id.0, true));
+            *is_kept &= *first == track.id.0;
+        }
+        let seen = numbers.iter().flatten().count();
+        assert!(time_s < 1.3 || seen == 50, "at {time_s}: {seen}");
+    });
+    assert!(numbers.iter().flatten().all(|(_, is_kept)| *is_kept), "{numbers:?}");
+}
+
+#[test]
+fn what_flies_out_of_the_picture_leaves_no_track_on_the_scene() {
+    let mut world = World::new(320, 240, 2.0, landscape, 23);
+    let spot = |time_s: f64| Spot {
+        x: 120.0 + 160.0 * (time_s - 1.0),
+        y: 105.0,
+        spread: [3.0, 2.0],
+        brighter: 110.0,
+    };
+    let (mut was_found, mut last_s) = (false, 0.0);
+    watch(
+        &mut world,
+        7.0,
+        |time_s| if time_s < 1.0 { Vec::new() } else { vec![spot(time_s)] },
+        |time_s, tracks| {
+            was_found |= tracks.iter().any(|track| is_at(track, &spot(time_s), 6.0));
+            if !tracks.is_empty() {
+                last_s = time_s;
+            }
+        },
+    );
+    // It is outside from 2.3 s on.
+    assert!(was_found && last_s < 4.5, "{was_found}, {last_s}");
+}
