@@ -15,7 +15,10 @@ pub enum VideoError {
         source: std::io::Error,
     },
     /// Neither a folder of images nor a file of a known kind.
-    #[error("{} is neither a folder of PNG or JPEG images nor a .y4m or .mp4 file", path.display())]
+    #[error(
+        "{} is neither a folder of PNG or JPEG images nor a .mp4, .avi or .y4m file (`ffmpeg -i IN -c:v libx264 -pix_fmt yuv420p OUT.mp4` makes most videos readable)",
+        path.display()
+    )]
     UnknownKind {
         /// The path.
         path: PathBuf,

@@ -1,8 +1,9 @@
 //! Frames with their capture times, from files: PNG and JPEG sequences, Y4M,
-//! MP4 with H.264. Nothing but cargo dependencies.
+//! MP4 with H.264, AVI with Motion JPEG. Nothing but cargo dependencies.
 //!
 //! The seam is [`FrameSource`]. [`open`] finds the right one for a path.
 
+mod avi;
 mod error;
 mod frame;
 mod mp4;
@@ -12,6 +13,7 @@ mod y4m_file;
 
 use std::path::Path;
 
+pub use avi::AviSource;
 pub use error::VideoError;
 pub use frame::{CaptureTime, Frame, Pixels};
 pub use mp4::Mp4Source;
@@ -61,7 +63,7 @@ impl FrameClock {
     }
 }
 
-/// Opens a folder of images, a `.y4m` or a `.mp4` file.
+/// Opens a folder of images, a `.y4m`, `.mp4` or `.avi` file.
 ///
 /// # Errors
 /// [`VideoError`] if it is not there, of another kind, or damaged from the start.
@@ -71,6 +73,7 @@ pub fn open(path: &Path, clock: FrameClock) -> Result<Box<dyn FrameSource>, Vide
         _ if path.is_dir() => Ok(Box::new(SequenceSource::open(path, clock)?)),
         Some("y4m") => Ok(Box::new(Y4mSource::open(path, clock)?)),
         Some("mp4" | "m4v" | "mov") => Ok(Box::new(Mp4Source::open(path, clock)?)),
+        Some("avi") => Ok(Box::new(AviSource::open(path, clock)?)),
         _ => Err(VideoError::UnknownKind { path: path.to_owned() }),
     }
 }

@@ -227,3 +227,75 @@ proptest! {
         let _ = decode_still(&bytes);
     }
 }
+
+/// A file beside this test.
+fn data(name: &str) -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
+}
+
+#[test]
+fn an_avi_file_with_motion_jpeg_is_read_at_its_rate_past_its_sound() {
+    let (frames, errors) = read(&data("motion.avi"));
+    assert_eq!(frames.len(), 5, "{errors:?}");
+    assert!(errors.iter().all(VideoError::is_one_frame), "{errors:?}");
+    assert!(frames.iter().all(|frame| (frame.width, frame.height) == (64, 48)));
+    for frame in &frames {
+        assert!(
+            (frame.capture.time.seconds() - frame.index as f64 / 25.0).abs() < 1e-6,
+            "{:?}",
+            frame.capture
+        );
+    }
+    let brightness = frames[0].brightness();
+    let (least, most) = brightness.iter().fold((255.0_f32, 0.0_f32), |(l, m), b| (l.min(*b), m.max(*b)));
+    assert!(least < 40.0 && most > 200.0, "a test picture has dark and bright: {least} to {most}");
+}
+
+#[test]
+fn what_an_avi_file_holds_that_is_not_read_is_named_with_what_converts_it() {
+    let refused = |path: &Path| {
+        let error = open(path, FrameClock::default()).err().unwrap();
+        error.to_string()
+    };
+    let text = refused(&data("other.avi"));
+    assert!(text.contains("FMP4") && text.contains("ffmpeg -i"), "{text}");
+    let folder = tempfile::tempdir().unwrap();
+    for (name, bytes) in
+        [("film.mkv", b"\x1a\x45\xdf\xa3".as_slice()), ("empty.avi", b""), ("text.avi", b"RIFF, not")]
+    {
+        let path = folder.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        assert!(refused(&path).contains("ffmpeg -i"), "{name}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+
+    #[test]
+    fn an_avi_file_with_any_bytes_changed_ends(
+        cut in 0_usize..20_000,
+        changed in prop::collection::vec((0_usize..6000, any::<u8>()), 0..8),
+    ) {
+        let mut bytes = fs::read(data("motion.avi")).unwrap();
+        for (at, byte) in changed {
+            bytes[at] = byte;
+        }
+        bytes.truncate(cut.max(12));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.avi");
+        fs::write(&path, bytes).unwrap();
+        let Ok(mut source) = open(&path, FrameClock::default()) else { return Ok(()) };
+        let mut calls = 0;
+        while let Some(going_on) = match source.next_frame() {
+            Ok(frame) => frame.map(|_| true),
+            Err(error) => Some(error.is_one_frame()),
+        } {
+            calls += 1;
+            prop_assert!(calls < 5000);
+            if !going_on {
+                break;
+            }
+        }
+    }
+}

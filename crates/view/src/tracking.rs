@@ -32,6 +32,8 @@ pub enum Sight {
 /// A target that is followed in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FollowedTarget {
+    /// Its number.
+    pub number: u64,
     /// Its box.
     pub place: ImageBox,
     /// Its centre as measured in this image, if it was.
@@ -46,8 +48,8 @@ pub struct FollowedTarget {
     pub nis: Option<f64>,
 }
 
-/// Draws a tracker's work on one video: the pictures, the box, the measurement, the label where there
-/// is one, and curves of score, certainty and innovation under them.
+/// Draws a tracker's work on one video: the pictures, boxes, measurements, the label where there is one, and
+/// curves of each target's score, certainty and innovation beside them.
 pub struct TrackingPicture {
     stream: RecordingStream,
 }
@@ -57,11 +59,35 @@ const COASTING: [u8; 3] = [250, 200, 60];
 const LOST: [u8; 3] = [240, 80, 80];
 const LABEL: [u8; 3] = [120, 170, 255];
 
-fn boxes(place: ImageBox, [red, green, blue]: [u8; 3], name: &str) -> Boxes2D {
-    let [x, y, width, height] = [place.x, place.y, place.width, place.height].map(|v| v as f32);
-    Boxes2D::from_mins_and_sizes([(x, y)], [(width, height)])
-        .with_colors([Color::from_rgb(red, green, blue)])
-        .with_labels([name])
+fn colour(sight: Sight) -> Color {
+    let [red, green, blue] = match sight {
+        Sight::Seen => SEEN,
+        Sight::Coasting => COASTING,
+        Sight::Lost => LOST,
+    };
+    Color::from_rgb(red, green, blue)
+}
+
+fn name(target: &FollowedTarget) -> String {
+    let sight = match target.sight {
+        Sight::Seen => "seen",
+        Sight::Coasting => "coasting",
+        Sight::Lost => "lost",
+    };
+    format!("{} {sight}", target.number)
+}
+
+fn boxes(drawn: impl Iterator<Item = (ImageBox, Color, String)>) -> Boxes2D {
+    let (mut corners, mut sides, mut colours, mut names) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for (ImageBox { x, y, width, height }, colour, name) in drawn {
+        corners.push((x as f32, y as f32));
+        sides.push((width as f32, height as f32));
+        colours.push(colour);
+        names.push(name);
+    }
+    Boxes2D::from_mins_and_sizes(corners, sides)
+        .with_colors(colours)
+        .with_labels(names)
         .with_show_labels(false)
         .with_radii([Radius::new_ui_points(1.0)])
 }
@@ -77,7 +103,7 @@ impl TrackingPicture {
         Ok(Self { stream })
     }
 
-    /// Draws one image (JPEG) with what was followed in it, and where it was labelled.
+    /// Draws one image (JPEG) with all that was followed in it, and where it was labelled.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -85,35 +111,36 @@ impl TrackingPicture {
         &self,
         time: Timestamp,
         jpeg: Vec<u8>,
-        target: Option<FollowedTarget>,
+        targets: &[FollowedTarget],
         label: Option<ImageBox>,
     ) -> Result<(), ViewError> {
         let stream = &self.stream;
         stream.set_timestamp_nanos_since_epoch(TIMELINE, time.nanos());
         stream.log("video", &EncodedImage::from_file_contents(jpeg).with_media_type(MediaType::jpeg()))?;
         match label {
-            Some(label) => stream.log("video/label", &boxes(label, LABEL, "label"))?,
+            Some(label) => {
+                let [red, green, blue] = LABEL;
+                let label = (label, Color::from_rgb(red, green, blue), "label".to_owned());
+                stream.log("video/label", &boxes(std::iter::once(label)))?;
+            }
             None => stream.log("video/label", &Clear::flat())?,
         }
-        let Some(target) = target else { return Ok(()) };
-        let (colour, name) = match target.sight {
-            Sight::Seen => (SEEN, "seen"),
-            Sight::Coasting => (COASTING, "coasting"),
-            Sight::Lost => (LOST, "lost"),
-        };
-        stream.log("video/target", &boxes(target.place, colour, name))?;
-        match target.measured {
-            Some([x, y]) => {
-                let cross = Points2D::new([(x as f32, y as f32)])
-                    .with_colors([Color::from_rgb(colour[0], colour[1], colour[2])]);
-                stream.log("video/measured", &cross.with_radii([Radius::new_ui_points(2.0)]))?;
+        stream.log(
+            "video/targets",
+            &boxes(targets.iter().map(|target| (target.place, colour(target.sight), name(target)))),
+        )?;
+        let measured = targets.iter().filter_map(|target| Some((target.measured?, colour(target.sight))));
+        let (places, colours): (Vec<_>, Vec<_>) =
+            measured.map(|([x, y], colour)| ((x as f32, y as f32), colour)).unzip();
+        let crosses = Points2D::new(places).with_colors(colours).with_radii([Radius::new_ui_points(2.0)]);
+        stream.log("video/measured", &crosses)?;
+        for target in targets {
+            let number = target.number;
+            stream.log(format!("curves/{number}/score"), &Scalars::single(target.score))?;
+            stream.log(format!("curves/{number}/certainty"), &Scalars::single(target.certainty))?;
+            if let Some(nis) = target.nis {
+                stream.log(format!("innovation/{number}"), &Scalars::single(nis.min(100.0)))?;
             }
-            None => stream.log("video/measured", &Clear::flat())?,
-        }
-        stream.log("curves/score", &Scalars::single(target.score))?;
-        stream.log("curves/certainty", &Scalars::single(target.certainty))?;
-        if let Some(nis) = target.nis {
-            stream.log("innovation/squared", &Scalars::single(nis.min(100.0)))?;
         }
         Ok(())
     }
