@@ -31,6 +31,41 @@ pub fn program() -> PathBuf {
     program
 }
 
+/// A row of the table of `crossfix track`: a target in a frame, or a frame without one.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Deserialize)]
+pub struct FollowedRow {
+    pub frame: u64,
+    pub x: Option<f64>,
+    pub y: Option<f64>,
+    pub w: Option<f64>,
+    pub h: Option<f64>,
+    pub ok: u8,
+    pub us: f64,
+    pub id: Option<u64>,
+    pub certainty: Option<f64>,
+    pub sd_x: Option<f64>,
+    pub sd_y: Option<f64>,
+    pub vx: Option<f64>,
+    pub vy: Option<f64>,
+}
+
+impl FollowedRow {
+    /// The middle of the box, where pixels cover a whole number to the next.
+    pub fn middle(&self) -> Option<[f64; 2]> {
+        Some([self.x? + self.w? / 2.0, self.y? + self.h? / 2.0])
+    }
+}
+
+/// Reads the table of `crossfix track`.
+pub fn followed_rows(path: &Path) -> Vec<FollowedRow> {
+    let mut reader = csv::Reader::from_path(path).unwrap();
+    assert_eq!(
+        reader.headers().unwrap().iter().collect::<Vec<_>>().join(","),
+        "frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy"
+    );
+    reader.deserialize().map(Result::unwrap).collect()
+}
+
 /// Runs the program to its end.
 pub fn crossfix(arguments: &[&str]) -> Output {
     Command::new(program()).args(arguments).output().unwrap()

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossfix_message::{Channel, Key, TrackFrame, TrackState, decode};
 use crossfix_recording::Entry;
 use crossfix_simulation::Scene;
-use crossfix_tests::{PATIENCE, Site, messages, now_seconds, succeed};
+use crossfix_tests::{PATIENCE, Site, followed_rows, messages, now_seconds, succeed};
 
 fn tracks(recording: &str) -> Vec<Entry> {
     messages(Path::new(recording), |channel| *channel == Channel::Tracks)
@@ -101,18 +101,18 @@ fn the_agent_follows_what_the_track_command_follows() {
     let (video, table) = (site.path("video/north.y4m"), site.path("north.csv"));
     succeed(&["track", &video, "--box", &place, "--csv", &table]);
 
-    let mut rows = csv::Reader::from_path(table).unwrap();
+    let rows = followed_rows(Path::new(&table));
     let frames = messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
     assert_eq!(frames.len(), 120);
     let mut compared = 0;
-    for (entry, row) in frames.iter().zip(rows.deserialize::<(u64, f64, f64, f64, f64, u8, f64)>()) {
+    for (entry, row) in frames.iter().zip(rows) {
         let frame: crossfix_message::BearingFrame = decode(&entry.data).unwrap();
-        let (index, x, y, w, h, ..) = row.unwrap();
+        let index = row.frame;
         assert_eq!(frame.sequence, index);
         let track = &frame.tracks[0];
         // The table has the filter's estimate, the wire the measurement: of a target that is seen, they
         // agree to a measurement's noise.
-        let (cx, cy) = (x + (w - 1.0) / 2.0, y + (h - 1.0) / 2.0);
+        let [cx, cy] = row.middle().unwrap().map(|middle| middle - 0.5);
         assert!((track.pixel_x - cx).hypot(track.pixel_y - cy) < 0.5, "frame {index}: {track:?}");
         compared += 1;
     }
