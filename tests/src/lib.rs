@@ -34,18 +34,31 @@ pub fn program() -> PathBuf {
 /// A row of the table of `crossfix track`: a target in a frame, or a frame without one.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Deserialize)]
 pub struct FollowedRow {
+    /// Number of the frame, from 0.
     pub frame: u64,
+    /// Left edge of the box, px.
     pub x: Option<f64>,
+    /// Upper edge.
     pub y: Option<f64>,
+    /// Columns.
     pub w: Option<f64>,
+    /// Rows.
     pub h: Option<f64>,
+    /// 1 while the target is measured or shortly predicted.
     pub ok: u8,
+    /// Time that all targets of the frame took, us.
     pub us: f64,
+    /// The target.
     pub id: Option<u64>,
+    /// Probability that it is there.
     pub certainty: Option<f64>,
+    /// Standard deviation of its place, px.
     pub sd_x: Option<f64>,
+    /// The same on the other axis.
     pub sd_y: Option<f64>,
+    /// Velocity, px/s.
     pub vx: Option<f64>,
+    /// The same on the other axis.
     pub vy: Option<f64>,
 }
 
