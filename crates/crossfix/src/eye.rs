@@ -8,7 +8,7 @@ use crossfix_message::{
 };
 use crossfix_video::{CaptureTime, Frame};
 use crossfix_vision::{ImageTrack, Measurement, TrackPhase};
-use nalgebra::Matrix2;
+use nalgebra::{Matrix2, Vector2};
 
 /// Quality of preview pictures, 1 to 100.
 const JPEG_QUALITY: u8 = 60;
@@ -49,12 +49,11 @@ impl CameraIdentity {
         (frame, unseen)
     }
 
-    /// A track as it goes over the wire: the measurement where there is one, else the prediction,
-    /// marked as such. The fusion wants measurements that are independent of each other, so it gets
+    /// A track as it goes over the wire: the measurement where there is one, else the prediction with
+    /// its own covariance, marked as such. The fusion wants measurements that are independent of each other, so it gets
     /// the place in this image and not the image filter's estimate.
     fn bearing_track(&self, track: &ImageTrack) -> Result<BearingTrack, GeometryError> {
-        let predicted = Measurement { place: track.position, covariance: Matrix2::identity() };
-        let Measurement { place, covariance } = track.measured.unwrap_or(predicted);
+        let Measurement { place, covariance } = track.measured.unwrap_or_else(|| predicted(track));
         let pixel = Pixel::new(place.x, place.y);
         let covariance = PixelCovariance(covariance);
         let bearing = self.camera.model().bearing(pixel, covariance)?;
@@ -77,6 +76,7 @@ impl CameraIdentity {
             height: track.height,
             score: track.score,
             state: state.into(),
+            certainty: track.certainty,
         })
     }
 
@@ -104,6 +104,15 @@ impl CameraIdentity {
     }
 }
 
+/// Where a track that this image did not show is believed to be, and how well that is known: to a
+/// pixel where the tracker does not say.
+fn predicted(track: &ImageTrack) -> Measurement {
+    let covariance = track
+        .covariances
+        .map_or_else(Matrix2::identity, |[x, y]| Matrix2::from_diagonal(&Vector2::new(x.m11, y.m11)));
+    Measurement { place: track.position, covariance }
+}
+
 /// 8-bit brightness as JPEG; `None` if it cannot be encoded.
 pub fn jpeg(brightness: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
     let mut data = Vec::new();
@@ -111,4 +120,52 @@ pub fn jpeg(brightness: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
         .encode(brightness, width as u32, height as u32, image::ExtendedColorType::L8)
         .ok()?;
     Some(data)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+    use crossfix_geometry::{Distortion, ImageSize, Intrinsics, Pose};
+    use crossfix_vision::{ImagePoint, ImageTrackId};
+    use nalgebra::Point3;
+
+    use super::*;
+
+    #[test]
+    fn a_target_that_is_lost_goes_out_with_what_is_known_of_its_place() {
+        let intrinsics = Intrinsics {
+            size: ImageSize { width: 640, height: 480 },
+            fx: 1000.0,
+            fy: 1000.0,
+            cx: 319.5,
+            cy: 239.5,
+            distortion: Distortion::None,
+        };
+        let pose = Pose::looking_at(Point3::new(100.0, 0.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
+        let identity = CameraIdentity {
+            name: "north".parse().unwrap(),
+            camera: Camera::new(intrinsics, pose).unwrap(),
+            clock_source: ClockSource::Ntp,
+        };
+        let lost = ImageTrack {
+            id: ImageTrackId(7),
+            phase: TrackPhase::Searching,
+            position: ImagePoint { x: 319.5, y: 239.5 },
+            velocity: ImagePoint { x: 0.0, y: 0.0 },
+            covariances: Some([400.0, 100.0].map(|variance| Matrix2::new(variance, 0.0, 0.0, 9.0))),
+            measured: None,
+            width: 10.0,
+            height: 6.0,
+            score: 0.2,
+            certainty: 0.1,
+            nis: None,
+        };
+        let sent = identity.bearing_track(&lost).unwrap();
+        assert_eq!(sent.state(), ImageTrackState::Coasting);
+        assert_eq!(sent.certainty, 0.1);
+        // At the middle of the picture a pixel is a milliradian.
+        assert!((sent.covariance_xx / 400e-6 - 1.0).abs() < 1e-3, "{sent:?}");
+        assert!((sent.covariance_yy / 100e-6 - 1.0).abs() < 1e-3, "{sent:?}");
+    }
 }

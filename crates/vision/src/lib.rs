@@ -39,6 +39,7 @@ mod noise;
 mod paper;
 mod posterior;
 mod reference;
+mod registration;
 mod scene;
 mod search;
 mod target;

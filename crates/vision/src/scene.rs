@@ -8,6 +8,7 @@ use crossfix_correlation::Plane;
 
 use crate::ImagePoint;
 use crate::mend::mend;
+use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
 /// Pictures that are kept, the latest, and the time between them, s: they reach back for 3 to 3.6 s. With half of either a
 /// slow target covers what it hides in all of them; with more, light and clouds are others by then.
@@ -20,22 +21,6 @@ const CHANGED_S: f64 = 1.0;
 const COARSENESS: usize = 8;
 /// How often the coarse picture is smoothed, by a quarter, a half and a quarter of neighbours.
 const SMOOTHED: usize = 3;
-/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between tell the same.
-const STRIDE: usize = 2;
-/// Steps of the registration, at most, and the step that ends it, coarse pixels.
-const STEPS: usize = 6;
-const SETTLED: f32 = 0.003;
-/// A longer step is a mistake, coarse pixels: it is taken so far.
-const LONGEST_STEP: f32 = 2.0;
-/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves is no turn.
-const OUTLYING: f32 = 5.0;
-/// A turn must lessen the misfit by so many times what a pixel has of it. Two smoothed pictures of noise alone fit by up to 60
-/// times better somewhere near, as only one pixel in eighteen is independent; with half of it a clear sky turns by chance,
-/// with twice as much a turn is told a frame later.
-const SIGNIFICANT: f32 = 120.0;
-/// Fewer pixels in common tell no turn.
-const LEAST_COMMON: f32 = 50.0;
-
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Picture {
@@ -118,7 +103,7 @@ impl Scene {
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
         newest.age_s += interval;
-        newest.shift = registered(&self.coarse, &newest.coarse, before);
+        newest.shift = turned(&self.coarse, &newest.coarse, before);
         for picture in others {
             picture.age_s += interval;
             for (shift, (now, before)) in picture.shift.iter_mut().zip(newest.shift.iter().zip(before)) {
@@ -136,7 +121,7 @@ impl Scene {
         }
         // Errors must not add up from picture to picture.
         for picture in &mut self.pictures {
-            picture.shift = registered(&self.coarse, &picture.coarse, picture.shift);
+            picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
         }
         self.turned = self.turned();
         let mut kept = if self.pictures.len() < PICTURES {
@@ -184,11 +169,11 @@ impl Scene {
     }
 }
 
-/// The places of a row that, moved by so many, are in the row, and the next one too.
-fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
-    let side = side as isize;
-    let first = (-by).clamp(0, side);
-    first as usize..(side - 1 - by).clamp(first, side) as usize
+/// By how much the camera has turned between two coarse pictures, px of the image; `before` where they do not tell.
+fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
+    let coarseness = COARSENESS as f64;
+    let told = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
+    told.map_or(before, |turned| turned.map(|turned| f64::from(turned) * coarseness))
 }
 
 /// The means of blocks. `sums` is memory for a row of them.
@@ -231,96 +216,6 @@ fn smooth(plane: &mut Plane, between: &mut Plane) {
             }
         }
     }
-}
-
-/// The normal equations of a step of registration, with the change of brightness taken out.
-#[derive(Clone, Copy, Debug, Default)]
-struct Normal {
-    weight: f32,
-    slope: [f32; 2],
-    off: f32,
-    slope_slope: [f32; 3],
-    slope_off: [f32; 2],
-    off_off: f32,
-}
-
-impl Normal {
-    /// Weighed mean of the squares that are left.
-    fn misfit(&self) -> f32 {
-        let weight = self.weight.max(1.0);
-        self.off_off / weight - (self.off / weight).powi(2)
-    }
-
-    fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
-        let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
-        self.weight += weight;
-        self.slope[0] += weight * gx;
-        self.slope[1] += weight * gy;
-        self.off += weight * off;
-        self.slope_slope[0] += weight * gx * gx;
-        self.slope_slope[1] += weight * gx * gy;
-        self.slope_slope[2] += weight * gy * gy;
-        self.slope_off[0] += weight * gx * off;
-        self.slope_off[1] += weight * gy * off;
-        self.off_off += weight * off * off;
-    }
-
-    /// The step, coarse pixels; `None` where nothing tells it.
-    fn step(self) -> Option<[f32; 2]> {
-        let Self { weight: n, slope: [sx, sy], off, .. } = self;
-        if n < LEAST_COMMON {
-            return None;
-        }
-        let [xx, xy, yy] = self.slope_slope;
-        let [xx, xy, yy] = [xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n];
-        let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
-        let determinant = xx * yy - xy * xy;
-        let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
-        let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
-        told.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
-    }
-}
-
-/// The normal equations for a picture of now against one of then, shifted by so many coarse pixels.
-fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> Normal {
-    let (width, height) = (now.width(), now.height());
-    let whole = shift.map(f32::floor);
-    let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
-    let [left, top] = whole.map(|s| s as isize);
-    let mut normal = Normal::default();
-    for y in overlap(height, top).step_by(STRIDE) {
-        let line = now.row(y);
-        let [above, below] = [0, 1].map(|k| then.row((y as isize + top) as usize + k));
-        for x in overlap(width, left).step_by(STRIDE) {
-            let i = (x as isize + left) as usize;
-            let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
-            let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
-            let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
-            normal.add(slope, line[x] - upper - down * (lower - upper));
-        }
-    }
-    normal
-}
-
-/// By how much a coarse picture of now is shifted against one of then, px of the image, from a first guess on (Lucas
-/// and Kanade 1981). The guess stands where another shift explains no more than noise would: a clear sky tells no turn.
-fn registered(now: &Plane, then: &Plane, start: [f64; 2]) -> [f64; 2] {
-    if (then.width(), then.height()) != (now.width(), now.height()) {
-        return start;
-    }
-    let mut shift = start.map(|s| (s / COARSENESS as f64) as f32);
-    let mut normal = normal_at(now, then, shift);
-    let before = normal.misfit();
-    for _ in 0..STEPS {
-        let Some([x, y]) = normal.step() else { return start };
-        shift = [shift[0] + x, shift[1] + y];
-        normal = normal_at(now, then, shift);
-        if x.abs() + y.abs() < SETTLED {
-            break;
-        }
-    }
-    let is_told = before - normal.misfit() > SIGNIFICANT * normal.misfit() / normal.weight.max(LEAST_COMMON);
-    if is_told { shift.map(|s| f64::from(s) * COARSENESS as f64) } else { start }
 }
 
 #[cfg(test)]
@@ -370,6 +265,23 @@ mod tests {
             let image = Plane::from_fn(640, 480, |_, _| 128.0 + normal.sample(&mut rng));
             scene.register(&image, 1.0 / 30.0);
             assert!(scene.pictures().flat_map(|picture| picture.shift).all(|shift| shift.abs() < 2.0));
+            scene.keep(&image);
+        }
+    }
+
+    #[test]
+    fn a_target_that_moves_over_a_still_sky_is_no_turn() {
+        let mut scene = Scene::default();
+        let mut rng = ChaCha8Rng::seed_from_u64(10);
+        let normal = Normal::new(0.0, 2.0).unwrap();
+        for frame in 0..60 {
+            let (x, y) = (40.0 + 4.0 * frame as f32, 120.0 + frame as f32);
+            let image = Plane::from_fn(320, 240, |column, row| {
+                let (u, v) = ((column as f32 - x) / 8.0, (row as f32 - y) / 6.0);
+                120.0 + normal.sample(&mut rng) + 100.0 * (-0.5 * (u * u + v * v)).exp()
+            });
+            scene.register(&image, 1.0 / 30.0);
+            assert!(scene.turned().iter().all(|turned| turned.abs() < 1.0), "{frame}: {:?}", scene.turned());
             scene.keep(&image);
         }
     }

@@ -82,6 +82,8 @@ pub(crate) struct Target {
     /// Variance of the box's centre about the target's own, px^2.
     centre_variance: f64,
     pub(crate) missed: u32,
+    /// How often it has been searched for since.
+    pub(crate) searches: u32,
     is_new: bool,
     /// Time since it was last seen, s.
     pub(crate) unseen_s: f64,
@@ -135,6 +137,7 @@ impl Target {
             common: [0.0; 2],
             centre_variance: config.centre_sd_px.powi(2),
             missed: 0,
+            searches: 0,
             is_new: true,
             unseen_s: 0.0,
             last_seen: centre,
@@ -379,7 +382,7 @@ impl Target {
     }
 
     fn seen(&mut self, place: ImagePoint) {
-        self.missed = 0;
+        (self.missed, self.searches) = (0, 0);
         self.unseen_s = 0.0;
         self.is_new = false;
         self.last_seen = place;
@@ -444,6 +447,10 @@ impl Target {
         let share = (frame.interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);
         self.contrast_variance += share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
+        if !frame.may_search {
+            self.missed += 1;
+            return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
+        }
         let found = crate::search::find(self, frame, bench);
         let Some(look) = found.look.filter(|_| found.accepted) else {
             self.missed += 1;

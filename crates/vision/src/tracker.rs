@@ -152,6 +152,8 @@ struct Followed {
     origin: Origin,
     target: Follower,
     measured_at: Timestamp,
+    /// When it was searched for last.
+    searched: Option<Timestamp>,
     /// Where it is in the next image, if somebody said so.
     cue: Option<ImagePoint>,
 }
@@ -272,8 +274,15 @@ impl ImageTracker {
         if posterior {
             self.scene.register(image, interval);
         }
-        let frame = Frame { image, interval, keepsake, scene: &self.scene, config: &self.config };
+        let frame =
+            Frame { image, interval, keepsake, scene: &self.scene, may_search: false, config: &self.config };
+        let turn =
+            self.followed.iter().filter(|f| f.target.is_searching()).min_by_key(|f| f.searched).map(|f| f.id);
         for followed in &mut self.followed {
+            let frame = Frame { may_search: turn == Some(followed.id), ..frame };
+            if frame.may_search {
+                followed.searched = Some(time);
+            }
             let step = followed.target.step(frame, followed.cue.take(), &mut self.bench);
             if step.measured.is_some() {
                 followed.measured_at = time;
@@ -416,7 +425,7 @@ impl ImageTracker {
             let id = ImageTrackId(self.next_id);
             self.next_id += 1;
             let target = Follower::new(image, place, &mut self.bench, &self.config);
-            let followed = Followed { id, origin, target, measured_at: time, cue: None };
+            let followed = Followed { id, origin, target, measured_at: time, searched: None, cue: None };
             let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
             self.tracks.push(describe(&followed, TrackPhase::Tentative, step));
             self.followed.push(followed);

@@ -1,0 +1,195 @@
+//! By how much a picture is shifted against another: the camera's turn, told from targets that move.
+
+use crossfix_correlation::Plane;
+
+/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between tell the same.
+pub(crate) const STRIDE: usize = 2;
+/// Steps of the registration, at most, and the step that ends it, pixels.
+const STEPS: usize = 6;
+const SETTLED: f32 = 0.003;
+/// A longer step is a mistake, pixels: it is taken so far.
+const LONGEST_STEP: f32 = 2.0;
+/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves is no turn.
+const OUTLYING: f32 = 5.0;
+/// A turn must lessen the misfit by so many times what a pixel has of it. Two smoothed pictures of noise alone fit by up to 60
+/// times better somewhere near, as only one pixel in eighteen is independent; with half of it a clear sky turns by chance,
+/// with twice as much a turn is told a frame later.
+const SIGNIFICANT: f32 = 120.0;
+/// Fewer pixels in common tell no turn.
+pub(crate) const LEAST_COMMON: f32 = 50.0;
+
+/// The places of a row that, moved by so many, are in the row, and the next one too.
+pub(crate) fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
+    let side = side as isize;
+    let first = (-by).clamp(0, side);
+    first as usize..(side - 1 - by).clamp(first, side) as usize
+}
+
+/// The normal equations of a step of registration, with the change of brightness taken out.
+#[derive(Clone, Copy, Debug, Default)]
+struct Normal {
+    weight: f32,
+    slope: [f32; 2],
+    off: f32,
+    slope_slope: [f32; 3],
+    slope_off: [f32; 2],
+}
+
+impl Normal {
+    fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
+        let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
+        self.weight += weight;
+        self.slope[0] += weight * gx;
+        self.slope[1] += weight * gy;
+        self.off += weight * off;
+        self.slope_slope[0] += weight * gx * gx;
+        self.slope_slope[1] += weight * gx * gy;
+        self.slope_slope[2] += weight * gy * gy;
+        self.slope_off[0] += weight * gx * off;
+        self.slope_off[1] += weight * gy * off;
+    }
+
+    /// The step, pixels; `None` where nothing tells it.
+    fn step(self) -> Option<[f32; 2]> {
+        let Self { weight: n, slope: [sx, sy], off, .. } = self;
+        if n < LEAST_COMMON {
+            return None;
+        }
+        let [xx, xy, yy] = self.slope_slope;
+        let [xx, xy, yy] = [xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n];
+        let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
+        let determinant = xx * yy - xy * xy;
+        let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
+        let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
+        told.then(|| step.map(|s| s.clamp(-LONGEST_STEP, LONGEST_STEP)))
+    }
+}
+
+/// The differences of a picture of now from one of then, shifted by so many pixels, with their places and the slopes
+/// of then.
+fn each_off(now: &Plane, then: &Plane, shift: [f32; 2], mut take: impl FnMut([usize; 2], [f32; 2], f32)) {
+    let (width, height) = (now.width(), now.height());
+    let whole = shift.map(f32::floor);
+    let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
+    let [left, top] = whole.map(|s| s as isize);
+    for y in overlap(height, top).step_by(STRIDE) {
+        let line = now.row(y);
+        let [above, below] = [0, 1].map(|k| then.row((y as isize + top) as usize + k));
+        for x in overlap(width, left).step_by(STRIDE) {
+            let i = (x as isize + left) as usize;
+            let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
+            let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
+            let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
+            take([x, y], slope, line[x] - upper - down * (lower - upper));
+        }
+    }
+}
+
+/// The normal equations for a picture of now against one of then, shifted by so many pixels.
+fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> Normal {
+    let mut normal = Normal::default();
+    each_off(now, then, shift, |_, slope, off| normal.add(slope, off));
+    normal
+}
+
+/// Columns and rows of the tiles of a picture by which a turn is told from a target that moves.
+const TILES: [usize; 2] = [12, 9];
+/// A target may be in so many tiles about the one where a turn would lessen the misfit most: 50 px of a picture of 320x240, and
+/// what smoothing makes of them.
+const AROUND: usize = 2;
+
+/// A turn lessens the misfit by at least this share of all away from where it does most: the ends of a large target's
+/// smoothed picture reach a twentieth that far.
+const ELSEWHERE: f32 = 0.1;
+
+/// The squares that are left in each tile, and their weights.
+#[derive(Clone, Copy, Debug)]
+struct Misfits([[(f32, f32); TILES[0]]; TILES[1]]);
+
+impl Misfits {
+    /// Those of a picture of now against one of then, shifted by so many pixels and brighter by so much.
+    fn at(now: &Plane, then: &Plane, shift: [f32; 2], brighter: f32) -> Self {
+        let sides = [now.width(), now.height()];
+        let mut tiles = [[(0.0, 0.0); TILES[0]]; TILES[1]];
+        each_off(now, then, shift, |[x, y], _, off| {
+            let off = off - brighter;
+            let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
+            let (squares, weights) = &mut tiles[y * TILES[1] / sides[1]][x * TILES[0] / sides[0]];
+            *squares += weight * off * off;
+            *weights += weight;
+        });
+        Self(tiles)
+    }
+
+    /// Whether they are less than others by more than noise makes them, and elsewhere too than about the two tiles that have
+    /// gained most: there a target may be, and have been.
+    fn are_better_than(&self, before: &Self) -> bool {
+        let whole = self.gain(before, &[]);
+        let (squares, weights) = self.sums(&[]);
+        let of_pixel = squares / weights.max(LEAST_COMMON);
+        if whole <= SIGNIFICANT * of_pixel {
+            return false;
+        }
+        let first = self.most_gained(before, &[]);
+        let second = self.most_gained(before, &[first]);
+        self.gain(before, &[first, second]) > ELSEWHERE * whole
+    }
+
+    /// Squares and weights of the tiles that are not about some others.
+    fn sums(&self, others: &[[usize; 2]]) -> (f32, f32) {
+        let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
+        kept.fold((0.0, 0.0), |(squares, weights), [x, y]| {
+            (squares + self.0[y][x].0, weights + self.0[y][x].1)
+        })
+    }
+
+    /// By how much the squares are less than others, but for the tiles about some.
+    fn gain(&self, before: &Self, others: &[[usize; 2]]) -> f32 {
+        gain_of(before.sums(others), self.sums(others))
+    }
+
+    /// The tile that has gained most, but for those about some.
+    fn most_gained(&self, before: &Self, others: &[[usize; 2]]) -> [usize; 2] {
+        let gain = |[x, y]: [usize; 2]| gain_of(before.0[y][x], self.0[y][x]);
+        let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
+        kept.max_by(|one, other| gain(*one).total_cmp(&gain(*other))).unwrap_or_default()
+    }
+}
+
+/// All tiles, by column and row.
+fn tiles() -> impl Iterator<Item = [usize; 2]> {
+    (0..TILES[1]).flat_map(|y| (0..TILES[0]).map(move |x| [x, y]))
+}
+
+fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
+    x.abs_diff(column) <= AROUND && y.abs_diff(row) <= AROUND
+}
+
+/// By how much weighed squares have become less, as many pixels as there are now.
+fn gain_of(before: (f32, f32), now: (f32, f32)) -> f32 {
+    let mean = |(squares, weights): (f32, f32)| squares / weights.max(f32::MIN_POSITIVE);
+    (mean(before) - mean(now)) * now.1
+}
+
+/// By how much a picture of now is shifted against one of then, px, from a first guess on (Lucas and Kanade 1981). `None`
+/// where another shift explains no more than noise would, or a target that moves: a clear sky tells no turn.
+pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[f32; 2]> {
+    if (then.width(), then.height()) != (now.width(), now.height()) {
+        return None;
+    }
+    let mut shift = first;
+    let mut normal = normal_at(now, then, shift);
+    let brighter = |normal: &Normal| normal.off / normal.weight.max(1.0);
+    let before = brighter(&normal);
+    for _ in 0..STEPS {
+        let [x, y] = normal.step()?;
+        shift = [shift[0] + x, shift[1] + y];
+        normal = normal_at(now, then, shift);
+        if x.abs() + y.abs() < SETTLED {
+            break;
+        }
+    }
+    let before = Misfits::at(now, then, first, before);
+    let after = Misfits::at(now, then, shift, brighter(&normal));
+    after.are_better_than(&before).then_some(shift)
+}
