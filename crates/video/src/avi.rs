@@ -1,5 +1,5 @@
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use crate::{CaptureTime, Frame, FrameClock, FrameSource, VideoError, decode_still};
@@ -31,16 +31,20 @@ type Chunk = ([u8; 4], u64);
 struct Chunks {
     file: BufReader<File>,
     length: u64,
+    /// Where the next chunk is.
     at: u64,
+    /// Where the file has been read to.
+    read_to: u64,
 }
 
 impl Chunks {
     /// The next chunk that is no list; `None` at the end, a torn name included.
     fn next(&mut self) -> std::io::Result<Option<Chunk>> {
         while self.at.saturating_add(8) <= self.length {
-            self.file.seek(SeekFrom::Start(self.at))?;
             let mut head = [0; 8];
+            self.go_to(self.at)?;
             self.file.read_exact(&mut head)?;
+            self.read_to += 8;
             let [a, b, c, d, size @ ..] = head;
             let (name, size) = ([a, b, c, d], u64::from(u32::from_le_bytes(size)));
             self.at += 8;
@@ -54,12 +58,21 @@ impl Chunks {
         Ok(None)
     }
 
+    /// Goes to a place; what is buffered stays.
+    fn go_to(&mut self, place: u64) -> std::io::Result<()> {
+        let by = place as i64 - self.read_to as i64;
+        self.file.seek_relative(by)?;
+        self.read_to = place;
+        Ok(())
+    }
+
     /// The bytes of the chunk that came last, as many as there are and at most so many.
     fn read(&mut self, size: u64, most: u64) -> std::io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
-        self.file.by_ref().take(size.min(most)).read_to_end(&mut bytes)?;
+        let got = self.file.by_ref().take(size.min(most)).read_to_end(&mut bytes);
+        self.read_to += bytes.len() as u64;
         self.skip(size);
-        Ok(bytes)
+        got.map(|_| bytes)
     }
 
     /// Goes on behind the chunk that came last; chunks begin at even places.
@@ -83,7 +96,7 @@ impl AviSource {
         if !(kind.starts_with(b"RIFF") && kind.ends_with(b"AVI ") && kind.len() == 12) {
             return Err(damaged("it does not begin as an AVI file".to_owned()));
         }
-        let mut chunks = Chunks { file, length, at: 0 };
+        let mut chunks = Chunks { file, length, at: 0, read_to: 12 };
         let (mut streams, mut rate_hz, mut is_video) = (0_u8, 0.0, false);
         while let Some((name, size)) = chunks.next().map_err(open)? {
             match &name {

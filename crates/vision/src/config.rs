@@ -168,12 +168,12 @@ impl TrackerConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DetectorConfig {
-    /// How often something may be found that is none, 1/min. Default 1.
+    /// How often something may be found that is none, 1/min, from 0.000001 to 1000000. Default 1.
     pub false_tracks_a_minute: f64,
-    /// Over how long the background is a mean, s. Default 5: clouds are others by then, and what hovers for as long is
+    /// Over how long the background is a mean, s, from 0.1 to 10000. Default 5: clouds are others by then, and what hovers for as long is
     /// background unless it was found before.
     pub background_s: f64,
-    /// Most targets followed at once. Default 50.
+    /// Most targets followed at once, from 1 to 1000. Default 50.
     pub max_targets: usize,
 }
 
@@ -248,6 +248,8 @@ impl TrackerConfig {
                 (1e-6..=1e6).contains(&rate),
                 "from 0.000001 to 1000000",
             )?;
+            let most = detector.max_targets;
+            check("detector.max_targets", most as f64, (1..=1000).contains(&most), "from 1 to 1000")?;
             let memory = detector.background_s;
             check("detector.background_s", memory, (0.1..=1e4).contains(&memory), "from 0.1 to 10000 s")?;
         }

@@ -91,6 +91,7 @@ impl Scene {
 
     /// Forgets all pictures.
     pub(crate) fn clear(&mut self) {
+        self.turned = self.turned();
         self.pictures.clear();
     }
 

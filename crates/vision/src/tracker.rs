@@ -264,7 +264,9 @@ impl ImageTracker {
         let since = |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
         let interval = self.last.map_or(LONGEST_INTERVAL, since);
         if self.last.is_some_and(|last| time.seconds_since(last.time) > LONGEST_INTERVAL) {
+            // Nobody knows what the camera did meanwhile.
             self.scene.clear();
+            self.detector = self.config.detector.clone().map(Detector::new);
         }
         self.last = Some(shot);
 
@@ -327,6 +329,10 @@ impl ImageTracker {
         if self.last.is_some_and(|last| last.size != shot.size) {
             // Places in pictures of another size mean nothing.
             self.followed.clear();
+        }
+        // What was noted in the wrong one's time means nothing either.
+        for followed in &mut self.followed {
+            (followed.measured_at, followed.searched) = (shot.time, None);
         }
         self.keepsake = None;
         self.scene.clear();
@@ -394,7 +400,9 @@ impl ImageTracker {
                 *has_moved |= (at.x - first.x).hypot(at.y - first.y) > side;
             }
         }
-        let known = self.followed.iter().map(|followed| Known {
+        // One that is lost is no longer where it is guessed to be: it may be found there, and something else too.
+        let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
+        let known = seen.map(|followed| Known {
             id: followed.id,
             place: box_of(&followed.target),
             is_watched: matches!(followed.origin, Origin::Detected { has_moved: true, .. }),
@@ -409,7 +417,7 @@ impl ImageTracker {
         let findings = detector.step(image, interval, self.scene.turned(), &known);
         self.followed.retain(|followed| !findings.scene.contains(&followed.id));
         self.tracks.retain(|track| !findings.scene.contains(&track.id));
-        let room = config.max_targets.saturating_sub(known.len());
+        let room = config.max_targets.saturating_sub(self.followed.len());
         let found = findings.found.into_iter().take(room).map(|found| {
             let has_moved = found.gone_px > found.place.width.max(found.place.height);
             (found.place, Origin::Detected { first: found.place.centre(), has_moved })

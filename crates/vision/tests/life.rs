@@ -193,16 +193,42 @@ fn a_camera_that_changes_its_size_or_has_had_one_wrong_time_is_followed_again() 
     assert_eq!(tracker.refused(), 3);
 }
 
+#[test]
+fn a_found_target_that_one_wrong_time_has_cut_off_is_given_up_in_time() {
+    let config = TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
+    let mut tracker = ImageTracker::new(config).unwrap();
+    for frame in 0..40 {
+        let t = frame as f32;
+        let image = if frame < 12 { spots(&[]) } else { spots(&[(20.0 + t, 30.0)]) };
+        let tracks = tracker.step(&image, at(frame)).len();
+        assert!(frame < 25 || tracks == 1, "{frame}: {tracks}");
+    }
+    // A time of the next day, and then nothing more to see.
+    tracker.step(&spots(&[(60.0, 30.0)]), at(2_592_000));
+    let mut tracks = 1;
+    for frame in 41..75 {
+        tracks = tracker.step(&spots(&[]), at(frame)).len();
+    }
+    assert_eq!(tracks, 0);
+}
+
 proptest! {
     #[test]
     fn any_box_on_any_image_is_survived(
         x in -200.0..400.0, y in -200.0..400.0, width in 0.0..300.0, height in 0.0..300.0,
-        level in prop_oneof![Just(0.0f32), Just(255.0), Just(f32::NAN), Just(f32::INFINITY)],
+        sides in (1_usize..160, 1_usize..120),
+        detects in any::<bool>(),
+        level in prop_oneof![Just(0.0f32), Just(255.0), Just(1e30), Just(f32::NAN), Just(f32::INFINITY)],
     ) {
-        let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
+        let detector = detects.then(DetectorConfig::default);
+        let mut tracker = ImageTracker::new(TrackerConfig { detector, ..TrackerConfig::default() }).unwrap();
         tracker.take_up(PixelBox { x, y, width, height });
-        for frame in 0..6 {
-            let image = Plane::from_fn(64, 48, |column, _| if column % 7 == 0 { level } else { 10.0 });
+        for frame in 0..14 {
+            // Stripes that move, so that something comes.
+            let moved = frame as usize * usize::from(frame > 8);
+            let image = Plane::from_fn(sides.0, sides.1, |column, row| {
+                if (column + moved) % 17 < 3 && row % 13 < 4 { level } else { 10.0 }
+            });
             for track in tracker.step(&image, at(frame)) {
                 prop_assert!(track.position.x.is_finite() && track.position.y.is_finite());
             }

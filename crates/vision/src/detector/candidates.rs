@@ -15,7 +15,8 @@ const MAKES_PLOT: f64 = 0.8;
 const VELOCITY_SD_PX: f64 = 120.0;
 /// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m in a lens of 1000 px a radian, half over.
 const ACCELERATION_SD_PX: f64 = 300.0;
-/// Scales of one thing's plots differ by at most so many times.
+/// Scales of one thing's plots differ by at most so many times: as its parts and its shadow come and go, the next scale on
+/// either side stands out more. With 5 a bird's plots and its flock's are one thing's.
 const SCALES: f64 = 2.5;
 /// A plot tells at most so much (logarithm of a likelihood ratio): an empty corner of the map is not known to be empty.
 const MOST_OF_PLOT: f64 = 4.0;
@@ -29,11 +30,13 @@ const MOST_IN_NOISE: f64 = 4.0;
 const PLACE_CELLS: f64 = 6.0;
 /// ... of which so many are counted: what jumps from branch to branch has gone far too.
 const MOST_PLACES: f64 = 10.0;
-/// The scene's own changes fall off with size as the exponential of this many of its textures; ...
+/// The scene's own changes fall off with size as the exponential of so many of its textures: compressed video has more
+/// large ones than a normal distribution. With half of it branches are found, with twice as much targets in front of trees
+/// are not.
 const TAIL: f64 = 1.5;
-/// ... targets stand out by anything from one to two hundred, equally in its logarithm: that many nats, and half as much
-/// again for the tail's own scale.
-const LOG_RANGE: f64 = 2.5;
+/// What it takes to stand out for a target, nats. Strengths from one to two hundred, uniform in their logarithm, give
+/// `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without targets.
+const STANDING: f64 = 2.5;
 /// What stands out tells at most so much.
 const MOST_OF_STANDING: f64 = 10.0;
 /// Variance of the noise that a mean over many images keeps, spreads^2: plots are those of the noise that stand out.
@@ -46,9 +49,11 @@ const UNSEEN_S: f64 = 0.4;
 const MOST: usize = 400;
 /// Side of a cell of the map of clutter, px.
 const MAP_CELL_PX: f64 = 32.0;
-/// Over how long the clutter is a mean, s.
+/// Over how long the clutter is a mean, s: with 1 a target's own first plots make it improbable, with 10 the leaves of a gust are
+/// targets.
 const CLUTTER_S: f64 = 3.0;
-/// Least clutter of a cell of the map, plots an image.
+/// Least clutter of a cell of the map, plots an image: one in ten thousand. With less, whatever comes into an empty sky is found
+/// with its second plot.
 const LEAST_CLUTTER: f64 = 1e-4;
 
 /// Something that may be a target.
@@ -59,10 +64,10 @@ pub(super) struct Candidate {
     axes: [AxisFilter; 2],
     /// The latest plot.
     pub(super) plot: Plot,
-    /// Log-likelihood ratio of its places against chance.
-    places: f64,
-    /// Mean of what has come, in spreads.
-    come: f64,
+    /// Log-likelihood ratio of where its plots were against chance.
+    motion_log_ratio: f64,
+    /// Mean of the plots' excess, in spreads.
+    mean_excess: f64,
     pub(super) plots: u32,
     unseen_s: f64,
     first: [f64; 2],
@@ -79,8 +84,8 @@ impl Candidate {
         Self {
             axes: place.map(start),
             plot,
-            places: 0.0,
-            come: f64::from(plot.come),
+            motion_log_ratio: 0.0,
+            mean_excess: f64::from(plot.excess),
             plots: 1,
             unseen_s: 0.0,
             first: place,
@@ -101,8 +106,8 @@ impl Candidate {
         let looks = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
         let noise = (1.0 / looks.max(1.0)).max(LEAST_NOISE);
         let texture = f64::from(self.plot.texture).powi(2) / self.parts();
-        let standing = (self.come / (texture + noise).sqrt()).max(1.0 / TAIL);
-        self.places + (standing / TAIL - standing.ln() - LOG_RANGE).min(MOST_OF_STANDING)
+        let standing = (self.mean_excess / (texture + noise).sqrt()).max(TAIL);
+        self.motion_log_ratio + (standing / TAIL - standing.ln() - STANDING).min(MOST_OF_STANDING)
     }
 
     /// Squared Mahalanobis distance of a plot's place, and the determinant of its covariance.
@@ -129,10 +134,10 @@ impl Candidate {
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
         let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
         let told = (MAKES_PLOT.ln() + there - chance.ln()).min(MOST_OF_PLOT);
-        self.places = (self.places + told)
+        self.motion_log_ratio = (self.motion_log_ratio + told)
             .min(MOST_IN_PLACE + MOST_IN_NOISE * (1.0 - f64::from(plot.persistence)) + self.parts() - 1.0);
         self.plots += 1;
-        self.come += (f64::from(plot.come) - self.come) / f64::from(self.plots);
+        self.mean_excess += (f64::from(plot.excess) - self.mean_excess) / f64::from(self.plots);
         self.plot = plot;
         self.unseen_s = 0.0;
     }
@@ -214,12 +219,14 @@ impl Candidates {
                     candidate.take(plot, in_scene(&plot), distance, self.clutter.density(plot.place));
                 }
                 None => {
-                    candidate.places += (1.0 - MAKES_PLOT).ln();
+                    candidate.motion_log_ratio += (1.0 - MAKES_PLOT).ln();
                     candidate.unseen_s += interval;
                 }
             }
         }
-        self.list.retain(|candidate| candidate.places > LEAST_LOG_RATIO && candidate.unseen_s < UNSEEN_S);
+        self.list.retain(|candidate| {
+            candidate.motion_log_ratio > LEAST_LOG_RATIO && candidate.unseen_s < UNSEEN_S
+        });
         for (plot, _) in plots.iter().zip(is_free).filter(|(_, is_free)| *is_free) {
             let cell = self.clutter.cell(plot.place);
             self.clutter.counts[cell] += 1.0;

@@ -83,7 +83,7 @@ fn means_along(sums: &[f32], means: &mut [f32]) {
     }
 }
 
-/// What is at each place and less than a cell further.
+/// The plane sampled at each cell plus `by`, less than a cell on either axis.
 pub(super) fn resample(from: &Plane, by: [f32; 2], to: &mut Plane) {
     let (width, height) = (from.width(), from.height());
     to.reshape(width, height);

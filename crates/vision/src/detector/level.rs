@@ -4,7 +4,7 @@
 use crossfix_correlation::Plane;
 use pulp::Arch;
 
-use super::filter::{Lines, OF_MEDIAN, between, median, moved, resample, stand_out};
+use super::filter::{Lines, OF_MEDIAN, SURROUNDINGS, between, median, moved, resample, stand_out};
 
 /// Of a squared change beyond this many variances only so much is learnt: what comes by is no noise of the place. With
 /// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind.
@@ -12,7 +12,8 @@ const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a level, and with half of it
 /// each such step is two standard deviations.
 const LEAST_SPREAD: f32 = 0.5;
-/// By how much a contrast is taken to vary from place to place when light changes, a share of it.
+/// By how much a contrast is taken to vary from place to place when light changes, a share of it. With half of it a cloud's
+/// shadow changes sharp edges by three standard deviations.
 const CONTRAST_SPREAD: f32 = 0.03;
 /// Bounds of the sway, px: no scene is stiller than the first, and beyond the second it is not sway but another scene.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];
@@ -24,20 +25,27 @@ const MOST_CHANGED: f32 = 0.3;
 const PROBE_PX: f32 = 0.25;
 /// What the sway is taken for before there is an image to tell, px.
 const FIRST_SWAY_PX: f32 = 0.5;
-/// Time constant with which a scene that has swayed is believed to be still again, s.
+/// Time constant with which a scene that has swayed is believed to be still again, s: a gust's or a step's. With half of it the
+/// second swing of a mast is taken for something that moves.
 const STILL_AGAIN_S: f64 = 0.3;
-/// Images over which the changes' persistence is a mean.
+/// Images over which the changes' persistence is a mean: a key frame of a codec, one in 12 to 30, must not count for all.
 const PERSISTENCE_IMAGES: f32 = 10.0;
-/// Least change of a plot, standard deviations. With 4 a target in noise as bright as itself is found in half of the
-/// images in which 3 finds it; with 2 plots of noise alone are hundreds in an image.
+/// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a second later; with 3
+/// plots of noise are so many that more is asked of each candidate, and faint ones are found later too.
 pub(super) const LEAST_CHANGE: f32 = 3.5;
-/// Noise that lasts is not less by being looked at again: what stands out of it must do so by the root of this more, at
-/// most. That is a persistence of 0.7; compressed video has 0.9, and what is as faint in it is given up.
+/// Noise that lasts is not less by being looked at again: what stands out must do so against its variance over many images,
+/// `(1 + p) / (1 - p)` times that of one, but no more than so many times. That is a persistence p of 0.7; compressed video has
+/// 0.9 and would ask for 19, and lose birds and far drones.
 const MOST_LASTING: f32 = 6.0;
 /// Cells that tell a spread, a contrast or a persistence to two per cent, ...
 const SAMPLES: usize = 4096;
-/// ... and the fewest that tell a contrast.
+/// ... and the fewest that tell a contrast, or, of twice as many, a sway: fewer may be those of a target.
 const LEAST_SAMPLES: usize = 100;
+const LEAST_TEXTURED: usize = 40;
+/// The contrast is told by cells that stand out by so many spreads, and never by more than this range: beyond it is another
+/// scene, or none.
+const CONTRAST_TOLD_BY: f32 = 4.0;
+const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
 /// Where and when an image was taken, for the background.
 #[derive(Clone, Copy, Debug)]
@@ -56,6 +64,16 @@ pub(super) struct Moment {
 pub(super) struct Cells {
     pub(super) columns: [usize; 2],
     pub(super) rows: [usize; 2],
+}
+
+impl Cells {
+    /// Whether they are in a cell's surroundings, or hold it: what covers them may stand out there.
+    fn are_near(&self, [x, y]: [usize; 2]) -> bool {
+        let is_near = |at: usize, [from, to]: [usize; 2]| {
+            at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
+        };
+        is_near(x, self.columns) && is_near(y, self.rows)
+    }
 }
 
 /// One scale.
@@ -140,7 +158,7 @@ impl Level {
         [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5)
     }
 
-    /// Which of the background's cells a place of the image is in.
+    /// A place of the image in the background's cells: whole numbers are their middles.
     pub(super) fn cell_of(&self, place: [f64; 2]) -> [f64; 2] {
         [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
     }
@@ -150,8 +168,8 @@ impl Level {
         self.contrast * between(&self.mean, self.cell_of(place))
     }
 
-    /// What has come of what stands out at a cell: 1 if the background has nothing there, 0 if it has the same.
-    pub(super) fn share_come(&self, [x, y]: [usize; 2]) -> f32 {
+    /// What share of what stands out at a cell is new: 1 if the background has nothing there, 0 if it has the same.
+    pub(super) fn new_share(&self, [x, y]: [usize; 2]) -> f32 {
         let now = self.now.row(y)[x];
         if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
     }
@@ -165,7 +183,7 @@ impl Level {
     /// How much the scene about a cell stands out by itself, in spreads: the median over the ring from the end of the
     /// cell's surroundings to twice that.
     pub(super) fn texture_about(&mut self, [x, y]: [usize; 2]) -> f32 {
-        let reach = 2 * super::filter::SURROUNDINGS as isize + 1;
+        let reach = 2 * SURROUNDINGS as isize + 1;
         self.scratch.clear();
         for down in (-reach..=reach).step_by(2) {
             for right in (-reach..=reach).step_by(2) {
@@ -186,7 +204,9 @@ impl Level {
             self.variance.reshape(self.now.width(), self.now.height());
             self.variance.samples_mut().fill(0.0);
         }
-        self.compare(moment.interval);
+        if !moment.is_first {
+            self.compare(moment.interval, known);
+        }
         self.learn(moment.share, known);
         self.remember_changes();
     }
@@ -212,15 +232,18 @@ impl Level {
     }
 
     /// Takes this image's changes, and what they tell of the light, the noise and the sway.
-    fn compare(&mut self, interval: f64) {
+    fn compare(&mut self, interval: f64, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         let step = (width * height / SAMPLES) | 1;
         let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
         self.scratch.clear();
-        self.scratch
-            .extend(cells().filter(|(mean, _)| mean.abs() > 4.0 * self.spread).map(|(mean, now)| now / mean));
+        self.scratch.extend(
+            cells()
+                .filter(|(mean, _)| mean.abs() > CONTRAST_TOLD_BY * self.spread)
+                .map(|(mean, now)| now / mean),
+        );
         let told = self.scratch.len() >= LEAST_SAMPLES;
-        self.contrast = if told { median(&mut self.scratch).clamp(0.5, 2.0) } else { 1.0 };
+        self.contrast = if told { median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1]) } else { 1.0 };
         self.scratch.clear();
         self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
         self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
@@ -232,7 +255,7 @@ impl Level {
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
             let slope = slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
-            if probe * slope > noise {
+            if probe * slope > noise && !known.iter().any(|cells| cells.are_near([i % width, i / width])) {
                 let usual = self.variance.samples()[i].max(noise);
                 let expected = probe * slope + usual;
                 let change = self.now.samples()[i] - self.contrast * mean[i];
@@ -242,8 +265,7 @@ impl Level {
                 changes += ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
             }
         }
-        // Fewer cells may be those of a target.
-        let is_told = told_by >= SAMPLES / 100;
+        let is_told = told_by >= LEAST_TEXTURED;
         self.is_lost = is_told && changed as f32 > MOST_CHANGED * told_by as f32;
         if is_told {
             let told = (changes / slopes).clamp(least, most);
@@ -257,15 +279,15 @@ impl Level {
     fn learn(&mut self, share: f32, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         self.change.reshape(width, height);
-        let lesson =
-            Lesson { share, noise: self.spread * self.spread, sway: self.sway, contrast: self.contrast };
+        let update =
+            CellUpdate { share, noise: self.spread * self.spread, sway: self.sway, contrast: self.contrast };
         for y in 0..height {
             let (above, below) = (self.mean.row(y.saturating_sub(1)), self.mean.row((y + 1).min(height - 1)));
-            lesson.textures(above, self.mean.row(y), below, &mut self.scratch);
+            update.textures(above, self.mean.row(y), below, &mut self.scratch);
             let change = self.change.row_mut(y);
             change.fill(0.0);
             for [from, to] in free_of(known, y, width) {
-                lesson.learn(Row {
+                update.learn(Row {
                     now: &self.now.row(y)[from..to],
                     textures: &self.scratch[from..to],
                     mean: &mut self.mean.row_mut(y)[from..to],
@@ -299,9 +321,9 @@ fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -> f32 {
     0.25 * ((right - left) * (right - left) + (below - above) * (below - above))
 }
 
-/// What one image teaches the background.
+/// How one image changes the background's cells.
 #[derive(Clone, Copy, Debug)]
-struct Lesson {
+struct CellUpdate {
     share: f32,
     noise: f32,
     sway: f32,
@@ -318,7 +340,7 @@ struct Row<'a> {
     change: &'a mut [f32],
 }
 
-impl Lesson {
+impl CellUpdate {
     /// Variances by which a row changes where the scene sways and the light varies.
     fn textures(self, above: &[f32], here: &[f32], below: &[f32], to: &mut Vec<f32>) {
         let Self { sway, .. } = self;

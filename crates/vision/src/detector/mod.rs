@@ -30,29 +30,33 @@ const LEAST_CELLS: usize = 18;
 /// How long the background is learnt before anything is found, s, and in how many images at least.
 const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
-/// Fewest plots of what is found.
+/// Fewest plots of what is found: two are a line, however far apart.
 const LEAST_PLOTS: u32 = 3;
-/// What is found has moved by more than so many times the scene's sway, ...
+/// What is found has moved by more than so many times the scene's sway: a swing of twice its root mean square is common, ...
 const SWAYS: f64 = 3.0;
-/// ... and the error of a plot's place: that of a cell over its strength, twice.
+/// ... and twice the error of a plot's place, a cell over its strength. With half of either branches are found, with twice as
+/// much a hovering drone takes seconds longer.
 const PLACE_ERRORS: f64 = 2.0;
 /// Nats asked for above the odds of chance, as images of a minute are not as many as they seem: noise, clouds and leaves
 /// of one image are those of the next. With 2 less, real scenes without targets give three false tracks a minute.
 const NOT_INDEPENDENT: f64 = 4.0;
 /// Fewest chances a minute that are reckoned with: before there has been a minute, nobody knows.
 const LEAST_CHANCES: f64 = 600.0;
-/// A known thing is covered with this much about it: a share of its sides, and px.
+/// A known thing is covered with this much about it: a share of its sides, and px. With half of it rotors and shadows beyond the
+/// box are found as others.
 const COVER: [f64; 2] = [0.25, 2.0];
-/// Sides of a target in cells of the scale at which it stands out.
+/// Sides of a target in cells of the scale at which it stands out most.
 const TARGET_CELLS: f64 = 2.5;
 /// Half side of the part of the image in which it is told how a target stands out, cells.
 const PART_CELLS: usize = filter::SURROUNDINGS + 2;
-/// What has come must be at least this share of what stands out, and that this share of what a plot has at least; ...
-const COME: f32 = 0.35;
+/// A watched thing is new in an image if the background lacks at least this share of what stands out (with half of it clouds
+/// and changing light make the scene new, with twice as much a target in front of its like is the scene), ...
+const NEW: f32 = 0.35;
+/// ... and if that is at least this share of the least strength of a plot.
 const STANDS_OUT: f32 = 0.7;
-/// ... what has in less than this share of the images of so long, s, is the scene.
-const LEAST_COME: f64 = 0.3;
-const COME_S: f64 = 0.5;
+/// Below this share of the latest images, a mean over so long, s, it is the scene, and given up.
+const LEAST_NEW: f64 = 0.3;
+const NEW_S: f64 = 0.5;
 
 /// Something that is followed already.
 #[derive(Clone, Copy, Debug)]
@@ -88,8 +92,8 @@ struct Watch {
     place: [f64; 2],
     /// By how much it stands out in this image, levels.
     stands_out: f32,
-    /// Share of the latest images in which it had come.
-    come: f64,
+    /// Share of the latest images in which it was new.
+    share_new: f64,
 }
 
 /// Finds what differs from the background.
@@ -176,7 +180,7 @@ impl Detector {
             let stands_out = stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
             match self.watches.iter_mut().find(|watch| watch.id == known.id) {
                 Some(watch) => (watch.level, watch.place, watch.stands_out) = (level, place, stands_out),
-                None => self.watches.push(Watch { id: known.id, level, place, stands_out, come: 1.0 }),
+                None => self.watches.push(Watch { id: known.id, level, place, stands_out, share_new: 1.0 }),
             }
         }
     }
@@ -184,7 +188,7 @@ impl Detector {
     /// Takes the image into the background of every scale, but for what is known.
     fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[Known]) {
         // A young background is the mean of what there was; an old one forgets.
-        let young = 1.0 / f64::from(self.images + 1);
+        let young = 1.0 / (f64::from(self.images) + 1.0);
         let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
         let moment = Moment { turned, interval, share, is_first: self.images == 0 };
         for index in 0..self.levels.len() {
@@ -196,21 +200,23 @@ impl Detector {
             let covered: Vec<Cells> = known.iter().map(|known| cells_of(level, &known.place)).collect();
             level.see(moment, &covered);
         }
+        if self.images > 0 {
+            self.age_s += interval;
+        }
         self.images = self.images.saturating_add(1);
-        self.age_s += interval;
     }
 
     /// Which of the watched are the scene.
     fn judge(&mut self, interval: f64) -> Vec<ImageTrackId> {
-        let share = 1.0 - (-interval / COME_S).exp();
+        let share = 1.0 - (-interval / NEW_S).exp();
         for watch in &mut self.watches {
             let level = &self.levels[watch.level];
-            let come = watch.stands_out - level.background(watch.place);
-            let has_come = watch.stands_out.abs() > STANDS_OUT * level.least_strength() * level.spread
-                && come.abs() >= COME * watch.stands_out.abs();
-            watch.come += share * (f64::from(u8::from(has_come)) - watch.come);
+            let excess = watch.stands_out - level.background(watch.place);
+            let is_new = watch.stands_out.abs() > STANDS_OUT * level.least_strength() * level.spread
+                && excess.abs() >= NEW * watch.stands_out.abs();
+            watch.share_new += share * (f64::from(u8::from(is_new)) - watch.share_new);
         }
-        self.watches.extract_if(.., |watch| watch.come < LEAST_COME).map(|watch| watch.id).collect()
+        self.watches.extract_if(.., |watch| watch.share_new < LEAST_NEW).map(|watch| watch.id).collect()
     }
 
     fn find(&mut self, image: &Plane, interval: f64, turned: [f64; 2], known: &[Known]) -> Vec<Found> {
@@ -261,8 +267,9 @@ fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
 
 /// The cells of a scale's background that a known thing covers.
 fn cells_of(level: &Level, place: &PixelBox) -> Cells {
-    let [first, last] = covered(place).map(|corner| level.cell_of(corner).map(|at| at.max(0.0) as usize));
-    Cells { columns: [first[0], last[0] + 1], rows: [first[1], last[1] + 1] }
+    let [first, last] = covered(place).map(|corner| level.cell_of(corner).map(f64::round));
+    let range = |axis: usize| [first[axis].max(0.0) as usize, (last[axis] + 1.0).max(0.0) as usize];
+    Cells { columns: range(0), rows: range(1) }
 }
 
 /// Paints a known thing over with what is left and right of it, so that it hides nothing about it.
@@ -277,21 +284,24 @@ fn cover(reduced: &mut Plane, place: &PixelBox) {
     let columns = (last[0] - first[0]) as f32;
     for y in first[1]..last[1] {
         let row = reduced.row_mut(y);
-        let (left, right) = (row[first[0].saturating_sub(1)], row[last[0].min(row.len() - 1)]);
+        // At the picture's edge there is one side alone, and where it covers all none.
+        let left = first[0].checked_sub(1).map(|x| row[x]);
+        let Some(left) = left.or(row.get(last[0]).copied()) else { continue };
+        let right = row.get(last[0]).copied().unwrap_or(left);
         for (x, sample) in row[first[0]..last[0]].iter_mut().enumerate() {
             *sample = left + (right - left) * (x as f32 + 0.5) / columns;
         }
     }
 }
 
-/// Whether the middle of either box is in the other.
+/// Whether two boxes' middles are apart by no more than half the larger side on either axis.
 fn overlap(one: &PixelBox, other: &PixelBox) -> bool {
     let (a, b) = (one.centre(), other.centre());
     (a.x - b.x).abs() <= one.width.max(other.width) / 2.0
         && (a.y - b.y).abs() <= one.height.max(other.height) / 2.0
 }
 
-/// Whether a plot lies in a box or within its sides of it.
+/// Whether a plot is within half a box's sides of it, and two of the plot's cells of its middle at least.
 fn touches(known: &PixelBox, plot: &Plot) -> bool {
     let ImagePoint { x, y } = known.centre();
     let reach = |side: f64| side.max(2.0 * plot.cell);

@@ -1,4 +1,5 @@
-//! The box of what has been found: all that stands out about a plot as it does.
+//! The box of what has been found: all that differs from what is about it, brighter or darker, and is connected with
+//! the plot.
 
 use crossfix_correlation::Plane;
 
@@ -7,7 +8,8 @@ use super::plots::Plot;
 use crate::mend::mend;
 use crate::{ImagePoint, PixelBox};
 
-/// Half sides of the window, in cells and at most in pixels: doubled until what is found lies inside.
+/// Half sides of the window, the first in cells and the largest in pixels: doubled until what is found lies inside. A target of
+/// 50 px and its surroundings fit.
 const FIRST_REACH_CELLS: f64 = 4.0;
 const MOST_REACH: usize = 64;
 /// What is found reaches to where it stands out by less than this share of its top ...
@@ -52,10 +54,7 @@ fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> 
 
     let mut gap = (plot.cell / 4.0).ceil() as usize;
     loop {
-        let [low, high] = connected(&window, seed, gap, |level| (level - around).abs() >= threshold);
-        if low.contains(&0) || high.contains(&(side - 1)) {
-            return None;
-        }
+        let [low, high] = connected(&window, seed, gap, |level| (level - around).abs() >= threshold)?;
         let sides = [0, 1].map(|i| high[i] - low[i] + 1);
         let wider = (GAP * sides[0].max(sides[1]) as f64) as usize;
         if wider <= gap {
@@ -76,13 +75,21 @@ fn smoothed(image: &Plane, corner: [isize; 2], side: usize) -> Plane {
     })
 }
 
-/// The corners of what counts and is connected with a place, over gaps of so many pixels.
-fn connected(window: &Plane, seed: [usize; 2], gap: usize, counts: impl Fn(f32) -> bool) -> [[usize; 2]; 2] {
+/// The corners of what counts and is connected with a place, over gaps of so many pixels; `None` if it reaches the border.
+fn connected(
+    window: &Plane,
+    seed: [usize; 2],
+    gap: usize,
+    counts: impl Fn(f32) -> bool,
+) -> Option<[[usize; 2]; 2]> {
     let (width, height) = (window.width(), window.height());
     let mut is_open: Vec<bool> = window.samples().iter().map(|level| counts(*level)).collect();
     let mut stack = vec![seed];
     let (mut low, mut high) = (seed, seed);
     while let Some([x, y]) = stack.pop() {
+        if x.min(y) == 0 || x == width - 1 || y == height - 1 {
+            return None;
+        }
         (low, high) = ([low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]);
         for ny in y.saturating_sub(gap)..=(y + gap).min(height - 1) {
             for nx in x.saturating_sub(gap)..=(x + gap).min(width - 1) {
@@ -92,5 +99,5 @@ fn connected(window: &Plane, seed: [usize; 2], gap: usize, counts: impl Fn(f32) 
             }
         }
     }
-    [low, high]
+    Some([low, high])
 }

@@ -7,12 +7,14 @@ use crate::ImagePoint;
 
 /// What stands out by less than this share of the change under it is not what came, but what went.
 const LEAST_OF_CHANGE: f32 = 0.5;
-/// Share of what stands out that has come, least and most: less is the scene itself, and more has come in the place of
-/// something else that went.
+/// Share of what stands out that the background does not have, least and most: less is the scene itself, and more is in the
+/// place of its opposite that went. With 0.1 a slow target is found when it has gone by a tenth of its size, with 3 the place
+/// that a target has left is another target.
 const SHARES: [f32; 2] = [0.02, 1.5];
-/// Within so many cells one thing makes one plot, ...
+/// Within so many cells one thing makes one plot: it is two or three cells large. ...
 const APART: f64 = 3.0;
-/// ... and a darker ring about a bright one (and the other way round) within so many, of at most this share of it.
+/// ... A darker ring about a bright one (and the other way round) reaches as far as its surroundings do from its ends, and has
+/// at most the share of it that a square of three cells has in one of nine, thrice: of several parts.
 const RING: f64 = 7.0;
 const MOST_OF_RING: f32 = 0.4;
 /// Most plots of an image, those that stand out most. Enough for fifty targets and as much noise.
@@ -29,8 +31,8 @@ pub(super) struct Plot {
     pub(super) cell: f64,
     /// By how much it stands out, in spreads of the scale.
     pub(super) strength: f32,
-    /// How much of that has come, in spreads.
-    pub(super) come: f32,
+    /// By how much of that the background does not, in spreads.
+    pub(super) excess: f32,
     /// How much the scene about it stands out by itself beyond noise, in spreads.
     pub(super) texture: f32,
     /// How much of the noise lasts from image to image, 0 to 1.
@@ -101,7 +103,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
         top = greatest_about(&level.now, top, standing);
     }
     let strength = standing(level.now.row(top[1])[top[0]]) / level.spread;
-    let share = level.share_come(top);
+    let share = level.new_share(top);
     if strength < level.least_strength().max(LEAST_OF_CHANGE * change.abs())
         || !(SHARES[0]..SHARES[1]).contains(&share)
     {
@@ -127,7 +129,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
         level: index,
         cell: level.cell() as f64,
         strength,
-        come: strength * share.min(1.0),
+        excess: strength * share.min(1.0),
         texture,
         persistence: level.persistence,
     })

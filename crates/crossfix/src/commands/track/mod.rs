@@ -32,8 +32,8 @@ use table::Table;
 pub struct Args {
     /// The video: .mp4 (H.264), .avi (Motion JPEG), .y4m, or a folder of PNG or JPEG images.
     video: PathBuf,
-    /// A target in the first frame: left,top,width,height in pixels. May be given several times: the
-    /// targets have the numbers 1, 2, ... in that order.
+    /// A target in the first frame that is followed (see --from): left,top,width,height in pixels. May
+    /// be given several times: the targets have the numbers 1, 2, ... in that order.
     #[arg(long = "box", value_name = "X,Y,W,H")]
     places: Vec<BoxArg>,
     /// Find targets, beside those of the boxes. Without a box that is done anyway.
@@ -79,7 +79,7 @@ impl FromStr for BoxArg {
         if place.is_possible() {
             Ok(Self(place))
         } else {
-            Err("a box has sides of 1 to 1000 pixels".to_owned())
+            Err("a box has sides of 1 to 1000 pixels, and a corner in or near the image".to_owned())
         }
     }
 }
@@ -104,6 +104,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
         let image = read.as_ref().and_then(eye::brightness);
         let (Some(frame), Some(image)) = (&read, &image) else {
+            if read.is_some() {
+                tracing::warn!("frame {index} has no pixels; going on");
+            }
             table.write(index, &[], 0.0)?;
             continue;
         };
