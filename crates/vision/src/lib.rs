@@ -45,10 +45,22 @@ mod search;
 mod target;
 mod tracker;
 
+use std::fmt;
+
 pub use config::{Algorithm, ConfigError, DetectorConfig, GateRule, PaperConfig, TrackerConfig};
 pub use frame::Measurement;
 pub use reference::{ImmConfig, PixelImm, ReferenceStrategy};
-pub use tracker::{ImageTrack, ImageTrackId, ImageTracker, TrackPhase};
+pub use tracker::{ImageTrack, ImageTracker, TrackPhase};
+
+/// Number of a 2D track, unique within its image stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct ImageTrackId(pub u64);
+
+impl fmt::Display for ImageTrackId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
 
 /// A place in the image, pixels; (0, 0) is the middle of the top left pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,5 +1,3 @@
-use std::fmt;
-
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
@@ -10,22 +8,12 @@ use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
 use crate::target::{Target, Workbench};
-use crate::{ConfigError, ImagePoint, PixelBox, TrackerConfig};
+use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// Steps longer or shorter than these are taken as these: after a pause nothing is known of a target
 /// anyway, and no camera is that fast.
 const LONGEST_INTERVAL: f64 = 1.0;
 const SHORTEST_INTERVAL: f64 = 1e-4;
-
-/// Number of a 2D track, unique within its image stream.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct ImageTrackId(pub u64);
-
-impl fmt::Display for ImageTrackId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
-    }
-}
 
 /// The life of a 2D track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

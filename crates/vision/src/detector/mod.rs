@@ -16,8 +16,7 @@ mod plots;
 use crossfix_correlation::Plane;
 
 use crate::mend::mend;
-use crate::tracker::ImageTrackId;
-use crate::{DetectorConfig, ImagePoint, PixelBox};
+use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
 use filter::{Lines, between, halve, stand_out};
 use level::{Cells, Level, Moment};
