@@ -54,13 +54,19 @@ fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> 
 
     let mut gap = (plot.cell / 4.0).ceil() as usize;
     loop {
-        let [low, high] = connected(&window, seed, gap, |level| (level - around).abs() >= threshold)?;
-        let sides = [0, 1].map(|i| high[i] - low[i] + 1);
-        let wider = (GAP * sides[0].max(sides[1]) as f64) as usize;
+        let off = |level: f32| (level - around).abs();
+        let Region { low, high, middle } =
+            connected(&window, seed, gap, |level| if off(level) >= threshold { off(level) } else { 0.0 })?;
+        let longest = (high[0] - low[0]).max(high[1] - low[1]) + 1;
+        let wider = (GAP * longest as f64) as usize;
         if wider <= gap {
-            let [width, height] = sides.map(|side| (side as f64).max(LEAST_SIDE));
-            let [x, y] = [0, 1].map(|i| corner[i] as f64 + (low[i] + high[i]) as f64 / 2.0);
-            return Some(PixelBox::about(ImagePoint { x, y }, width, height));
+            // About the middle of what stands out, which is the same for cameras on all sides; a box's own is not.
+            let side = |i: usize| {
+                let reach = (middle[i] - low[i] as f64).max(high[i] as f64 - middle[i]);
+                (2.0 * reach + 1.0).ceil().max(LEAST_SIDE)
+            };
+            let [x, y] = [0, 1].map(|i| corner[i] as f64 + middle[i]);
+            return Some(PixelBox::about(ImagePoint { x, y }, side(0), side(1)));
         }
         gap = wider;
     }
@@ -75,29 +81,37 @@ fn smoothed(image: &Plane, corner: [isize; 2], side: usize) -> Plane {
     })
 }
 
-/// The corners of what counts and is connected with a place, over gaps of so many pixels; `None` if it reaches the border.
-fn connected(
-    window: &Plane,
-    seed: [usize; 2],
-    gap: usize,
-    counts: impl Fn(f32) -> bool,
-) -> Option<[[usize; 2]; 2]> {
+/// What is connected: its corners, and the middle of its weights.
+#[derive(Clone, Copy, Debug)]
+struct Region {
+    low: [usize; 2],
+    high: [usize; 2],
+    middle: [f64; 2],
+}
+
+/// What has a weight and is connected with a place, over gaps of so many pixels; `None` if it reaches the border.
+fn connected(window: &Plane, seed: [usize; 2], gap: usize, weight: impl Fn(f32) -> f32) -> Option<Region> {
     let (width, height) = (window.width(), window.height());
-    let mut is_open: Vec<bool> = window.samples().iter().map(|level| counts(*level)).collect();
-    let mut stack = vec![seed];
+    let mut weights: Vec<f32> = window.samples().iter().map(|level| weight(*level)).collect();
     let (mut low, mut high) = (seed, seed);
-    while let Some([x, y]) = stack.pop() {
+    let (mut sum, mut moments) = (0.0, [0.0; 2]);
+    let mut stack = vec![(seed, std::mem::take(&mut weights[seed[1] * width + seed[0]]))];
+    while let Some(([x, y], weight)) = stack.pop() {
         if x.min(y) == 0 || x == width - 1 || y == height - 1 {
             return None;
         }
+        let weight = f64::from(weight);
+        sum += weight;
+        moments = [moments[0] + weight * x as f64, moments[1] + weight * y as f64];
         (low, high) = ([low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]);
         for ny in y.saturating_sub(gap)..=(y + gap).min(height - 1) {
             for nx in x.saturating_sub(gap)..=(x + gap).min(width - 1) {
-                if std::mem::take(&mut is_open[ny * width + nx]) {
-                    stack.push([nx, ny]);
+                let weight = std::mem::take(&mut weights[ny * width + nx]);
+                if weight > 0.0 {
+                    stack.push(([nx, ny], weight));
                 }
             }
         }
     }
-    Some([low, high])
+    (sum > 0.0).then(|| Region { low, high, middle: moments.map(|moment| moment / sum) })
 }
