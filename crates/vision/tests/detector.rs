@@ -106,6 +106,11 @@ fn watch(
     }
 }
 
+/// A spot from a time on.
+fn from(begin_s: f64, spot: impl Fn(f64) -> Spot) -> impl Fn(f64) -> Vec<Spot> {
+    move |time_s| if time_s < begin_s { Vec::new() } else { vec![spot(time_s)] }
+}
+
 fn is_at(track: &ImageTrack, spot: &Spot, within: f64) -> bool {
     (track.position.x - spot.x).hypot(track.position.y - spot.y) <= within
 }
@@ -119,21 +124,16 @@ fn what_comes_is_found_once_within_half_a_second() {
             let spot =
                 |time_s: f64| Spot { x: 30.0 + 70.0 * (time_s - 2.0), y: 60.0, spread: [4.0, 2.5], brighter };
             let (mut found_s, mut numbers) = (None, Vec::new());
-            watch(
-                &mut world,
-                4.0,
-                |time_s| if time_s < 2.0 { Vec::new() } else { vec![spot(time_s)] },
-                |time_s, tracks| {
-                    for track in tracks {
-                        assert!(
-                            time_s >= 2.0 && is_at(track, &spot(time_s), 8.0),
-                            "{seed} at {time_s}: {track:?}"
-                        );
-                        found_s.get_or_insert(time_s);
-                        numbers.push(track.id);
-                    }
-                },
-            );
+            watch(&mut world, 4.0, from(2.0, spot), |time_s, tracks| {
+                for track in tracks {
+                    assert!(
+                        time_s >= 2.0 && is_at(track, &spot(time_s), 8.0),
+                        "{seed} at {time_s}: {track:?}"
+                    );
+                    found_s.get_or_insert(time_s);
+                    numbers.push(track.id);
+                }
+            });
             numbers.dedup();
             assert!(found_s.is_some_and(|found_s| found_s <= 2.5), "{seed}, {brighter}: {found_s:?}");
             assert_eq!(numbers.len(), 1, "{seed}, {brighter}");
@@ -222,17 +222,12 @@ fn a_shaken_camera_finds_what_comes_and_nothing_else() {
     let spot =
         |time_s: f64| Spot { x: 30.0 + 60.0 * (time_s - 3.0), y: 50.0, spread: [4.0, 2.5], brighter: 100.0 };
     let mut seen = 0;
-    watch(
-        &mut world,
-        5.0,
-        |time_s| if time_s < 3.0 { Vec::new() } else { vec![spot(time_s)] },
-        |time_s, tracks| {
-            assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
-            let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 8.0));
-            assert!(is_there, "at {time_s}: {tracks:?}");
-            seen += usize::from(time_s >= 3.5 && !tracks.is_empty());
-        },
-    );
+    watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
+        assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
+        let is_there = tracks.iter().all(|track| is_at(track, &spot(time_s), 8.0));
+        assert!(is_there, "at {time_s}: {tracks:?}");
+        seen += usize::from(time_s >= 3.5 && !tracks.is_empty());
+    });
     assert!(seen >= 44, "in {seen} of 45 images");
 }
 
@@ -246,16 +241,11 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
     let spot =
         |time_s: f64| Spot { x: 20.0 + 50.0 * (time_s - 3.0), y: 120.0, spread: [4.0, 3.0], brighter: 100.0 };
     let mut seen = 0;
-    watch(
-        &mut world,
-        5.0,
-        |time_s| if time_s < 3.0 { Vec::new() } else { vec![spot(time_s)] },
-        |time_s, tracks| {
-            let on_it = tracks.iter().filter(|track| is_at(track, &spot(time_s), 8.0)).count();
-            assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
-            seen += usize::from(time_s >= 4.0 && on_it == 1);
-        },
-    );
+    watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
+        let on_it = tracks.iter().filter(|track| is_at(track, &spot(time_s), 8.0)).count();
+        assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
+        seen += usize::from(time_s >= 4.0 && on_it == 1);
+    });
     assert!(seen >= 28, "in {seen} of 30 images");
 }
 
@@ -304,17 +294,12 @@ fn what_flies_out_of_the_picture_leaves_no_track_on_the_scene() {
         brighter: 110.0,
     };
     let (mut was_found, mut last_s) = (false, 0.0);
-    watch(
-        &mut world,
-        7.0,
-        |time_s| if time_s < 1.0 { Vec::new() } else { vec![spot(time_s)] },
-        |time_s, tracks| {
-            was_found |= tracks.iter().any(|track| is_at(track, &spot(time_s), 6.0));
-            if !tracks.is_empty() {
-                last_s = time_s;
-            }
-        },
-    );
+    watch(&mut world, 7.0, from(1.0, spot), |time_s, tracks| {
+        was_found |= tracks.iter().any(|track| is_at(track, &spot(time_s), 6.0));
+        if !tracks.is_empty() {
+            last_s = time_s;
+        }
+    });
     // It is outside from 2.3 s on, and given up half a second after it was seen last.
     assert!(was_found && last_s < 3.3, "{was_found}, {last_s}");
 }

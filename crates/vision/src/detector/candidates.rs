@@ -21,8 +21,9 @@ const SCALES: f64 = 2.5;
 /// A plot tells at most so much (logarithm of a likelihood ratio): an empty corner of the map is not known to be empty.
 const MOST_OF_PLOT: f64 = 4.0;
 /// Plots of something that keeps to its place tell at most so much together: what comes and goes in the same place, as
-/// a branch in the wind, makes as many as a target. With half of it a target needs to stand out by twice as much, with
-/// twice as much branches are found.
+/// a branch in the wind, makes as many as a target. With half of it false tracks are 0.4 and 1.5 a minute
+/// (thermal, visible) in place of 1.1 and 3.1, but what a shaken camera sees in noise is found in 76 % of the images in place
+/// of 89; with twice as much they are 13 and 49.
 const MOST_IN_PLACE: f64 = 8.0;
 /// ... and so much more where noise does not last: then what lasts is less likely to be nothing.
 const MOST_IN_NOISE: f64 = 4.0;
@@ -31,8 +32,8 @@ const PLACE_CELLS: f64 = 6.0;
 /// ... of which so many are counted: what jumps from branch to branch has gone far too.
 const MOST_PLACES: f64 = 10.0;
 /// The scene's own changes fall off with size as the exponential of so many of its textures: compressed video has more
-/// large ones than a normal distribution. With half of it branches are found, with twice as much targets in front of trees
-/// are not.
+/// large ones than a normal distribution. With twice as much 89.0 % of the thermal frames have their target in place of
+/// 90.6, and false tracks are 0.4 and 1.9 a minute.
 const TAIL: f64 = 1.5;
 /// What it takes to stand out for a target, nats. Strengths from one to two hundred, uniform in their logarithm, give
 /// `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without targets.
