@@ -30,6 +30,9 @@ pub struct TrackerConfig {
     pub start_velocity_sd_px: f64,
     /// Standard deviation of a place that is given (a box, a cue), px. Default 0.1.
     pub given_sd_px: f64,
+    /// How far beside its target a box may be given, standard deviation, px: one that is too large or lies beside what
+    /// stands out there is moved onto it. 0 takes every box as it is. Default 4.
+    pub box_sd_px: f64,
     /// Standard deviation of the box's centre about the target's own, px: the same in all images of a
     /// track, and part of every covariance that is answered. Default 0.1.
     pub centre_sd_px: f64,
@@ -136,6 +139,7 @@ impl Default for TrackerConfig {
             acceleration_sd_px: 900.0,
             start_velocity_sd_px: 120.0,
             given_sd_px: 0.1,
+            box_sd_px: 4.0,
             centre_sd_px: 0.1,
             prediction_floor_px: 0.3,
             mismatch: 30.0,
@@ -222,6 +226,8 @@ impl TrackerConfig {
         }
         let centre = self.centre_sd_px;
         check("centre_sd_px", centre, (0.0..=100.0).contains(&centre), "from 0 to 100 px")?;
+        let given = self.box_sd_px;
+        check("box_sd_px", given, (0.0..=100.0).contains(&given), "from 0 to 100 px")?;
         let within = |value: f64| value > 0.0 && value < 1.0;
         let visible = self.visible_probability;
         check("visible_probability", visible, within(visible), "between 0 and 1")?;

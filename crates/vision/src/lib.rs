@@ -29,6 +29,7 @@ mod appearance;
 mod arrival;
 mod config;
 mod detector;
+mod figure;
 mod frame;
 mod identity;
 mod lanes;

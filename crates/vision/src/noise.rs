@@ -4,8 +4,14 @@ use crossfix_correlation::Plane;
 const SAMPLES: usize = 200;
 /// The response of the mask to white noise: the root of the sum of its squared weights.
 const MASK_GAIN: f32 = 6.0;
-/// Median of the absolute value of a normal variable.
-const MEDIAN_OF_NORMAL: f32 = 0.6745;
+/// Standard deviation of a normal distribution over its median absolute deviation.
+pub(crate) const OF_MEDIAN: f32 = 1.4826;
+
+/// The middle of values in their order, which is lost; 0 of none.
+pub(crate) fn median(values: &mut [f32]) -> f32 {
+    let middle = values.len() / 2;
+    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
+}
 
 /// Estimates the noise of an image from the image: the second difference of second differences, to
 /// which a smooth scene is zero, and its median, to which edges are outliers.
@@ -31,12 +37,7 @@ impl NoiseMeter {
                 self.responses.push((corners - 2.0 * sides + 4.0 * b[1]).abs());
             }
         }
-        let middle = self.responses.len() / 2;
-        if middle == 0 {
-            return floor * floor;
-        }
-        let (_, median, _) = self.responses.select_nth_unstable_by(middle, f32::total_cmp);
-        let deviation = *median / (MEDIAN_OF_NORMAL * MASK_GAIN);
+        let deviation = OF_MEDIAN * median(&mut self.responses) / MASK_GAIN;
         (deviation * deviation).max(floor * floor)
     }
 }

@@ -4,6 +4,7 @@ use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
 use crate::detector::{Detector, Known};
+use crate::figure::meant;
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
@@ -413,6 +414,17 @@ impl ImageTracker {
         found.collect()
     }
 
+    /// The box of the target that a given box was meant for.
+    fn meant(&mut self, image: &Plane, place: PixelBox, origin: Origin) -> PixelBox {
+        let TrackerConfig { algorithm, box_sd_px, noise_floor, .. } = self.config;
+        let as_given = algorithm == Algorithm::Paper || origin != Origin::Given || box_sd_px <= 0.0;
+        if as_given {
+            return place;
+        }
+        let noise = self.bench.meter.variance(image, noise_floor as f32);
+        meant(image, place, box_sd_px, noise.sqrt())
+    }
+
     fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting).into_iter().map(|place| (place, Origin::Given));
         let mut new: Vec<(PixelBox, Origin)> = given.collect();
@@ -420,6 +432,7 @@ impl ImageTracker {
         for (place, origin) in new {
             let id = ImageTrackId(self.next_id);
             self.next_id += 1;
+            let place = self.meant(image, place, origin);
             let target = Follower::new(image, place, &mut self.bench, &self.config);
             let followed = Followed { id, origin, target, measured_at: time, searched: None, cue: None };
             let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };

@@ -128,15 +128,6 @@ pub(super) fn between(plane: &Plane, [x, y]: [f64; 2]) -> f32 {
     above + down * (below - above)
 }
 
-/// The middle of values in their order, which is lost; 0 of none.
-pub(super) fn median(values: &mut [f32]) -> f32 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
-}
-
-/// Standard deviation of a normal distribution over its median absolute deviation.
-pub(super) const OF_MEDIAN: f32 = 1.4826;
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -4,7 +4,8 @@
 use crossfix_correlation::Plane;
 use pulp::Arch;
 
-use super::filter::{Lines, OF_MEDIAN, SURROUNDINGS, between, median, moved, resample, stand_out};
+use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
+use crate::noise::{OF_MEDIAN, median};
 
 /// Of a squared change beyond this many variances only so much is learnt: what comes by is no noise of the place. With
 /// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind.

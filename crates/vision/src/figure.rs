@@ -1,0 +1,246 @@
+//! Figure and ground: the part of an image that stands out from what is about it, brighter or darker.
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+use std::ops::RangeInclusive;
+
+use crossfix_correlation::Plane;
+
+use crate::mend::mend;
+use crate::noise::{OF_MEDIAN, median};
+use crate::{ImagePoint, PixelBox};
+
+/// The figure reaches to where it stands out by less than this share of its top ...
+const SHARE_OF_TOP: f32 = 0.3;
+/// ... or by less than so many standard deviations of the ground, but not further up than half of the top.
+const ABOVE_GROUND: f32 = 4.0;
+const MOST_OF_TOP: f32 = 0.5;
+/// Parts that are apart by less than this share of the longer side are one thing: rotors, legs and the body.
+const GAP: f64 = 0.35;
+/// How far a given box may lie beside its target, standard deviations: further off it is another thing's.
+const FURTHEST: f64 = 2.5;
+/// Windows that its figure is sought in, from as wide as that down to the box itself: what stands out beside the box
+/// (a house below a drone) is in none of the last.
+const WINDOWS: u32 = 4;
+/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a box twice as large.
+const SIDES: RangeInclusive<usize> = 5..=256;
+/// Pixels about a figure that the widest window has beside.
+const GROUND_PX: f64 = 2.0;
+/// A figure is taken for the target if its top is so many standard deviations of the noise: in noise alone the highest of
+/// a thousand pixels is 4. With half of it boxes in noise are moved by noise, with twice as much only boxes on what the eye
+/// sees at once are mended.
+const LEAST_TOP: f32 = 6.0;
+/// ... and if this share of all that stands out is its own: else nobody knows which of two was meant.
+const LEAST_SHARE: f32 = 0.8;
+/// A box is right as it is if its figure is longer than this share of it, both ways, ...
+const LEAST_FILLED: f64 = 0.6;
+/// ... and lies in its middle to this share of its side, and a pixel: figures are known no better.
+const MOST_OFF: f64 = 0.15;
+
+/// A part of a window that is connected: its corners, the middle of its weights, and their sum.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Region {
+    low: [usize; 2],
+    high: [usize; 2],
+    middle: [f64; 2],
+    weight: f64,
+}
+
+impl Region {
+    /// Its box, of at least some sides, in the image whose pixel `corner` is the window's first.
+    ///
+    /// It lies about the middle of what stands out, which is the same for cameras on all sides; the corners' is not.
+    pub(crate) fn place(&self, corner: [isize; 2], least: [f64; 2]) -> PixelBox {
+        let Self { low, high, middle, .. } = *self;
+        let side = |i: usize| {
+            let reach = (middle[i] - low[i] as f64).max(high[i] as f64 - middle[i]);
+            (2.0 * reach + 1.0).ceil().max(least[i])
+        };
+        let [x, y] = [0, 1].map(|i| corner[i] as f64 + middle[i]);
+        PixelBox::about(ImagePoint { x, y }, side(0), side(1))
+    }
+}
+
+/// How far up what stands out by `top` is the figure, in ground of a standard deviation.
+fn threshold(top: f32, spread: f32) -> f32 {
+    (SHARE_OF_TOP * top).max(ABOVE_GROUND * spread).min(MOST_OF_TOP * top)
+}
+
+/// The figure about a place: all that stands out, and is connected with it over gaps; `None` if it goes on beyond the
+/// window.
+///
+/// `off` is by how much each pixel differs from a ground of standard deviation `spread`; `gap` is the least gap, px.
+pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize) -> Option<Region> {
+    let threshold = threshold(off.row(seed[1])[seed[0]], spread);
+    loop {
+        let region = connected(off, seed, gap, threshold)?;
+        let longest = (region.high[0] - region.low[0]).max(region.high[1] - region.low[1]) + 1;
+        let wider = (GAP * longest as f64) as usize;
+        if wider <= gap {
+            return Some(region);
+        }
+        gap = wider;
+    }
+}
+
+/// What is above a threshold and connected with a place, over gaps of so many pixels; `None` if it reaches the border.
+fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Option<Region> {
+    let (width, height) = (off.width(), off.height());
+    let weight = |level: &f32| if *level >= threshold { *level } else { 0.0 };
+    let mut weights: Vec<f32> = off.samples().iter().map(weight).collect();
+    let (mut low, mut high) = (seed, seed);
+    let (mut sum, mut moments) = (0.0, [0.0; 2]);
+    let mut stack = vec![(seed, std::mem::take(&mut weights[seed[1] * width + seed[0]]))];
+    while let Some(([x, y], weight)) = stack.pop() {
+        if x.min(y) == 0 || x == width - 1 || y == height - 1 {
+            return None;
+        }
+        let weight = f64::from(weight);
+        sum += weight;
+        moments = [moments[0] + weight * x as f64, moments[1] + weight * y as f64];
+        (low, high) = ([low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]);
+        for ny in y.saturating_sub(gap)..=(y + gap).min(height - 1) {
+            for nx in x.saturating_sub(gap)..=(x + gap).min(width - 1) {
+                let weight = std::mem::take(&mut weights[ny * width + nx]);
+                if weight > 0.0 {
+                    stack.push(([nx, ny], weight));
+                }
+            }
+        }
+    }
+    (sum > 0.0).then(|| Region { low, high, middle: moments.map(|moment| moment / sum), weight: sum })
+}
+
+/// Means of three by three pixels about those of a part of an image; beyond its border it is black.
+pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usize; 2]) -> Plane {
+    let mut part = image.crop(corner[0] - 1, corner[1] - 1, width + 2, height + 2);
+    mend(&mut part);
+    Plane::from_fn(width, height, |x, y| {
+        (y..y + 3).map(|y| part.row(y)[x..x + 3].iter().sum::<f32>()).sum::<f32>() / 9.0
+    })
+}
+
+/// By how much each pixel stands out of a window: how far one has to climb, or to descend, at least on every way from it
+/// to the border. What goes on beyond the border (a horizon, a mast) does not stand out, whatever it is like.
+fn standing_out(window: &Plane) -> Plane {
+    let upside_down = Plane::from_fn(window.width(), window.height(), |x, y| -window.row(y)[x]);
+    let [dark, bright] = [window, &upside_down].map(depths);
+    Plane::from_fn(window.width(), window.height(), |x, y| dark.row(y)[x].max(bright.row(y)[x]))
+}
+
+/// A pixel that the water has reached, at a level.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shore {
+    level: f32,
+    place: [usize; 2],
+}
+
+impl Eq for Shore {}
+
+impl Ord for Shore {
+    /// The lowest is the greatest: it is the next to be flooded.
+    fn cmp(&self, other: &Self) -> Ordering {
+        other.level.total_cmp(&self.level)
+    }
+}
+
+impl PartialOrd for Shore {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+/// How deep the water is on each pixel if it is poured over a landscape and runs off at its border (priority flood).
+fn depths(landscape: &Plane) -> Plane {
+    let (width, height) = (landscape.width(), landscape.height());
+    let mut surface = Plane::from_fn(width, height, |_, _| f32::INFINITY);
+    let mut shores = BinaryHeap::new();
+    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+        if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
+            let level = landscape.row(y)[x];
+            surface.row_mut(y)[x] = level;
+            shores.push(Shore { level, place: [x, y] });
+        }
+    }
+    while let Some(Shore { level, place: [x, y] }) = shores.pop() {
+        for ny in y.saturating_sub(1)..=(y + 1).min(height - 1) {
+            for nx in x.saturating_sub(1)..=(x + 1).min(width - 1) {
+                let reached = &mut surface.row_mut(ny)[nx];
+                if reached.is_infinite() {
+                    *reached = level.max(landscape.row(ny)[nx]);
+                    shores.push(Shore { level: *reached, place: [nx, ny] });
+                }
+            }
+        }
+    }
+    Plane::from_fn(width, height, |x, y| surface.row(y)[x] - landscape.row(y)[x])
+}
+
+/// The box of the target that a given box was meant for: the given one where it fits, and else that of the one thing that
+/// stands out there, if there is one.
+///
+/// `given_sd` is how well a given box lies on its target, px, and `noise_sd` the standard deviation of the image's noise.
+pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32) -> PixelBox {
+    let windows = (0..WINDOWS).rev().map(|window| f64::from(window) / f64::from(WINDOWS - 1));
+    let mut figures = windows.filter_map(|share| {
+        figure_within(image, given, given_sd, share * (FURTHEST * given_sd + GROUND_PX), noise_sd)
+    });
+    figures.next().filter(|figure| !fits(given, *figure)).unwrap_or(given)
+}
+
+/// Whether a box lies on its figure.
+fn fits(given: PixelBox, figure: PixelBox) -> bool {
+    let (at, is) = (given.centre(), figure.centre());
+    let sides = [(given.width, figure.width, is.x - at.x), (given.height, figure.height, is.y - at.y)];
+    sides.iter().all(|(side, filled, off)| {
+        let is_filled = *filled >= LEAST_FILLED * side && *side >= LEAST_FILLED * filled;
+        is_filled && off.abs() <= MOST_OFF * side + 1.0
+    })
+}
+
+/// The box of the one thing that stands out in a window that is wider than a given box by so many pixels on each side.
+fn figure_within(
+    image: &Plane,
+    given: PixelBox,
+    given_sd: f64,
+    beside: f64,
+    noise_sd: f32,
+) -> Option<PixelBox> {
+    let (centre, sides) = (given.centre(), [given.width, given.height]);
+    let at = [centre.x, centre.y];
+    let image_sides = [image.width(), image.height()];
+    let ranges = [0, 1].map(|i| {
+        let reach = sides[i] / 2.0 + beside;
+        let first = (at[i] - reach).ceil().max(0.0) as usize;
+        let end = ((at[i] + reach).floor().max(0.0) as usize + 1).min(image_sides[i]);
+        first..end.max(first)
+    });
+    if !ranges.iter().all(|range| SIDES.contains(&range.len())) {
+        return None;
+    }
+    let corner = [0, 1].map(|i| ranges[i].start as isize);
+    let off = standing_out(&smoothed(image, corner, [ranges[0].len(), ranges[1].len()]));
+    // The mean of nine pixels has a third of their noise.
+    let spread = (OF_MEDIAN * median(&mut off.samples().to_vec())).max(noise_sd / 3.0);
+
+    // Inside of the box everything is as likely to have been meant.
+    let beside_box =
+        |i: usize, index: usize| (((ranges[i].start + index) as f64 - at[i]).abs() - sides[i] / 2.0).max(0.0);
+    let likely = |[x, y]: [usize; 2]| {
+        (-0.5 * (beside_box(0, x).powi(2) + beside_box(1, y).powi(2)) / given_sd.powi(2)).exp() as f32
+    };
+    let level = |[x, y]: [usize; 2]| off.row(y)[x];
+    let places = (0..off.height()).flat_map(|y| (0..off.width()).map(move |x| [x, y]));
+    let score = |place: [usize; 2]| level(place) * likely(place);
+    let seed = places.max_by(|one, other| score(*one).total_cmp(&score(*other)))?;
+    let top = level(seed);
+    if top < LEAST_TOP * spread {
+        return None;
+    }
+    let region = figure(&off, seed, spread, 1)?;
+    let threshold = threshold(top, spread);
+    let all: f32 = off.samples().iter().filter(|level| **level >= threshold).sum();
+    // Where the noise ends the figure early, nothing is known of its size.
+    let least = if ABOVE_GROUND * spread <= SHARE_OF_TOP * top { [1.0; 2] } else { sides };
+    (region.weight >= f64::from(LEAST_SHARE * all)).then(|| region.place(corner, least))
+}
