@@ -1,7 +1,7 @@
 use crossfix_correlation::Plane;
 
 /// No camera is brighter; sums of the squares of more would lose the rest.
-const BRIGHTEST: f32 = 1e6;
+pub(crate) const BRIGHTEST: f32 = 1e6;
 
 /// Makes broken samples (not finite, or beyond every brightness) black: one of them must not spoil a
 /// whole gate.

@@ -1,5 +1,7 @@
 use crossfix_correlation::Plane;
 
+use crate::mend::BRIGHTEST;
+
 /// Samples that the median is taken of; more tell little more.
 const SAMPLES: usize = 200;
 /// The response of the mask to white noise: the root of the sum of its squared weights.
@@ -21,20 +23,40 @@ pub(crate) struct NoiseMeter {
 }
 
 impl NoiseMeter {
-    /// The noise's variance in a part of an image, at least `floor^2`.
-    pub(crate) fn variance(&mut self, part: &Plane, floor: f32) -> f32 {
-        let (width, height) = (part.width(), part.height());
+    /// The noise's variance in an image, at least `floor^2`.
+    pub(crate) fn variance(&mut self, image: &Plane, floor: f32) -> f32 {
+        self.variance_within(image, [0, 0], [image.width(), image.height()], floor)
+    }
+
+    /// The noise's variance in what of a part is in the image, at least `floor^2`. `corner` is its first column and row.
+    pub(crate) fn variance_within(
+        &mut self,
+        image: &Plane,
+        corner: [isize; 2],
+        sides: [usize; 2],
+        floor: f32,
+    ) -> f32 {
+        let image_sides = [image.width(), image.height()];
+        let [columns, rows] = [0, 1].map(|i| {
+            let within = |at: isize| at.clamp(0, image_sides[i] as isize) as usize;
+            within(corner[i])..within(corner[i].saturating_add_unsigned(sides[i]))
+        });
         self.responses.clear();
-        if width >= 3 && height >= 3 {
-            let places = (width - 2) * (height - 2);
+        if columns.len() >= 3 && rows.len() >= 3 {
+            let width = columns.len() - 2;
+            let places = width * (rows.len() - 2);
             // An odd step walks over all columns.
             let step = (places / SAMPLES).max(1) | 1;
             for place in (0..places).step_by(step) {
-                let (x, y) = (place % (width - 2), place / (width - 2));
-                let [a, b, c] = [0, 1, 2].map(|k| &part.row(y + k)[x..x + 3]);
+                let (x, y) = (columns.start + place % width, rows.start + place / width);
+                let [a, b, c] = [0, 1, 2].map(|k| &image.row(y + k)[x..x + 3]);
                 let corners = a[0] + a[2] + c[0] + c[2];
                 let sides = a[1] + b[0] + b[2] + c[1];
-                self.responses.push((corners - 2.0 * sides + 4.0 * b[1]).abs());
+                let response = (corners - 2.0 * sides + 4.0 * b[1]).abs();
+                // Broken samples tell nothing.
+                if response <= BRIGHTEST {
+                    self.responses.push(response);
+                }
             }
         }
         let deviation = OF_MEDIAN * median(&mut self.responses) / MASK_GAIN;

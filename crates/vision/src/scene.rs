@@ -5,6 +5,7 @@
 //! the scene and no target, whatever a reference makes of it.
 
 use crossfix_correlation::Plane;
+use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
 use crate::mend::mend;
@@ -183,15 +184,32 @@ fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
     let share = 1.0 / (COARSENESS * COARSENESS) as f32;
     for y in 0..to.height() {
         // Down the columns first: that is many at a time. Of a picture of less than a block the last row counts again.
+        let rows: [&[f32]; COARSENESS] =
+            std::array::from_fn(|k| from.row((y * COARSENESS + k).min(from.height() - 1)));
         sums.clear();
         sums.resize(from.width(), 0.0);
-        for row in y * COARSENESS..(y + 1) * COARSENESS {
-            for (sum, sample) in sums.iter_mut().zip(from.row(row.min(from.height() - 1))) {
-                *sum += sample;
-            }
+        Arch::new().dispatch(ColumnSums { rows, sums });
+        let (blocks, _) = sums.as_chunks::<COARSENESS>();
+        for (mean, [a, b, c, d, e, f, g, h]) in to.row_mut(y).iter_mut().zip(blocks) {
+            *mean = share * (((a + e) + (b + f)) + ((c + g) + (d + h)));
         }
-        for (mean, block) in to.row_mut(y).iter_mut().zip(sums.chunks(COARSENESS)) {
-            *mean = share * block.iter().sum::<f32>();
+    }
+}
+
+/// The sums of rows, column by column.
+struct ColumnSums<'a> {
+    rows: [&'a [f32]; COARSENESS],
+    sums: &'a mut [f32],
+}
+
+impl WithSimd for ColumnSums<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let [a, b, c, d, e, f, g, h] = self.rows.map(|row| &row[..self.sums.len()]);
+        for (x, sum) in self.sums.iter_mut().enumerate() {
+            *sum = ((a[x] + b[x]) + (c[x] + d[x])) + ((e[x] + f[x]) + (g[x] + h[x]));
         }
     }
 }
@@ -199,21 +217,26 @@ fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
 /// Smooths a picture, in rows and in columns.
 fn smooth(plane: &mut Plane, between: &mut Plane) {
     let (width, height) = (plane.width(), plane.height());
+    if width < 2 {
+        return;
+    }
     between.reshape(width, height);
-    let neighbours = |at: usize, side: usize| (at.saturating_sub(1), (at + 1).min(side - 1));
+    let mean = |before: f32, at: f32, after: f32| 0.25 * before + 0.5 * at + 0.25 * after;
     for _ in 0..SMOOTHED {
         for y in 0..height {
-            let row = plane.row(y);
-            for (x, out) in between.row_mut(y).iter_mut().enumerate() {
-                let (left, right) = neighbours(x, width);
-                *out = 0.25 * row[left] + 0.5 * row[x] + 0.25 * row[right];
+            let (row, out) = (plane.row(y), between.row_mut(y));
+            for (out, three) in out[1..].iter_mut().zip(row.windows(3)) {
+                *out = mean(three[0], three[1], three[2]);
             }
+            // Beyond the border the border goes on.
+            out[0] = mean(row[0], row[0], row[1]);
+            out[width - 1] = mean(row[width - 2], row[width - 1], row[width - 1]);
         }
         for y in 0..height {
-            let (up, down) = neighbours(y, height);
+            let (up, down) = (y.saturating_sub(1), (y + 1).min(height - 1));
             let rows = between.row(up).iter().zip(between.row(y)).zip(between.row(down));
             for (out, ((up, at), down)) in plane.row_mut(y).iter_mut().zip(rows) {
-                *out = 0.25 * up + 0.5 * at + 0.25 * down;
+                *out = mean(*up, *at, *down);
             }
         }
     }

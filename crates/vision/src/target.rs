@@ -27,6 +27,8 @@ const NOISE_SHARE: f32 = 0.3;
 const NARROW: f64 = 0.5;
 /// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
 const MANOEUVRE: f64 = 25.0;
+/// Certainty above which the rest of the gate is not looked at: what is there could take no more from it than this leaves.
+const SURE: f64 = 0.99;
 /// Certainty above which a target counts as seen.
 const SEEN: f64 = 0.5;
 /// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
@@ -92,6 +94,29 @@ pub(crate) struct Target {
     pub(crate) in_keepsake: Option<ImagePoint>,
     pub(crate) background: Option<Background>,
     pub(crate) identity: Identity,
+}
+
+/// Placements of a reference about the prediction, and the part of the image that they cover.
+#[derive(Clone, Copy, Debug)]
+struct Region {
+    /// Placements on either side of the middle one.
+    half: [usize; 2],
+    /// Where the middle of the first placement is, px.
+    origin: [f64; 2],
+    /// First column and row of the part, and its sides, px.
+    corner: [isize; 2],
+    sides: [usize; 2],
+}
+
+impl Region {
+    fn about(target: &Target, half: [usize; 2]) -> Self {
+        let ImagePoint { x, y } = target.position();
+        let reference = target.appearance.working.image();
+        let reference = [reference.width(), reference.height()];
+        let origin = [0, 1].map(|i| [x, y][i].round() - half[i] as f64);
+        let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
+        Self { half, origin, corner, sides: [0, 1].map(|i| 2 * half[i] + reference[i]) }
+    }
 }
 
 /// 0 below the first value, 1 above the second, linear between.
@@ -275,36 +300,61 @@ impl Target {
 
     pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
-        let predicted = self.position();
-        let half = self.half_gate(image, config);
-        let middle = [predicted.x.round(), predicted.y.round()];
-        let reference = self.appearance.working.image();
-        let sides = [reference.width(), reference.height()];
-        // Column 0 of the map is the placement whose middle is `origin`.
-        let origin = [0, 1].map(|i| middle[i] - half[i] as f64);
-        let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
-        let gate_sides = [0, 1].map(|i| 2 * half[i] + sides[i]);
-        image.crop_into(corner[0], corner[1], gate_sides[0], gate_sides[1], &mut bench.gate);
-        mend(&mut bench.gate);
-        let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
+        let whole = Region::about(self, self.half_gate(image, config));
+        let noise =
+            bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
         self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
 
+        // The whole gate is looked at only where the middle of it leaves a doubt.
+        let middle = self.middle_of_gate(whole.half, config).map(|half| Region::about(self, half));
+        let sure = middle.map(|middle| (self.posterior(frame, middle, bench), middle));
+        let (posterior, region) = match sure.filter(|(posterior, _)| posterior.near.mass > SURE) {
+            Some(sure) => sure,
+            None => (self.posterior(frame, whole, bench), whole),
+        };
+        let [column, row] = posterior.peak;
+        let look = self.look(column, row, region.origin, bench, config);
+        self.update(frame, &posterior, look, region.origin, bench)
+    }
+
+    /// Half sides of what counts as one peak of the map of placements.
+    fn peak_half(&self) -> [usize; 2] {
+        let reference = self.appearance.working.image();
+        [reference.width(), reference.height()].map(|side| (side / 8).max(2))
+    }
+
+    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as much of what is none;
+    /// `None` where that is not much less, or the papers' gate is asked for.
+    fn middle_of_gate(&self, whole: [usize; 2], config: &TrackerConfig) -> Option<[usize; 2]> {
+        let GateRule::Innovation { sigmas } = config.gate else { return None };
+        let peak = self.peak_half();
+        let half = [0, 1].map(|i| {
+            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil() as usize;
+            (spread + 4 * peak[i]).min(whole[i])
+        });
+        (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
+    }
+
+    /// The posterior over the placements in a region, of which the image is left in the bench's gate.
+    fn posterior(&self, frame: Frame<'_>, region: Region, bench: &mut Workbench) -> Posterior {
+        let Frame { image, config, .. } = frame;
+        let Region { origin, corner, sides, .. } = region;
+        image.crop_into(corner[0], corner[1], sides[0], sides[1], &mut bench.gate);
+        mend(&mut bench.gate);
         bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
         let expected =
             self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
         mask_outside(&mut bench.ratios, origin, image);
+        let predicted = self.position();
         let prior = Prior {
             centre: [predicted.x - origin[0], predicted.y - origin[1]],
             variance: [0, 1].map(|i| self.axes[i].position_variance() + config.prediction_floor_px.powi(2)),
             anywhere: self.anywhere(config),
             visible: config.visible_probability,
-            near: sides.map(|side| (side / 8).max(2)),
+            near: self.peak_half(),
         };
-        let posterior = bench.map.of(&bench.ratios, &prior);
-        let [column, row] = posterior.peak;
-        let look = self.look(column, row, origin, bench, config);
-        self.update(frame, &posterior, look, origin, bench)
+        bench.map.of(&bench.ratios, &prior)
     }
 
     /// Takes the posterior into the filters and the target's image into the reference.
