@@ -330,7 +330,7 @@ impl Target {
         let peak = self.peak_half();
         let half = [0, 1].map(|i| {
             let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil() as usize;
-            (spread + 4 * peak[i]).min(whole[i])
+            (spread + 3 * peak[i]).min(whole[i])
         });
         (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
     }
