@@ -9,6 +9,7 @@ use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::look::Look;
 use crate::mend::mend;
+use crate::noise::{OF_MEDIAN, median};
 use crate::target::{Target, Workbench};
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few milliseconds then; with 8 it
@@ -17,10 +18,14 @@ use crate::target::{Target, Workbench};
 const COARSE_SIDE: usize = 5;
 const MOST_COARSE: usize = 4;
 /// A found place is believed if its log ratio is at least this, at least `MARGIN` above the next
-/// best place's, and in white noise alone the best of all placements would not come near it.
+/// best place's, and its contrast is by so many nats likelier the target's than that of the best of so many places of what
+/// is searched through. Of the places that a search takes for the target on the shared and drawn cases half are others'
+/// without the last, and with 4 a third; with twice as much an eighth of the right ones is refused.
 const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
+/// No scene looks less like a target than this, in contrasts: the samples' own steps.
+const LEAST_LIKENESS: f64 = 1e-3;
 /// Variance of the noise of what has changed over the image's: its own, and what interpolation leaves of the picture's.
 const NOISE_OF_CHANGE: f32 = 1.6;
 
@@ -38,6 +43,7 @@ pub(crate) struct Search {
     coarse: Plane,
     fine: Plane,
     change: Plane,
+    contrasts: Vec<f32>,
 }
 
 /// The best place of a search.
@@ -111,6 +117,37 @@ impl Coarse {
         let expected = target.expectation(noise, self.reference.variance() * pixels, pixels, config);
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
     }
+
+    /// How much what has been correlated last looks like the reference.
+    fn likeness(&self, bench: &mut Workbench) -> Likeness {
+        let covariances = bench.statistics.covariance.samples();
+        let Search { contrasts, .. } = &mut bench.search;
+        contrasts.clear();
+        contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
+        let deviation = OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
+        Likeness {
+            deviation: f64::from(deviation).max(LEAST_LIKENESS),
+            places: contrasts.len().max(1) as f64,
+        }
+    }
+}
+
+/// How much what is searched through looks like a target: the contrast with which its reference is found, place by place.
+#[derive(Clone, Copy, Debug)]
+struct Likeness {
+    /// Its standard deviation about none.
+    deviation: f64,
+    places: f64,
+}
+
+impl Likeness {
+    /// Log-likelihood ratio of a contrast's being a target's, whose usual one is known, against the best place's of the
+    /// scene.
+    fn log_ratio(self, contrast: f64, usual: f64, contrast_sd: f64) -> f64 {
+        let Self { deviation, places } = self;
+        let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
+        normal(contrast - usual, contrast_sd * usual) - normal(contrast, deviation) - places.ln()
+    }
 }
 
 /// What is searched through.
@@ -168,6 +205,7 @@ fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench:
     mend(&mut picture);
     coarse.ratios(target, noise, &picture, &ranges, bench, config);
     bench.search.coarse = picture;
+    let likeness = coarse.likeness(bench);
     let area = Area { ranges, predicted: at, half, sides, coarseness, is_change };
     let best = area.best_place(target, bench, config);
 
@@ -194,11 +232,10 @@ fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench:
         mend(&mut bench.gate);
     }
     let look = target.look(peak.column, peak.row, origin, bench, config);
-    let above_chance = contrast * contrast * f64::from(energy / (2.0 * noise));
-    let placements = (2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0);
+    let usual = target.usual_contrast * f64::from(target.appearance.clear_share());
     let accepted = peak.score - best.background > LEAST_RATIO
         && best.margin > MARGIN
-        && above_chance > placements.ln() + ABOVE_CHANCE
+        && likeness.log_ratio(contrast, usual, config.contrast_sd) > ABOVE_CHANCE
         && target.arrival_log_ratio(frame, look.place, bench) >= 0.0;
     Found { look: Some(look), accepted }
 }

@@ -301,8 +301,7 @@ impl Target {
     pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
         let whole = Region::about(self, self.half_gate(image, config));
-        let noise =
-            bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
+        let noise = bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
         self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
 
         // The whole gate is looked at only where the middle of it leaves a doubt.
