@@ -31,6 +31,7 @@ mod config;
 mod detector;
 mod figure;
 mod frame;
+mod hypotheses;
 mod identity;
 mod lanes;
 mod likelihood;

@@ -36,6 +36,8 @@ pub(crate) struct Posterior {
     pub(crate) near: Part,
     pub(crate) elsewhere: Part,
     pub(crate) unseen: f64,
+    /// How likely the image is with this prior, in a unit that is the same for all priors of one map.
+    pub(crate) evidence: f64,
 }
 
 impl Posterior {
@@ -95,11 +97,7 @@ impl PosteriorMap {
             share: (1.0 - prior.anywhere) as f32,
         });
 
-        let row =
-            (0..height).fold(0, |best, y| if self.sums[y].best > self.sums[best].best { y } else { best });
-        let line = self.weights.row(row);
-        let column = (0..width).fold(0, |best, x| if line[x] > line[best] { x } else { best });
-        let peak = [column, row];
+        let peak = self.peak();
         let near = self.moments(around(peak, prior.near, [width, height]));
         let total = self.total();
 
@@ -117,7 +115,29 @@ impl PosteriorMap {
         let rest = Part { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
         let sum = total.mass + unseen;
         let share = |part: Part| Part { mass: part.mass / sum, ..part };
-        Posterior { peak, near: share(near), elsewhere: share(rest), unseen: unseen / sum }
+        Posterior { peak, near: share(near), elsewhere: share(rest), unseen: unseen / sum, evidence: sum }
+    }
+
+    /// The placement of most weight.
+    fn peak(&self) -> [usize; 2] {
+        let (width, height) = (self.weights.width(), self.weights.height());
+        let row =
+            (0..height).fold(0, |best, y| if self.sums[y].best > self.sums[best].best { y } else { best });
+        let line = self.weights.row(row);
+        [(0..width).fold(0, |best, x| if line[x] > line[best] { x } else { best }), row]
+    }
+
+    /// Takes the best peak off the map of the last posterior, and returns it with its part in units of the evidence.
+    pub(crate) fn take_peak(&mut self, near: [usize; 2]) -> ([usize; 2], Part) {
+        let peak = self.peak();
+        let [columns, rows] = around(peak, near, [self.weights.width(), self.weights.height()]);
+        let part = self.moments([columns.clone(), rows.clone()]);
+        for row in rows {
+            let line = self.weights.row_mut(row);
+            line[columns.clone()].fill(0.0);
+            self.sums[row].best = line.iter().copied().fold(0.0, f32::max);
+        }
+        (peak, part)
     }
 
     /// Mass, mean and variance of the weights of a part of the map.

@@ -10,6 +10,7 @@ use crate::appearance::{Appearance, Workshop};
 use crate::arrival::Comparison;
 use crate::config::GateRule;
 use crate::frame::{FRAME_INTERVAL, Frame, Measurement, Step};
+use crate::hypotheses::Hypotheses;
 use crate::identity::Identity;
 use crate::likelihood::{Expectation, log_ratios};
 use crate::look::Look;
@@ -30,7 +31,7 @@ const MANOEUVRE: f64 = 25.0;
 /// Certainty above which the rest of the gate is not looked at: what is there could take no more from it than this leaves.
 const SURE: f64 = 0.99;
 /// Certainty above which a target counts as seen.
-const SEEN: f64 = 0.5;
+pub(crate) const SEEN: f64 = 0.5;
 /// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
 const USUAL_S: f64 = 3.0;
 /// Time constant with which a lost target's contrast is taken for what it usually is again, s: about a cloud's edge.
@@ -63,7 +64,7 @@ pub(crate) struct Workbench {
     pub(crate) statistics: Statistics,
     pub(crate) ratios: Plane,
     pub(crate) search: Search,
-    map: PosteriorMap,
+    pub(crate) map: PosteriorMap,
     pub(crate) comparison: Comparison,
 }
 
@@ -94,15 +95,16 @@ pub(crate) struct Target {
     pub(crate) in_keepsake: Option<ImagePoint>,
     pub(crate) background: Option<Background>,
     pub(crate) identity: Identity,
+    pub(crate) hypotheses: Hypotheses,
 }
 
 /// Placements of a reference about the prediction, and the part of the image that they cover.
 #[derive(Clone, Copy, Debug)]
-struct Region {
+pub(crate) struct Region {
     /// Placements on either side of the middle one.
     half: [usize; 2],
     /// Where the middle of the first placement is, px.
-    origin: [f64; 2],
+    pub(crate) origin: [f64; 2],
     /// First column and row of the part, and its sides, px.
     corner: [isize; 2],
     sides: [usize; 2],
@@ -169,6 +171,7 @@ impl Target {
             in_keepsake: None,
             background: None,
             identity: Identity::new(),
+            hypotheses: Hypotheses::default(),
         }
     }
 
@@ -196,7 +199,7 @@ impl Target {
     }
 
     /// What a look measured, with all that its covariance must hold.
-    fn measurement(&self, look: &Look) -> Measurement {
+    pub(crate) fn measurement(&self, look: &Look) -> Measurement {
         let covariance = look.covariance + Matrix2::identity() * self.centre_variance;
         Measurement { place: look.place, covariance }
     }
@@ -230,6 +233,7 @@ impl Target {
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, interval, .. } = frame;
         predict(&mut self.axes, interval, image);
+        self.hypotheses.predict(frame);
         self.unseen_s += interval;
         let frames = interval / FRAME_INTERVAL;
         let [scale, turn] = &mut self.shape_variances;
@@ -270,6 +274,7 @@ impl Target {
         }
         self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.seen(place);
+        self.hypotheses.clear();
         self.identity.is_given();
         let covariance = Matrix2::identity() * (variance + self.centre_variance);
         let measured = Measurement { place, covariance };
@@ -300,7 +305,10 @@ impl Target {
 
     pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
-        let whole = Region::about(self, self.half_gate(image, config));
+        let reach = self.hypotheses.reach(self.position());
+        let half = self.half_gate(image, config);
+        let half = [0, 1].map(|i| half[i] + (reach[i].ceil() as usize).min(2 * half[i]));
+        let whole = Region::about(self, half);
         let noise = bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
         self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
 
@@ -311,13 +319,16 @@ impl Target {
             Some(sure) => sure,
             None => (self.posterior(frame, whole, bench), whole),
         };
+        if self.must_doubt(&posterior, config) {
+            return self.follow_hypotheses(frame, region, bench);
+        }
         let [column, row] = posterior.peak;
         let look = self.look(column, row, region.origin, bench, config);
         self.update(frame, &posterior, look, region.origin, bench)
     }
 
     /// Half sides of what counts as one peak of the map of placements.
-    fn peak_half(&self) -> [usize; 2] {
+    pub(crate) fn peak_half(&self) -> [usize; 2] {
         let reference = self.appearance.working.image();
         [reference.width(), reference.height()].map(|side| (side / 8).max(2))
     }
@@ -326,12 +337,26 @@ impl Target {
     /// `None` where that is not much less, or the papers' gate is asked for.
     fn middle_of_gate(&self, whole: [usize; 2], config: &TrackerConfig) -> Option<[usize; 2]> {
         let GateRule::Innovation { sigmas } = config.gate else { return None };
+        if !self.hypotheses.is_empty() {
+            return None;
+        }
         let peak = self.peak_half();
         let half = [0, 1].map(|i| {
             let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil() as usize;
             (spread + 3 * peak[i]).min(whole[i])
         });
         (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
+    }
+
+    /// What is expected of the place by some filters, on the placements of a region.
+    pub(crate) fn prior(&self, axes: &[AxisFilter; 2], region: Region, config: &TrackerConfig) -> Prior {
+        Prior {
+            centre: [0, 1].map(|i| axes[i].position() - region.origin[i]),
+            variance: [0, 1].map(|i| axes[i].position_variance() + config.prediction_floor_px.powi(2)),
+            anywhere: self.anywhere(config),
+            visible: config.visible_probability,
+            near: self.peak_half(),
+        }
     }
 
     /// The posterior over the placements in a region, of which the image is left in the bench's gate.
@@ -345,14 +370,7 @@ impl Target {
             self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
         mask_outside(&mut bench.ratios, origin, image);
-        let predicted = self.position();
-        let prior = Prior {
-            centre: [predicted.x - origin[0], predicted.y - origin[1]],
-            variance: [0, 1].map(|i| self.axes[i].position_variance() + config.prediction_floor_px.powi(2)),
-            anywhere: self.anywhere(config),
-            visible: config.visible_probability,
-            near: self.peak_half(),
-        };
+        let prior = self.prior(&self.axes, region, config);
         bench.map.of(&bench.ratios, &prior)
     }
 
@@ -430,7 +448,7 @@ impl Target {
         }
     }
 
-    fn seen(&mut self, place: ImagePoint) {
+    pub(crate) fn seen(&mut self, place: ImagePoint) {
         (self.missed, self.searches) = (0, 0);
         self.unseen_s = 0.0;
         self.is_new = false;
@@ -439,7 +457,7 @@ impl Target {
     }
 
     /// Follows contrast, size, direction and appearance, the more the surer the target was seen.
-    fn learn(
+    pub(crate) fn learn(
         &mut self,
         frame: Frame<'_>,
         place: ImagePoint,

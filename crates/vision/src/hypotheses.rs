@@ -1,0 +1,213 @@
+//! Several places where a target may be, each with filters of its own, as long as none of them is sure.
+//!
+//! One Gaussian cannot hold two places: their mean is neither, and in the next image both lie outside of what it expects.
+
+use crossfix_filter::{AxisFilter, AxisMeasurement};
+
+use crate::config::GateRule;
+use crate::frame::{Frame, Step};
+use crate::posterior::Posterior;
+use crate::target::{Region, SEEN, Target, Workbench, predict};
+use crate::{ImagePoint, TrackerConfig};
+
+/// Certainty of the best place below which the others are kept too.
+const DOUBT: f64 = 0.9;
+/// Hypotheses that are kept, and places in an image that each of them may go to.
+const MOST: usize = 12;
+const MOST_PEAKS: usize = 4;
+/// A place with less of a hypothesis, and a hypothesis with less of the target, is dropped.
+const LEAST: f64 = 0.01;
+/// Hypotheses are one if their places and velocities differ by less than so many standard deviations.
+const SAME: f64 = 2.0;
+/// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the target has been elsewhere.
+const UNEXPECTED: f64 = 16.0;
+/// A target of which this long no place is sure is lost, s.
+const LONGEST_S: f64 = 0.4;
+
+/// A place where the target may be, and how it moves then.
+#[derive(Clone, Debug)]
+pub(crate) struct Hypothesis {
+    weight: f64,
+    axes: [AxisFilter; 2],
+    /// Whether it has been seen there in this image, and on which placement of the map.
+    peak: Option<[usize; 2]>,
+}
+
+impl Hypothesis {
+    fn is_like(&self, other: &Self) -> bool {
+        self.axes.iter().zip(&other.axes).all(|(one, other)| {
+            let (a, b) = (one.covariance(), other.covariance());
+            let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
+            near(one.position() - other.position(), a.m11.max(b.m11))
+                && near(one.velocity() - other.velocity(), a.m22.max(b.m22))
+        })
+    }
+}
+
+/// The hypotheses of a target; none while it is sure.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Hypotheses {
+    all: Vec<Hypothesis>,
+    /// For how long none has been sure, s.
+    doubted_s: f64,
+}
+
+impl Hypotheses {
+    pub(crate) fn clear(&mut self) {
+        self.all.clear();
+        self.doubted_s = 0.0;
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    pub(crate) fn predict(&mut self, frame: Frame<'_>) {
+        for hypothesis in &mut self.all {
+            predict(&mut hypothesis.axes, frame.interval, frame.image);
+        }
+    }
+
+    /// The furthest of them from a place, px an axis.
+    pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
+        let at = [place.x, place.y];
+        [0, 1].map(|i| {
+            let far = |hypothesis: &Hypothesis| (hypothesis.axes[i].position() - at[i]).abs();
+            self.all.iter().map(far).fold(0.0, f64::max)
+        })
+    }
+}
+
+impl Target {
+    /// Whether a posterior leaves more than one place to be kept.
+    pub(crate) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
+        let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
+        in_doubt && matches!(config.gate, GateRule::Innovation { .. }) && !self.identity.is_on_probation()
+    }
+
+    /// Follows all places where the target may be into the image whose log ratios are in the bench's map.
+    pub(crate) fn follow_hypotheses(
+        &mut self,
+        frame: Frame<'_>,
+        region: Region,
+        bench: &mut Workbench,
+    ) -> Step {
+        let config = frame.config;
+        let mut before = std::mem::take(&mut self.hypotheses.all);
+        if before.is_empty() {
+            before.push(Hypothesis { weight: 1.0, axes: self.axes.clone(), peak: None });
+        }
+        let branches = self.branches(&before, frame, region, bench);
+        self.hypotheses.all = kept(branches);
+        let Some(best) = self.hypotheses.all.first().cloned() else {
+            self.missed += 1;
+            return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
+        };
+        let seen: f64 = self.hypotheses.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum();
+        self.axes = best.axes.clone();
+        let Some([column, row]) = best.peak else {
+            self.missed += 1;
+            self.settle(0.0);
+            return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
+        };
+        let near = self.peak_half();
+        let here = |h: &&Hypothesis| {
+            h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
+        };
+        let sure: f64 = self.hypotheses.all.iter().filter(here).map(|h| h.weight).sum();
+        let look = self.look(column, row, region.origin, bench, config);
+        let is_there = self.doubt(frame, look.place, bench);
+        let certainty = sure * is_there;
+        self.hypotheses.doubted_s += frame.interval;
+        if certainty > SEEN {
+            self.seen(look.place);
+        } else if seen * is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
+            self.missed += 1;
+        }
+        self.learn(frame, look.place, look, certainty, bench);
+        self.settle(best.weight);
+        let measured = (certainty > SEEN).then(|| self.measurement(&look));
+        Step { measured, score: look.score, certainty, nis: None }
+    }
+
+    /// One place is left, or none: the others are forgotten.
+    fn settle(&mut self, weight: f64) {
+        if weight > DOUBT || self.is_searching() {
+            self.hypotheses.clear();
+        }
+    }
+
+    /// Where each hypothesis may have gone, with their weights.
+    fn branches(
+        &self,
+        before: &[Hypothesis],
+        frame: Frame<'_>,
+        region: Region,
+        bench: &mut Workbench,
+    ) -> Vec<Hypothesis> {
+        let config = frame.config;
+        let mut branches = Vec::with_capacity(before.len() * (MOST_PEAKS + 1));
+        for hypothesis in before {
+            let prior = self.prior(&hypothesis.axes, region, config);
+            let posterior = bench.map.of(&bench.ratios, &prior);
+            let weight = hypothesis.weight * posterior.evidence;
+            branches.push(Hypothesis {
+                weight: weight * posterior.unseen,
+                axes: hypothesis.axes.clone(),
+                peak: None,
+            });
+            for _ in 0..MOST_PEAKS {
+                let (peak, part) = bench.map.take_peak(prior.near);
+                let share = part.mass / posterior.evidence;
+                if share.is_nan() || share < LEAST {
+                    break;
+                }
+                let mut axes = hypothesis.axes.clone();
+                let at = [0, 1].map(|i| AxisMeasurement {
+                    position: region.origin[i] + part.mean[i],
+                    variance: part.variance[i],
+                });
+                let is_expected =
+                    (0..2).map(|i| axes[i].innovation(at[i]).normalised_squared()).sum::<f64>() < UNEXPECTED;
+                for (axis, at) in axes.iter_mut().zip(at) {
+                    if is_expected {
+                        axis.condition(AxisMeasurement {
+                            variance: at.variance.min(axis.position_variance()),
+                            ..at
+                        });
+                    } else {
+                        *axis = AxisFilter::start_at_rest(
+                            at,
+                            config.search_velocity_sd_px,
+                            config.acceleration_sd_px,
+                        );
+                    }
+                }
+                branches.push(Hypothesis { weight: weight * share, axes, peak: Some(peak) });
+            }
+        }
+        branches
+    }
+}
+
+/// The hypotheses that are kept of all, the heaviest first, of which the weights sum to 1.
+fn kept(mut all: Vec<Hypothesis>) -> Vec<Hypothesis> {
+    all.sort_by(|one, other| other.weight.total_cmp(&one.weight));
+    let mut kept: Vec<Hypothesis> = Vec::with_capacity(MOST);
+    for hypothesis in all {
+        let known = kept.iter().position(|known| known.is_like(&hypothesis));
+        match known {
+            Some(known) => kept[known].weight += hypothesis.weight,
+            None if kept.len() < MOST => kept.push(hypothesis),
+            None => {}
+        }
+    }
+    let total: f64 = kept.iter().map(|hypothesis| hypothesis.weight).sum();
+    if total.is_nan() || total <= 0.0 {
+        return Vec::new();
+    }
+    kept.iter_mut().for_each(|hypothesis| hypothesis.weight /= total);
+    kept.retain(|hypothesis| hypothesis.weight >= LEAST);
+    kept.sort_by(|one, other| other.weight.total_cmp(&one.weight));
+    kept
+}
