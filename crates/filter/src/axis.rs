@@ -157,6 +157,11 @@ impl AxisFilter {
         Matrix2::new(self.position_variance, self.cross, self.cross, self.velocity_variance)
     }
 
+    /// Moves the origin of the axis: what was at a position is at that plus `by`, and all else stays.
+    pub fn move_by(&mut self, by: f64) {
+        self.position += by;
+    }
+
     /// Puts the state at rest at a position, keeping its covariance.
     pub fn hold_at(&mut self, position: f64) {
         (self.position, self.velocity) = (position, 0.0);

@@ -68,6 +68,11 @@ impl Hypotheses {
         }
     }
 
+    pub(crate) fn move_by(&mut self, by: [f64; 2]) {
+        let axes = self.all.iter_mut().flat_map(|hypothesis| hypothesis.axes.iter_mut().zip(by));
+        axes.for_each(|(axis, by)| axis.move_by(by));
+    }
+
     /// The furthest of them from a place, px an axis.
     pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
@@ -116,7 +121,7 @@ impl Target {
         };
         let sure: f64 = self.hypotheses.all.iter().filter(here).map(|h| h.weight).sum();
         let look = self.look(column, row, region.origin, bench, config);
-        let is_there = self.doubt(frame, look.place, bench);
+        let is_there = self.doubt(frame, look, bench);
         let certainty = sure * is_there;
         self.hypotheses.doubted_s += frame.interval;
         if certainty > SEEN {

@@ -5,6 +5,7 @@ use crossfix_filter::AxisFilter;
 use crate::ImagePoint;
 use crate::arrival::Placed;
 use crate::frame::{FRAME_INTERVAL, Frame, Step};
+use crate::look::Look;
 use crate::scene::Scene;
 use crate::target::{Target, Workbench, predict};
 
@@ -17,6 +18,15 @@ const GOES_PER_S: f64 = 0.1;
 const COMES_PER_S: f64 = 2.0;
 /// The probability that what a search has found is the target: the search has asked more of it than of what is followed.
 const FOUND: f64 = 0.9;
+/// Standard deviation of a target's contrast about its usual one, as a share of that: in the third of a second that a cloud's
+/// edge takes.
+const CONTRAST_SD: f64 = 0.3;
+/// Standard deviation of the best of many placements in noise, over that of one: a third to a half of it.
+const BEST_SD: f64 = 0.5;
+/// With a reference of which less than this share is the target's nobody knows the usual contrast.
+const CLEAR: f64 = 0.9;
+/// No image tells more than this by its contrast: noise may be other than white.
+const MOST: f64 = 2.0;
 /// Pictures of the scene that a target remembers its place in: more than there are.
 const MOST_PICTURES: usize = 16;
 
@@ -61,6 +71,12 @@ impl Identity {
     pub(crate) fn is_given(&mut self) {
         (self.is_there, self.probation) = (1.0, None);
         self.in_pictures.clear();
+    }
+
+    pub(crate) fn move_by(&mut self, by: [f64; 2]) {
+        if let Some(probation) = &mut self.probation {
+            probation.axes.iter_mut().zip(by).for_each(|(axis, by)| axis.move_by(by));
+        }
     }
 
     /// Whether it has been found again, and that is not sure.
@@ -120,12 +136,29 @@ impl Target {
         arrival.map_or(0.0, |arrival| arrival.log_ratio(usual))
     }
 
-    /// The probability that what is followed is the target and not the scene: a chain of two states that sees whether
-    /// what is at a place has come there.
-    pub(crate) fn doubt(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> f64 {
+    /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against its being that of the best
+    /// of so many placements in noise.
+    fn above_noise_log_ratio(&self, contrast: f64, placements: f64) -> f64 {
+        let deviation = f64::from(self.noise / self.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
+        let clear = f64::from(self.appearance.clear_share());
+        if clear < CLEAR {
+            return 0.0;
+        }
+        let usual = self.usual_contrast * clear;
+        let best_of_noise = deviation * (2.0 * placements.max(2.0).ln()).sqrt();
+        let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
+        let target = normal(contrast - usual, (CONTRAST_SD * usual).hypot(deviation));
+        (target - normal(contrast - best_of_noise, BEST_SD * deviation)).clamp(-MOST, 0.0)
+    }
+
+    /// The probability that what is followed is the target and neither the scene nor noise: a chain of two states that sees
+    /// whether what is at a place has come there, and stands out as the target does.
+    pub(crate) fn doubt(&mut self, frame: Frame<'_>, look: Look, bench: &mut Workbench) -> f64 {
         // Images that follow each other sooner tell no more together than one.
         let share = (frame.interval / FRAME_INTERVAL).min(1.0);
-        let log_ratio = share * self.arrival_log_ratio(frame, place, bench);
+        let placements = bench.ratios.samples().len() as f64;
+        let above_noise = self.above_noise_log_ratio(look.contrast, placements);
+        let log_ratio = share * (self.arrival_log_ratio(frame, look.place, bench) + above_noise);
         let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
         let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
         let before = settled + (self.identity.is_there - settled) * kept;

@@ -9,6 +9,7 @@ use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
 use crate::mend::mend;
+use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
 /// Pictures that are kept, the latest, and the time between them, s: they reach back for 3 to 3.6 s. With half of either a
@@ -24,9 +25,15 @@ const COARSENESS: usize = 8;
 const SMOOTHED: usize = 3;
 /// A camera that has turned by less than this since it was looked at stands still, px: twice what noise makes of it ...
 const STILL_PX: f64 = 0.1;
-/// ... and is looked at again after so long, s: a wind that begins shakes it by no more than a pixel or two till then. With
-/// half of it an image costs 10 us more, of 640x480 30 us.
+/// ... and is looked at again after so long, s, if it is not jerked: with half of it an image costs 10 us more, of 640x480
+/// 30 us.
 const STILL_S: f64 = 0.1;
+
+/// A camera is jerked if what changes from one image to the next is this much more than usual, and so many levels, ...
+const JERK: f32 = 1.5;
+const JERK_LEVELS: f32 = 0.25;
+/// ... where this share of what is usual is the last image's.
+const USUAL_SHARE: f32 = 0.05;
 
 /// A picture of the scene.
 #[derive(Clone, Debug, Default)]
@@ -66,6 +73,42 @@ impl Picture {
     }
 }
 
+/// Blocks along a row of which one is looked at: there are hundreds, and half of them has to change.
+const GLANCED: usize = 4;
+
+/// A row in some blocks, by which a jerk of the camera is noticed at a tenth of what a look costs.
+#[derive(Debug, Default)]
+struct Glance {
+    /// Means of a row of a block.
+    means: Vec<f32>,
+    changes: Vec<f32>,
+    /// Median change of a mean from image to image, usually, levels.
+    usual: f32,
+}
+
+impl Glance {
+    /// Whether most of the image is another than it was in the image before, more than by noise.
+    fn is_another(&mut self, image: &Plane) -> bool {
+        let Self { means, changes, usual } = self;
+        let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
+        let blocks = rows.flat_map(|y| image.row(y).as_chunks::<COARSENESS>().0.iter().step_by(GLANCED));
+        let now = blocks.map(|block| block.iter().sum::<f32>() / COARSENESS as f32);
+        changes.clear();
+        if means.is_empty() {
+            means.extend(now);
+            return true;
+        }
+        for (before, now) in means.iter_mut().zip(now) {
+            changes.push((now - *before).abs());
+            *before = now;
+        }
+        let change = median(changes);
+        let is_jerk = change > JERK * *usual + JERK_LEVELS;
+        *usual += USUAL_SHARE * (change.min(JERK * *usual + JERK_LEVELS) - *usual);
+        is_jerk
+    }
+}
+
 /// The last seconds' pictures.
 #[derive(Debug, Default)]
 pub(crate) struct Scene {
@@ -78,6 +121,7 @@ pub(crate) struct Scene {
     /// Whether the camera had not turned when it was looked at last, and how long ago that is, s.
     is_still: bool,
     unlooked_s: f64,
+    glance: Glance,
     /// How far the scene had moved when the newest picture was taken, px.
     turned: [f64; 2],
 }
@@ -112,7 +156,8 @@ impl Scene {
         for picture in &mut self.pictures {
             picture.age_s += interval;
         }
-        let is_time = self.unlooked_s + interval / 2.0 >= if self.is_still { STILL_S } else { 0.0 };
+        let is_jerked = self.glance.is_another(image);
+        let is_time = is_jerked || !self.is_still || self.unlooked_s + interval / 2.0 >= STILL_S;
         let is_kept = self.pictures.first().is_none_or(|newest| newest.age_s >= SPACING_S);
         if !is_time && !is_kept {
             return;

@@ -262,11 +262,21 @@ impl ImageTracker {
         self.tracks.clear();
         let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
         let posterior = self.config.algorithm == Algorithm::Posterior;
+        let before = self.scene.turned();
         if posterior {
             self.scene.register(image, interval);
         }
-        let frame =
-            Frame { image, interval, keepsake, scene: &self.scene, may_search: false, config: &self.config };
+        let after = self.scene.turned();
+        let scene_moved = [0, 1].map(|i| before[i] - after[i]);
+        let frame = Frame {
+            image,
+            interval,
+            keepsake,
+            scene: &self.scene,
+            scene_moved,
+            may_search: false,
+            config: &self.config,
+        };
         let turn =
             self.followed.iter().filter(|f| f.target.is_searching()).min_by_key(|f| f.searched).map(|f| f.id);
         for followed in &mut self.followed {
