@@ -34,13 +34,15 @@ pub(crate) struct Hypothesis {
 }
 
 impl Hypothesis {
+    /// Whether two say the same; where it has been seen and where it has been waited for are not the same.
     fn is_like(&self, other: &Self) -> bool {
-        self.axes.iter().zip(&other.axes).all(|(one, other)| {
+        let alike = self.axes.iter().zip(&other.axes).all(|(one, other)| {
             let (a, b) = (one.covariance(), other.covariance());
             let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
             near(one.position() - other.position(), a.m11.max(b.m11))
                 && near(one.velocity() - other.velocity(), a.m22.max(b.m22))
-        })
+        });
+        alike && self.peak.is_some() == other.peak.is_some()
     }
 }
 
@@ -71,6 +73,15 @@ impl Hypotheses {
     pub(crate) fn move_by(&mut self, by: [f64; 2]) {
         let axes = self.all.iter_mut().flat_map(|hypothesis| hypothesis.axes.iter_mut().zip(by));
         axes.for_each(|(axis, by)| axis.move_by(by));
+    }
+
+    /// How far they are from a place, mean squares of either axis, px^2: what its variance does not hold.
+    pub(crate) fn spread(&self, place: ImagePoint) -> [f64; 2] {
+        let at = [place.x, place.y];
+        [0, 1].map(|i| {
+            let off = |h: &Hypothesis| h.weight * (h.axes[i].position() - at[i]).powi(2);
+            self.all.iter().map(off).sum()
+        })
     }
 
     /// The furthest of them from a place, px an axis.

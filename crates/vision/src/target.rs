@@ -189,11 +189,13 @@ impl Target {
         &self.axes
     }
 
-    /// Covariance of position and velocity on either axis, the reference's own place included.
+    /// Covariance of position and velocity on either axis, the reference's own place and the other places where the target
+    /// may be included.
     pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
+        let spread = self.hypotheses.spread(self.position());
         [0, 1].map(|i| {
             let mut covariance = self.axes[i].covariance();
-            covariance.m11 += self.common[i] + self.centre_variance;
+            covariance.m11 += self.common[i] + self.centre_variance + spread[i];
             covariance
         })
     }

@@ -158,7 +158,10 @@ fn what_is_as_faint_as_the_noise_is_found_by_looking_for_longer() {
         |time_s| vec![spot(time_s)],
         |time_s, tracks| {
             for track in tracks {
-                assert!(is_at(track, &spot(time_s), 12.0), "at {time_s}: {track:?}");
+                // In an image that does not show it, it is somewhere within what is stated.
+                let deviation = track.covariances.map_or(0.0, |[x, y]| (x.m11 + y.m11).sqrt());
+                let within = if track.measured.is_some() { 12.0 } else { 12.0 + 3.0 * deviation };
+                assert!(is_at(track, &spot(time_s), within), "at {time_s}: {track:?}");
             }
             seen += usize::from(time_s >= 4.0 && !tracks.is_empty());
         },
