@@ -29,7 +29,7 @@ const GROUND_PX: f64 = 2.0;
 /// A figure is taken for the target if its top is so many standard deviations of the noise: in noise alone the highest of
 /// a thousand pixels is 4. With half of it boxes in noise are moved by noise, with twice as much only boxes on what the eye
 /// sees at once are mended.
-const LEAST_TOP: f32 = 6.0;
+const LEAST_TOP: f32 = 9.0;
 /// ... and if this share of all that stands out is its own: else nobody knows which of two was meant.
 const LEAST_SHARE: f32 = 0.8;
 /// A box is right as it is if its figure is longer than this share of it, both ways, ...

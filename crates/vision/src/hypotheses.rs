@@ -21,6 +21,8 @@ const LEAST: f64 = 0.01;
 const SAME: f64 = 2.0;
 /// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the target has been elsewhere.
 const UNEXPECTED: f64 = 16.0;
+/// A turn of the camera by less than this is within what is not known of a target's motion anyway, px.
+const LEAST_MOVE_PX: f64 = 2.0;
 /// A target of which this long no place is sure is lost, s.
 const LONGEST_S: f64 = 0.4;
 
@@ -70,9 +72,14 @@ impl Hypotheses {
         }
     }
 
-    pub(crate) fn move_by(&mut self, by: [f64; 2]) {
-        let axes = self.all.iter_mut().flat_map(|hypothesis| hypothesis.axes.iter_mut().zip(by));
-        axes.for_each(|(axis, by)| axis.move_by(by));
+    /// Each may have moved by so many pixels, or not.
+    fn fork(&mut self, by: [f64; 2]) {
+        self.all.iter_mut().for_each(|hypothesis| hypothesis.weight *= 0.5);
+        let mut moved = self.all.clone();
+        for (axis, by) in moved.iter_mut().flat_map(|hypothesis| hypothesis.axes.iter_mut().zip(by)) {
+            axis.move_by(by);
+        }
+        self.all.extend(moved);
     }
 
     /// How far they are from a place, mean squares of either axis, px^2: what its variance does not hold.
@@ -95,6 +102,23 @@ impl Hypotheses {
 }
 
 impl Target {
+    /// The camera may have turned: then everything in its image has moved, the target too. Light that changes may be taken
+    /// for a turn, so it may have stayed as well.
+    pub(crate) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
+        let by = frame.scene_moved;
+        let is_followed = !self.is_searching() && !self.identity.is_on_probation();
+        if !is_followed
+            || by[0].hypot(by[1]) < LEAST_MOVE_PX
+            || !matches!(frame.config.gate, GateRule::Innovation { .. })
+        {
+            return;
+        }
+        if self.hypotheses.is_empty() {
+            self.hypotheses.all.push(Hypothesis { weight: 1.0, axes: self.axes.clone(), peak: None });
+        }
+        self.hypotheses.fork(by);
+    }
+
     /// Whether a posterior leaves more than one place to be kept.
     pub(crate) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
         let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;

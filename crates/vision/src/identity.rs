@@ -73,12 +73,6 @@ impl Identity {
         self.in_pictures.clear();
     }
 
-    pub(crate) fn move_by(&mut self, by: [f64; 2]) {
-        if let Some(probation) = &mut self.probation {
-            probation.axes.iter_mut().zip(by).for_each(|(axis, by)| axis.move_by(by));
-        }
-    }
-
     /// Whether it has been found again, and that is not sure.
     pub(crate) fn is_on_probation(&self) -> bool {
         self.probation.is_some()

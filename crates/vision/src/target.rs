@@ -234,7 +234,7 @@ impl Target {
     /// Follows the target into the next image.
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, interval, .. } = frame;
-        self.move_with_scene(frame.scene_moved);
+        self.may_move_with_scene(frame);
         predict(&mut self.axes, interval, image);
         self.hypotheses.predict(frame);
         self.unseen_s += interval;
@@ -249,15 +249,6 @@ impl Target {
         } else {
             self.follow(frame, bench)
         }
-    }
-
-    /// The camera has turned: everything in its image has moved by so many pixels, the target too.
-    fn move_with_scene(&mut self, by: [f64; 2]) {
-        for (axis, by) in self.axes.iter_mut().zip(by) {
-            axis.move_by(by);
-        }
-        self.hypotheses.move_by(by);
-        self.identity.move_by(by);
     }
 
     /// Takes a place in the next image from somebody who knows it, instead of measuring it: with the

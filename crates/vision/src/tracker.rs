@@ -431,7 +431,11 @@ impl ImageTracker {
         if as_given {
             return place;
         }
-        let noise = self.bench.meter.variance(image, noise_floor as f32);
+        // Of what is about it: the ground below a sky has other noise.
+        let PixelBox { x, y, width, height } = place;
+        let corner = [x - width, y - height].map(|at| at as isize);
+        let sides = [width, height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
+        let noise = self.bench.meter.variance_within(image, corner, sides, noise_floor as f32);
         meant(image, place, box_sd_px, noise.sqrt())
     }
 
