@@ -22,8 +22,9 @@ const FURTHEST: f64 = 2.5;
 /// Windows that its figure is sought in, from as wide as that down to the box itself: what stands out beside the box
 /// (a house below a drone) is in none of the last.
 const WINDOWS: u32 = 4;
-/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a box twice as large.
-const SIDES: RangeInclusive<usize> = 5..=256;
+/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a box twice as large;
+/// twice as wide a one takes a second.
+const SIDES: RangeInclusive<usize> = 5..=129;
 /// Pixels about a figure that the widest window has beside.
 const GROUND_PX: f64 = 2.0;
 /// A figure is taken for the target if its top is so many standard deviations of the noise: in noise alone the highest of
@@ -111,7 +112,7 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
     (sum > 0.0).then(|| Region { low, high, middle: moments.map(|moment| moment / sum), weight: sum })
 }
 
-/// Means of three by three pixels about those of a part of an image; beyond its border it is black.
+/// Means of three by three pixels about those of a part of an image; beyond the border the border goes on.
 pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usize; 2]) -> Plane {
     let mut part = image.crop(corner[0] - 1, corner[1] - 1, width + 2, height + 2);
     mend(&mut part);

@@ -82,7 +82,8 @@ impl Identity {
 impl Target {
     /// Notes where it was when a picture of the scene was taken, if it was seen.
     pub(crate) fn note_picture(&mut self, number: u64) {
-        if self.missed > 0 {
+        // In doubt it is not known where it was.
+        if self.unseen_s > 0.0 {
             return;
         }
         if self.identity.probation.is_none() {

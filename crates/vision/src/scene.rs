@@ -99,8 +99,12 @@ impl Glance {
             return true;
         }
         for (before, now) in means.iter_mut().zip(now) {
-            changes.push((now - *before).abs());
+            let change = (now - *before).abs();
             *before = now;
+            // Broken samples tell nothing.
+            if change.is_finite() {
+                changes.push(change);
+            }
         }
         let change = median(changes);
         let is_jerk = change > JERK * *usual + JERK_LEVELS;
@@ -147,6 +151,7 @@ impl Scene {
     pub(crate) fn clear(&mut self) {
         self.turned = self.turned();
         self.pictures.clear();
+        (self.glance, self.is_still) = (Glance::default(), false);
     }
 
     /// Finds out how the camera has turned, by the newest picture: the others turned as much against that one as when

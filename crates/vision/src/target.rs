@@ -310,7 +310,9 @@ impl Target {
         let Frame { image, config, .. } = frame;
         let reach = self.hypotheses.reach(self.position());
         let half = self.half_gate(image, config);
-        let half = [0, 1].map(|i| half[i] + (reach[i].ceil() as usize).min(2 * half[i]));
+        let image_sides = [image.width(), image.height()];
+        let half =
+            [0, 1].map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
         let whole = Region::about(self, half);
         let noise = bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
         self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };

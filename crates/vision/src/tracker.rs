@@ -131,7 +131,7 @@ impl Follower {
     }
 
     fn is_seen(&self) -> bool {
-        !matches!(self, Self::Posterior(target) if target.missed > 0 || target.identity.is_on_probation())
+        !matches!(self, Self::Posterior(target) if target.unseen_s > 0.0 || target.identity.is_on_probation())
     }
 }
 
@@ -243,7 +243,7 @@ impl ImageTracker {
     }
 
     /// Follows all targets into the next image and returns its tracks, ordered by id. An image without
-    /// new, lost or given-up targets allocates no memory, but for the detector.
+    /// new, lost, doubtful or given-up targets allocates no memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
         let shot = Shot { time, size: (image.width(), image.height()) };
         if image.samples().is_empty() || !self.admits(shot) {
