@@ -6,7 +6,7 @@ use crossfix_correlation::{
 };
 
 use crate::ImagePoint;
-use crate::mend::mend;
+use crate::crop::mend;
 use crate::reference::Adaptation;
 use crate::{PixelBox, TrackerConfig};
 
@@ -78,6 +78,12 @@ fn odd(length: f64) -> usize {
     2 * (length / 2.0) as usize + 1
 }
 
+/// A row of the middle of a plane; sides are odd, so that the middles of all are a pixel.
+fn middle(plane: &Plane, width: usize, height: usize, row: usize) -> &[f32] {
+    let [left, top] = [(plane.width() - width) / 2, (plane.height() - height) / 2];
+    &plane.row(top + row)[left..left + width]
+}
+
 fn without_mean(plane: &mut Plane) {
     let mean = plane.mean();
     plane.samples_mut().iter_mut().for_each(|s| *s -= mean);
@@ -139,6 +145,37 @@ impl Appearance {
         };
         appearance.prepare(workshop);
         appearance
+    }
+
+    /// Correlation of two looks with each other, each in its size and direction, their noise taken out.
+    pub(crate) fn likeness(&self, other: &Self) -> f32 {
+        let (one, two) = (self.working.image(), other.working.image());
+        let (width, height) = (one.width().min(two.width()), one.height().min(two.height()));
+        let rows = (0..height).map(|y| (middle(one, width, height, y), middle(two, width, height, y)));
+        let product: f32 = rows.flat_map(|(one, two)| one.iter().zip(two)).map(|(a, b)| a * b).sum();
+        let clear = self.clear_share() * other.clear_share();
+        product / (self.energy() * other.energy() * clear).max(1e-12).sqrt()
+    }
+
+    /// The look at first, to go on from.
+    pub(crate) fn at_first(&self, config: &TrackerConfig, workshop: &mut Workshop) -> Self {
+        let (own, noise) = (self.anchor.clone(), self.anchor_noise);
+        let adaptation = Adaptation::new(config.reference, &own, noise, config.noise_floor as f32);
+        let mut first = Self {
+            adaptation: adaptation.after(self.anchor_images),
+            scale: 1.0,
+            turn_rad: 0.0,
+            drift: Drift::default(),
+            own,
+            ..self.clone()
+        };
+        first.prepare(workshop);
+        first
+    }
+
+    /// Sides of the target's box, px.
+    pub(crate) fn sides(&self) -> [f64; 2] {
+        self.size.map(|side| side * self.scale)
     }
 
     /// Energy of the reference in use.

@@ -6,7 +6,7 @@
 use crossfix_correlation::{Plane, Resampler, View};
 
 use crate::ImagePoint;
-use crate::mend::mend;
+use crate::crop::mend;
 use crate::scene::Picture;
 
 /// What has not changed may seem to have by this share of the reference: registration, compression. With half of it
@@ -83,17 +83,17 @@ impl Comparison {
         mend(&mut self.now);
     }
 
-    /// Compares what was looked at with what a picture of the scene has there. Where the target was `seen` in that picture
-    /// it does not count; `None` if that is nearly everywhere, or the place was outside.
+    /// Compares what was looked at with what a picture has in a place. Where the target was `seen` in that picture it does not
+    /// count; `None` if that is nearly everywhere, or the place was outside.
     pub(crate) fn with(
         &mut self,
         picture: &Picture,
+        then: ImagePoint,
         seen: Option<ImagePoint>,
         placed: Placed<'_>,
         resampler: &mut Resampler,
     ) -> Option<Arrival> {
-        let Placed { reference, energy, place, noise } = placed;
-        let then = picture.then(place);
+        let Placed { reference, energy, noise, .. } = placed;
         if !picture.holds(then) {
             return None;
         }

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 
 use crossfix_correlation::Plane;
 
-use crate::mend::mend;
+use crate::crop::mend;
 use crate::noise::{OF_MEDIAN, median};
 use crate::{ImagePoint, PixelBox};
 

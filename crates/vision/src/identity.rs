@@ -3,7 +3,7 @@
 use crossfix_filter::AxisFilter;
 
 use crate::ImagePoint;
-use crate::arrival::Placed;
+use crate::arrival::{Arrival, Placed};
 use crate::frame::{FRAME_INTERVAL, Frame, Step};
 use crate::look::Look;
 use crate::scene::Scene;
@@ -117,7 +117,8 @@ impl Target {
         let lost_since = self.identity.probation.as_ref().map(|probation| probation.picture);
         let Workbench { workshop, comparison, .. } = bench;
         comparison.look(frame.image, placed, &mut workshop.resampler);
-        let arrival = frame.scene.pictures().find_map(|picture| {
+        let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
+        let log_ratio = frame.scene.pictures().find_map(|picture| {
             let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
             let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
@@ -125,10 +126,16 @@ impl Target {
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
             }
-            comparison.with(picture, seen, placed, &mut workshop.resampler)
+            let then = picture.then(place);
+            let arrival = comparison.with(picture, then, seen, placed, &mut workshop.resampler)?;
+            // What is written into the video, or lies on the lens, turns with the camera.
+            let has_turned = (then.x - place.x).hypot(then.y - place.y) > longest;
+            let in_image =
+                has_turned.then(|| comparison.with(picture, place, seen, placed, &mut workshop.resampler));
+            let log_ratio = |arrival: Arrival| arrival.log_ratio(usual);
+            Some(in_image.flatten().map_or(f64::INFINITY, log_ratio).min(log_ratio(arrival)))
         });
-        let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
-        arrival.map_or(0.0, |arrival| arrival.log_ratio(usual))
+        log_ratio.unwrap_or(0.0)
     }
 
     /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against its being that of the best
@@ -187,6 +194,7 @@ impl Target {
         {
             (self.axes, self.unseen_s, self.last_seen) = (before.axes, before.unseen_s, before.last_seen);
             self.missed = self.missed.max(before.missed);
+            self.take_last_look();
             self.identity.in_pictures.retain(|(number, _)| *number <= before.picture);
             return step;
         }

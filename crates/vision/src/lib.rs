@@ -28,15 +28,17 @@
 mod appearance;
 mod arrival;
 mod config;
+mod crop;
 mod detector;
 mod figure;
+mod finding;
 mod frame;
 mod hypotheses;
 mod identity;
 mod lanes;
 mod likelihood;
 mod look;
-mod mend;
+mod looks;
 mod noise;
 mod paper;
 mod posterior;
@@ -44,6 +46,7 @@ mod reference;
 mod registration;
 mod scene;
 mod search;
+mod sighting;
 mod target;
 mod tracker;
 

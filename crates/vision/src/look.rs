@@ -1,6 +1,7 @@
 //! The reference fitted between the pixels, where the target is believed to be: the measurement.
 
 use crossfix_correlation::{Fit, FitOptions, Freedom};
+use crossfix_filter::{AxisFilter, AxisMeasurement};
 use nalgebra::Matrix2;
 
 use crate::appearance::Drift;
@@ -25,6 +26,15 @@ pub(crate) struct Look {
     pub(crate) shape: Option<[(f64, f64); 2]>,
     /// Correlation with the noise taken out.
     pub(crate) score: f64,
+}
+
+impl Look {
+    /// The filter of an axis that begins here, of a target that moves as one does that was lost.
+    pub(crate) fn start(&self, axis: usize, config: &TrackerConfig) -> AxisFilter {
+        let position = [self.place.x, self.place.y][axis];
+        let first = AxisMeasurement { position, variance: self.covariance[(axis, axis)] };
+        AxisFilter::start_at_rest(first, config.search_velocity_sd_px, config.acceleration_sd_px)
+    }
 }
 
 impl Target {

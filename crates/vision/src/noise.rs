@@ -1,6 +1,6 @@
 use crossfix_correlation::Plane;
 
-use crate::mend::BRIGHTEST;
+use crate::crop::BRIGHTEST;
 
 /// Samples that the median is taken of; more tell little more.
 const SAMPLES: usize = 200;

@@ -5,8 +5,8 @@ use crossfix_correlation::{Extent, Plane, Reference, Window};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
 use nalgebra::Matrix2;
 
+use crate::crop::mend;
 use crate::frame::{Measurement, Step};
-use crate::mend::mend;
 use crate::reference::Adaptation;
 use crate::target::{Workbench, predict};
 use crate::{ImagePoint, PixelBox, TrackerConfig};

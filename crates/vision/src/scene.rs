@@ -8,7 +8,7 @@ use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
-use crate::mend::mend;
+use crate::crop::mend;
 use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 

@@ -5,10 +5,10 @@ use std::ops::Range;
 use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
+use crate::crop::{crop, mend};
 use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::look::Look;
-use crate::mend::mend;
 use crate::noise::{OF_MEDIAN, median};
 use crate::target::{Target, Workbench};
 
@@ -21,7 +21,7 @@ const MOST_COARSE: usize = 4;
 /// best place's, and its contrast is by so many nats likelier the target's than that of the best of so many places of what
 /// is searched through. Of the places that a search takes for the target on the shared and drawn cases half are others'
 /// without the last, and with 4 a third; with twice as much an eighth of the right ones is refused.
-const LEAST_RATIO: f32 = 3.0;
+pub(crate) const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
 /// No scene looks less like a target than this, in contrasts: the samples' own steps.
@@ -109,7 +109,8 @@ impl Coarse {
         let (width, height) = (self.reference.image().width(), self.reference.image().height());
         let left = columns.start as isize - (width as isize - 1) / 2;
         let top = rows.start as isize - (height as isize - 1) / 2;
-        picture.crop_into(left, top, columns.len() + width - 1, rows.len() + height - 1, &mut bench.gate);
+        let sides = [columns.len() + width - 1, rows.len() + height - 1];
+        crop(picture, [left, top], sides, &mut bench.gate);
         bench.correlator.statistics(&bench.gate, &self.reference, &mut bench.statistics);
         let pixels = (width * height) as f32;
         let noise = noise / (self.coarseness * self.coarseness) as f32;
@@ -160,10 +161,14 @@ struct Searched<'a> {
     is_change: bool,
 }
 
-/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image, where it may hover.
+/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image, where it may hover; and by turns
+/// in its last look and its first, which stays if it is found by that.
 pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench) -> Found {
     let mut change = std::mem::take(&mut bench.search.change);
     let is_change = target.searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
+    if target.searches / 2 % 2 == 1 {
+        target.take_first_look(frame.config, &mut bench.workshop);
+    }
     target.searches += 1;
     let searched = if is_change {
         Searched { picture: &change, noise: NOISE_OF_CHANGE * target.noise, is_change }
@@ -172,6 +177,9 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     };
     let found = find_in(target, frame, searched, bench);
     bench.search.change = change;
+    if !found.accepted {
+        target.take_last_look();
+    }
     found
 }
 
@@ -210,38 +218,68 @@ fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench:
     let best = area.best_place(target, bench, config);
 
     // Once more at full resolution, where the coarse search says.
-    let reach = coarseness + 1;
-    let origin = [0, 1].map(|i| best.place[i].round() - reach as f64);
-    let corner = [0, 1].map(|i| origin[i] as isize - (sides[i] as isize - 1) / 2);
-    let gate = sides.map(|side| 2 * reach + side);
-    image.crop_into(corner[0], corner[1], gate[0], gate[1], &mut bench.gate);
-    mend(&mut bench.gate);
-    bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
-    let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
-    let expected = target.expectation(noise, energy, pixels, config);
-    let mut fine = std::mem::take(&mut bench.search.fine);
-    log_ratios(&bench.statistics, expected, &mut fine);
-    let peak = fine.peak();
-    bench.search.fine = fine;
-    let contrast =
-        f64::from(bench.statistics.covariance.row(peak.row)[peak.column] * pixels / energy.max(1e-12))
-            .max(0.0);
+    let peak = best_near(target, image, noise, best.place, (coarseness + 1) as f64, bench, config);
     if is_change {
         // Where it is the image says best: the change has the noise of two.
-        frame.image.crop_into(corner[0], corner[1], gate[0], gate[1], &mut bench.gate);
-        mend(&mut bench.gate);
+        crop(frame.image, peak.corner, peak.sides, &mut bench.gate);
     }
-    let look = target.look(peak.column, peak.row, origin, bench, config);
+    let look = target.look(peak.column, peak.row, peak.origin, bench, config);
     let usual = target.usual_contrast * f64::from(target.appearance.clear_share());
-    let accepted = peak.score - best.background > LEAST_RATIO
+    let accepted = peak.log_ratio - best.background > LEAST_RATIO
         && best.margin > MARGIN
-        && likeness.log_ratio(contrast, usual, config.contrast_sd) > ABOVE_CHANCE
+        && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
         && target.arrival_log_ratio(frame, look.place, bench) >= 0.0;
     Found { look: Some(look), accepted }
 }
 
+/// The best placement of a reference near a place.
+pub(crate) struct Peak {
+    pub(crate) column: usize,
+    pub(crate) row: usize,
+    pub(crate) log_ratio: f32,
+    /// Contrast over the reference's.
+    pub(crate) contrast: f64,
+    /// Where the middle of the first placement is, and the part of the image that they cover, px.
+    pub(crate) origin: [f64; 2],
+    pub(crate) corner: [isize; 2],
+    pub(crate) sides: [usize; 2],
+}
+
+/// The best of the placements within a reach of a place, px, at full resolution; the part that they cover is left in the
+/// bench's gate.
+pub(crate) fn best_near(
+    target: &Target,
+    image: &Plane,
+    noise: f32,
+    place: [f64; 2],
+    reach: f64,
+    bench: &mut Workbench,
+    config: &TrackerConfig,
+) -> Peak {
+    let working = target.appearance.working.image();
+    let reference = [working.width(), working.height()];
+    let origin = place.map(|at| at.round() - reach.ceil());
+    let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
+    let sides = reference.map(|side| 2 * reach.ceil() as usize + side);
+    crop(image, corner, sides, &mut bench.gate);
+    bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
+    let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
+    let mut fine = std::mem::take(&mut bench.search.fine);
+    log_ratios(&bench.statistics, target.expectation(noise, energy, pixels, config), &mut fine);
+    let peak = fine.peak();
+    bench.search.fine = fine;
+    let covariance = bench.statistics.covariance.row(peak.row)[peak.column];
+    let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
+    Peak { column: peak.column, row: peak.row, log_ratio: peak.score, contrast, origin, corner, sides }
+}
+
 /// Half sides of the search, px: they grow from frame to frame.
-fn half_sides(target: &Target, image: &Plane, sides: [usize; 2], config: &TrackerConfig) -> [f64; 2] {
+pub(crate) fn half_sides(
+    target: &Target,
+    image: &Plane,
+    sides: [usize; 2],
+    config: &TrackerConfig,
+) -> [f64; 2] {
     let grown = config.search_growth_px * target.unseen_s;
     let gate = target.half_gate(image, config);
     let most = [image.width(), image.height()];

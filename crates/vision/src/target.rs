@@ -9,12 +9,13 @@ use nalgebra::Matrix2;
 use crate::appearance::{Appearance, Workshop};
 use crate::arrival::Comparison;
 use crate::config::GateRule;
+use crate::crop::crop;
 use crate::frame::{FRAME_INTERVAL, Frame, Measurement, Step};
 use crate::hypotheses::Hypotheses;
 use crate::identity::Identity;
 use crate::likelihood::{Expectation, log_ratios};
 use crate::look::Look;
-use crate::mend::mend;
+use crate::looks::OtherLook;
 use crate::noise::NoiseMeter;
 use crate::posterior::{Part, Posterior, PosteriorMap, Prior};
 use crate::search::{Background, Search};
@@ -94,6 +95,8 @@ pub(crate) struct Target {
     /// Where it was in the tracker's keepsake picture.
     pub(crate) in_keepsake: Option<ImagePoint>,
     pub(crate) background: Option<Background>,
+    /// What else it is searched for as, while it is lost.
+    pub(crate) other_look: Option<Box<OtherLook>>,
     pub(crate) identity: Identity,
     pub(crate) hypotheses: Hypotheses,
 }
@@ -146,8 +149,7 @@ impl Target {
         let centre = place.centre();
         let around = [place.width, place.height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
         let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
-        image.crop_into(corner[0] as isize, corner[1] as isize, around[0], around[1], &mut bench.gate);
-        mend(&mut bench.gate);
+        crop(image, corner.map(|at| at as isize), around, &mut bench.gate);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
         let start = |position| {
             let first = AxisMeasurement { position, variance: config.given_sd_px.powi(2) };
@@ -170,6 +172,7 @@ impl Target {
             last_seen: centre,
             in_keepsake: None,
             background: None,
+            other_look: None,
             identity: Identity::new(),
             hypotheses: Hypotheses::default(),
         }
@@ -204,6 +207,11 @@ impl Target {
     pub(crate) fn measurement(&self, look: &Look) -> Measurement {
         let covariance = look.covariance + Matrix2::identity() * self.centre_variance;
         Measurement { place: look.place, covariance }
+    }
+
+    /// Whether it is searched for, or for long has not been sure in any place.
+    pub(crate) fn is_lost(&self) -> bool {
+        self.is_searching() || self.hypotheses.are_doubted()
     }
 
     pub(crate) fn is_searching(&self) -> bool {
@@ -368,8 +376,7 @@ impl Target {
     fn posterior(&self, frame: Frame<'_>, region: Region, bench: &mut Workbench) -> Posterior {
         let Frame { image, config, .. } = frame;
         let Region { origin, corner, sides, .. } = region;
-        image.crop_into(corner[0], corner[1], sides[0], sides[1], &mut bench.gate);
-        mend(&mut bench.gate);
+        crop(image, corner, sides, &mut bench.gate);
         bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
         let expected =
             self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
@@ -380,7 +387,7 @@ impl Target {
     }
 
     /// Takes the posterior into the filters and the target's image into the reference.
-    fn update(
+    pub(crate) fn update(
         &mut self,
         frame: Frame<'_>,
         posterior: &Posterior,
@@ -459,6 +466,9 @@ impl Target {
         self.is_new = false;
         self.last_seen = place;
         self.background = None;
+        if !self.identity.is_on_probation() {
+            self.other_look = None;
+        }
     }
 
     /// Follows contrast, size, direction and appearance, the more the surer the target was seen.
@@ -539,9 +549,7 @@ impl Target {
                 let variance = variances[i].min(axis.position_variance());
                 axis.condition(AxisMeasurement { position: at[i], variance });
             } else {
-                let first = AxisMeasurement { position: at[i], variance: variances[i] };
-                *axis =
-                    AxisFilter::start_at_rest(first, config.search_velocity_sd_px, config.acceleration_sd_px);
+                *axis = look.start(i, config);
             }
         }
         self.seen(look.place);

@@ -3,8 +3,7 @@ use crossfix_message::Timestamp;
 use nalgebra::Matrix2;
 
 use crate::config::Algorithm;
-use crate::detector::{Detector, Known};
-use crate::figure::meant;
+use crate::detector::Detector;
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
@@ -59,34 +58,38 @@ pub struct ImageTrack {
 
 /// Who took a target up.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Origin {
+pub(crate) enum Origin {
     /// A person or a configuration: it is never given up.
     Given,
     /// The detector.
     Detected {
-        /// Where it was found.
+        /// Where it was found, and how far the scene had moved then, px.
         first: ImagePoint,
-        /// Whether it has been elsewhere since or before, so that the background of its place is known without it.
+        turned: [f64; 2],
+        /// Whether it has been elsewhere since or before, in the image and in the scene, so that the background of its place
+        /// is known without it: what keeps to its place in the image is on the lens, or written into the video.
         has_moved: bool,
+        /// Whether it is followed only because a target is lost that it may be: it has no track of its own.
+        is_candidate: bool,
     },
 }
 
 /// A target as one of the algorithms follows it.
 #[derive(Debug)]
-enum Follower {
+pub(crate) enum Follower {
     Posterior(Box<Target>),
     Paper(Box<PaperTarget>),
 }
 
 impl Follower {
-    fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
+    pub(crate) fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
         match config.algorithm {
             Algorithm::Posterior => Self::Posterior(Box::new(Target::new(image, place, bench, config))),
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }
     }
 
-    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
+    pub(crate) fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
         match (self, cue) {
             (Self::Posterior(target), None) => target.step(frame, bench),
             (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
@@ -97,21 +100,21 @@ impl Follower {
         }
     }
 
-    fn position(&self) -> ImagePoint {
+    pub(crate) fn position(&self) -> ImagePoint {
         match self {
             Self::Posterior(target) => target.position(),
             Self::Paper(target) => target.position(),
         }
     }
 
-    fn velocity(&self) -> ImagePoint {
+    pub(crate) fn velocity(&self) -> ImagePoint {
         match self {
             Self::Posterior(target) => target.velocity(),
             Self::Paper(target) => target.velocity(),
         }
     }
 
-    fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
+    pub(crate) fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
         match self {
             Self::Posterior(target) => Some(target.covariances()),
             Self::Paper(target) => target.axes().map(|[x, y]| [x.covariance(), y.covariance()]),
@@ -119,32 +122,46 @@ impl Follower {
     }
 
     /// Width and height of the target, px.
-    fn size(&self) -> [f64; 2] {
+    pub(crate) fn size(&self) -> [f64; 2] {
         match self {
-            Self::Posterior(target) => target.appearance.size.map(|side| side * target.appearance.scale),
+            Self::Posterior(target) => target.appearance.sides(),
             Self::Paper(target) => target.size,
         }
     }
 
-    fn is_searching(&self) -> bool {
+    pub(crate) fn is_lost(&self) -> bool {
+        matches!(self, Self::Posterior(target) if target.is_lost())
+    }
+
+    pub(crate) fn is_searching(&self) -> bool {
         matches!(self, Self::Posterior(target) if target.is_searching())
     }
 
-    fn is_seen(&self) -> bool {
+    pub(crate) fn is_seen(&self) -> bool {
         !matches!(self, Self::Posterior(target) if target.unseen_s > 0.0 || target.identity.is_on_probation())
     }
 }
 
 #[derive(Debug)]
-struct Followed {
-    id: ImageTrackId,
-    origin: Origin,
-    target: Follower,
-    measured_at: Timestamp,
+pub(crate) struct Followed {
+    pub(crate) id: ImageTrackId,
+    pub(crate) origin: Origin,
+    pub(crate) target: Follower,
+    pub(crate) measured_at: Timestamp,
     /// When it was searched for last.
-    searched: Option<Timestamp>,
+    pub(crate) searched: Option<Timestamp>,
     /// Where it is in the next image, if somebody said so.
-    cue: Option<ImagePoint>,
+    pub(crate) cue: Option<ImagePoint>,
+    /// Since when it is followed.
+    pub(crate) since: Timestamp,
+    /// The candidate that is shown in its place, while it is lost.
+    pub(crate) stand_in: Option<ImageTrackId>,
+}
+
+impl Followed {
+    pub(crate) fn is_candidate(&self) -> bool {
+        matches!(self.origin, Origin::Detected { is_candidate: true, .. })
+    }
 }
 
 /// A picture of a moment ago in which every target was seen: what a lost target is not.
@@ -181,15 +198,17 @@ impl Shot {
 /// given up.
 #[derive(Debug)]
 pub struct ImageTracker {
-    config: TrackerConfig,
-    bench: Workbench,
+    pub(crate) config: TrackerConfig,
+    pub(crate) bench: Workbench,
     keepsake: Option<Keepsake>,
-    scene: Scene,
-    detector: Option<Detector>,
-    waiting: Vec<PixelBox>,
-    followed: Vec<Followed>,
-    tracks: Vec<ImageTrack>,
-    next_id: u64,
+    pub(crate) scene: Scene,
+    pub(crate) detector: Option<Detector>,
+    pub(crate) waiting: Vec<PixelBox>,
+    pub(crate) followed: Vec<Followed>,
+    pub(crate) tracks: Vec<ImageTrack>,
+    pub(crate) next_id: u64,
+    /// Candidates are counted down from the last number: theirs are never published.
+    pub(crate) next_candidate: u64,
     last: Option<Shot>,
     refused: u64,
     /// The newest refused image, and how many in a row agreed with each other.
@@ -214,6 +233,7 @@ impl ImageTracker {
             followed: Vec::new(),
             tracks: Vec::new(),
             next_id: 1,
+            next_candidate: u64::MAX - 1,
             last: None,
             refused: 0,
             refused_last: None,
@@ -277,8 +297,12 @@ impl ImageTracker {
             may_search: false,
             config: &self.config,
         };
-        let turn =
-            self.followed.iter().filter(|f| f.target.is_searching()).min_by_key(|f| f.searched).map(|f| f.id);
+        let turn = self
+            .followed
+            .iter()
+            .filter(|f| f.target.is_searching() && f.stand_in.is_none())
+            .min_by_key(|f| f.searched)
+            .map(|f| f.id);
         for followed in &mut self.followed {
             let frame = Frame { may_search: turn == Some(followed.id), ..frame };
             if frame.may_search {
@@ -290,10 +314,10 @@ impl ImageTracker {
             }
             let phase = match step.measured {
                 Some(_) => TrackPhase::Tracking,
-                None if followed.target.is_searching() => TrackPhase::Searching,
+                None if followed.target.is_lost() => TrackPhase::Searching,
                 None => TrackPhase::Coasting,
             };
-            self.tracks.push(describe(followed, phase, step));
+            self.tracks.push(describe(followed.id, &followed.target, phase, step));
         }
         self.give_up(time);
         self.tracks.retain(|track| self.followed.iter().any(|followed| followed.id == track.id));
@@ -331,7 +355,7 @@ impl ImageTracker {
         }
         // What was noted in the wrong one's time means nothing either.
         for followed in &mut self.followed {
-            (followed.measured_at, followed.searched) = (shot.time, None);
+            (followed.measured_at, followed.since, followed.searched) = (shot.time, shot.time, None);
         }
         self.keepsake = None;
         self.scene.clear();
@@ -343,7 +367,8 @@ impl ImageTracker {
     /// Keeps a picture for later losses: from time to time, while every target is seen, and when one
     /// is new.
     fn keep(&mut self, image: &Plane, time: Timestamp) {
-        let all_seen = self.followed.iter().all(|followed| followed.target.is_seen());
+        let all_seen =
+            self.followed.iter().all(|followed| followed.is_candidate() || followed.target.is_seen());
         let new = self
             .followed
             .iter()
@@ -381,82 +406,9 @@ impl ImageTracker {
             }
         }
     }
-
-    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for the scene is given up.
-    fn detect(
-        &mut self,
-        image: &Plane,
-        interval: f64,
-        given: &[(PixelBox, Origin)],
-    ) -> Vec<(PixelBox, Origin)> {
-        let (Some(detector), Some(config)) = (&mut self.detector, &self.config.detector) else {
-            return Vec::new();
-        };
-        for followed in &mut self.followed {
-            let place = box_of(&followed.target);
-            let (at, side) = (place.centre(), place.width.max(place.height));
-            if let Origin::Detected { first, has_moved } = &mut followed.origin {
-                *has_moved |= (at.x - first.x).hypot(at.y - first.y) > side;
-            }
-        }
-        // One that is lost is no longer where it is guessed to be: it may be found there, and something else too.
-        let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
-        let known = seen.map(|followed| Known {
-            id: followed.id,
-            place: box_of(&followed.target),
-            is_watched: matches!(followed.origin, Origin::Detected { has_moved: true, .. }),
-        });
-        // The number of a track to be is nobody's.
-        let given = given.iter().map(|(place, _)| Known {
-            id: ImageTrackId(u64::MAX),
-            place: *place,
-            is_watched: false,
-        });
-        let known: Vec<Known> = known.chain(given).collect();
-        let findings = detector.step(image, interval, self.scene.turned(), &known);
-        self.followed.retain(|followed| !findings.scene.contains(&followed.id));
-        self.tracks.retain(|track| !findings.scene.contains(&track.id));
-        let room = config.max_targets.saturating_sub(self.followed.len());
-        let found = findings.found.into_iter().take(room).map(|found| {
-            let has_moved = found.gone_px > found.place.width.max(found.place.height);
-            (found.place, Origin::Detected { first: found.place.centre(), has_moved })
-        });
-        found.collect()
-    }
-
-    /// The box of the target that a given box was meant for.
-    fn meant(&mut self, image: &Plane, place: PixelBox, origin: Origin) -> PixelBox {
-        let TrackerConfig { algorithm, box_sd_px, noise_floor, .. } = self.config;
-        let as_given = algorithm == Algorithm::Paper || origin != Origin::Given || box_sd_px <= 0.0;
-        if as_given {
-            return place;
-        }
-        // Of what is about it: the ground below a sky has other noise.
-        let PixelBox { x, y, width, height } = place;
-        let corner = [x - width, y - height].map(|at| at as isize);
-        let sides = [width, height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
-        let noise = self.bench.meter.variance_within(image, corner, sides, noise_floor as f32);
-        meant(image, place, box_sd_px, noise.sqrt())
-    }
-
-    fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
-        let given = std::mem::take(&mut self.waiting).into_iter().map(|place| (place, Origin::Given));
-        let mut new: Vec<(PixelBox, Origin)> = given.collect();
-        new.extend(self.detect(image, interval, &new));
-        for (place, origin) in new {
-            let id = ImageTrackId(self.next_id);
-            self.next_id += 1;
-            let place = self.meant(image, place, origin);
-            let target = Follower::new(image, place, &mut self.bench, &self.config);
-            let followed = Followed { id, origin, target, measured_at: time, searched: None, cue: None };
-            let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
-            self.tracks.push(describe(&followed, TrackPhase::Tentative, step));
-            self.followed.push(followed);
-        }
-    }
 }
 
-fn box_of(target: &Follower) -> PixelBox {
+pub(crate) fn box_of(target: &Follower) -> PixelBox {
     let [width, height] = target.size();
     PixelBox::about(target.position(), width, height)
 }
@@ -468,11 +420,10 @@ fn same(one: &Follower, other: &Follower) -> bool {
     (a.x - b.x).abs() < aw.max(bw) / 2.0 && (a.y - b.y).abs() < ah.max(bh) / 2.0
 }
 
-fn describe(followed: &Followed, phase: TrackPhase, step: Step) -> ImageTrack {
-    let target = &followed.target;
+pub(crate) fn describe(id: ImageTrackId, target: &Follower, phase: TrackPhase, step: Step) -> ImageTrack {
     let [width, height] = target.size();
     ImageTrack {
-        id: followed.id,
+        id,
         phase,
         position: target.position(),
         velocity: target.velocity(),

@@ -18,7 +18,7 @@ mod plots;
 
 use crossfix_correlation::Plane;
 
-use crate::mend::mend;
+use crate::crop::mend;
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
 use filter::{Lines, between, halve, stand_out};

@@ -63,6 +63,11 @@ impl Adaptation {
         Self { strategy, filter, images: 1.0, noise }
     }
 
+    /// The same after so many images, of which the first is the mean.
+    pub(crate) fn after(self, images: f32) -> Self {
+        Self { images, ..self }
+    }
+
     /// Takes an image in, of noise of a variance, that shows the target with a certainty of 0 to 1,
     /// `interval` seconds after the last one.
     pub(crate) fn take_in(

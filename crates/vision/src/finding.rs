@@ -1,0 +1,205 @@
+//! What is new in an image: boxes that somebody gave, and what the detector finds, which may be a target that was lost.
+
+use crossfix_correlation::Plane;
+use crossfix_message::Timestamp;
+
+use crate::config::Algorithm;
+use crate::detector::{Detector, Found, Known};
+use crate::figure::meant;
+use crate::frame::{Frame, Step};
+use crate::tracker::{Followed, Follower, Origin, box_of, describe};
+use crate::{DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
+
+/// Most things that are followed because they may be a target that is lost: each costs as much as a target.
+const MOST_CANDIDATES: usize = 20;
+/// A candidate is shown in a lost target's place after so long, s: as long as what a search has found is on probation. With
+/// half of it a panning camera's trees are shown.
+const CANDIDATE_S: f64 = 0.5;
+/// It may be so many times larger or smaller, a side: of a drone before trees the brightest part is found.
+const STAND_IN_SIZES: f64 = 4.0;
+/// The probability that it is the target, at most: nothing is known for it but that it moves, and nothing else has been found.
+const STAND_IN_CERTAINTY: f64 = 0.5;
+
+impl ImageTracker {
+    /// Takes up what somebody gave, and what the detector finds: a target that was lost, or a new one.
+    pub(crate) fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
+        let given = std::mem::take(&mut self.waiting);
+        let found = self.detect(image, interval, &given);
+        for place in given {
+            let place = self.meant(image, place);
+            self.take_up_at(image, place, Origin::Given, time);
+        }
+        for found in found {
+            if !self.is_lost_one(image, found.place, time, interval) {
+                self.take_up_found(image, found, time);
+            }
+        }
+        self.show_stand_ins(time);
+    }
+
+    fn take_up_found(&mut self, image: &Plane, found: Found, time: Timestamp) {
+        let has_room = match &self.config.detector {
+            Some(config) => self.followed.len() < config.max_targets,
+            None => self.followed.iter().filter(|f| f.is_candidate()).count() < MOST_CANDIDATES,
+        };
+        if !has_room {
+            return;
+        }
+        let Found { place, gone_px } = found;
+        let is_candidate = self.config.detector.is_none();
+        let origin = Origin::Detected {
+            first: place.centre(),
+            turned: self.scene.turned(),
+            // What may be a lost target has to show by itself that it moves.
+            has_moved: !is_candidate && gone_px > place.width.max(place.height),
+            is_candidate,
+        };
+        self.take_up_at(image, place, origin, time);
+    }
+
+    fn take_up_at(&mut self, image: &Plane, place: PixelBox, origin: Origin, time: Timestamp) {
+        let is_candidate = matches!(origin, Origin::Detected { is_candidate: true, .. });
+        let id = if is_candidate { &mut self.next_candidate } else { &mut self.next_id };
+        let number = *id;
+        *id = if is_candidate { number - 1 } else { number + 1 };
+        let id = ImageTrackId(number);
+        let target = Follower::new(image, place, &mut self.bench, &self.config);
+        let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
+        self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
+        self.followed.push(Followed {
+            id,
+            origin,
+            target,
+            measured_at: time,
+            since: time,
+            searched: None,
+            cue: None,
+            stand_in: None,
+        });
+    }
+
+    /// While a target is lost, what else moves may be it, and is shown in its place.
+    fn show_stand_ins(&mut self, time: Timestamp) {
+        for lost in 0..self.followed.len() {
+            let followed = &self.followed[lost];
+            let is_lost = followed.origin == Origin::Given && followed.target.is_searching();
+            let stand_in = if is_lost { self.stand_in_of(followed, time) } else { None };
+            self.followed[lost].stand_in = stand_in;
+            let track = |id| self.tracks.iter().position(|track| track.id == id);
+            if let (Some(shown), Some(instead)) = (track(self.followed[lost].id), stand_in.and_then(track)) {
+                let certainty = self.tracks[instead].certainty.min(STAND_IN_CERTAINTY);
+                self.tracks[shown] =
+                    ImageTrack { id: self.tracks[shown].id, certainty, ..self.tracks[instead] };
+            }
+        }
+        let is_candidate =
+            |id| self.followed.iter().any(|followed| followed.id == id && followed.is_candidate());
+        self.tracks.retain(|track| !is_candidate(track.id));
+    }
+
+    /// The candidate that stands in for a lost target: the one that did before, or one that does for no other.
+    fn stand_in_of(&self, lost: &Followed, time: Timestamp) -> Option<ImageTrackId> {
+        let [width, height] = lost.target.size();
+        let fits = |followed: &Followed| {
+            let [w, h] = followed.target.size();
+            let larger = ((w * h) / (width * height)).sqrt();
+            followed.is_candidate()
+                && matches!(followed.origin, Origin::Detected { has_moved: true, .. })
+                && followed.target.is_seen()
+                && time.seconds_since(followed.since) > CANDIDATE_S
+                && (1.0 / STAND_IN_SIZES..=STAND_IN_SIZES).contains(&larger)
+                && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
+        };
+        let before = self.followed.iter().find(|followed| Some(followed.id) == lost.stand_in);
+        before.or_else(|| self.followed.iter().find(|followed| fits(followed))).map(|followed| followed.id)
+    }
+
+    /// The box of the target that a given box was meant for.
+    fn meant(&mut self, image: &Plane, place: PixelBox) -> PixelBox {
+        let TrackerConfig { algorithm, box_sd_px, noise_floor, .. } = self.config;
+        if algorithm == Algorithm::Paper || box_sd_px <= 0.0 {
+            return place;
+        }
+        // Of what is about it: the ground below a sky has other noise.
+        let PixelBox { x, y, width, height } = place;
+        let corner = [x - width, y - height].map(|at| at as isize);
+        let sides = [width, height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
+        let noise = self.bench.meter.variance_within(image, corner, sides, noise_floor as f32);
+        meant(image, place, box_sd_px, noise.sqrt())
+    }
+
+    /// The detector is there where it is asked for, and while a target is lost.
+    fn call_detector(&mut self) {
+        if self.config.detector.is_some() || self.config.algorithm == Algorithm::Paper {
+            return;
+        }
+        if self.followed.iter().all(|followed| followed.is_candidate() || followed.target.is_seen()) {
+            self.detector = None;
+            self.followed.retain(|followed| !followed.is_candidate());
+        } else if self.detector.is_none()
+            && self.followed.iter().any(|f| !f.is_candidate() && f.target.is_searching())
+        {
+            self.detector = Some(Detector::new(DetectorConfig::default()));
+        }
+    }
+
+    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for the scene is given up.
+    fn detect(&mut self, image: &Plane, interval: f64, given: &[PixelBox]) -> Vec<Found> {
+        self.call_detector();
+        let Some(detector) = &mut self.detector else { return Vec::new() };
+        let turned = self.scene.turned();
+        for followed in &mut self.followed {
+            let place = box_of(&followed.target);
+            let (at, side) = (place.centre(), place.width.max(place.height));
+            if let Origin::Detected { first, turned: then, has_moved, .. } = &mut followed.origin {
+                let gone = [at.x - first.x, at.y - first.y];
+                let in_scene = [gone[0] + turned[0] - then[0], gone[1] + turned[1] - then[1]];
+                *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
+            }
+        }
+        // One that is lost is no longer where it is guessed to be: it may be found there, and something else too.
+        let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
+        let known = seen.map(|followed| Known {
+            id: followed.id,
+            place: box_of(&followed.target),
+            is_watched: matches!(followed.origin, Origin::Detected { has_moved: true, .. }),
+        });
+        // The number of a track to be is nobody's.
+        let given =
+            given.iter().map(|place| Known { id: ImageTrackId(u64::MAX), place: *place, is_watched: false });
+        let known: Vec<Known> = known.chain(given).collect();
+        let findings = detector.step(image, interval, turned, &known);
+        self.followed.retain(|followed| !findings.scene.contains(&followed.id));
+        self.tracks.retain(|track| !findings.scene.contains(&track.id));
+        findings.found
+    }
+
+    /// Whether what the detector has found is a target that was lost: then that one goes on there, the likeliest of them.
+    fn is_lost_one(&mut self, image: &Plane, place: PixelBox, time: Timestamp, interval: f64) -> bool {
+        let frame = Frame {
+            image,
+            interval,
+            keepsake: None,
+            scene: &self.scene,
+            scene_moved: [0.0; 2],
+            may_search: false,
+            config: &self.config,
+        };
+        let bench = &mut self.bench;
+        let sightings = self.followed.iter_mut().filter_map(|followed| {
+            let Follower::Posterior(target) = &mut followed.target else { return None };
+            let seen = target.sighting(frame, place, bench)?;
+            Some((followed, seen))
+        });
+        let best = sightings.max_by(|(_, one), (_, other)| one.log_ratio.total_cmp(&other.log_ratio));
+        let Some((followed, seen)) = best else { return false };
+        let Follower::Posterior(target) = &mut followed.target else { return false };
+        let step = target.go_on_at(frame, seen, &mut self.bench);
+        followed.measured_at = time;
+        let track = describe(followed.id, &followed.target, TrackPhase::Tracking, step);
+        if let Some(shown) = self.tracks.iter_mut().find(|shown| shown.id == followed.id) {
+            *shown = track;
+        }
+        true
+    }
+}
