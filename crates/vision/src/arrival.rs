@@ -14,6 +14,8 @@ use crate::scene::Picture;
 const UNCHANGED: f64 = 0.1;
 /// How much of a target's usual contrast the scene itself may have in its place: as much as half, often.
 const SCENE_SHARE: f64 = 0.5;
+/// By how much of it the scene behind what lies on the lens changes its contrast: a scene has half as much as what is told from it, now and then.
+const BEHIND: f64 = 0.35;
 /// How well the pictures are registered, px an axis.
 const REGISTERED_PX: f64 = 0.25;
 /// Pixels that are one look: neighbours are blurred and compressed together, ...
@@ -22,6 +24,9 @@ const PIXELS_A_LOOK: f64 = 4.0;
 const MOST_LOOKS: f64 = 12.0;
 /// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model must be able to be.
 const MOST: f64 = 8.0;
+/// The contrast of a scene that has not changed may have by so many times, as the light or the exposure did. At 1 whatever is
+/// there has come with every step of the light, where there is no noise to hide it.
+const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// So much of the reference's energy must lie where the target was not before.
 const LEAST_FREE: f64 = 0.25;
 /// Fewer pixels tell nothing.
@@ -65,12 +70,22 @@ impl Arrival {
     /// Before, the scene had any contrast c there, `c ~ N(0, (usual / 2)^2)`, or the one that is there now; and where the
     /// scene has not changed, no pixel has.
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
-        let Self { now, before, variance, change, looks } = self;
+        let Self { change, looks, .. } = self;
+        let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
+        (self.contrast_log_ratio(usual, UNCHANGED) + changed.min(MOST)).clamp(-MOST, MOST)
+    }
+
+    /// The same against what lies on the lens, or is written into the video: the scene behind it has changed.
+    pub(crate) fn on_lens_log_ratio(self, usual: f64) -> f64 {
+        self.contrast_log_ratio(usual, BEHIND * usual).clamp(-MOST, MOST)
+    }
+
+    /// By the contrasts alone, of which what has not changed may be off by a standard deviation.
+    fn contrast_log_ratio(self, usual: f64, unchanged_sd: f64) -> f64 {
+        let Self { now, before, variance, .. } = self;
         let normal = |off: f64, variance: f64| -0.5 * (off * off / variance + variance.ln());
         let arrived = normal(before, variance + (SCENE_SHARE * usual).powi(2));
-        let unchanged = normal(before - now, 2.0 * variance + UNCHANGED.powi(2));
-        let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
-        (arrived - unchanged + changed.min(MOST)).clamp(-MOST, MOST)
+        arrived - normal(before - now, 2.0 * variance + unchanged_sd.powi(2))
     }
 }
 
@@ -136,7 +151,9 @@ struct Sums {
     reference_squared: f64,
     reference_now: f64,
     reference_before: f64,
-    change_squared: f64,
+    now_squared: f64,
+    before_squared: f64,
+    now_before: f64,
     slope_squared: f64,
 }
 
@@ -150,8 +167,21 @@ impl Sums {
         self.reference_squared += reference * reference;
         self.reference_now += reference * now;
         self.reference_before += reference * before;
-        self.change_squared += (now - before).powi(2);
+        self.now_squared += now * now;
+        self.before_squared += before * before;
+        self.now_before += now * before;
         self.slope_squared += f64::from(slope_squared);
+    }
+
+    /// Sum of the squares of what has changed but for the light: its brightness, and its contrast.
+    fn change_squared(&self) -> f64 {
+        let n = self.pixels;
+        let now = (self.now_squared - self.now * self.now / n).max(0.0);
+        let before = (self.before_squared - self.before * self.before / n).max(0.0);
+        let both = self.now_before - self.now * self.before / n;
+        let [least, most] = LIGHTER;
+        let lighter = if before > 0.0 { (both / before).clamp(least, most) } else { 1.0 };
+        (now - 2.0 * lighter * both + lighter * lighter * before).max(0.0)
     }
 
     fn arrival(self, whole: f64, noise: f64) -> Option<Arrival> {
@@ -167,12 +197,11 @@ impl Sums {
         // Two differences of noisy pixels are in each slope.
         let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
         let unchanged = (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
-        let brighter = self.now - self.before;
         Some(Arrival {
             now: contrast(self.reference_now, self.now),
             before: contrast(self.reference_before, self.before),
             variance: noise / energy,
-            change: (self.change_squared - brighter * brighter / n) / n / unchanged,
+            change: self.change_squared() / n / unchanged,
             looks: (n / PIXELS_A_LOOK).min(MOST_LOOKS),
         })
     }

@@ -6,8 +6,9 @@ use crossfix_filter::{AxisFilter, AxisMeasurement};
 
 use crate::config::GateRule;
 use crate::frame::{Frame, Step};
+use crate::gate::Region;
 use crate::posterior::Posterior;
-use crate::target::{Region, SEEN, Target, Workbench, predict};
+use crate::target::{SEEN, Target, Workbench, predict};
 use crate::{ImagePoint, TrackerConfig};
 
 /// Certainty of the best place below which the others are kept too.

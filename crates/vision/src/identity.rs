@@ -3,10 +3,10 @@
 use crossfix_filter::AxisFilter;
 
 use crate::ImagePoint;
-use crate::arrival::{Arrival, Placed};
+use crate::arrival::Placed;
 use crate::frame::{FRAME_INTERVAL, Frame, Step};
 use crate::look::Look;
-use crate::scene::Scene;
+use crate::scene::{Picture, Scene};
 use crate::target::{Target, Workbench, predict};
 
 /// A target that was found again is believed after so long, s: until then a mistake costs what is known of where it went,
@@ -118,7 +118,7 @@ impl Target {
         let Workbench { workshop, comparison, .. } = bench;
         comparison.look(frame.image, placed, &mut workshop.resampler);
         let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
-        let log_ratio = frame.scene.pictures().find_map(|picture| {
+        let mut against = |picture: &Picture, then: ImagePoint| {
             let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
             let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
@@ -126,16 +126,16 @@ impl Target {
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
             }
-            let then = picture.then(place);
-            let arrival = comparison.with(picture, then, seen, placed, &mut workshop.resampler)?;
-            // What is written into the video, or lies on the lens, turns with the camera.
-            let has_turned = (then.x - place.x).hypot(then.y - place.y) > longest;
-            let in_image =
-                has_turned.then(|| comparison.with(picture, place, seen, placed, &mut workshop.resampler));
-            let log_ratio = |arrival: Arrival| arrival.log_ratio(usual);
-            Some(in_image.flatten().map_or(f64::INFINITY, log_ratio).min(log_ratio(arrival)))
-        });
-        log_ratio.unwrap_or(0.0)
+            comparison.with(picture, then, seen, placed, &mut workshop.resampler)
+        };
+        let pictures = || frame.scene.pictures();
+        let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
+        // What is written into the video, or lies on the lens, turns with the camera.
+        let has_turned = |then: ImagePoint| (then.x - place.x).hypot(then.y - place.y) > longest;
+        let turned = pictures().filter(|picture| has_turned(picture.then(place)));
+        let lens = turned.filter_map(|picture| against(picture, place)).next();
+        let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
+        lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
     }
 
     /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against its being that of the best

@@ -33,6 +33,7 @@ mod detector;
 mod figure;
 mod finding;
 mod frame;
+mod gate;
 mod hypotheses;
 mod identity;
 mod lanes;

@@ -11,6 +11,10 @@ use crate::target::Target;
 /// correlate by 0.94 or more, and 0.65 to 0.78 where the last look finds nothing. With half of it the first look is not
 /// searched for.
 const ALIKE: f32 = 0.8;
+/// So long after it was seen it is searched for as it was last alone, s: then it has been hidden, and has turned since it was
+/// first seen. With half of it one that turns is found where it is not, with twice as much one that has fooled its reference is
+/// found a second later.
+const LAST_LOOK_S: f64 = 1.0;
 /// With its first look it is seen as it was then; how much that may vary the search knows.
 const FIRST_CONTRAST: f64 = 1.0;
 
@@ -27,8 +31,11 @@ pub(crate) struct OtherLook {
 }
 
 impl Target {
-    /// Takes its first look, unless the last is like it. False if it has not.
+    /// Takes its first look, unless the last is like it or it was seen a moment ago. False if it has not.
     pub(crate) fn take_first_look(&mut self, config: &TrackerConfig, workshop: &mut Workshop) -> bool {
+        if self.unseen_s < LAST_LOOK_S {
+            return false;
+        }
         let last = &self.appearance;
         let other = self.other_look.get_or_insert_with(|| {
             let appearance = last.at_first(config, workshop);

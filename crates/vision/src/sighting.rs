@@ -66,11 +66,9 @@ impl Target {
         let at = found.centre();
         let peak = best_near(self, frame.image, self.noise, [at.x, at.y], reach, bench, frame.config);
         let look = self.look(peak.column, peak.row, peak.origin, bench, frame.config);
-        (peak.log_ratio > LEAST_RATIO).then_some(Sighting {
-            look,
-            log_ratio: peak.log_ratio,
-            by_first_look: false,
-        })
+        let has_come =
+            peak.log_ratio > LEAST_RATIO && self.arrival_log_ratio(frame, look.place, bench) >= 0.0;
+        has_come.then_some(Sighting { look, log_ratio: peak.log_ratio, by_first_look: false })
     }
 
     /// Goes on where the detector has found it, on probation.

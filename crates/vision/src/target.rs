@@ -11,13 +11,14 @@ use crate::arrival::Comparison;
 use crate::config::GateRule;
 use crate::crop::crop;
 use crate::frame::{FRAME_INTERVAL, Frame, Measurement, Step};
+use crate::gate::Region;
 use crate::hypotheses::Hypotheses;
 use crate::identity::Identity;
-use crate::likelihood::{Expectation, log_ratios};
+use crate::likelihood::Expectation;
 use crate::look::Look;
 use crate::looks::OtherLook;
 use crate::noise::NoiseMeter;
-use crate::posterior::{Part, Posterior, PosteriorMap, Prior};
+use crate::posterior::{Part, Posterior, PosteriorMap};
 use crate::search::{Background, Search};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
@@ -37,8 +38,6 @@ pub(crate) const SEEN: f64 = 0.5;
 const USUAL_S: f64 = 3.0;
 /// Time constant with which a lost target's contrast is taken for what it usually is again, s: about a cloud's edge.
 const FADES_S: f64 = 0.5;
-/// Log ratio of a placement outside the image.
-const IMPOSSIBLE: f32 = -50.0;
 /// Floor of a measurement's standard deviation, px.
 pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.015;
 /// Share of a measurement's variance that is the image's own noise, new in every frame. The rest is
@@ -99,29 +98,6 @@ pub(crate) struct Target {
     pub(crate) other_look: Option<Box<OtherLook>>,
     pub(crate) identity: Identity,
     pub(crate) hypotheses: Hypotheses,
-}
-
-/// Placements of a reference about the prediction, and the part of the image that they cover.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Region {
-    /// Placements on either side of the middle one.
-    half: [usize; 2],
-    /// Where the middle of the first placement is, px.
-    pub(crate) origin: [f64; 2],
-    /// First column and row of the part, and its sides, px.
-    corner: [isize; 2],
-    sides: [usize; 2],
-}
-
-impl Region {
-    fn about(target: &Target, half: [usize; 2]) -> Self {
-        let ImagePoint { x, y } = target.position();
-        let reference = target.appearance.working.image();
-        let reference = [reference.width(), reference.height()];
-        let origin = [0, 1].map(|i| [x, y][i].round() - half[i] as f64);
-        let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
-        Self { half, origin, corner, sides: [0, 1].map(|i| 2 * half[i] + reference[i]) }
-    }
 }
 
 /// 0 below the first value, 1 above the second, linear between.
@@ -292,28 +268,6 @@ impl Target {
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
 
-    /// Half sides of the gate (000, section 1; 001, 5.12): how far from the prediction the reference is
-    /// placed.
-    pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
-        let reference = self.appearance.working.image();
-        let sides = [(reference.width(), image.width()), (reference.height(), image.height())];
-        [0, 1].map(|i| {
-            let (side, most) = sides[i];
-            let sigmas = match config.gate {
-                GateRule::ThreeSided => 0.0,
-                GateRule::Innovation { sigmas } => sigmas,
-                GateRule::Ellipsoid { probability } => Gate::with_probability(probability).threshold().sqrt(),
-            };
-            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil();
-            (side as f64).max(spread).min(most as f64) as usize
-        })
-    }
-
-    /// Share of the prior that lies anywhere: it doubles with every image without the target.
-    pub(crate) fn anywhere(&self, config: &TrackerConfig) -> f64 {
-        (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5)
-    }
-
     pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, config, .. } = frame;
         let reach = self.hypotheses.reach(self.position());
@@ -338,52 +292,6 @@ impl Target {
         let [column, row] = posterior.peak;
         let look = self.look(column, row, region.origin, bench, config);
         self.update(frame, &posterior, look, region.origin, bench)
-    }
-
-    /// Half sides of what counts as one peak of the map of placements.
-    pub(crate) fn peak_half(&self) -> [usize; 2] {
-        let reference = self.appearance.working.image();
-        [reference.width(), reference.height()].map(|side| (side / 8).max(2))
-    }
-
-    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as much of what is none;
-    /// `None` where that is not much less, or the papers' gate is asked for.
-    fn middle_of_gate(&self, whole: [usize; 2], config: &TrackerConfig) -> Option<[usize; 2]> {
-        let GateRule::Innovation { sigmas } = config.gate else { return None };
-        if !self.hypotheses.is_empty() {
-            return None;
-        }
-        let peak = self.peak_half();
-        let half = [0, 1].map(|i| {
-            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil() as usize;
-            (spread + 3 * peak[i]).min(whole[i])
-        });
-        (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
-    }
-
-    /// What is expected of the place by some filters, on the placements of a region.
-    pub(crate) fn prior(&self, axes: &[AxisFilter; 2], region: Region, config: &TrackerConfig) -> Prior {
-        Prior {
-            centre: [0, 1].map(|i| axes[i].position() - region.origin[i]),
-            variance: [0, 1].map(|i| axes[i].position_variance() + config.prediction_floor_px.powi(2)),
-            anywhere: self.anywhere(config),
-            visible: config.visible_probability,
-            near: self.peak_half(),
-        }
-    }
-
-    /// The posterior over the placements in a region, of which the image is left in the bench's gate.
-    fn posterior(&self, frame: Frame<'_>, region: Region, bench: &mut Workbench) -> Posterior {
-        let Frame { image, config, .. } = frame;
-        let Region { origin, corner, sides, .. } = region;
-        crop(image, corner, sides, &mut bench.gate);
-        bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
-        let expected =
-            self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
-        log_ratios(&bench.statistics, expected, &mut bench.ratios);
-        mask_outside(&mut bench.ratios, origin, image);
-        let prior = self.prior(&self.axes, region, config);
-        bench.map.of(&bench.ratios, &prior)
     }
 
     /// Takes the posterior into the filters and the target's image into the reference.
@@ -524,7 +432,6 @@ impl Target {
     }
 
     fn search(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
-        let config = frame.config;
         // Nothing is known of its contrast any more but what it usually is.
         let share = (frame.interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);
@@ -533,48 +440,32 @@ impl Target {
             self.missed += 1;
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
         }
+        self.find_again(frame, bench).unwrap_or_else(|score| {
+            self.missed += 1;
+            Step { measured: None, score, certainty: 0.0, nis: None }
+        })
+    }
+
+    /// Takes what a search finds, if it is believed; else its score.
+    fn find_again(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Result<Step, f64> {
         let found = crate::search::find(self, frame, bench);
         let Some(look) = found.look.filter(|_| found.accepted) else {
-            self.missed += 1;
-            let score = found.look.map_or(0.0, |look| look.score);
-            return Step { measured: None, score, certainty: 0.0, nis: None };
+            return Err(found.look.map_or(0.0, |look| look.score));
         };
         self.begin_probation(frame.scene);
-        let at = [look.place.x, look.place.y];
-        let variances = [look.covariance.m11, look.covariance.m22];
-        for i in 0..2 {
+        for (i, position) in [look.place.x, look.place.y].into_iter().enumerate() {
             let axis = &mut self.axes[i];
-            let near = (at[i] - axis.position()).powi(2) < MANOEUVRE * axis.position_variance();
+            let near = (position - axis.position()).powi(2) < MANOEUVRE * axis.position_variance();
             if self.missed < 20 && near {
-                let variance = variances[i].min(axis.position_variance());
-                axis.condition(AxisMeasurement { position: at[i], variance });
+                let variance = look.covariance[(i, i)].min(axis.position_variance());
+                axis.condition(AxisMeasurement { position, variance });
             } else {
-                *axis = look.start(i, config);
+                *axis = look.start(i, frame.config);
             }
         }
         self.seen(look.place);
+        self.hypotheses.clear();
         let measured = self.measurement(&look);
-        Step { measured: Some(measured), score: look.score, certainty: 1.0, nis: None }
-    }
-}
-
-/// Placements whose middle lies outside the image are impossible.
-fn mask_outside(ratios: &mut Plane, origin: [f64; 2], image: &Plane) {
-    let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
-    let (width, height) = (ratios.width(), ratios.height());
-    let whole = inside(origin[0], image.width())
-        && inside(origin[1], image.height())
-        && inside(origin[0] + width as f64 - 1.0, image.width())
-        && inside(origin[1] + height as f64 - 1.0, image.height());
-    if whole {
-        return;
-    }
-    for row in 0..height {
-        let row_inside = inside(origin[1] + row as f64, image.height());
-        for (column, ratio) in ratios.row_mut(row).iter_mut().enumerate() {
-            if !row_inside || !inside(origin[0] + column as f64, image.width()) {
-                *ratio = IMPOSSIBLE;
-            }
-        }
+        Ok(Step { measured: Some(measured), score: look.score, certainty: 1.0, nis: None })
     }
 }

@@ -297,6 +297,7 @@ impl ImageTracker {
             may_search: false,
             config: &self.config,
         };
+        // One that is stood in for is taken back where the detector finds it: what a search finds elsewhere moves less.
         let turn = self
             .followed
             .iter()
@@ -397,8 +398,10 @@ impl ImageTracker {
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
-            let doubled =
-                rest[0].origin != Origin::Given && older.iter().any(|o| same(&o.target, &rest[0].target));
+            // One that is lost is not where it is guessed to be.
+            let is_of =
+                |older: &Followed| !older.target.is_searching() && same(&older.target, &rest[0].target);
+            let doubled = rest[0].origin != Origin::Given && older.iter().any(is_of);
             if doubled {
                 self.followed.remove(index);
             } else {

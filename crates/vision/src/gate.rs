@@ -1,0 +1,129 @@
+//! The gate: the part of an image in which a target is looked for, and the posterior over the placements of its reference there.
+
+use crossfix_correlation::Plane;
+use crossfix_filter::{AxisFilter, Gate};
+
+use crate::config::GateRule;
+use crate::crop::crop;
+use crate::frame::Frame;
+use crate::likelihood::log_ratios;
+use crate::posterior::{Posterior, Prior};
+use crate::target::{Target, Workbench};
+use crate::{ImagePoint, TrackerConfig};
+
+/// Log ratio of a placement outside the image.
+const IMPOSSIBLE: f32 = -50.0;
+
+/// Placements of a reference about the prediction, and the part of the image that they cover.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Region {
+    /// Placements on either side of the middle one.
+    pub(crate) half: [usize; 2],
+    /// Where the middle of the first placement is, px.
+    pub(crate) origin: [f64; 2],
+    /// First column and row of the part, and its sides, px.
+    pub(crate) corner: [isize; 2],
+    pub(crate) sides: [usize; 2],
+}
+
+impl Region {
+    pub(crate) fn about(target: &Target, half: [usize; 2]) -> Self {
+        let ImagePoint { x, y } = target.position();
+        let reference = target.appearance.working.image();
+        let reference = [reference.width(), reference.height()];
+        let origin = [0, 1].map(|i| [x, y][i].round() - half[i] as f64);
+        let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
+        Self { half, origin, corner, sides: [0, 1].map(|i| 2 * half[i] + reference[i]) }
+    }
+}
+
+impl Target {
+    /// Half sides of the gate (000, section 1; 001, 5.12): how far from the prediction the reference is
+    /// placed.
+    pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
+        let reference = self.appearance.working.image();
+        let sides = [(reference.width(), image.width()), (reference.height(), image.height())];
+        [0, 1].map(|i| {
+            let (side, most) = sides[i];
+            let sigmas = match config.gate {
+                GateRule::ThreeSided => 0.0,
+                GateRule::Innovation { sigmas } => sigmas,
+                GateRule::Ellipsoid { probability } => Gate::with_probability(probability).threshold().sqrt(),
+            };
+            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil();
+            (side as f64).max(spread).min(most as f64) as usize
+        })
+    }
+
+    /// Share of the prior that lies anywhere: it doubles with every image without the target.
+    pub(crate) fn anywhere(&self, config: &TrackerConfig) -> f64 {
+        (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5)
+    }
+
+    /// Half sides of what counts as one peak of the map of placements.
+    pub(crate) fn peak_half(&self) -> [usize; 2] {
+        let reference = self.appearance.working.image();
+        [reference.width(), reference.height()].map(|side| (side / 8).max(2))
+    }
+
+    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as much of what is none;
+    /// `None` where that is not much less, or the papers' gate is asked for.
+    pub(crate) fn middle_of_gate(&self, whole: [usize; 2], config: &TrackerConfig) -> Option<[usize; 2]> {
+        let GateRule::Innovation { sigmas } = config.gate else { return None };
+        if !self.hypotheses.is_empty() {
+            return None;
+        }
+        let peak = self.peak_half();
+        let half = [0, 1].map(|i| {
+            let spread = (sigmas * self.axes[i].position_variance().sqrt()).ceil() as usize;
+            (spread + 3 * peak[i]).min(whole[i])
+        });
+        (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
+    }
+
+    /// What is expected of the place by some filters, on the placements of a region.
+    pub(crate) fn prior(&self, axes: &[AxisFilter; 2], region: Region, config: &TrackerConfig) -> Prior {
+        Prior {
+            centre: [0, 1].map(|i| axes[i].position() - region.origin[i]),
+            variance: [0, 1].map(|i| axes[i].position_variance() + config.prediction_floor_px.powi(2)),
+            anywhere: self.anywhere(config),
+            visible: config.visible_probability,
+            near: self.peak_half(),
+        }
+    }
+
+    /// The posterior over the placements in a region, of which the image is left in the bench's gate.
+    pub(crate) fn posterior(&self, frame: Frame<'_>, region: Region, bench: &mut Workbench) -> Posterior {
+        let Frame { image, config, .. } = frame;
+        let Region { origin, corner, sides, .. } = region;
+        crop(image, corner, sides, &mut bench.gate);
+        bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
+        let expected =
+            self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
+        log_ratios(&bench.statistics, expected, &mut bench.ratios);
+        mask_outside(&mut bench.ratios, origin, image);
+        let prior = self.prior(&self.axes, region, config);
+        bench.map.of(&bench.ratios, &prior)
+    }
+}
+
+/// Placements whose middle lies outside the image are impossible.
+fn mask_outside(ratios: &mut Plane, origin: [f64; 2], image: &Plane) {
+    let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
+    let (width, height) = (ratios.width(), ratios.height());
+    let whole = inside(origin[0], image.width())
+        && inside(origin[1], image.height())
+        && inside(origin[0] + width as f64 - 1.0, image.width())
+        && inside(origin[1] + height as f64 - 1.0, image.height());
+    if whole {
+        return;
+    }
+    for row in 0..height {
+        let row_inside = inside(origin[1] + row as f64, image.height());
+        for (column, ratio) in ratios.row_mut(row).iter_mut().enumerate() {
+            if !row_inside || !inside(origin[0] + column as f64, image.width()) {
+                *ratio = IMPOSSIBLE;
+            }
+        }
+    }
+}
