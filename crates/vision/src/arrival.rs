@@ -14,7 +14,9 @@ use crate::scene::Picture;
 const UNCHANGED: f64 = 0.1;
 /// How much of a target's usual contrast the scene itself may have in its place: as much as half, often.
 const SCENE_SHARE: f64 = 0.5;
-/// By how much of it the scene behind what lies on the lens changes its contrast: a scene has half as much as what is told from it, now and then.
+/// Standard deviation by which the scenes behind what lies on the lens change its contrast, as a share of the target's usual
+/// one: two scenes, each with a quarter of it. With half of it digits before clouds count as come, with twice as much a target
+/// that comes to where a cloud was counts as there before.
 const BEHIND: f64 = 0.35;
 /// How well the pictures are registered, px an axis.
 const REGISTERED_PX: f64 = 0.25;
@@ -24,8 +26,8 @@ const PIXELS_A_LOOK: f64 = 4.0;
 const MOST_LOOKS: f64 = 12.0;
 /// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model must be able to be.
 const MOST: f64 = 8.0;
-/// The contrast of a scene that has not changed may have by so many times, as the light or the exposure did. At 1 whatever is
-/// there has come with every step of the light, where there is no noise to hide it.
+/// By how many times the contrast of a scene may change with the light or the exposure. With no range at all whatever is there
+/// counts as come with every step of the light, where there is no noise to hide the difference.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// So much of the reference's energy must lie where the target was not before.
 const LEAST_FREE: f64 = 0.25;

@@ -57,7 +57,7 @@ pub struct TrackerConfig {
     pub give_up_after_s: f64,
     /// What [`Algorithm::Paper`] uses.
     pub paper: PaperConfig,
-    /// Finds targets by itself. Absent (default): only given boxes are followed.
+    /// Finds targets by itself. Absent (default): only given boxes are followed, and found again where they are lost.
     pub detector: Option<DetectorConfig>,
 }
 

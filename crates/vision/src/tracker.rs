@@ -263,7 +263,7 @@ impl ImageTracker {
     }
 
     /// Follows all targets into the next image and returns its tracks, ordered by id. An image without
-    /// new, lost, doubtful or given-up targets allocates no memory, but for the detector.
+    /// new, lost, doubtful or given-up targets, and none at its border, allocates no memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
         let shot = Shot { time, size: (image.width(), image.height()) };
         if image.samples().is_empty() || !self.admits(shot) {
