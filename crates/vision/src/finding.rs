@@ -16,7 +16,7 @@ const MOST_CANDIDATES: usize = 6;
 /// A candidate is shown in a lost target's place after so long, s: as long as what a search has found is on probation. With
 /// half of it a panning camera's trees are shown.
 const CANDIDATE_S: f64 = 0.5;
-/// It may be so many times larger or smaller, a side: of a drone before trees the brightest part is found.
+/// Its mean side may be so many times longer or shorter: of a drone before trees the brightest part is found.
 const STAND_IN_SIZES: f64 = 4.0;
 /// The probability that it is the target, at most: nothing is known for it but that it moves, and nothing else has been found.
 const STAND_IN_CERTAINTY: f64 = 0.5;
@@ -29,6 +29,14 @@ impl ImageTracker {
         for place in given {
             let place = self.meant(image, place);
             self.take_up_at(image, place, Origin::Given, time);
+        }
+        // What stands in for a target may look like it by now.
+        for index in 0..self.followed.len() {
+            let stand_in = self.followed[index].stand_in;
+            let place = self.followed.iter().find(|f| Some(f.id) == stand_in).map(|f| box_of(&f.target));
+            if let Some(place) = place {
+                self.is_lost_one(image, place, time, interval);
+            }
         }
         for found in found {
             if !self.is_lost_one(image, found.place, time, interval) {
@@ -93,9 +101,7 @@ impl ImageTracker {
                     ImageTrack { id: self.tracks[shown].id, certainty, ..self.tracks[instead] };
             }
         }
-        let is_candidate =
-            |id| self.followed.iter().any(|followed| followed.id == id && followed.is_candidate());
-        self.tracks.retain(|track| !is_candidate(track.id));
+        self.tracks.retain(|track| track.id.0 <= self.next_candidate);
     }
 
     /// The candidate that stands in for a lost target: the one that did before, or one that does for no other.
@@ -105,13 +111,14 @@ impl ImageTracker {
             let [w, h] = followed.target.size();
             let larger = ((w * h) / (width * height)).sqrt();
             followed.is_candidate()
-                && matches!(followed.origin, Origin::Detected { has_moved: true, .. })
+                && followed.has_moved()
                 && followed.target.is_seen()
                 && time.seconds_since(followed.since) > CANDIDATE_S
                 && (1.0 / STAND_IN_SIZES..=STAND_IN_SIZES).contains(&larger)
                 && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
         };
-        let before = self.followed.iter().find(|followed| Some(followed.id) == lost.stand_in);
+        let is_before = |followed: &&Followed| Some(followed.id) == lost.stand_in;
+        let before = self.followed.iter().find(is_before).filter(|before| !before.target.is_searching());
         before.or_else(|| self.followed.iter().find(|followed| fits(followed))).map(|followed| followed.id)
     }
 
@@ -152,7 +159,10 @@ impl ImageTracker {
         for followed in &mut self.followed {
             let place = box_of(&followed.target);
             let (at, side) = (place.centre(), place.width.max(place.height));
-            if let Origin::Detected { first, turned: then, has_moved, .. } = &mut followed.origin {
+            // Where a lost one is nobody knows.
+            if let Origin::Detected { first, turned: then, has_moved, .. } = &mut followed.origin
+                && followed.target.is_seen()
+            {
                 let gone = [at.x - first.x, at.y - first.y];
                 let in_scene = [gone[0] + turned[0] - then[0], gone[1] + turned[1] - then[1]];
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
@@ -163,7 +173,7 @@ impl ImageTracker {
         let known = seen.map(|followed| Known {
             id: followed.id,
             place: box_of(&followed.target),
-            is_watched: matches!(followed.origin, Origin::Detected { has_moved: true, .. }),
+            is_watched: followed.has_moved(),
         });
         // The number of a track to be is nobody's.
         let given =
@@ -187,7 +197,7 @@ impl ImageTracker {
             config: &self.config,
         };
         let bench = &mut self.bench;
-        let sightings = self.followed.iter_mut().filter_map(|followed| {
+        let sightings = self.followed.iter_mut().filter(|f| !f.is_candidate()).filter_map(|followed| {
             let Follower::Posterior(target) = &mut followed.target else { return None };
             let seen = target.sighting(frame, place, bench)?;
             Some((followed, seen))

@@ -152,6 +152,7 @@ impl Target {
         let branches = self.branches(&before, frame, region, bench);
         self.hypotheses.all = kept(branches);
         let Some(best) = self.hypotheses.all.first().cloned() else {
+            self.hypotheses.clear();
             self.missed += 1;
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
         };

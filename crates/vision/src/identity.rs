@@ -97,7 +97,7 @@ impl Target {
     }
 
     /// Log-likelihood ratio of the target's having come to a place against what is there having been there before, by the
-    /// first picture of the scene that tells; 0 if none does.
+    /// first picture of the scene that tells, and by the first that shows whether it turns with the camera; 0 if none does.
     ///
     /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as it did when it was last
     /// seen; one that hovered may be in all of them.

@@ -1,4 +1,5 @@
-//! The two looks that a lost target is searched for in: its last one, and the one it had at first.
+//! The two looks that a lost target is searched for in: its last one, and the one it had at first (the mean of its first images,
+//! as many as it takes to be clear of noise).
 //!
 //! A reference follows what a target looks like, into the clouds and trees that it is lost before, too.
 
@@ -11,7 +12,7 @@ use crate::target::Target;
 /// correlate by 0.94 or more, and 0.65 to 0.78 where the last look finds nothing. With half of it the first look is not
 /// searched for.
 const ALIKE: f32 = 0.8;
-/// So long after it was seen it is searched for as it was last alone, s: then it has been hidden, and has turned since it was
+/// Until so long after it was seen only its last look is searched for, s: before that it has been hidden, and has turned since it was
 /// first seen. With half of it one that turns is found where it is not, with twice as much one that has fooled its reference is
 /// found a second later.
 const LAST_LOOK_S: f64 = 1.0;

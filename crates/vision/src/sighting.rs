@@ -77,6 +77,7 @@ impl Target {
         if by_first_look {
             self.take_first_look(frame.config, &mut bench.workshop);
         }
+        self.hypotheses.clear();
         self.begin_probation(frame.scene);
         self.axes = [0, 1].map(|i| look.start(i, frame.config));
         self.seen(look.place);

@@ -259,10 +259,10 @@ impl Target {
                 axis.measurement_update(at(position));
             }
         }
+        self.identity.is_given();
         self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.seen(place);
         self.hypotheses.clear();
-        self.identity.is_given();
         let covariance = Matrix2::identity() * (variance + self.centre_variance);
         let measured = Measurement { place, covariance };
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }

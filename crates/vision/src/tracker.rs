@@ -24,14 +24,14 @@ pub enum TrackPhase {
     Tracking,
     /// Not measured in this image: a prediction.
     Coasting,
-    /// Not measured for several images: it is searched for, and the prediction is a guess.
+    /// Not measured for several images, or for long not sure in any place: the prediction is a guess, and it is searched for.
     Searching,
 }
 
 /// One target in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageTrack {
-    /// The track.
+    /// The track. While a target that was given is lost, what else moves may be shown as it, with a `certainty` of at most 0.5.
     pub id: ImageTrackId,
     /// Its life.
     pub phase: TrackPhase,
@@ -162,7 +162,16 @@ impl Followed {
     pub(crate) fn is_candidate(&self) -> bool {
         matches!(self.origin, Origin::Detected { is_candidate: true, .. })
     }
+
+    /// Whether it has been found, and elsewhere since.
+    pub(crate) fn has_moved(&self) -> bool {
+        matches!(self.origin, Origin::Detected { has_moved: true, .. })
+    }
 }
+
+/// A candidate that keeps to its place for so long is none, s: a target that can be told from its scene has gone further than
+/// its size by then.
+const STAYS_S: f64 = 1.5;
 
 /// A picture of a moment ago in which every target was seen: what a lost target is not.
 #[derive(Debug)]
@@ -297,11 +306,11 @@ impl ImageTracker {
             may_search: false,
             config: &self.config,
         };
-        // One that is stood in for is taken back where the detector finds it: what a search finds elsewhere moves less.
+        // For one that is stood in for something moves already: what a search finds beside that is more often the scene.
         let turn = self
             .followed
             .iter()
-            .filter(|f| f.target.is_searching() && f.stand_in.is_none())
+            .filter(|f| f.target.is_searching() && f.stand_in.is_none() && !f.is_candidate())
             .min_by_key(|f| f.searched)
             .map(|f| f.id);
         for followed in &mut self.followed {
@@ -395,13 +404,19 @@ impl ImageTracker {
     fn give_up(&mut self, now: Timestamp) {
         let patience = self.config.give_up_after_s;
         self.followed.retain(|f| f.origin == Origin::Given || now.seconds_since(f.measured_at) <= patience);
+        // They would take the places of others, and cover a target that hovers there.
+        let stays = |f: &Followed| f.is_candidate() && !f.has_moved() && now.seconds_since(f.since) > STAYS_S;
+        self.followed.retain(|followed| !stays(followed));
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
             // One that is lost is not where it is guessed to be.
             let is_of =
-                |older: &Followed| !older.target.is_searching() && same(&older.target, &rest[0].target);
-            let doubled = rest[0].origin != Origin::Given && older.iter().any(is_of);
+                |other: &Followed| !other.target.is_searching() && same(&other.target, &rest[0].target);
+            let is_double = rest[0].origin != Origin::Given && older.iter().any(is_of);
+            let is_known = rest[0].is_candidate()
+                && rest[1..].iter().any(|younger| !younger.is_candidate() && is_of(younger));
+            let doubled = is_double || is_known;
             if doubled {
                 self.followed.remove(index);
             } else {

@@ -44,27 +44,30 @@ fn what_looks_as_it_did_at_first_is_found_again() {
 }
 
 #[test]
-fn the_one_thing_that_moves_is_shown_for_a_lost_target_and_nobody_is_sure() {
+fn the_one_thing_that_moves_is_shown_for_a_lost_target_until_that_is_found() {
     for seed in 0..3 {
         let mut scene = Scene::new(seed, 4.0, 2.0, 60.0);
         let mut tracker = tracker_on([60.0, 60.0]);
         let mut shown = 0;
-        for frame in 0..150 {
+        for frame in 0..200 {
             let at = [60.0 + 0.8 * frame as f32, 60.0 + 0.4 * frame as f32];
             let image = match frame {
                 0..50 => scene.image(Some(at), [0.0; 2]),
                 50..75 => scene.image(None, [0.0; 2]),
-                // It comes out of a cloud as something that nobody has seen before.
-                _ => scene.image_with(None, [0.0; 2], bar(at, -50.0)),
+                // It comes out of a cloud as something that nobody has seen before, and turns back.
+                75..150 => scene.image_with(None, [0.0; 2], bar(at, -50.0)),
+                _ => scene.image(Some(at), [0.0; 2]),
             };
             let track = step(&mut tracker, &image, frame);
-            assert_eq!(track.id.0, 1);
-            if frame >= 125 && track.phase == TrackPhase::Tracking && off(&track, at) < 4.0 {
+            if (125..150).contains(&frame) && track.phase == TrackPhase::Tracking && off(&track, at) < 4.0 {
                 assert!(track.certainty <= 0.5, "seed {seed}, image {frame}: {}", track.certainty);
                 shown += 1;
             }
+            if frame == 199 {
+                assert!(off(&track, at) < 3.0 && track.certainty > 0.9, "seed {seed}: {track:?}");
+            }
         }
-        assert!(shown >= 23, "seed {seed}: shown in {shown} of the last 25 images");
+        assert!(shown >= 23, "seed {seed}: shown in {shown} of 25 images");
     }
 }
 

@@ -72,7 +72,9 @@ pub fn tracker_on([x, y]: [f32; 2]) -> ImageTracker {
 }
 
 pub fn step(tracker: &mut ImageTracker, image: &Plane, frame: u32) -> ImageTrack {
-    tracker.step(image, Timestamp::from_seconds(f64::from(frame) / 25.0))[0]
+    let tracks = tracker.step(image, Timestamp::from_seconds(f64::from(frame) / 25.0));
+    assert!(tracks.len() == 1 && tracks[0].id.0 == 1, "image {frame}: {tracks:?}");
+    tracks[0]
 }
 
 pub fn off(track: &ImageTrack, [x, y]: [f32; 2]) -> f64 {
