@@ -74,7 +74,7 @@ fn wait_until_recorded(path: &str, bytes: u64) {
     let deadline = Instant::now() + PATIENCE;
     while Path::new(path).metadata().map_or(0, |file| file.len()) < bytes {
         assert!(Instant::now() < deadline, "nothing is recorded");
-        std::thread::sleep(Duration::from_millis(50));
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 
@@ -135,7 +135,9 @@ fn an_interrupted_replay_leaves_a_whole_file_that_ends_early() {
         .args(["-q", "replay", &source, "--fuse", "-o", &tracks])
         .spawn()
         .unwrap();
-    std::thread::sleep(Duration::from_millis(300));
+    // It writes beside its output until that is whole. Stopped at its first tracks it has most of them to go.
+    let part = format!("{tracks}.{}.part", replay.id());
+    wait_until_recorded(&part, 10_000);
     let pid = replay.id().to_string();
     std::process::Command::new("kill").args(["-INT", &pid]).status().unwrap();
     let output = replay.wait_with_output().unwrap();
