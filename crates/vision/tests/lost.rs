@@ -94,3 +94,26 @@ fn what_is_written_into_the_video_is_not_taken_for_a_lost_target() {
         assert!(taken <= 15, "seed {seed}: taken in {taken} images");
     }
 }
+
+#[test]
+fn what_was_shown_for_a_lost_target_is_forgotten_where_that_comes_back() {
+    for seed in 0..3 {
+        let mut scene = Scene::new(seed, 4.0, 2.0, 60.0);
+        let mut tracker = tracker_on([60.0, 60.0]);
+        let mut found = None;
+        for frame in 0..200 {
+            let at = [60.0 + 0.8 * frame as f32, 60.0 + 0.4 * frame as f32];
+            let other = [200.0 - 0.7 * frame as f32, 150.0];
+            // Both are there in the end; `step` wants one track in every image.
+            let image = match frame {
+                0..50 => scene.image(Some(at), [0.0; 2]),
+                50..130 => scene.image_with(None, [0.0; 2], bar(other, -50.0)),
+                _ => scene.image_with(Some(at), [0.0; 2], bar(other, -50.0)),
+            };
+            let track = step(&mut tracker, &image, frame);
+            let is_there = frame >= 130 && off(&track, at) < 3.0 && track.certainty > 0.9;
+            found = found.or(is_there.then_some(frame));
+        }
+        assert!(found.is_some_and(|found| found < 160), "seed {seed}: found in image {found:?}");
+    }
+}
