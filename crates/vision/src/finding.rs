@@ -14,7 +14,7 @@ use crate::{DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, Tr
 /// panning camera takes up to 42 ms in place of 14, and no more is found.
 const MOST_CANDIDATES: usize = 6;
 /// A candidate is shown in a lost target's place after so long, s: as long as what a search has found is on probation. With
-/// half of it a panning camera's trees are shown.
+/// half of it half a percent more of a still camera's frames are right, and as many less of a panning one's.
 const CANDIDATE_S: f64 = 0.5;
 /// Its mean side may be so many times longer or shorter: of a drone before trees the brightest part is found.
 const STAND_IN_SIZES: f64 = 4.0;

@@ -132,8 +132,8 @@ impl Target {
         let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
         // What is written into the video, or lies on the lens, turns with the camera.
         let has_turned = |then: ImagePoint| (then.x - place.x).hypot(then.y - place.y) > longest;
-        let turned = pictures().filter(|picture| has_turned(picture.then(place)));
-        let lens = turned.filter_map(|picture| against(picture, place)).next();
+        let mut turned = pictures().filter(|picture| has_turned(picture.then(place)));
+        let lens = turned.find_map(|picture| against(picture, place));
         let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
     }

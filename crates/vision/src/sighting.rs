@@ -7,7 +7,8 @@ use crate::search::{LEAST_RATIO, best_near, half_sides};
 use crate::target::{Target, Workbench};
 
 /// What is found may be so many times larger or smaller than the target was, a side: outlines lose what is as bright as the
-/// sky behind it. With half of it half of the right ones are refused.
+/// sky behind it. With half of it a panning camera's
+/// target is right in 96.5 % of the frames in place of 97.5, and longer taken for something else.
 const SIZES: f64 = 2.5;
 /// Its middle may be this far off, in the larger sides.
 const OFF_SIDES: f64 = 0.5;

@@ -89,7 +89,7 @@ impl Follower {
         }
     }
 
-    pub(crate) fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
+    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
         match (self, cue) {
             (Self::Posterior(target), None) => target.step(frame, bench),
             (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
@@ -107,14 +107,14 @@ impl Follower {
         }
     }
 
-    pub(crate) fn velocity(&self) -> ImagePoint {
+    fn velocity(&self) -> ImagePoint {
         match self {
             Self::Posterior(target) => target.velocity(),
             Self::Paper(target) => target.velocity(),
         }
     }
 
-    pub(crate) fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
+    fn covariances(&self) -> Option<[Matrix2<f64>; 2]> {
         match self {
             Self::Posterior(target) => Some(target.covariances()),
             Self::Paper(target) => target.axes().map(|[x, y]| [x.covariance(), y.covariance()]),
@@ -129,7 +129,7 @@ impl Follower {
         }
     }
 
-    pub(crate) fn is_lost(&self) -> bool {
+    fn is_lost(&self) -> bool {
         matches!(self, Self::Posterior(target) if target.is_lost())
     }
 
@@ -170,7 +170,7 @@ impl Followed {
 }
 
 /// A candidate that keeps to its place for so long is none, s: a target that can be told from its scene has gone further than
-/// its size by then.
+/// its size by then if it moves at all. Half of it is little more than a candidate needs to be shown.
 const STAYS_S: f64 = 1.5;
 
 /// A picture of a moment ago in which every target was seen: what a lost target is not.
