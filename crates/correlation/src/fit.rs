@@ -37,8 +37,6 @@ pub struct Fit {
     pub log_scale: f64,
     /// How far the image is turned from the reference, x towards y, rad; 0 with [`Freedom::Shift`].
     pub turn_rad: f64,
-    /// Energy of the reference's gradient along x and y.
-    pub gradient_energy: [f64; 2],
     /// Variance of what the reference does not explain.
     pub residual_variance: f64,
     /// Pixels compared.
@@ -133,7 +131,6 @@ impl Fitter {
             gain: 0.0,
             log_scale: 0.0,
             turn_rad: 0.0,
-            gradient_energy: [0.0; 2],
             residual_variance: f64::INFINITY,
             pixels: width * height,
             inverse: None,
@@ -248,7 +245,6 @@ impl Normal {
             normal[(0, 0)] += KNOWN * energy;
             right[0] += KNOWN * energy * contrast;
         }
-        fit.gradient_energy = [p[1][1], p[2][2]];
         let solved = normal.cholesky()?;
         let solution = solved.solve(&right);
         let gain = solution[0];

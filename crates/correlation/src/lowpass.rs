@@ -13,6 +13,7 @@ pub struct LowPass {
     noise_gain: f32,
     own_weight: f32,
     gradient_gain: f32,
+    cross_gradient_gain: f32,
 }
 
 /// Memory for filtering.
@@ -38,11 +39,14 @@ impl LowPass {
         let squares: f32 = taps.iter().map(|tap| tap * tap).sum();
         let slopes: f32 = (-1..=taps.len() as isize).map(|k| ((at(k + 1) - at(k - 1)) / 2.0).powi(2)).sum();
         let own = taps[reach];
+        // The central difference of one sample's weights with that of the sample: on its axis h(0) and h(2), across it h(0).
+        let cross = 0.5 * (own - at(reach as isize + 2)) * own;
         Self {
             deviation,
             noise_gain: squares * squares,
             own_weight: own * own,
             gradient_gain: slopes * squares,
+            cross_gradient_gain: cross,
             taps,
         }
     }
@@ -65,6 +69,11 @@ impl LowPass {
     /// Variance of white noise's central difference along an axis, over the noise's variance.
     pub fn gradient_gain(&self) -> f32 {
         self.gradient_gain
+    }
+
+    /// Covariance of white noise's central difference along an axis before and after, over the noise's variance.
+    pub fn cross_gradient_gain(&self) -> f32 {
+        self.cross_gradient_gain
     }
 
     /// Filters a plane.
@@ -123,6 +132,10 @@ mod tests {
                 }
             }
             assert!((slopes - filter.gradient_gain).abs() < 1e-5);
+            let row = out.row(10);
+            // Of the impulse itself: half after it, less half before it.
+            let cross = 0.5 * (row[10] - row[8]) / 2.0 - 0.5 * (row[12] - row[10]) / 2.0;
+            assert!((cross - filter.cross_gradient_gain).abs() < 1e-5, "{cross} {filter:?}");
         }
     }
 }
