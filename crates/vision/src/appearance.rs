@@ -23,6 +23,11 @@ const ANCHOR_NOISE_SHARE: f32 = 0.02;
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
 /// Stiffness of scale and turn in that comparison.
 const ANCHOR_STIFFNESS: f64 = 0.02;
+/// When so much of the reference is new, what is correlated is made anew: a few images' worth. Half of it costs half as much
+/// again for a target of 50x30, and nothing is followed better.
+const MOST_CHANGED: f32 = 0.1;
+/// Least of what a reference's slopes answer to: one of noise alone tells no place.
+const LEAST_STEEPNESS: f64 = 0.15;
 /// Scale of a target over its first size.
 const SCALE_RANGE: [f64; 2] = [0.25, 4.0];
 
@@ -66,6 +71,14 @@ pub(crate) struct Appearance {
     chosen: usize,
     /// The low-passed reference, in its own size and direction.
     smooth: Plane,
+    /// See [`Self::steepness`] and [`Self::taken`].
+    steepness: [f64; 2],
+    taken: f32,
+    /// The share of images in the reference that are not in what is correlated yet, whether that has its shape, and whether the
+    /// reference was like the anchor when it was compared.
+    changed: f32,
+    is_in_shape: bool,
+    is_like_anchor: bool,
     /// The reference that is correlated: low-passed, in the image's size and direction.
     pub(crate) working: Reference,
     /// The anchor low-passed, and by which low-pass; absent while the anchor changes.
@@ -91,6 +104,30 @@ fn without_mean(plane: &mut Plane) {
 
 fn energy(plane: &Plane) -> f32 {
     plane.samples().iter().map(|s| s * s).sum()
+}
+
+/// What a reference's slopes answer to where the target is displaced, over what they would if it were the reference: the sums
+/// of the products of its slopes G with the target's, on either axis, over those of G with itself.
+///
+/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the target's slopes: the bound
+/// over this squared. T is known with noise, of which the product's mean is taken out.
+fn steepness(reference: &Plane, target: &Plane, noise_answer: f64) -> [f64; 2] {
+    let (width, height) = (reference.width(), reference.height());
+    let (mut own, mut with) = ([0.0_f64; 2], [0.0_f64; 2]);
+    for y in 1..height.saturating_sub(1) {
+        let rows = |plane| [y - 1, y, y + 1].map(|row| Plane::row(plane, row));
+        let ([above, row, below], [target_above, target_row, target_below]) = (rows(reference), rows(target));
+        for x in 1..width - 1 {
+            let slopes = [row[x + 1] - row[x - 1], below[x] - above[x]];
+            let of_target = [target_row[x + 1] - target_row[x - 1], target_below[x] - target_above[x]];
+            for axis in 0..2 {
+                own[axis] += f64::from(slopes[axis] * slopes[axis]) / 4.0;
+                with[axis] += f64::from(slopes[axis] * of_target[axis]) / 4.0;
+            }
+        }
+    }
+    let pixels = (width.saturating_sub(2) * height.saturating_sub(2)) as f64;
+    [0, 1].map(|axis| ((with[axis] - noise_answer * pixels) / own[axis].max(1e-12)).max(LEAST_STEEPNESS))
 }
 
 /// How much of white noise's variance a view between the samples keeps.
@@ -138,6 +175,11 @@ impl Appearance {
             low_passes: LOW_PASSES.into_iter().map(LowPass::new).collect(),
             chosen: 0,
             smooth: own.clone(),
+            steepness: [1.0; 2],
+            taken: 0.0,
+            changed: 0.0,
+            is_in_shape: true,
+            is_like_anchor: true,
             working: plain.clone(),
             memory: plain,
             remembered: None,
@@ -188,19 +230,30 @@ impl Appearance {
         self.working.image().samples().len() as f32
     }
 
-    /// Variance of the noise in it, and of that noise's gradient.
-    pub(crate) fn noise(&self) -> (f32, f32) {
-        let filter = &self.low_passes[self.chosen];
-        (self.adaptation.noise * filter.noise_gain(), self.adaptation.noise * filter.gradient_gain())
+    /// Variance of the noise in it.
+    pub(crate) fn noise(&self) -> f32 {
+        self.adaptation.noise * self.low_passes[self.chosen].noise_gain()
+    }
+
+    /// How much of what its slopes answer to is the target's, on either axis: see [`steepness`]; and mean square of what the
+    /// low-pass has taken from the target.
+    pub(crate) fn steepness(&self) -> [f64; 2] {
+        self.steepness
+    }
+
+    /// Mean square of what the low-pass has taken from the target.
+    pub(crate) fn taken(&self) -> f32 {
+        self.taken
     }
 
     /// Share of its energy that is the target's: a noisy reference finds the target fainter than it is.
     pub(crate) fn clear_share(&self) -> f32 {
-        let noise = self.noise().0 * self.pixels();
+        let noise = self.noise() * self.pixels();
         (1.0 - noise / self.energy().max(f32::MIN_POSITIVE)).clamp(0.2, 1.0)
     }
 
-    /// Takes the target's image in, with a certainty that it shows the target.
+    /// Takes the target's image in, with a certainty that it shows the target. Returns its share in what measurements refer to:
+    /// the anchor, or while the target is another than that, the reference.
     pub(crate) fn learn(
         &mut self,
         image: &Plane,
@@ -209,7 +262,7 @@ impl Appearance {
         certainty: f32,
         interval: f64,
         workshop: &mut Workshop,
-    ) {
+    ) -> f32 {
         let mut view = std::mem::take(&mut workshop.view);
         view.reshape(self.own.width(), self.own.height());
         let seen = View { x: place.x, y: place.y, scale: self.scale, turn_rad: self.turn_rad };
@@ -217,32 +270,45 @@ impl Appearance {
         mend(&mut view);
         without_mean(&mut view);
         let noise = noise * noise_kept(place);
-        self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
+        let own_share = self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
+        let mut anchor_share = 0.0;
 
         let noise_share = self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
         if noise_share > ANCHOR_NOISE_SHARE {
-            let share = certainty / (self.anchor_images + 1.0);
+            anchor_share = certainty / (self.anchor_images + 1.0);
             for (old, new) in self.anchor.samples_mut().iter_mut().zip(view.samples()) {
-                *old += share * (new - *old);
+                *old += anchor_share * (new - *old);
             }
-            self.anchor_noise = (1.0 - share).powi(2) * self.anchor_noise + share * share * noise;
+            self.anchor_noise =
+                (1.0 - anchor_share).powi(2) * self.anchor_noise + anchor_share.powi(2) * noise;
             self.anchor_images += certainty;
             self.remembered = None;
         }
         workshop.view = view;
-        self.prepare(workshop);
-        self.compare_with_anchor(workshop);
+        self.changed += own_share;
+        if self.changed > MOST_CHANGED || anchor_share > 0.0 {
+            self.prepare(workshop);
+            self.is_like_anchor = self.compare_with_anchor(workshop);
+        }
+        if self.is_like_anchor { anchor_share } else { own_share }
     }
 
-    /// Changes size and direction; takes effect with the next [`learn`](Self::learn).
+    /// Whether what is correlated has the size and direction that the target is believed to have.
+    pub(crate) fn is_in_shape(&self) -> bool {
+        self.is_in_shape
+    }
+
+    /// Changes size and direction; takes effect when enough has been [learned](Self::learn).
     pub(crate) fn reshape(&mut self, log_scale: f64, turn_rad: f64) {
         self.scale = (self.scale * log_scale.exp()).clamp(SCALE_RANGE[0], SCALE_RANGE[1]);
         self.turn_rad += turn_rad;
+        self.is_in_shape = false;
     }
 
     /// The working reference from the one in its own size and direction: the low-pass of least risk
     /// (Stein's estimate), scaled and turned.
     fn prepare(&mut self, workshop: &mut Workshop) {
+        (self.changed, self.is_in_shape) = (0.0, true);
         let noise = self.adaptation.noise;
         let pixels = self.own.samples().len() as f32;
         let clear = pixels * noise < CLEAR_NOISE_SHARE * energy(&self.own);
@@ -255,12 +321,16 @@ impl Appearance {
             let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
+                let noise_taken = noise * (1.0 - 2.0 * filter.own_weight() + filter.noise_gain());
+                self.taken = (taken / pixels - noise_taken).max(0.0);
                 self.smooth.copy_from(filtered);
             }
             if clear {
                 break;
             }
         }
+        let answer = noise * self.low_passes[self.chosen].cross_gradient_gain();
+        self.steepness = steepness(&self.smooth, &self.own, f64::from(answer));
         let (width, height) = (self.own.width() as f64, self.own.height() as f64);
         let Self { smooth, working, scale, turn_rad, .. } = self;
         working.update(|image| {
@@ -273,8 +343,8 @@ impl Appearance {
     }
 
     /// How the reference has drifted: each image was taken at an estimated place, and their errors
-    /// add up; the anchor, to which almost nothing is added any more, stays.
-    fn compare_with_anchor(&mut self, workshop: &mut Workshop) {
+    /// add up; the anchor, to which almost nothing is added any more, stays. Returns whether they are alike at all.
+    fn compare_with_anchor(&mut self, workshop: &mut Workshop) -> bool {
         let index = self
             .low_passes
             .iter()
@@ -293,7 +363,7 @@ impl Appearance {
             self.memory.image().samples().iter().zip(filtered.samples()).map(|(a, b)| a * b).sum();
         let score = product / (energy(self.memory.image()) * energy(filtered)).max(1e-12).sqrt();
         if score < ANCHOR_LEAST_SCORE {
-            return;
+            return false;
         }
         let options = FitOptions {
             border: 0,
@@ -309,6 +379,7 @@ impl Appearance {
             log_scale: fit.log_scale.clamp(-0.1, 0.1),
             turn_rad: fit.turn_rad.clamp(-0.1, 0.1),
         };
+        true
     }
 
     /// A displacement in the reference's own pixels as one in the image.

@@ -23,8 +23,9 @@ pub struct TrackerConfig {
     /// Least standard deviation of the image's noise: a level. Default 1, a level of 8 bits; the noise
     /// above it is measured in every image. The per-pixel filters' noises are in this unit.
     pub noise_floor: f64,
-    /// Standard deviation of the target's white acceleration, px/s^2 (000, equation 4: the largest
-    /// acceleration by root 3). Default 900, a pixel a frame squared at 30 frames a second.
+    /// Standard deviation of the white acceleration of the liveliest target, px/s^2 (000, equation 4: the largest
+    /// acceleration by root 3). Default 900, a pixel a frame squared at 30 frames a second. How lively one is, from even flight
+    /// on, is learnt of each; the papers' algorithm takes all for the liveliest.
     pub acceleration_sd_px: f64,
     /// Standard deviation of the velocity of a target that is taken up, px/s. Default 120.
     pub start_velocity_sd_px: f64,
@@ -43,7 +44,7 @@ pub struct TrackerConfig {
     pub mismatch: f64,
     /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.5.
     pub contrast_sd: f64,
-    /// Probability that a target can be seen in an image. Default 0.95.
+    /// Share of the images in which a target can be seen, a blur and a bird before it apart. Default 0.95.
     pub visible_probability: f64,
     /// Share of the prior that lies anywhere in the gate. Default 0.01; it doubles with every image
     /// without the target, up to a half.

@@ -2,13 +2,14 @@
 //!
 //! One Gaussian cannot hold two places: their mean is neither, and in the next image both lie outside of what it expects.
 
-use crossfix_filter::{AxisFilter, AxisMeasurement};
+use crossfix_filter::AxisMeasurement;
 
 use crate::config::GateRule;
 use crate::frame::{Frame, Step};
 use crate::gate::Region;
+use crate::motion::Motion;
 use crate::posterior::Posterior;
-use crate::target::{SEEN, Target, Workbench, predict};
+use crate::target::{SEEN, Target, Workbench};
 use crate::{ImagePoint, TrackerConfig};
 
 /// Certainty of the best place below which the others are kept too.
@@ -34,20 +35,29 @@ const LONGEST_S: f64 = 2.0;
 #[derive(Clone, Debug)]
 pub(crate) struct Hypothesis {
     weight: f64,
-    axes: [AxisFilter; 2],
+    motion: Motion,
+    /// How likely it could not be seen in the image before.
+    hidden: f64,
     /// Whether it has been seen there in this image, and on which placement of the map.
     peak: Option<[usize; 2]>,
 }
 
 impl Hypothesis {
+    fn at(&self) -> [f64; 2] {
+        let ImagePoint { x, y } = self.motion.position();
+        [x, y]
+    }
+
     /// Whether two say the same; where it has been seen and where it has been waited for are not the same.
     fn is_like(&self, other: &Self) -> bool {
-        let alike = self.axes.iter().zip(&other.axes).all(|(one, other)| {
-            let (a, b) = (one.covariance(), other.covariance());
-            let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
-            near(one.position() - other.position(), a.m11.max(b.m11))
-                && near(one.velocity() - other.velocity(), a.m22.max(b.m22))
-        });
+        let (here, there) = (self.motion.position(), other.motion.position());
+        let (one, two) = (self.motion.velocity(), other.motion.velocity());
+        let (a, b) = (self.motion.covariances(), other.motion.covariances());
+        let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
+        let alike = [(here.x - there.x, one.x - two.x), (here.y - there.y, one.y - two.y)]
+            .into_iter()
+            .zip(a.iter().zip(&b))
+            .all(|((apart, faster), (a, b))| near(apart, a.m11.max(b.m11)) && near(faster, a.m22.max(b.m22)));
         alike && self.peak.is_some() == other.peak.is_some()
     }
 }
@@ -77,7 +87,7 @@ impl Hypotheses {
 
     pub(crate) fn predict(&mut self, frame: Frame<'_>) {
         for hypothesis in &mut self.all {
-            predict(&mut hypothesis.axes, frame.interval, frame.image);
+            hypothesis.motion.predict(frame.interval, frame.image);
         }
     }
 
@@ -85,9 +95,7 @@ impl Hypotheses {
     fn fork(&mut self, by: [f64; 2]) {
         self.all.iter_mut().for_each(|hypothesis| hypothesis.weight *= 0.5);
         let mut moved = self.all.clone();
-        for (axis, by) in moved.iter_mut().flat_map(|hypothesis| hypothesis.axes.iter_mut().zip(by)) {
-            axis.move_by(by);
-        }
+        moved.iter_mut().for_each(|hypothesis| hypothesis.motion.move_by(by));
         self.all.extend(moved);
     }
 
@@ -95,7 +103,7 @@ impl Hypotheses {
     pub(crate) fn spread(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
-            let off = |h: &Hypothesis| h.weight * (h.axes[i].position() - at[i]).powi(2);
+            let off = |h: &Hypothesis| h.weight * (h.at()[i] - at[i]).powi(2);
             self.all.iter().map(off).sum()
         })
     }
@@ -104,7 +112,7 @@ impl Hypotheses {
     pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
-            let far = |hypothesis: &Hypothesis| (hypothesis.axes[i].position() - at[i]).abs();
+            let far = |hypothesis: &Hypothesis| (hypothesis.at()[i] - at[i]).abs();
             self.all.iter().map(far).fold(0.0, f64::max)
         })
     }
@@ -123,7 +131,12 @@ impl Target {
             return;
         }
         if self.hypotheses.is_empty() {
-            self.hypotheses.all.push(Hypothesis { weight: 1.0, axes: self.axes.clone(), peak: None });
+            self.hypotheses.all.push(Hypothesis {
+                weight: 1.0,
+                motion: self.motion.clone(),
+                hidden: self.hidden,
+                peak: None,
+            });
         }
         self.hypotheses.fork(by);
     }
@@ -144,9 +157,14 @@ impl Target {
         let config = frame.config;
         let mut before = std::mem::take(&mut self.hypotheses.all);
         if before.is_empty() {
-            before.push(Hypothesis { weight: 1.0, axes: self.axes.clone(), peak: None });
+            before.push(Hypothesis {
+                weight: 1.0,
+                motion: self.motion.clone(),
+                hidden: self.hidden,
+                peak: None,
+            });
         }
-        if let Some(one) = self.one_place(&before, region, bench, config) {
+        if let Some(one) = self.one_place(&before, frame, region, bench) {
             return self.settle_on(one, frame, region, bench);
         }
         let branches = self.branches(&before, frame, region, bench);
@@ -157,10 +175,10 @@ impl Target {
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
         };
         let seen: f64 = self.hypotheses.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum();
-        self.axes = best.axes.clone();
+        (self.motion, self.hidden) = (best.motion.clone(), best.hidden);
         let Some([column, row]) = best.peak else {
             self.hypotheses.doubted_s += frame.interval;
-            if seen < SEEN || self.hypotheses.doubted_s > LONGEST_S {
+            if seen < 1.0 - DOUBT || self.hypotheses.doubted_s > LONGEST_S {
                 self.missed += 1;
             }
             self.settle(0.0);
@@ -177,7 +195,7 @@ impl Target {
         self.hypotheses.doubted_s += frame.interval;
         if certainty > SEEN {
             self.seen(look.place);
-        } else if seen * is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
+        } else if seen < 1.0 - DOUBT || is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
             self.missed += 1;
         }
         self.learn(frame, look.place, look, certainty, bench);
@@ -197,33 +215,35 @@ impl Target {
     fn one_place(
         &self,
         before: &[Hypothesis],
+        frame: Frame<'_>,
         region: Region,
         bench: &mut Workbench,
-        config: &TrackerConfig,
-    ) -> Option<([AxisFilter; 2], Posterior)> {
+    ) -> Option<(Motion, Posterior)> {
         let near = self.peak_half();
         let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(before.len());
         let mut all = 0.0;
         for (index, hypothesis) in before.iter().enumerate() {
-            let posterior = bench.map.of(&bench.ratios, &self.prior(&hypothesis.axes, region, config));
+            let posterior = bench
+                .map
+                .of(&bench.ratios, &self.prior(&hypothesis.motion, hypothesis.hidden, region, frame));
             all += hypothesis.weight * posterior.evidence;
             ways.push((hypothesis.weight * posterior.evidence * posterior.near.mass, index, posterior));
         }
         let (_, best, posterior) = *ways.iter().max_by(|one, other| one.0.total_cmp(&other.0))?;
         let here = |peak: [usize; 2]| (0..2).all(|i| peak[i].abs_diff(posterior.peak[i]) <= near[i]);
         let there: f64 = ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
-        (there > DOUBT * all).then(|| (before[best].axes.clone(), posterior))
+        (there > DOUBT * all).then(|| (before[best].motion.clone(), posterior))
     }
 
     /// No doubt is left: the target has been where its likeliest hypothesis was.
     fn settle_on(
         &mut self,
-        (axes, posterior): ([AxisFilter; 2], Posterior),
+        (motion, posterior): (Motion, Posterior),
         frame: Frame<'_>,
         region: Region,
         bench: &mut Workbench,
     ) -> Step {
-        self.axes = axes;
+        self.motion = motion;
         self.hypotheses.clear();
         let [column, row] = posterior.peak;
         let look = self.look(column, row, region.origin, bench, frame.config);
@@ -241,12 +261,13 @@ impl Target {
         let config = frame.config;
         let mut branches = Vec::with_capacity(before.len() * (MOST_PEAKS + 1));
         for hypothesis in before {
-            let prior = self.prior(&hypothesis.axes, region, config);
+            let prior = self.prior(&hypothesis.motion, hypothesis.hidden, region, frame);
             let posterior = bench.map.of(&bench.ratios, &prior);
             let weight = hypothesis.weight * posterior.evidence;
             branches.push(Hypothesis {
                 weight: weight * posterior.unseen,
-                axes: hypothesis.axes.clone(),
+                motion: hypothesis.motion.clone(),
+                hidden: 1.0,
                 peak: None,
             });
             for _ in 0..MOST_PEAKS {
@@ -255,28 +276,21 @@ impl Target {
                 if share.is_nan() || share < LEAST {
                     break;
                 }
-                let mut axes = hypothesis.axes.clone();
+                let mut motion = hypothesis.motion.clone();
+                let expected = motion.found();
                 let at = [0, 1].map(|i| AxisMeasurement {
                     position: region.origin[i] + part.mean[i],
                     variance: part.variance[i],
                 });
-                let is_expected =
-                    (0..2).map(|i| axes[i].innovation(at[i]).normalised_squared()).sum::<f64>() < UNEXPECTED;
-                for (axis, at) in axes.iter_mut().zip(at) {
-                    if is_expected {
-                        axis.condition(AxisMeasurement {
-                            variance: at.variance.min(axis.position_variance()),
-                            ..at
-                        });
-                    } else {
-                        *axis = AxisFilter::start_at_rest(
-                            at,
-                            config.search_velocity_sd_px,
-                            config.acceleration_sd_px,
-                        );
-                    }
+                if motion.surprise(at) < UNEXPECTED {
+                    motion.condition([0, 1].map(|i| AxisMeasurement {
+                        variance: at[i].variance.min(expected[i].variance),
+                        ..at[i]
+                    }));
+                } else {
+                    motion.restart(at, config.search_velocity_sd_px);
                 }
-                branches.push(Hypothesis { weight: weight * share, axes, peak: Some(peak) });
+                branches.push(Hypothesis { weight: weight * share, motion, hidden: 0.0, peak: Some(peak) });
             }
         }
         branches

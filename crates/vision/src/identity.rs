@@ -1,13 +1,12 @@
 //! Whether what is followed is the target: it has come to where it is, and the scene was there before.
 
-use crossfix_filter::AxisFilter;
-
 use crate::ImagePoint;
 use crate::arrival::Placed;
 use crate::frame::{FRAME_INTERVAL, Frame, Step};
 use crate::look::Look;
+use crate::motion::Motion;
 use crate::scene::{Picture, Scene};
-use crate::target::{Target, Workbench, predict};
+use crate::target::{Target, Workbench};
 
 /// A target that was found again is believed after so long, s: until then a mistake costs what is known of where it went,
 /// and nothing is learnt of it.
@@ -37,8 +36,10 @@ pub(crate) struct Identity {
     is_there: f64,
     /// Where the target was seen in the scene's pictures, by their numbers.
     in_pictures: Vec<(u64, ImagePoint)>,
-    /// How fast it went when it was last seen for sure, px/s.
+    /// How fast it went when it was last seen for sure, px/s, ...
     speed_px_s: f64,
+    /// ... and where that was in the scene: its place in the image and how far the camera had turned, px.
+    last_in_scene: Option<[f64; 2]>,
     /// What was known before it was found again, as long as that is not sure.
     probation: Option<Probation>,
 }
@@ -46,7 +47,7 @@ pub(crate) struct Identity {
 /// What was known of a target before it was found again.
 #[derive(Clone, Debug)]
 struct Probation {
-    axes: [AxisFilter; 2],
+    motion: Motion,
     unseen_s: f64,
     last_seen: ImagePoint,
     missed: u32,
@@ -63,6 +64,7 @@ impl Identity {
             is_there: 1.0,
             in_pictures: Vec::with_capacity(MOST_PICTURES),
             speed_px_s: 0.0,
+            last_in_scene: None,
             probation: None,
         }
     }
@@ -81,13 +83,14 @@ impl Identity {
 
 impl Target {
     /// Notes where it was when a picture of the scene was taken, if it was seen.
-    pub(crate) fn note_picture(&mut self, number: u64) {
+    pub(crate) fn note_picture(&mut self, number: u64, turned: [f64; 2]) {
         // In doubt it is not known where it was.
         if self.unseen_s > 0.0 {
             return;
         }
         if self.identity.probation.is_none() {
             self.identity.speed_px_s = self.velocity().x.hypot(self.velocity().y);
+            self.identity.last_in_scene = Some([self.last_seen.x + turned[0], self.last_seen.y + turned[1]]);
         }
         let in_pictures = &mut self.identity.in_pictures;
         if in_pictures.len() >= MOST_PICTURES {
@@ -99,8 +102,8 @@ impl Target {
     /// Log-likelihood ratio of the target's having come to a place against what is there having been there before, by the
     /// first picture of the scene that tells, and by the first that shows whether it turns with the camera; 0 if none does.
     ///
-    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as it did when it was last
-    /// seen; one that hovered may be in all of them.
+    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as fast as when it was last seen,
+    /// or as it must have to be here by now; one that hovered, and is where it was, may be in all of them.
     pub(crate) fn arrival_log_ratio(
         &self,
         frame: Frame<'_>,
@@ -118,11 +121,12 @@ impl Target {
         let Workbench { workshop, comparison, .. } = bench;
         comparison.look(frame.image, placed, &mut workshop.resampler);
         let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
+        let speed = self.identity.speed_px_s.max(self.least_speed(frame, place));
         let mut against = |picture: &Picture, then: ImagePoint| {
             let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
             let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
-            let has_moved_on = self.identity.speed_px_s * picture.age_s() > longest;
+            let has_moved_on = speed * picture.age_s() > longest;
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
             }
@@ -136,6 +140,14 @@ impl Target {
         let lens = turned.find_map(|picture| against(picture, place));
         let scene = scene.map_or(0.0, |arrival| arrival.log_ratio(usual));
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
+    }
+
+    /// How fast a lost target has gone at least to be at a place now, px/s.
+    fn least_speed(&self, frame: Frame<'_>, place: ImagePoint) -> f64 {
+        let Some([x, y]) = self.identity.last_in_scene else { return 0.0 };
+        let turned = frame.scene.turned();
+        let lost_s = self.identity.probation.as_ref().map_or(self.unseen_s, |probation| probation.unseen_s);
+        (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
     }
 
     /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against its being that of the best
@@ -171,7 +183,7 @@ impl Target {
     /// A search has found something.
     pub(crate) fn begin_probation(&mut self, scene: &Scene) {
         self.identity.probation = Some(Probation {
-            axes: self.axes.clone(),
+            motion: self.motion.clone(),
             unseen_s: self.unseen_s,
             last_seen: self.last_seen,
             missed: self.missed,
@@ -185,14 +197,14 @@ impl Target {
     /// was known before.
     pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         if let Some(probation) = &mut self.identity.probation {
-            predict(&mut probation.axes, frame.interval, frame.image);
+            probation.motion.predict(frame.interval, frame.image);
             probation.unseen_s += frame.interval;
         }
         let step = self.follow(frame, bench);
         if self.is_searching()
             && let Some(before) = self.identity.probation.take()
         {
-            (self.axes, self.unseen_s, self.last_seen) = (before.axes, before.unseen_s, before.last_seen);
+            (self.motion, self.unseen_s, self.last_seen) = (before.motion, before.unseen_s, before.last_seen);
             self.missed = self.missed.max(before.missed);
             self.take_last_look();
             self.identity.in_pictures.retain(|(number, _)| *number <= before.picture);

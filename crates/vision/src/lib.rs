@@ -40,6 +40,7 @@ mod lanes;
 mod likelihood;
 mod look;
 mod looks;
+mod motion;
 mod noise;
 mod paper;
 mod posterior;

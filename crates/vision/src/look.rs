@@ -1,19 +1,16 @@
 //! The reference fitted between the pixels, where the target is believed to be: the measurement.
 
 use crossfix_correlation::{Fit, FitOptions, Freedom};
-use crossfix_filter::{AxisFilter, AxisMeasurement};
+use crossfix_filter::AxisMeasurement;
 use nalgebra::Matrix2;
 
 use crate::appearance::Drift;
 use crate::target::{LEAST_MEASUREMENT_SD, Target, Workbench};
 use crate::{ImagePoint, TrackerConfig};
 
-/// How much of what the reference does not explain counts as noise: it is not white.
-const UNEXPLAINED_WEIGHT: f64 = 10.0;
-/// A fit's variance over the bound, and what is added to it for each time that the noise's energy holds
-/// the target's. Measured: `validate tracker` shows the consistency that follows.
-const FIT_LOSS: f64 = 1.1;
-const FIT_LOSS_IN_NOISE: f64 = 0.035;
+/// What noise and the reference do not explain is something else before the target: parts of it, of so many pixels, change
+/// together, and displace the fit as noise of so many times its variance would.
+const PIXELS_A_PART: f64 = 10.0;
 
 /// A reference fitted to the image at the best placement.
 #[derive(Clone, Copy, Debug)]
@@ -29,11 +26,11 @@ pub(crate) struct Look {
 }
 
 impl Look {
-    /// The filter of an axis that begins here, of a target that moves as one does that was lost.
-    pub(crate) fn start(&self, axis: usize, config: &TrackerConfig) -> AxisFilter {
-        let position = [self.place.x, self.place.y][axis];
-        let first = AxisMeasurement { position, variance: self.covariance[(axis, axis)] };
-        AxisFilter::start_at_rest(first, config.search_velocity_sd_px, config.acceleration_sd_px)
+    /// Where the reference is found, as a measurement of either axis.
+    pub(crate) fn found(&self) -> [AxisMeasurement; 2] {
+        let Self { place, covariance, .. } = self;
+        [(place.x, covariance.m11), (place.y, covariance.m22)]
+            .map(|(position, variance)| AxisMeasurement { position, variance })
     }
 }
 
@@ -54,15 +51,11 @@ impl Target {
         let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
         let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
         let contrast = fit.gain.max(least_contrast);
-        let (reference_noise, slope_noise) = self.appearance.noise();
+        let expected = f64::from(self.appearance.noise() + self.appearance.taken()) * contrast * contrast;
         let explained = image_noise * (1.0 + 2.0 * (2.0 / pixels).sqrt());
-        let unexplained =
-            (fit.residual_variance - explained - f64::from(reference_noise) * contrast * contrast).max(0.0);
-        let noise = image_noise + UNEXPLAINED_WEIGHT * unexplained;
-        let energy = contrast.powi(2) * f64::from(self.appearance.energy()).max(1e-12);
-        let inverse_ratio = f64::from(self.appearance.pixels()) * image_noise / energy;
-        let loss = FIT_LOSS + FIT_LOSS_IN_NOISE * inverse_ratio.min(10.0);
-        let covariance = self.covariance(&fit, loss * noise, f64::from(slope_noise) * pixels, contrast);
+        let unexplained = (fit.residual_variance - explained - expected).max(0.0);
+        let noise = image_noise + PIXELS_A_PART * unexplained;
+        let covariance = self.covariance(&fit, self.motion.noise_factor() * noise, contrast);
         let drift = self.appearance.in_image(self.appearance.drift);
         let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
         let scaled = noise * (fit.gain / contrast).powi(2);
@@ -78,15 +71,14 @@ impl Target {
 
     /// The covariance of a fit: the bound in the image's noise, and what of the reference's gradient
     /// is itself noise.
-    fn covariance(&self, fit: &Fit, noise: f64, slope_noise: f64, contrast: f64) -> Matrix2<f64> {
+    fn covariance(&self, fit: &Fit, noise: f64, contrast: f64) -> Matrix2<f64> {
         let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
             return Matrix2::identity();
         };
-        let clear =
-            fit.gradient_energy.map(|energy| (1.0 - slope_noise / energy.max(1e-12)).clamp(0.15, 1.0));
+        let steepness = self.appearance.steepness();
         let floor = LEAST_MEASUREMENT_SD.powi(2);
         Matrix2::from_fn(|i, j| {
-            bound[(i, j)] / (clear[i] * clear[j]).sqrt() + if i == j { floor } else { 0.0 }
+            bound[(i, j)] / (steepness[i] * steepness[j]) + if i == j { floor } else { 0.0 }
         })
     }
 }

@@ -8,7 +8,7 @@ use nalgebra::Matrix2;
 use crate::crop::mend;
 use crate::frame::{Measurement, Step};
 use crate::reference::Adaptation;
-use crate::target::{Workbench, predict};
+use crate::target::Workbench;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// A target under track.
@@ -141,8 +141,21 @@ impl PaperTarget {
         let (seen, _) = crop(image, self.position(), width, height);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
         let adaptation = &mut self.adaptation;
-        self.reference.update(|own| adaptation.take_in(own, &seen, noise, 1.0, interval as f32));
+        self.reference.update(|own| {
+            adaptation.take_in(own, &seen, noise, 1.0, interval as f32);
+        });
         self.answer(place, f64::from(peak.score), nis, config)
+    }
+}
+
+/// Moves both axes on; a target that leaves the picture is waited for at its border.
+fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
+    for (axis, side) in axes.iter_mut().zip([image.width(), image.height()]) {
+        axis.time_update(interval);
+        let edge = side as f64 - 1.0;
+        if !(0.0..=edge).contains(&axis.position()) {
+            axis.hold_at(axis.position().clamp(0.0, edge));
+        }
     }
 }
 

@@ -330,7 +330,7 @@ impl Area {
         let (sides, coarseness) = (*sides, *coarseness);
         let side = coarseness as f64;
         let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
-        let variances = [0, 1].map(|i| target.axes()[i].position_variance());
+        let variances = target.motion.found().map(|found| found.variance);
         let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
         let anywhere = target.anywhere(config);
         let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));

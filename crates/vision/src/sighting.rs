@@ -80,7 +80,7 @@ impl Target {
         }
         self.hypotheses.clear();
         self.begin_probation(frame.scene);
-        self.axes = [0, 1].map(|i| look.start(i, frame.config));
+        self.motion.restart(look.found(), frame.config.search_velocity_sd_px);
         self.seen(look.place);
         Step { measured: Some(self.measurement(&look)), score: look.score, certainty: 1.0, nis: None }
     }

@@ -3,7 +3,7 @@
 //! be seen at all.
 
 use crossfix_correlation::{Correlator, Plane, Statistics};
-use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
+use crossfix_filter::{AxisMeasurement, Gate};
 use nalgebra::Matrix2;
 
 use crate::appearance::{Appearance, Workshop};
@@ -17,6 +17,7 @@ use crate::identity::Identity;
 use crate::likelihood::Expectation;
 use crate::look::Look;
 use crate::looks::OtherLook;
+use crate::motion::{Evidence, Motion};
 use crate::noise::NoiseMeter;
 use crate::posterior::{Part, Posterior, PosteriorMap};
 use crate::search::{Background, Search};
@@ -38,12 +39,8 @@ pub(crate) const SEEN: f64 = 0.5;
 const USUAL_S: f64 = 3.0;
 /// Time constant with which a lost target's contrast is taken for what it usually is again, s: about a cloud's edge.
 const FADES_S: f64 = 0.5;
-/// Floor of a measurement's standard deviation, px.
-pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.015;
-/// Share of a measurement's variance that is the image's own noise, new in every frame. The rest is
-/// where the noise of the first image has put the reference: it is common to all measurements of a
-/// track, and no filter can take it out. About half, since image and first image are alike.
-const OWN_SHARE: f64 = 0.62;
+/// Floor of a measurement's standard deviation, px: the fit's bias over the phases of a pixel, which no noise shows.
+pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.005;
 /// Correlations at which an image is not learned at all, and fully.
 const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
 /// How fast the contrast, the log scale and the turn wander, a frame; and the floors of their
@@ -72,7 +69,9 @@ pub(crate) struct Workbench {
 #[derive(Clone, Debug)]
 pub(crate) struct Target {
     pub(crate) appearance: Appearance,
-    pub(crate) axes: [AxisFilter; 2],
+    pub(crate) motion: Motion,
+    /// How likely it could not be seen in the last image.
+    pub(crate) hidden: f64,
     /// Variance of the image's noise.
     pub(crate) noise: f32,
     pub(crate) contrast: f64,
@@ -80,10 +79,6 @@ pub(crate) struct Target {
     /// What the contrast is over seconds, as long as the target is seen.
     pub(crate) usual_contrast: f64,
     shape_variances: [f64; 2],
-    /// Variance of the reference's own place, x and y, px^2.
-    common: [f64; 2],
-    /// Variance of the box's centre about the target's own, px^2.
-    centre_variance: f64,
     pub(crate) missed: u32,
     /// How often it has been searched for since.
     pub(crate) searches: u32,
@@ -105,15 +100,14 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
     ((value - low) / (high - low)).clamp(0.0, 1.0)
 }
 
-/// Moves both axes on; a target that leaves the picture is waited for at its border.
-pub(crate) fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
-    for (axis, side) in axes.iter_mut().zip([image.width(), image.height()]) {
-        axis.time_update(interval);
-        let edge = side as f64 - 1.0;
-        if !(0.0..=edge).contains(&axis.position()) {
-            axis.hold_at(axis.position().clamp(0.0, edge));
-        }
-    }
+/// The measurement that makes a posterior of a prior: the inverse variances' difference.
+fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeasurement {
+    let information = (1.0 / posterior.variance - 1.0 / prior.variance).max(1e-3 / prior.variance);
+    let weighted = posterior.position / posterior.variance - prior.position / prior.variance;
+    let variance = 1.0 / information;
+    // Where the image tells nothing there is nothing to weigh.
+    let position = if posterior.variance < prior.variance { weighted * variance } else { posterior.position };
+    AxisMeasurement { position, variance }
 }
 
 impl Target {
@@ -127,20 +121,17 @@ impl Target {
         let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
         crop(image, corner.map(|at| at as isize), around, &mut bench.gate);
         let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
-        let start = |position| {
-            let first = AxisMeasurement { position, variance: config.given_sd_px.powi(2) };
-            AxisFilter::start_at_rest(first, config.start_velocity_sd_px, config.acceleration_sd_px)
-        };
+        let variance = config.given_sd_px.powi(2) + config.centre_sd_px.powi(2);
+        let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
         Self {
             appearance: Appearance::new(image, place, noise, config, &mut bench.workshop),
-            axes: [start(centre.x), start(centre.y)],
+            motion: Motion::at_rest(given, config.start_velocity_sd_px, config.acceleration_sd_px),
+            hidden: 0.0,
             noise,
             contrast: 1.0,
             contrast_variance: 0.0,
             usual_contrast: 1.0,
             shape_variances: [1e-6; 2],
-            common: [0.0; 2],
-            centre_variance: config.centre_sd_px.powi(2),
             missed: 0,
             searches: 0,
             is_new: true,
@@ -156,33 +147,30 @@ impl Target {
 
     /// Where the target is believed to be.
     pub(crate) fn position(&self) -> ImagePoint {
-        ImagePoint { x: self.axes[0].position(), y: self.axes[1].position() }
+        self.motion.position()
     }
 
     /// How fast it is believed to move, px/s.
     pub(crate) fn velocity(&self) -> ImagePoint {
-        ImagePoint { x: self.axes[0].velocity(), y: self.axes[1].velocity() }
+        self.motion.velocity()
     }
 
-    pub(crate) fn axes(&self) -> &[AxisFilter; 2] {
-        &self.axes
-    }
-
-    /// Covariance of position and velocity on either axis, the reference's own place and the other places where the target
-    /// may be included.
+    /// Covariance of position and velocity on either axis, the other places where the target may be included.
     pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
         let spread = self.hypotheses.spread(self.position());
+        let covariances = self.motion.covariances();
         [0, 1].map(|i| {
-            let mut covariance = self.axes[i].covariance();
-            covariance.m11 += self.common[i] + self.centre_variance + spread[i];
+            let mut covariance = covariances[i];
+            covariance.m11 += spread[i];
             covariance
         })
     }
 
-    /// What a look measured, with all that its covariance must hold.
+    /// What a look measured, the reference's offset taken out, with all that its covariance must hold.
     pub(crate) fn measurement(&self, look: &Look) -> Measurement {
-        let covariance = look.covariance + Matrix2::identity() * self.centre_variance;
-        Measurement { place: look.place, covariance }
+        let [x, y] = self.motion.offset();
+        let place = ImagePoint { x: look.place.x - x.position, y: look.place.y - y.position };
+        Measurement { place, covariance: look.covariance + Matrix2::new(x.variance, 0.0, 0.0, y.variance) }
     }
 
     /// Whether it is searched for, or for long has not been sure in any place.
@@ -219,7 +207,7 @@ impl Target {
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         let Frame { image, interval, .. } = frame;
         self.may_move_with_scene(frame);
-        predict(&mut self.axes, interval, image);
+        self.motion.predict(interval, image);
         self.hypotheses.predict(frame);
         self.unseen_s += interval;
         let frames = interval / FRAME_INTERVAL;
@@ -241,29 +229,21 @@ impl Target {
         let Frame { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
         let searching = self.is_searching();
-        let at = |position| AxisMeasurement { position, variance };
-        if !self.is_new {
-            predict(&mut self.axes, interval, image);
-        }
-        for (axis, position) in self.axes.iter_mut().zip([place.x, place.y]) {
-            if self.is_new {
-                *axis =
-                    AxisFilter::start(at(axis.position()), at(position), interval, config.acceleration_sd_px);
-            } else if searching {
-                *axis = AxisFilter::start_at_rest(
-                    at(position),
-                    config.search_velocity_sd_px,
-                    config.acceleration_sd_px,
-                );
-            } else {
-                axis.measurement_update(at(position));
-            }
+        let given = [place.x, place.y].map(|position| AxisMeasurement { position, variance });
+        if self.is_new {
+            self.motion.start(given, interval);
+        } else if searching {
+            self.motion.restart(self.motion.found_if_at(given), config.search_velocity_sd_px);
+        } else {
+            self.motion.predict(interval, image);
+            self.motion.update(&Evidence::of(self.motion.found_if_at(given)));
         }
         self.identity.is_given();
-        self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
+        let share = self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
+        self.motion.learn(place, f64::from(share), None);
         self.seen(place);
         self.hypotheses.clear();
-        let covariance = Matrix2::identity() * (variance + self.centre_variance);
+        let covariance = Matrix2::identity() * variance;
         let measured = Measurement { place, covariance };
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
@@ -304,17 +284,11 @@ impl Target {
         bench: &mut Workbench,
     ) -> Step {
         let is_there = self.doubt(frame, look, bench);
-        let posterior = &posterior.doubted(is_there);
-        let certainty = posterior.near.mass;
-        let at = [look.place.x, look.place.y];
-        let variances = [look.covariance.m11, look.covariance.m22].map(|v| OWN_SHARE * v);
-        self.common = variances.map(|own| own * (1.0 - OWN_SHARE) / OWN_SHARE);
-        let distance: f64 = (0..2)
-            .map(|i| {
-                let measurement = AxisMeasurement { position: at[i], variance: variances[i] };
-                self.axes[i].innovation(measurement).normalised_squared()
-            })
-            .sum();
+        let doubted = posterior.doubted(is_there);
+        let certainty = doubted.near.mass;
+        let found = look.found();
+        self.motion.tell_noise(found.map(|at| at.variance));
+        let distance = self.motion.surprise(found);
         let step = |measured| Step { measured, score: look.score, certainty, nis: Some(distance) };
         let measured = self.measurement(&look);
         if let GateRule::Ellipsoid { probability } = frame.config.gate
@@ -325,52 +299,52 @@ impl Target {
         }
         if certainty > SEEN && distance > MANOEUVRE {
             // Certain, and not where it was expected: the filters are too sure of themselves.
-            for i in 0..2 {
-                self.axes[i].inflate(distance / MANOEUVRE);
-                self.axes[i].measurement_update(AxisMeasurement { position: at[i], variance: variances[i] });
-            }
+            self.motion.inflate(distance / MANOEUVRE);
+            self.motion.update(&Evidence::of(found));
             self.seen(look.place);
             self.learn(frame, look.place, look, certainty, bench);
             return step(Some(measured));
         }
-        self.condition(posterior, at, variances, origin);
-        let estimate = self.position();
+        // Whether it is the target that is followed is said by the certainty, and the covariance is that of where it is then.
+        let posterior = if certainty > SEEN { posterior } else { &doubted };
+        self.motion.update(&self.evidence(posterior, found, origin));
+        let (estimate, hidden) = (self.position(), posterior.unseen);
         if certainty > SEEN {
             self.seen(estimate);
+            self.motion.match_noise(distance);
         } else {
             self.missed += 1;
         }
+        self.hidden = hidden;
         self.learn(frame, estimate, look, certainty, bench);
         step((certainty > SEEN).then_some(measured))
     }
 
-    /// The mixture of near, elsewhere and not seen, an axis, by its mean and variance.
-    fn condition(&mut self, posterior: &Posterior, at: [f64; 2], variances: [f64; 2], origin: [f64; 2]) {
-        let narrow = variances.iter().all(|v| *v < NARROW);
-        for i in 0..2 {
-            let (prior_mean, prior) = (self.axes[i].position(), self.axes[i].position_variance());
-            let (near_mean, near_variance) = if narrow {
-                let gain = prior / (prior + variances[i]);
-                (prior_mean + gain * (at[i] - prior_mean), (1.0 - gain) * prior)
-            } else {
-                (origin[i] + posterior.near.mean[i], posterior.near.variance[i])
-            };
-            let Part { mass, mean, variance } = posterior.elsewhere;
-            let parts = [
-                (posterior.near.mass, near_mean, near_variance),
-                (mass, origin[i] + mean[i], variance[i]),
-                (posterior.unseen, prior_mean, prior),
-            ];
-            let mean: f64 = parts.iter().map(|(mass, mean, _)| mass * mean).sum();
-            let spread: f64 =
-                parts.iter().map(|(mass, at, variance)| mass * (variance + (at - mean).powi(2))).sum();
-            self.axes[i].condition(AxisMeasurement { position: mean, variance: spread.min(4.0 * prior) });
+    /// What a posterior over the placements says of where the reference is found. Where the fit is narrower than the pixels of
+    /// the map, it says where in the peak; elsewhere the peak's own moments do, the prediction's part taken out.
+    fn evidence(&self, posterior: &Posterior, fitted: [AxisMeasurement; 2], origin: [f64; 2]) -> Evidence {
+        let narrow = fitted.iter().all(|at| at.variance < NARROW);
+        let expected = self.motion.found();
+        let in_image = |part: &Part, i: usize| AxisMeasurement {
+            position: origin[i] + part.mean[i],
+            variance: part.variance[i],
+        };
+        let at = if narrow {
+            fitted
+        } else {
+            [0, 1].map(|i| without_prior(in_image(&posterior.near, i), expected[i]))
+        };
+        Evidence {
+            near: posterior.near.mass,
+            at,
+            elsewhere: posterior.elsewhere.mass,
+            elsewhere_at: [0, 1].map(|i| in_image(&posterior.elsewhere, i)),
         }
     }
 
     pub(crate) fn seen(&mut self, place: ImagePoint) {
         (self.missed, self.searches) = (0, 0);
-        self.unseen_s = 0.0;
+        (self.unseen_s, self.hidden) = (0.0, 0.0);
         self.is_new = false;
         self.last_seen = place;
         self.background = None;
@@ -408,10 +382,13 @@ impl Target {
         let certainty = certainty * ramp(look.score, LEARNING_SCORES);
         if certainty >= 0.02 && !self.identity.is_on_probation() {
             // Size and direction take effect with the learning; without it they would run away.
-            if seen {
+            if seen && self.appearance.is_in_shape() {
                 self.follow_shape(look);
             }
-            self.appearance.learn(image, place, self.noise, certainty as f32, interval, &mut bench.workshop);
+            let (certainty, workshop) = (certainty as f32, &mut bench.workshop);
+            let share = self.appearance.learn(image, place, self.noise, certainty, interval, workshop);
+            let variances = [look.covariance.m11, look.covariance.m22];
+            self.motion.learn(place, f64::from(share), Some(variances));
         }
     }
 
@@ -453,15 +430,16 @@ impl Target {
             return Err(found.look.map_or(0.0, |look| look.score));
         };
         self.begin_probation(frame.scene);
-        for (i, position) in [look.place.x, look.place.y].into_iter().enumerate() {
-            let axis = &mut self.axes[i];
-            let near = (position - axis.position()).powi(2) < MANOEUVRE * axis.position_variance();
-            if self.missed < 20 && near {
-                let variance = look.covariance[(i, i)].min(axis.position_variance());
-                axis.condition(AxisMeasurement { position, variance });
-            } else {
-                *axis = look.start(i, frame.config);
-            }
+        let (found, expected) = (look.found(), self.motion.found());
+        let is_near =
+            |i: usize| (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance;
+        if self.missed < 20 && is_near(0) && is_near(1) {
+            self.motion.condition([0, 1].map(|i| AxisMeasurement {
+                variance: found[i].variance.min(expected[i].variance),
+                ..found[i]
+            }));
+        } else {
+            self.motion.restart(found, frame.config.search_velocity_sd_px);
         }
         self.seen(look.place);
         self.hypotheses.clear();

@@ -69,7 +69,7 @@ impl Adaptation {
     }
 
     /// Takes an image in, of noise of a variance, that shows the target with a certainty of 0 to 1,
-    /// `interval` seconds after the last one.
+    /// `interval` seconds after the last one. Returns its share in the reference.
     pub(crate) fn take_in(
         &mut self,
         reference: &mut Plane,
@@ -77,9 +77,9 @@ impl Adaptation {
         noise: f32,
         certainty: f32,
         interval: f32,
-    ) {
+    ) -> f32 {
         let share = match self.strategy {
-            ReferenceStrategy::Fixed => return,
+            ReferenceStrategy::Fixed => return 0.0,
             ReferenceStrategy::Replacement => 1.0,
             ReferenceStrategy::Smoothing { memory } => (1.0 - memory) * certainty,
             ReferenceStrategy::Mean { least_share } => {
@@ -94,7 +94,7 @@ impl Adaptation {
                     // About four frames' mean where nothing changes, one where it jumps.
                     self.noise = (0.75 * self.noise).max(noise / 4.0);
                 }
-                return;
+                return 0.25;
             }
         };
         for (old, new) in reference.samples_mut().iter_mut().zip(image.samples()) {
@@ -102,6 +102,7 @@ impl Adaptation {
         }
         self.noise = (1.0 - share).powi(2) * self.noise + share * share * noise;
         self.images += certainty;
+        share
     }
 }
 
