@@ -10,7 +10,7 @@ use super::runs::Noise;
 
 /// One tact of the texts, s.
 pub(crate) const TACT: f64 = 1.0 / 30.0;
-/// Standard deviation of the places that a tracker is given, px: they are the true ones.
+/// Standard deviation of the places that a tracker is given about the true ones, px.
 const GIVEN_SD: f64 = 0.02;
 /// Sides of the pictures, px.
 const SIDE: usize = 640;
@@ -157,9 +157,16 @@ impl Follower {
         Some(Self { tracker, frame: 0, size: sides.map(|s| s as f64), last: None, sigma_a })
     }
 
-    /// Takes the next picture with the true place and velocity (px/s); `None` in the first two.
-    pub(crate) fn step(&mut self, image: &Plane, truth: [f64; 2], velocity: [f64; 2]) -> Option<Outcome> {
-        let place = ImagePoint { x: truth[0], y: truth[1] };
+    /// Takes the next picture with the true place and velocity (px/s); in the first two the tracker is given the place, and there is no outcome.
+    pub(crate) fn step(
+        &mut self,
+        image: &Plane,
+        truth: [f64; 2],
+        velocity: [f64; 2],
+        noise: &mut Noise,
+    ) -> Option<Outcome> {
+        let [x, y] = if self.frame < 2 { truth.map(|at| at + GIVEN_SD * noise.normal()) } else { truth };
+        let place = ImagePoint { x, y };
         match (self.frame, &self.last) {
             (0, _) => self.tracker.take_up(PixelBox::about(place, self.size[0], self.size[1])),
             (1, Some(track)) => self.tracker.cue(track.id, place),

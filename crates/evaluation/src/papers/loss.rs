@@ -55,7 +55,9 @@ fn kept(
         let Some(mut follower) = Follower::new(config.clone(), sides) else { return 0 };
         for (frame, place) in path.iter().enumerate() {
             let image = canvas.paint(Some(stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
-            let off = follower.step(image, *place, [0.0; 2]).map_or([0.0; 2], |outcome| outcome.prediction);
+            let off = follower
+                .step(image, *place, [0.0; 2], &mut noise)
+                .map_or([0.0; 2], |outcome| outcome.prediction);
             if off[0].abs() > sides[0] as f64 || off[1].abs() > sides[1] as f64 || off[0].is_nan() {
                 return frame;
             }
