@@ -12,7 +12,6 @@ pub struct LowPass {
     taps: Vec<f32>,
     noise_gain: f32,
     own_weight: f32,
-    gradient_gain: f32,
     cross_gradient_gain: f32,
 }
 
@@ -37,7 +36,6 @@ impl LowPass {
         taps.iter_mut().for_each(|tap| *tap /= sum);
         let at = |k: isize| usize::try_from(k).ok().and_then(|k| taps.get(k)).copied().unwrap_or(0.0);
         let squares: f32 = taps.iter().map(|tap| tap * tap).sum();
-        let slopes: f32 = (-1..=taps.len() as isize).map(|k| ((at(k + 1) - at(k - 1)) / 2.0).powi(2)).sum();
         let own = taps[reach];
         // The central difference of one sample's weights with that of the sample: on its axis h(0) and h(2), across it h(0).
         let cross = 0.5 * (own - at(reach as isize + 2)) * own;
@@ -45,7 +43,6 @@ impl LowPass {
             deviation,
             noise_gain: squares * squares,
             own_weight: own * own,
-            gradient_gain: slopes * squares,
             cross_gradient_gain: cross,
             taps,
         }
@@ -64,11 +61,6 @@ impl LowPass {
     /// The weight of a sample in its own result.
     pub fn own_weight(&self) -> f32 {
         self.own_weight
-    }
-
-    /// Variance of white noise's central difference along an axis, over the noise's variance.
-    pub fn gradient_gain(&self) -> f32 {
-        self.gradient_gain
     }
 
     /// Covariance of white noise's central difference along an axis before and after, over the noise's variance.
@@ -125,13 +117,6 @@ mod tests {
             let squares: f32 = out.samples().iter().map(|v| v * v).sum();
             assert!((squares - filter.noise_gain).abs() < 1e-5);
             assert!((out.row(10)[10] - filter.own_weight).abs() < 1e-6);
-            let mut slopes = 0.0;
-            for y in 0..21 {
-                for x in 1..20 {
-                    slopes += ((out.row(y)[x + 1] - out.row(y)[x - 1]) / 2.0).powi(2);
-                }
-            }
-            assert!((slopes - filter.gradient_gain).abs() < 1e-5);
             let row = out.row(10);
             // Of the impulse itself: half after it, less half before it.
             let cross = 0.5 * (row[10] - row[8]) / 2.0 - 0.5 * (row[12] - row[10]) / 2.0;

@@ -17,9 +17,15 @@ fn energies_are_the_papers() {
 }
 
 #[test]
-fn losses_are_the_papers_and_the_default_has_fewer() {
-    // Standard errors of 40 runs are up to 0.08; limits of the default are 0.01 to 0.2.
-    assert_eq!(failures("loss of track", 40), Vec::<String>::new());
+fn losses_are_the_papers() {
+    // Standard errors of 150 runs are 0.02 to 0.04, and the limits 0.03 to 0.06.
+    assert_eq!(failures("paper mode", 150), Vec::<String>::new());
+}
+
+#[test]
+fn the_default_has_fewer_losses() {
+    // Limits are 0.01 to 0.2, of 0.1 to 1 that the papers lose.
+    assert_eq!(failures("loss of track, default", 60), Vec::<String>::new());
 }
 
 #[test]
@@ -34,15 +40,15 @@ fn the_default_reference_holds_in_the_loop() {
 
 #[test]
 fn the_default_is_as_sure_as_it_is_right() {
-    let options = ValidationOptions { runs: 60, seed: 3 };
+    let options = ValidationOptions { runs: 30, seed: 3 };
     let tables = validate_tracker(options, "Kalman filter and prediction", |_, _, _| {});
     let honesty = tables.iter().find(|table| table.name == "honesty").map(|table| &table.rows[..]);
     let rows = |what: &'static str, flight: &'static str| {
         let of = move |name: &str| name.starts_with(what) && name.ends_with(flight);
         honesty.unwrap_or_default().iter().filter(move |row| of(&row.series)).collect::<Vec<_>>()
     };
-    // Standard errors are a tenth at most, and 16 cells have one outlier of two of them. Beside that they lie where they do with
-    // many runs: 1.95 to 2.2 and 1.8 to 2.4; of a straight flight 1.8 to 2.4.
+    // Standard errors of 30 runs are a tenth, and of 16 cells one may be off by three. With many runs the cells lie from 1.95 to
+    // 2.2 (NIS) and 1.8 to 2.4 (NEES); of a straight flight from 1.6 to 2.2.
     let within = |what, flight, [low, high]: [f64; 2]| {
         let rows = rows(what, flight);
         assert_eq!(rows.len(), 16, "{what} {flight}");
@@ -51,9 +57,9 @@ fn the_default_is_as_sure_as_it_is_right() {
         }
         rows.iter().map(|row| row.ours).sum::<f64>() / rows.len() as f64
     };
-    assert!((within("NIS", "texts", [1.75, 2.35]) - 2.0).abs() < 0.1);
-    assert!((within("NEES", "texts", [1.6, 2.6]) - 2.0).abs() < 0.15);
-    assert!((within("NIS", "straight", [1.65, 2.55]) - 2.0).abs() < 0.1);
+    assert!((within("NIS", "texts", [1.6, 2.5]) - 2.0).abs() < 0.1);
+    assert!((within("NEES", "texts", [1.5, 2.7]) - 2.0).abs() < 0.15);
+    assert!((within("NIS", "straight", [1.4, 2.6]) - 2.0).abs() < 0.3);
     // It may turn any moment, and nothing says that it will not: it is better than it says.
     within("NEES", "straight", [0.1, 2.0]);
 }

@@ -26,6 +26,8 @@ const ANCHOR_STIFFNESS: f64 = 0.02;
 /// When so much of the reference is new, what is correlated is made anew: a few images' worth. Half of it costs half as much
 /// again for a target of 50x30, and nothing is followed better.
 const MOST_CHANGED: f32 = 0.1;
+/// An image counts as at least this share of what is new: its size and direction are, where nothing is learned.
+const SHAPE_SHARE: f32 = 0.03;
 /// Least of what a reference's slopes answer to: one of noise alone tells no place.
 const LEAST_STEEPNESS: f64 = 0.15;
 /// Scale of a target over its first size.
@@ -109,9 +111,17 @@ fn energy(plane: &Plane) -> f32 {
 /// What a reference's slopes answer to where the target is displaced, over what they would if it were the reference: the sums
 /// of the products of its slopes G with the target's, on either axis, over those of G with itself.
 ///
-/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the target's slopes: the bound
-/// over this squared. T is known with noise, of which the product's mean is taken out.
-fn steepness(reference: &Plane, target: &Plane, noise_answer: f64) -> [f64; 2] {
+/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the target's slopes. The bound
+/// `sigma^2 (G'G)^-1` is taken at the contrast with which the reference fits best, which is as many times the target's own as the
+/// target has the reference in it: so that is divided by. T is known with noise; the means of its products, `answers` a pixel
+/// of slopes and of values, are taken out.
+fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
+    let [noise_answer, value_answer] = answers;
+    let product: f64 =
+        reference.samples().iter().zip(target.samples()).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+    let count = target.samples().len() as f64;
+    let contrast =
+        ((product - value_answer * count) / f64::from(energy(reference)).max(1e-12)).max(LEAST_STEEPNESS);
     let (width, height) = (reference.width(), reference.height());
     let (mut own, mut with) = ([0.0_f64; 2], [0.0_f64; 2]);
     for y in 1..height.saturating_sub(1) {
@@ -127,7 +137,10 @@ fn steepness(reference: &Plane, target: &Plane, noise_answer: f64) -> [f64; 2] {
         }
     }
     let pixels = (width.saturating_sub(2) * height.saturating_sub(2)) as f64;
-    [0, 1].map(|axis| ((with[axis] - noise_answer * pixels) / own[axis].max(1e-12)).max(LEAST_STEEPNESS))
+    [0, 1].map(|axis| {
+        let steeper = (with[axis] - noise_answer * pixels) / own[axis].max(1e-12);
+        steeper.max(LEAST_STEEPNESS) / contrast
+    })
 }
 
 /// How much of white noise's variance a view between the samples keeps.
@@ -208,6 +221,7 @@ impl Appearance {
             scale: 1.0,
             turn_rad: 0.0,
             drift: Drift::default(),
+            is_like_anchor: true,
             own,
             ..self.clone()
         };
@@ -235,8 +249,7 @@ impl Appearance {
         self.adaptation.noise * self.low_passes[self.chosen].noise_gain()
     }
 
-    /// How much of what its slopes answer to is the target's, on either axis: see [`steepness`]; and mean square of what the
-    /// low-pass has taken from the target.
+    /// How much steeper the target is than the reference, on either axis: see [`steepness`].
     pub(crate) fn steepness(&self) -> [f64; 2] {
         self.steepness
     }
@@ -285,7 +298,7 @@ impl Appearance {
             self.remembered = None;
         }
         workshop.view = view;
-        self.changed += own_share;
+        self.changed += own_share.max(SHAPE_SHARE);
         if self.changed > MOST_CHANGED || anchor_share > 0.0 {
             self.prepare(workshop);
             self.is_like_anchor = self.compare_with_anchor(workshop);
@@ -300,9 +313,11 @@ impl Appearance {
 
     /// Changes size and direction; takes effect when enough has been [learned](Self::learn).
     pub(crate) fn reshape(&mut self, log_scale: f64, turn_rad: f64) {
-        self.scale = (self.scale * log_scale.exp()).clamp(SCALE_RANGE[0], SCALE_RANGE[1]);
-        self.turn_rad += turn_rad;
-        self.is_in_shape = false;
+        if [log_scale, turn_rad] != [0.0; 2] {
+            self.scale = (self.scale * log_scale.exp()).clamp(SCALE_RANGE[0], SCALE_RANGE[1]);
+            self.turn_rad += turn_rad;
+            self.is_in_shape = false;
+        }
     }
 
     /// The working reference from the one in its own size and direction: the low-pass of least risk
@@ -329,8 +344,9 @@ impl Appearance {
                 break;
             }
         }
-        let answer = noise * self.low_passes[self.chosen].cross_gradient_gain();
-        self.steepness = steepness(&self.smooth, &self.own, f64::from(answer));
+        let filter = &self.low_passes[self.chosen];
+        let answers = [filter.cross_gradient_gain(), filter.own_weight()].map(|gain| f64::from(noise * gain));
+        self.steepness = steepness(&self.smooth, &self.own, answers);
         let (width, height) = (self.own.width() as f64, self.own.height() as f64);
         let Self { smooth, working, scale, turn_rad, .. } = self;
         working.update(|image| {

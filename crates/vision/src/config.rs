@@ -35,7 +35,7 @@ pub struct TrackerConfig {
     /// stands out there is moved onto it. 0 takes every box as it is. Default 4.
     pub box_sd_px: f64,
     /// Standard deviation of the box's centre about the target's own, px: the same in all images of a
-    /// track, and part of every covariance that is answered. Default 0.1.
+    /// track, and part of every covariance that is answered until somebody says where the target is. Default 0.1.
     pub centre_sd_px: f64,
     /// Floor of the prediction's standard deviation, px. Default 0.3.
     pub prediction_floor_px: f64,

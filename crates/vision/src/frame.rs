@@ -27,6 +27,13 @@ pub(crate) struct Frame<'a> {
     pub(crate) config: &'a TrackerConfig,
 }
 
+impl Frame<'_> {
+    /// Columns and rows of the image.
+    pub(crate) fn sides(&self) -> [usize; 2] {
+        [self.image.width(), self.image.height()]
+    }
+}
+
 /// A place measured in one image, whatever was known before.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measurement {

@@ -12,8 +12,8 @@ use crate::motion::Motion;
 use crate::posterior::{Posterior, Prior};
 use crate::target::{Target, Workbench};
 
-/// How long a target cannot be seen when it cannot, in the mean, s: a blur is shorter, a cloud longer, and that of the
-/// cameras of the fusion is the same. With half of it 3.8 % of the frames of ten seeds' sequences are lost in place of 1.7,
+/// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target cannot be seen when it cannot. A
+/// blur is shorter, a cloud longer. With half of it 3.8 % of the frames of ten seeds' sequences are lost in place of 1.7,
 /// with twice as much 2.7: what is faint is given up too soon.
 const HIDDEN_S: f64 = 0.05;
 /// Log ratio of a placement outside the image.

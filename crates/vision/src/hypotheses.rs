@@ -50,14 +50,15 @@ impl Hypothesis {
 
     /// Whether two say the same; where it has been seen and where it has been waited for are not the same.
     fn is_like(&self, other: &Self) -> bool {
-        let (here, there) = (self.motion.position(), other.motion.position());
+        let (here, there) = (self.motion.found(), other.motion.found());
         let (one, two) = (self.motion.velocity(), other.motion.velocity());
         let (a, b) = (self.motion.covariances(), other.motion.covariances());
         let near = |off: f64, variance: f64| off.abs() < SAME * variance.sqrt();
-        let alike = [(here.x - there.x, one.x - two.x), (here.y - there.y, one.y - two.y)]
-            .into_iter()
-            .zip(a.iter().zip(&b))
-            .all(|((apart, faster), (a, b))| near(apart, a.m11.max(b.m11)) && near(faster, a.m22.max(b.m22)));
+        let faster = [one.x - two.x, one.y - two.y];
+        let alike = (0..2).all(|i| {
+            near(here[i].position - there[i].position, here[i].variance.max(there[i].variance))
+                && near(faster[i], a[i].m22.max(b[i].m22))
+        });
         alike && self.peak.is_some() == other.peak.is_some()
     }
 }
@@ -87,7 +88,7 @@ impl Hypotheses {
 
     pub(crate) fn predict(&mut self, frame: Frame<'_>) {
         for hypothesis in &mut self.all {
-            hypothesis.motion.predict(frame.interval, frame.image);
+            hypothesis.motion.predict(frame.interval, frame.sides());
         }
     }
 
@@ -194,6 +195,7 @@ impl Target {
         let certainty = sure * is_there;
         self.hypotheses.doubted_s += frame.interval;
         if certainty > SEEN {
+            self.motion.tell_noise(look.found().map(|at| at.variance));
             self.seen(look.place);
         } else if seen < 1.0 - DOUBT || is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
             self.missed += 1;

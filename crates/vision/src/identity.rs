@@ -73,6 +73,7 @@ impl Identity {
     pub(crate) fn is_given(&mut self) {
         (self.is_there, self.probation) = (1.0, None);
         self.in_pictures.clear();
+        (self.speed_px_s, self.last_in_scene) = (0.0, None);
     }
 
     /// Whether it has been found again, and that is not sure.
@@ -82,15 +83,24 @@ impl Identity {
 }
 
 impl Target {
+    /// Notes where in the scene it was in the image before, if it was seen for sure.
+    pub(crate) fn note_last_place(&mut self, frame: Frame<'_>) {
+        if self.unseen_s > 0.0 || self.identity.probation.is_some() {
+            return;
+        }
+        let (turned, moved) = (frame.scene.turned(), frame.scene_moved);
+        let ImagePoint { x, y } = self.last_seen;
+        self.identity.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
+    }
+
     /// Notes where it was when a picture of the scene was taken, if it was seen.
-    pub(crate) fn note_picture(&mut self, number: u64, turned: [f64; 2]) {
+    pub(crate) fn note_picture(&mut self, number: u64) {
         // In doubt it is not known where it was.
         if self.unseen_s > 0.0 {
             return;
         }
         if self.identity.probation.is_none() {
             self.identity.speed_px_s = self.velocity().x.hypot(self.velocity().y);
-            self.identity.last_in_scene = Some([self.last_seen.x + turned[0], self.last_seen.y + turned[1]]);
         }
         let in_pictures = &mut self.identity.in_pictures;
         if in_pictures.len() >= MOST_PICTURES {
@@ -197,7 +207,7 @@ impl Target {
     /// was known before.
     pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         if let Some(probation) = &mut self.identity.probation {
-            probation.motion.predict(frame.interval, frame.image);
+            probation.motion.predict(frame.interval, frame.sides());
             probation.unseen_s += frame.interval;
         }
         let step = self.follow(frame, bench);

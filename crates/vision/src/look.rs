@@ -12,6 +12,9 @@ use crate::{ImagePoint, TrackerConfig};
 /// together, and displace the fit as noise of so many times its variance would.
 const PIXELS_A_PART: f64 = 10.0;
 
+/// A place that is measured no better than this is not known at all, standard deviation, px.
+const MOST_MEASUREMENT_SD: f64 = 1e3;
+
 /// A reference fitted to the image at the best placement.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Look {
@@ -69,16 +72,17 @@ impl Target {
         Look { place, covariance, contrast, shape, score }
     }
 
-    /// The covariance of a fit: the bound in the image's noise, and what of the reference's gradient
-    /// is itself noise.
+    /// The covariance of a fit by a reference that is not the target itself: see [`crate::appearance`]'s `steepness`.
     fn covariance(&self, fit: &Fit, noise: f64, contrast: f64) -> Matrix2<f64> {
         let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
             return Matrix2::identity();
         };
         let steepness = self.appearance.steepness();
         let floor = LEAST_MEASUREMENT_SD.powi(2);
-        Matrix2::from_fn(|i, j| {
+        let covariance = Matrix2::from_fn(|i, j| {
             bound[(i, j)] / (steepness[i] * steepness[j]) + if i == j { floor } else { 0.0 }
-        })
+        });
+        let is_known = covariance.m11.max(covariance.m22) <= MOST_MEASUREMENT_SD.powi(2);
+        if is_known { covariance } else { Matrix2::identity() * MOST_MEASUREMENT_SD.powi(2) }
     }
 }

@@ -9,7 +9,6 @@
 //! lively as anything flies, weighted by how well each has predicted (interacting multiple models, 003 (10)-(17); there of a
 //! pixel's brightness).
 
-use crossfix_correlation::Plane;
 use crossfix_filter::{AxisMeasurement, normal_score};
 use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
 
@@ -31,9 +30,13 @@ const AT_FIRST: [f64; WAYS] = [1.0, 0.0, 0.0, 0.0];
 const MATCHED_S: f64 = 3.0;
 /// What was expected counts like innovations of so long, s.
 const AT_LEAST_S: f64 = 0.5;
-/// The squared normalised innovation of both axes that one in a hundred exceeds: what is beyond is no noise.
+/// How strongly it is drawn to what was expected, of e times which it is off: where innovations tell little of the noise, as the
+/// target's own motion is most of them, nothing else keeps it.
+const AS_EXPECTED: f64 = 0.01;
+/// The squared normalised innovation of both axes that one in a hundred exceeds: one image counts for no more.
 const OUTLIER: f64 = 9.21;
-/// The noise as it is matched is at most so many times more or less than was expected, variances.
+/// The noise as it is matched is at most so many times more or less than was expected, variances: a hundred times in its
+/// deviation, from a pixel's hundredth to a pixel.
 const MOST_MATCHED: f64 = 1e4;
 
 /// The states of an axis, by their places.
@@ -68,6 +71,8 @@ pub(crate) struct Motion {
     /// that measurement's variances.
     gains: [[Vector3<f64>; 2]; WAYS],
     measured: [f64; 2],
+    /// The noise's share in that measurement's innovations, by the ways that are likely now.
+    told: f64,
     /// Acceleration variances of the ways, px^2/s^4.
     accelerations: [f64; WAYS],
     /// Variance that the noise of the learned images has in the offset and that is not in the covariances yet, in units of
@@ -154,6 +159,7 @@ impl Motion {
             all,
             gains: [[Vector3::zeros(); 2]; WAYS],
             measured: [0.0; 2],
+            told: 0.0,
             accelerations: LIVELINESS.map(|share| (share * acceleration_sd).powi(2)),
             untold: 1.0,
         }
@@ -170,14 +176,14 @@ impl Motion {
         }
         self.ways = [self.all; WAYS];
         self.weights = AT_FIRST;
-        self.gains = Default::default();
+        (self.gains, self.measured) = ([[Vector3::x(); 2]; WAYS], found.map(|at| at.variance));
     }
 
     /// Starts from a second place that somebody knows, `interval` seconds after the first one (000 (13)-(14)).
     pub(crate) fn start(&mut self, second: [AxisMeasurement; 2], interval: f64) {
         for i in 0..2 {
             let first = self.all[i];
-            let first_variance = first.covariance[(POSITION, POSITION)];
+            let first_variance = first.covariance[(OFFSET, OFFSET)];
             let (at, variance) = (second[i].position, second[i].variance);
             for (way, acceleration) in self.ways.iter_mut().zip(self.accelerations) {
                 let axis = &mut way[i];
@@ -194,17 +200,34 @@ impl Motion {
         self.combine();
     }
 
-    /// Where the reference is found if the target is at places that somebody knows.
-    pub(crate) fn found_if_at(&self, given: [AxisMeasurement; 2]) -> [AxisMeasurement; 2] {
-        let offset = self.offset();
-        [0, 1].map(|i| AxisMeasurement {
-            position: given[i].position + offset[i].position,
-            variance: given[i].variance + offset[i].variance,
-        })
+    /// Starts anew at a place that somebody knows; the reference's offset stays known as it was.
+    pub(crate) fn restart_at(&mut self, given: [AxisMeasurement; 2], velocity_sd: f64) {
+        for (axis, AxisMeasurement { position, variance }) in self.all.iter_mut().zip(given) {
+            axis.mean = Vector3::new(position, 0.0, axis.mean[OFFSET]);
+            let offset = axis.covariance[(OFFSET, OFFSET)];
+            axis.covariance = Matrix3::from_diagonal(&Vector3::new(variance, velocity_sd.powi(2), offset));
+        }
+        self.ways = [self.all; WAYS];
+        self.weights = AT_FIRST;
+        self.gains = Default::default();
     }
 
-    /// Moves on; a target that leaves the picture is waited for at its border.
-    pub(crate) fn predict(&mut self, interval: f64, image: &Plane) {
+    /// Takes in where the target is, which somebody knows.
+    pub(crate) fn take_place(&mut self, given: [AxisMeasurement; 2]) {
+        for way in &mut self.ways {
+            for (axis, given) in way.iter_mut().zip(given) {
+                let variance = axis.covariance[(POSITION, POSITION)] + given.variance;
+                let gain = axis.covariance.column(POSITION) / variance;
+                axis.mean += gain * (given.position - axis.mean[POSITION]);
+                axis.covariance -= gain * gain.transpose() * variance;
+            }
+        }
+        self.gains = Default::default();
+        self.combine();
+    }
+
+    /// Moves on; a target that leaves the picture, of given sides, is waited for at its border.
+    pub(crate) fn predict(&mut self, interval: f64, sides: [usize; 2]) {
         let stays = (-CHANGES_PER_S * interval).exp();
         let drawn = (1.0 - stays) / WAYS as f64;
         for ((way, weight), acceleration) in
@@ -220,7 +243,7 @@ impl Motion {
         self.gains = Default::default();
         self.interval = interval;
         self.combine();
-        for (i, side) in [image.width(), image.height()].into_iter().enumerate() {
+        for (i, side) in sides.into_iter().enumerate() {
             let edge = side as f64 - 1.0;
             if !(0.0..=edge).contains(&self.all[i].mean[POSITION]) {
                 let held = self.all[i].mean[POSITION].clamp(0.0, edge);
@@ -294,11 +317,12 @@ impl Motion {
         self.noise_factor
     }
 
-    /// Matches the noise to an innovation's square, of both axes.
+    /// Matches the noise to the innovation of the last update, whose square of both axes is given: as far as it tells the noise.
     pub(crate) fn match_noise(&mut self, surprise: f64) {
         self.matched_s = (self.matched_s + self.interval).min(MATCHED_S);
         let share = (self.interval / (self.matched_s + AT_LEAST_S)).min(1.0);
-        let factor = self.noise_factor * (1.0 + share * (surprise.min(OUTLIER) / 2.0 - 1.0));
+        let more = self.told * (surprise.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
+        let factor = self.noise_factor * (1.0 + share * more);
         self.noise_factor = factor.clamp(1.0 / MOST_MATCHED, MOST_MATCHED);
     }
 
@@ -324,11 +348,14 @@ impl Motion {
             let axis = |i: usize| {
                 let prior = self.ways[way][i].found();
                 let variance = prior.variance + at[i].variance;
-                (-0.5 * (at[i].position - prior.position).powi(2) / variance).exp() / variance.sqrt()
+                -0.5 * ((at[i].position - prior.position).powi(2) / variance + variance.ln())
             };
-            axis(0) * axis(1)
+            axis(0) + axis(1)
         });
+        let largest = likelihoods.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let likelihoods = likelihoods.map(|logarithm| (logarithm - largest).exp());
         let mean: f64 = likelihoods.iter().zip(self.weights).map(|(l, w)| l * w).sum();
+        let mut told = [0.0; WAYS];
         for (way, weight) in self.weights.iter_mut().enumerate() {
             if mean > f64::MIN_POSITIVE {
                 *weight *= near * likelihoods[way] / mean + (1.0 - near);
@@ -337,6 +364,7 @@ impl Motion {
                 let axis = &mut self.ways[way][i];
                 let prior = axis.found();
                 let gain = prior.variance / (prior.variance + at[i].variance);
+                told[way] += (1.0 - gain) / 2.0;
                 let here = AxisMeasurement {
                     position: prior.position + gain * (at[i].position - prior.position),
                     variance: (1.0 - gain) * prior.variance,
@@ -353,16 +381,20 @@ impl Motion {
         }
         let total: f64 = self.weights.iter().sum();
         self.weights.iter_mut().for_each(|weight| *weight /= total);
+        self.told = told.iter().zip(self.weights).map(|(told, weight)| told * weight).sum();
         self.combine();
     }
 
     /// Replaces what is known of where the reference is found, on both axes.
     pub(crate) fn condition(&mut self, found: [AxisMeasurement; 2]) {
-        for way in &mut self.ways {
-            for (axis, found) in way.iter_mut().zip(found) {
-                axis.condition(found);
+        for (way, gains) in self.ways.iter_mut().zip(&mut self.gains) {
+            for i in 0..2 {
+                let gain = (1.0 - found[i].variance / way[i].found().variance).max(0.0);
+                gains[i] = way[i].slope() * gain;
+                way[i].condition(found[i]);
             }
         }
+        self.measured = found.map(|at| at.variance);
         self.combine();
     }
 
@@ -372,9 +404,9 @@ impl Motion {
     /// `(1 - share) b + share (place - x - v)`. The estimate of x has taken in the same v by its gain.
     pub(crate) fn learn(&mut self, place: ImagePoint, share: f64, variances: Option<[f64; 2]>) {
         let shifted = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -share, 0.0, 1.0 - share);
-        if variances.is_none() {
-            self.untold = (1.0 - share).powi(2) * self.untold + share * share;
-        }
+        // What is learned with a variance is told with it.
+        let new = if variances.is_none() { share * share } else { 0.0 };
+        self.untold = (1.0 - share).powi(2) * self.untold + new;
         let place = [place.x, place.y];
         for (way, gains) in self.ways.iter_mut().zip(&self.gains) {
             for i in 0..2 {
@@ -385,8 +417,8 @@ impl Motion {
                 let known = shifted * gains[i] * new.transpose();
                 axis.covariance = shifted * axis.covariance * shifted.transpose();
                 if let Some(variances) = variances {
-                    axis.covariance += (known + known.transpose()) * self.measured[i]
-                        + new * new.transpose() * variances[i].max(self.measured[i]);
+                    axis.covariance += (known + known.transpose()) * variances[i].min(self.measured[i])
+                        + new * new.transpose() * variances[i];
                 }
             }
         }

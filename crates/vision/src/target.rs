@@ -29,8 +29,13 @@ pub(crate) const SEARCH_AFTER_FRAMES: u32 = 3;
 const NOISE_SHARE: f32 = 0.3;
 /// Variance below which a fit is narrower than the pixels of the map, px^2.
 const NARROW: f64 = 0.5;
+/// What a map tells of a place is at least this share of what is known then: with less, chance would be taken for a measurement
+/// from afar.
+const LEAST_TOLD: f64 = 0.1;
 /// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
 const MANOEUVRE: f64 = 25.0;
+/// A manoeuvre makes the filters' variances at most so many times larger: from a tenth of a pixel to ten.
+const MOST_INFLATED: f64 = 1e4;
 /// Certainty above which the rest of the gate is not looked at: what is there could take no more from it than this leaves.
 const SURE: f64 = 0.99;
 /// Certainty above which a target counts as seen.
@@ -102,12 +107,14 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 
 /// The measurement that makes a posterior of a prior: the inverse variances' difference.
 fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeasurement {
-    let information = (1.0 / posterior.variance - 1.0 / prior.variance).max(1e-3 / prior.variance);
-    let weighted = posterior.position / posterior.variance - prior.position / prior.variance;
-    let variance = 1.0 / information;
-    // Where the image tells nothing there is nothing to weigh.
-    let position = if posterior.variance < prior.variance { weighted * variance } else { posterior.position };
-    AxisMeasurement { position, variance }
+    // A placement stands for a whole pixel, of which the map's prior knows nothing.
+    let known = (posterior.variance - 1.0 / 12.0).max(1e-3 * prior.variance);
+    let share = (1.0 - known / prior.variance).max(LEAST_TOLD);
+    let off = (posterior.position - prior.position) / share;
+    AxisMeasurement {
+        position: prior.position + off,
+        variance: prior.variance * (1.0 / share - 1.0) + 1.0 / 12.0,
+    }
 }
 
 impl Target {
@@ -205,9 +212,10 @@ impl Target {
 
     /// Follows the target into the next image.
     pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
-        let Frame { image, interval, .. } = frame;
+        let interval = frame.interval;
         self.may_move_with_scene(frame);
-        self.motion.predict(interval, image);
+        self.note_last_place(frame);
+        self.motion.predict(interval, frame.sides());
         self.hypotheses.predict(frame);
         self.unseen_s += interval;
         let frames = interval / FRAME_INTERVAL;
@@ -233,10 +241,10 @@ impl Target {
         if self.is_new {
             self.motion.start(given, interval);
         } else if searching {
-            self.motion.restart(self.motion.found_if_at(given), config.search_velocity_sd_px);
+            self.motion.restart_at(given, config.search_velocity_sd_px);
         } else {
-            self.motion.predict(interval, image);
-            self.motion.update(&Evidence::of(self.motion.found_if_at(given)));
+            self.motion.predict(interval, frame.sides());
+            self.motion.take_place(given);
         }
         self.identity.is_given();
         let share = self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
@@ -287,7 +295,10 @@ impl Target {
         let doubted = posterior.doubted(is_there);
         let certainty = doubted.near.mass;
         let found = look.found();
-        self.motion.tell_noise(found.map(|at| at.variance));
+        if certainty > SEEN {
+            self.motion.tell_noise(found.map(|at| at.variance));
+        }
+        let expected = self.motion.found();
         let distance = self.motion.surprise(found);
         let step = |measured| Step { measured, score: look.score, certainty, nis: Some(distance) };
         let measured = self.measurement(&look);
@@ -299,7 +310,8 @@ impl Target {
         }
         if certainty > SEEN && distance > MANOEUVRE {
             // Certain, and not where it was expected: the filters are too sure of themselves.
-            self.motion.inflate(distance / MANOEUVRE);
+            let off = |i: usize| (found[i].position - expected[i].position).powi(2) / expected[i].variance;
+            self.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
             self.motion.update(&Evidence::of(found));
             self.seen(look.place);
             self.learn(frame, look.place, look, certainty, bench);
@@ -307,7 +319,7 @@ impl Target {
         }
         // Whether it is the target that is followed is said by the certainty, and the covariance is that of where it is then.
         let posterior = if certainty > SEEN { posterior } else { &doubted };
-        self.motion.update(&self.evidence(posterior, found, origin));
+        self.motion.update(&self.evidence(posterior, found, origin, frame.config));
         let (estimate, hidden) = (self.position(), posterior.unseen);
         if certainty > SEEN {
             self.seen(estimate);
@@ -322,9 +334,16 @@ impl Target {
 
     /// What a posterior over the placements says of where the reference is found. Where the fit is narrower than the pixels of
     /// the map, it says where in the peak; elsewhere the peak's own moments do, the prediction's part taken out.
-    fn evidence(&self, posterior: &Posterior, fitted: [AxisMeasurement; 2], origin: [f64; 2]) -> Evidence {
+    fn evidence(
+        &self,
+        posterior: &Posterior,
+        fitted: [AxisMeasurement; 2],
+        origin: [f64; 2],
+        config: &TrackerConfig,
+    ) -> Evidence {
         let narrow = fitted.iter().all(|at| at.variance < NARROW);
-        let expected = self.motion.found();
+        let floor = config.prediction_floor_px.powi(2);
+        let expected = self.motion.found().map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
         let in_image = |part: &Part, i: usize| AxisMeasurement {
             position: origin[i] + part.mean[i],
             variance: part.variance[i],

@@ -336,7 +336,7 @@ impl ImageTracker {
         if posterior && let Some(number) = self.scene.keep(image) {
             for followed in &mut self.followed {
                 if let Follower::Posterior(target) = &mut followed.target {
-                    target.note_picture(number, self.scene.turned());
+                    target.note_picture(number);
                 }
             }
         }

@@ -7,8 +7,9 @@ use pulp::Arch;
 use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Of a squared change beyond this many variances only so much is learnt: what comes by is no noise of the place. With
-/// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind.
+/// Of a squared change beyond this many variances only so much is learnt, of mean and variance: what comes by is no noise of the place. With
+/// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind, and its place
+/// before it was found something that has come.
 const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a level, and with half of it
 /// each such step is two standard deviations.
@@ -364,7 +365,8 @@ impl CellUpdate {
                 let off = now - contrast * *mean;
                 let usual = variance.max(noise);
                 *change = off / (usual + texture).sqrt();
-                *mean += share * off;
+                let most = (OUTLYING * usual).sqrt();
+                *mean += share * off.clamp(-most, most);
                 *variance += share * ((off * off).min(OUTLYING * usual) - *variance);
             }
         });
