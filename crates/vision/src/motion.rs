@@ -32,8 +32,8 @@ const MATCHED_S: f64 = 3.0;
 /// What was expected counts like innovations of so long, s: the first dozen of them, which tell a third.
 const AT_LEAST_S: f64 = 0.5;
 /// How strongly it is drawn to what was expected, of e times which it is off: where innovations tell little of the noise, as the
-/// target's own motion is most of them, nothing else keeps it. With three times as much a noise of 0.3 times the expected
-/// deviation is found two per cent less well, and a lively target's kept as much better.
+/// target's own motion is most of them, nothing else keeps it. With three times as much the noise that is
+/// found of even and of lively targets changes by less than 4 %.
 const AS_EXPECTED: f64 = 0.01;
 /// The squared normalised innovation of both axes that one in a hundred exceeds: one image counts for no more.
 const OUTLIER: f64 = 9.21;
