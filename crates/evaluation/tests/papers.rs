@@ -48,7 +48,8 @@ fn the_default_is_as_sure_as_it_is_right() {
         honesty.unwrap_or_default().iter().filter(move |row| of(&row.series)).collect::<Vec<_>>()
     };
     // Standard errors of 30 runs are a tenth, and of 16 cells one may be off by three. With many runs the cells lie from 1.95 to
-    // 2.2 (NIS) and 1.8 to 2.4 (NEES); of a straight flight from 1.6 to 2.2.
+    // 2.2 (NIS) and 1.8 to 2.4 (NEES); of a straight flight from 1.4 to 2.2, where 2 is asked
+    // as well.
     let within = |what, flight, [low, high]: [f64; 2]| {
         let rows = rows(what, flight);
         assert_eq!(rows.len(), 16, "{what} {flight}");
@@ -60,6 +61,7 @@ fn the_default_is_as_sure_as_it_is_right() {
     assert!((within("NIS", "texts", [1.6, 2.5]) - 2.0).abs() < 0.1);
     assert!((within("NEES", "texts", [1.5, 2.7]) - 2.0).abs() < 0.15);
     assert!((within("NIS", "straight", [1.4, 2.6]) - 2.0).abs() < 0.3);
-    // It may turn any moment, and nothing says that it will not: it is better than it says.
-    within("NEES", "straight", [0.1, 2.0]);
+    // 2 is asked of straight flight too, and not reached: the filters allow for turns that do not come. What is held here is what is
+    // reached, 0.2 to 0.66 with many runs.
+    within("NEES", "straight", [0.15, 0.9]);
 }

@@ -23,8 +23,8 @@ const ANCHOR_NOISE_SHARE: f32 = 0.02;
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
 /// Stiffness of scale and turn in that comparison.
 const ANCHOR_STIFFNESS: f64 = 0.02;
-/// When so much of the reference is new, what is correlated is made anew: a few images' worth. Half of it costs half as much
-/// again for a target of 50x30, and nothing is followed better.
+/// When so much of the reference is new, what is correlated is made anew: a few images' worth. Reasoned: with half of it that
+/// is done, and costs, twice as often.
 const MOST_CHANGED: f32 = 0.1;
 /// An image counts as at least this share of what is new: its size and direction are, where nothing is learned.
 const SHAPE_SHARE: f32 = 0.03;

@@ -19,7 +19,7 @@ const WAYS: usize = 4;
 /// neighbours none predicts much worse than the right one would; the last flies evenly.
 const LIVELINESS: [f64; WAYS] = [1.0, 0.2, 0.04, 0.0];
 /// How often a target goes over to another way, drawn from all alike, 1/s. With a tenth of it the first images of a turn come as
-/// surprises, and of ten seeds' sequences 2.3 % of the frames are lost in place of 1.7; with ten times as much 2.1.
+/// surprises, and when it was chosen 2.3 % of the frames of ten seeds' sequences were lost with it in place of 1.7; with ten times as much 2.1.
 const CHANGES_PER_S: f64 = 0.5;
 /// Of a target that is taken up or found again nobody knows whether it flies evenly: it is lively until it has shown that it
 /// is not.

@@ -129,11 +129,7 @@ fn honesty(options: ValidationOptions) -> Table {
                     [("NIS", over_runs(&runs, |o| o.nis)), ("NEES", over_runs(&runs, |o| Some(o.nees)))]
                 {
                     let name = format!("{what} {}x{}, {}", sides[0], sides[1], flight.name);
-                    // A straight flight may end at any moment: no more may be believed of it than that.
-                    let limit = match (what, flight.name) {
-                        ("NEES", "straight") => Limit::AtMost(2.1),
-                        _ => Limit::Near { value: 2.0, tolerance: 0.1 },
-                    };
+                    let limit = Limit::Near { value: 2.0, tolerance: 0.1 };
                     rows.push(Row::new(name, sigma_n, figure).limit(limit));
                 }
             }

@@ -7,8 +7,8 @@ use pulp::Arch;
 use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Of a squared change beyond this many variances only so much is learnt, of mean and variance: what comes by is no noise of the place. With
-/// half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind, and its place
+/// Of a squared change beyond this many variances only so much is learnt, of mean and variance: what comes by is no noise of
+/// the place. With half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind, and its place
 /// before it was found something that has come.
 const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a level, and with half of it
