@@ -8,6 +8,7 @@ use crossfix_message::{
 };
 use crossfix_video::{CaptureTime, Frame};
 use crossfix_vision::{ImageTrack, Measurement, TrackPhase};
+use jpeg_encoder::{ColorType, Encoder};
 use nalgebra::{Matrix2, Vector2};
 
 /// Quality of preview pictures, 1 to 100.
@@ -116,9 +117,8 @@ fn predicted(track: &ImageTrack) -> Measurement {
 /// 8-bit brightness as JPEG; `None` if it cannot be encoded.
 pub fn jpeg(brightness: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
     let mut data = Vec::new();
-    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut data, JPEG_QUALITY)
-        .encode(brightness, width as u32, height as u32, image::ExtendedColorType::L8)
-        .ok()?;
+    let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
+    Encoder::new(&mut data, JPEG_QUALITY).encode(brightness, width, height, ColorType::Luma).ok()?;
     Some(data)
 }
 

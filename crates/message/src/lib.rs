@@ -34,10 +34,11 @@ pub use time::Timestamp;
 pub use track::{TrackNumber, track_id};
 pub use wire::*;
 
-/// The generated types; their documentation is the definition file's.
+/// The types that `tests/generated.rs` makes of `messages.proto`; their documentation is the
+/// definitions'.
 #[allow(missing_docs, clippy::all)]
 mod wire {
-    include!(concat!(env!("OUT_DIR"), "/crossfix.v1.rs"));
+    include!("generated/crossfix.v1.rs");
 }
 
 /// The version of the message definitions that this build speaks.

@@ -23,9 +23,14 @@ pub trait Payload: Message + Default + Clone {
     fn stamped(self) -> Self;
 
     /// The bytes for wire and recording, stamped with this build's version.
-    fn encode(&self) -> Vec<u8> {
-        self.clone().stamped().encode_to_vec()
-    }
+    fn encode(&self) -> Vec<u8>;
+
+    /// A message of its bytes, whatever its version and size: for [`decode`].
+    ///
+    /// # Errors
+    /// If the bytes are no such message.
+    #[doc(hidden)]
+    fn of_bytes(bytes: &[u8]) -> Result<Self, prost::DecodeError>;
 
     /// The bytes with the version that the message has, as another sender's.
     fn encode_unstamped(&self) -> Vec<u8> {
@@ -47,6 +52,16 @@ macro_rules! payload {
             fn stamped(mut self) -> Self {
                 self.version = Some(VERSION);
                 self
+            }
+
+            // Both are here and not in the trait, so that they are compiled with this crate, and
+            // as well optimised, and not anew in each crate that uses them.
+            fn encode(&self) -> Vec<u8> {
+                self.clone().stamped().encode_to_vec()
+            }
+
+            fn of_bytes(bytes: &[u8]) -> Result<Self, prost::DecodeError> {
+                Message::decode(bytes)
             }
         }
     )*};
@@ -105,7 +120,7 @@ pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
     if decoded > MAX_DECODED_BYTES {
         return Err(DecodeError::TooLarge { schema: M::SCHEMA, wire_bytes: bytes.len() });
     }
-    let message = M::decode(bytes).map_err(malformed)?;
+    let message = M::of_bytes(bytes).map_err(malformed)?;
     match message.version() {
         Some(version) if version.major > VERSION.major => {
             Err(DecodeError::NewerMajor { schema: M::SCHEMA, theirs: version.major, ours: VERSION.major })
@@ -116,7 +131,7 @@ pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
 
 /// The compiled definitions as a `google.protobuf.FileDescriptorSet`: the schema in recordings.
 pub fn file_descriptor_set() -> &'static [u8] {
-    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"))
+    include_bytes!("generated/descriptors.bin")
 }
 
 #[cfg(test)]

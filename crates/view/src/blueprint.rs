@@ -1,54 +1,84 @@
-use nalgebra::{Point3, Vector3};
-use rerun::blueprint::components::{BackgroundKind, Eye3DKind, PanelState, PlayState};
+use nalgebra::Point3;
 use rerun::blueprint::{
     Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
     Spatial2DView, Spatial3DView, TextDocumentView, TextLogView, TimePanel, TimeSeriesView, Vertical,
 };
 use rerun::external::re_log_types::BlueprintActivationCommand;
-use rerun::external::re_sdk_types::blueprint::archetypes::{Background, EyeControls3D};
 use rerun::log::LogMsg;
-use rerun::{AsComponents, Color, EntityPath, RecordingStream, RecordingStreamBuilder};
+use rerun::{AsComponents, EntityPath, RecordingStream, RecordingStreamBuilder};
+use rerun_types::blueprint::archetypes::{Background, LineGrid3D, VisualBounds2D};
+use rerun_types::blueprint::components::{BackgroundKind, PanelState, PlayState};
+use rerun_types::components::Color;
+use rerun_types::datatypes::Range2D;
 
-use crate::ViewError;
+use crate::extent::Extent;
 use crate::paths::{TIMELINE, image_path};
+use crate::{ViewError, eye};
 
-/// Where targets are likely to be above the cameras, m.
-const AIR_M: f64 = 25.0;
+/// A camera's images in the layout.
+pub(crate) struct CameraPanel {
+    /// The camera.
+    pub(crate) name: String,
+    /// The part of its pictures that is shown, low and high corner in the picture's pixels; all without.
+    pub(crate) shown: Option<[[f64; 2]; 2]>,
+}
 
-/// A camera's name and place.
-pub(crate) type NamedPlace = (String, Point3<f64>);
-
-/// Lays the picture out: the site on the left, cameras, plots and events on the right.
-pub(crate) fn send(stream: &RecordingStream, cameras: &[NamedPlace]) -> Result<(), ViewError> {
+/// Lays a site out: the world, plots and the legend on the left, images and events on the right.
+pub(crate) fn send(
+    stream: &RecordingStream,
+    cameras: &[CameraPanel],
+    extent: &Extent,
+) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
-    let images: Vec<ContainerLike> = cameras
-        .iter()
-        .map(|(name, _)| Spatial2DView::new(name.clone()).with_origin(image_path(name)).into())
-        .collect();
-    let plots: Vec<ContainerLike> = vec![
+    let (images, image_paths): (Vec<_>, Vec<_>) =
+        cameras.iter().map(|camera| image_view(&camera.name)).unzip();
+    let plots: [ContainerLike; 3] = [
         TimeSeriesView::new("residuals [mrad]").with_origin("/plots/residual").into(),
         TimeSeriesView::new("latency [ms]").with_origin("/plots/latency").into(),
-        TextLogView::new("events").with_origin("/events").into(),
+        TextDocumentView::new("legend").with_origin("/legend").into(),
     ];
+    let plots = Horizontal::new(plots).with_column_shares([1.0, 1.0, 1.3]);
+    let left = Vertical::new([site, plots.into()]).with_row_shares([3.2, 1.0]);
+    // One below the other they are wide, and few enough to be high.
+    let columns = if cameras.len() <= 3 { 1 } else { 2 };
     let right = Vertical::new([
-        ContainerLike::from(Grid::new(images).with_grid_columns(2)),
-        ContainerLike::from(Vertical::new(plots)),
+        ContainerLike::from(Grid::new(images).with_grid_columns(columns)),
+        ContainerLike::from(TextLogView::new("events").with_origin("/events")),
     ])
-    .with_row_shares([1.0, 1.0]);
-    let root = Horizontal::new([site, right.into()]).with_column_shares([1.7, 1.0]);
-    let blueprint = Blueprint::new(root)
+    .with_row_shares([5.0, 1.0]);
+    let root = Horizontal::new([ContainerLike::from(left), right.into()]).with_column_shares([1.9, 1.0]);
+    let time = TimePanel::new()
+        .with_state(PanelState::Collapsed)
+        .with_timeline(TIMELINE)
+        .with_play_state(PlayState::Following);
+    let shown = cameras.iter().map(|camera| camera.shown.map(visual_bounds));
+    let zooms: Vec<(EntityPath, VisualBounds2D)> = image_paths
+        .into_iter()
+        .zip(shown)
+        .filter_map(|(path, shown)| Some((EntityPath::from(format!("{}/VisualBounds2D", path?)), shown?)))
+        .collect();
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &zooms)
+}
+
+/// The view of a camera's images, and where its properties are written.
+fn image_view(name: &str) -> (ContainerLike, Option<EntityPath>) {
+    let view: ContainerLike = Spatial2DView::new(name).with_origin(image_path(name)).into();
+    let path = path_of(&view);
+    (view, path)
+}
+
+fn visual_bounds([low, high]: [[f64; 2]; 2]) -> VisualBounds2D {
+    let range = |axis: usize| [low[axis], high[axis]];
+    VisualBounds2D::new(Range2D { x_range: range(0).into(), y_range: range(1).into() })
+}
+
+/// A blueprint with nothing open but what it shows.
+fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
+    Blueprint::new(root)
         .with_auto_views(false)
         .with_auto_layout(false)
         .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
         .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
-        .with_time_panel(
-            TimePanel::new()
-                .with_state(PanelState::Collapsed)
-                .with_timeline(TIMELINE)
-                .with_play_state(PlayState::Following),
-        );
-    let places: Vec<Point3<f64>> = cameras.iter().map(|(_, place)| *place).collect();
-    send_site(stream, &blueprint, site_path.as_ref(), &eye_on(&places))
 }
 
 /// Lays a volume out: the site on the left, the scale of colours and the words on the right.
@@ -60,37 +90,46 @@ pub(crate) fn send_volume(stream: &RecordingStream, places: &[Point3<f64>]) -> R
     ])
     .with_column_shares([0.4, 1.0]);
     let root = Horizontal::new([site, right.into()]).with_column_shares([1.8, 1.0]);
-    let blueprint = Blueprint::new(root)
-        .with_auto_views(false)
-        .with_auto_layout(false)
-        .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
-        .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
-        .with_time_panel(TimePanel::new().with_state(PanelState::Collapsed));
-    send_site(stream, &blueprint, site_path.as_ref(), &eye_on(places))
+    let time = TimePanel::new().with_state(PanelState::Collapsed);
+    let extent = Extent::of(places.iter().copied());
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, &extent, &[])
 }
 
 /// The view of the world, and where its properties are written.
 fn site_view() -> (ContainerLike, Option<EntityPath>) {
     let site: ContainerLike = Spatial3DView::new("site").with_origin("/world").into();
-    let path = match &site {
-        ContainerLike::View(view) => Some(view.blueprint_path()),
-        _ => None,
-    };
+    let path = path_of(&site);
     (site, path)
 }
 
-/// Sends a blueprint whose view of the world has this eye, and a dark background.
+/// Where a view's properties are written.
+fn path_of(view: &ContainerLike) -> Option<EntityPath> {
+    match view {
+        ContainerLike::View(view) => Some(view.blueprint_path()),
+        _ => None,
+    }
+}
+
+/// Sends a blueprint whose view of the world has all of a box in view, before a dark background and without
+/// Rerun's grid, which has no end and no scale.
 fn send_site(
     stream: &RecordingStream,
     blueprint: &Blueprint,
-    site_path: Option<&EntityPath>,
-    eye: &EyeControls3D,
+    site_path: Option<EntityPath>,
+    extent: &Extent,
+    zooms: &[(EntityPath, VisualBounds2D)],
 ) -> Result<(), ViewError> {
     let background = Background::new(BackgroundKind::SolidColor).with_color(Color::from_rgb(18, 20, 28));
-    let part = |name: &str| site_path.map(|path| EntityPath::from(format!("{path}/{name}")));
+    let grid = LineGrid3D::new().with_visible(false);
+    let eye = eye::on(extent);
+    let of_site: [(&str, &dyn AsComponents); 3] =
+        [("EyeControls3D", &eye), ("Background", &background), ("LineGrid3D", &grid)];
     let mut properties: Vec<(EntityPath, &dyn AsComponents)> = Vec::new();
-    properties.extend(part("EyeControls3D").map(|path| (path, eye as &dyn AsComponents)));
-    properties.extend(part("Background").map(|path| (path, &background as &dyn AsComponents)));
+    if let Some(path) = site_path {
+        let places = of_site.map(|(name, property)| (EntityPath::from(format!("{path}/{name}")), property));
+        properties.extend(places);
+    }
+    properties.extend(zooms.iter().map(|(path, bounds)| (path.clone(), bounds as &dyn AsComponents)));
     send_with(stream, blueprint, &properties)
 }
 
@@ -103,28 +142,7 @@ pub(crate) fn send_tracking(stream: &RecordingStream) -> Result<(), ViewError> {
     ]);
     let root = Horizontal::new([video, curves.into()]).with_column_shares([1.6, 1.0]);
     let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
-    let blueprint = Blueprint::new(root)
-        .with_auto_views(false)
-        .with_auto_layout(false)
-        .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
-        .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
-        .with_time_panel(time);
-    send_with(stream, &blueprint, &[])
-}
-
-/// An eye that has all cameras, or other places, and the air above them in view.
-fn eye_on(places: &[Point3<f64>]) -> EyeControls3D {
-    let count = places.len().max(1) as f64;
-    let sum = places.iter().map(|place| place.coords).sum::<Vector3<f64>>();
-    let middle = sum / count + Vector3::z() * AIR_M;
-    let reach = places.iter().map(|place| (place.coords - middle).norm()).fold(50.0, f64::max);
-    let eye = middle + Vector3::new(-0.75, -1.5, 1.05) * reach;
-    let f32s = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
-    EyeControls3D::new()
-        .with_kind(Eye3DKind::Orbital)
-        .with_position(f32s(eye))
-        .with_look_target(f32s(middle))
-        .with_eye_up([0.0_f32, 0.0, 1.0])
+    send_with(stream, &without_panels(root).with_time_panel(time), &[])
 }
 
 /// Sends a blueprint with properties of views, for which this version of Rerun has no setters in

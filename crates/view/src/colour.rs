@@ -1,18 +1,30 @@
-use rerun::Color;
+use rerun_types::components::Color;
 
-/// Colours that can be told apart, also by those who see red and green alike.
-const PALETTE: [[u8; 3]; 8] = [
-    [230, 159, 0],
-    [86, 180, 233],
-    [0, 158, 115],
-    [240, 228, 66],
-    [0, 114, 178],
-    [213, 94, 0],
-    [204, 121, 167],
-    [180, 180, 180],
-];
+/// Colours of cameras that can be told apart, also by those who see red and green alike.
+const PALETTE: [[u8; 3]; 6] =
+    [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [180, 180, 180]];
 
-/// The colour of the n-th camera or track.
+/// Colours of tracks: none is a camera's.
+const TRACKS: [[u8; 3]; 5] =
+    [[255, 105, 97], [193, 140, 255], [255, 190, 225], [255, 80, 190], [190, 120, 90]];
+
+fn of_id(id: u64) -> [u8; 3] {
+    TRACKS[(id % TRACKS.len() as u64) as usize]
+}
+
+/// The colour of a track, the same for as long as it lives.
+pub(crate) fn of_track(id: u64) -> Color {
+    let [r, g, b] = of_id(id);
+    Color::from_rgb(r, g, b)
+}
+
+/// The same, see-through, of a track that is not sure or not seen.
+pub(crate) fn of_unsure_track(id: u64) -> Color {
+    let [r, g, b] = of_id(id);
+    Color::from_unmultiplied_rgba(r, g, b, 120)
+}
+
+/// The colour of the n-th camera.
 pub(crate) fn of(index: u64) -> Color {
     let [r, g, b] = PALETTE[(index % PALETTE.len() as u64) as usize];
     Color::from_rgb(r, g, b)

@@ -3,10 +3,12 @@
 use crossfix_geometry::{Camera, ImageSize};
 use crossfix_message::{BearingFrame, BearingTrack, Track, TrackNumber, TrackState};
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
-use rerun::{
-    Arrows3D, Boxes2D, Color, Ellipsoids3D, FillMode, LineStrips3D, Pinhole, Points3D, Quaternion, Radius,
-    RecordingStream, SeriesLines, Transform3D,
+use rerun::RecordingStream;
+use rerun_types::archetypes::{
+    Arrows3D, Ellipsoids3D, LineStrips3D, Pinhole, Points3D, SeriesLines, Transform3D,
 };
+use rerun_types::components::{Color, FillMode, PinholeProjection, Radius};
+use rerun_types::datatypes::Quaternion;
 
 use crate::paths::image_path;
 use crate::{ViewError, colour};
@@ -14,9 +16,12 @@ use crate::{ViewError, colour};
 /// Length of the frustums, m: large enough to be seen in a site of 100 m.
 const FRUSTUM_M: f32 = 12.0;
 /// An ellipsoid's half axes, standard deviations.
-const SIGMAS: f64 = 3.0;
-/// An ellipsoid smaller than this would not be seen, m.
-const LEAST_HALF_AXIS_M: f64 = 0.3;
+pub(crate) const SIGMAS: f64 = 3.0;
+/// Ellipsoids of tracks that are known to within [`ENLARGED_UP_TO_M`] are drawn so many times too large, as
+/// the legend says: five centimetres are less than a point of the screen in a site of 100 m.
+pub(crate) const ENLARGED: f64 = 30.0;
+/// Standard deviation along the worst axis, m: enlarged it would be as large as the site.
+pub(crate) const ENLARGED_UP_TO_M: f64 = 0.5;
 /// Arrows show the way of this time, s.
 const ARROW_S: f64 = 1.0;
 
@@ -51,7 +56,7 @@ pub(crate) fn camera(
     let lens = camera.model().intrinsics();
     let ImageSize { width, height } = lens.size;
     let scaled = |value: f64| (value * scale) as f32;
-    let projection = rerun::components::PinholeProjection::from_focal_length_and_principal_point(
+    let projection = PinholeProjection::from_focal_length_and_principal_point(
         [scaled(lens.fx), scaled(lens.fy)],
         [scaled(lens.cx), scaled(lens.cy)],
     );
@@ -75,14 +80,13 @@ pub(crate) fn residual_plot(stream: &RecordingStream, name: &str, index: u64) ->
     Ok(())
 }
 
-/// The sight lines of a frame, `reach_m` long, and the boxes in its image.
+/// The sight lines of a frame, `reach_m` long.
 pub(crate) fn bearings(
     stream: &RecordingStream,
     frame: &BearingFrame,
     index: u64,
     camera: &Camera,
     reach_m: f64,
-    scale: f64,
 ) -> Result<(), ViewError> {
     let measured = |track: &&BearingTrack| track.state() == crossfix_message::ImageTrackState::Tracking;
     let origin = camera.pose().position();
@@ -102,20 +106,6 @@ pub(crate) fn bearings(
             .with_colors([colour::faint(index, 150)])
             .with_radii([Radius::new_ui_points(0.8)]),
     )?;
-    let boxes: Vec<&BearingTrack> = frame.tracks.iter().filter(|t| t.width > 0.0).collect();
-    let scaled = |value: f64| (value * scale) as f32;
-    // Rerun's pixels have their upper left corner at whole numbers.
-    let centres = boxes.iter().map(|t| (scaled(t.pixel_x + 0.5), scaled(t.pixel_y + 0.5)));
-    let sizes = boxes.iter().map(|t| (scaled(t.width), scaled(t.height)));
-    stream.log(
-        format!("{}/targets", image_path(&frame.camera)),
-        &Boxes2D::from_centers_and_sizes(centres, sizes)
-            .with_labels(boxes.iter().map(|t| t.track_id.to_string()))
-            // Labels would hide targets of a few pixels.
-            .with_show_labels(false)
-            .with_colors([colour::of(index)])
-            .with_radii([Radius::new_ui_points(1.5)]),
-    )?;
     Ok(())
 }
 
@@ -129,20 +119,15 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]])
     let place = f32s(&position.coords);
     let path = format!("world/tracks/{}", track.id);
     let sure = track.state() == TrackState::Confirmed;
-    let tint: Color = if sure { colour::of(track.id + 3) } else { colour::faint(track.id + 3, 110) };
-    let number = TrackNumber(track.id);
-    let label = match track.state() {
-        TrackState::Tentative => format!("{number}?"),
-        TrackState::Coasting => format!("{number} (coasting)"),
-        _ => format!("{number}  {:.0} m/s  {:.0} m", velocity.norm(), position.z),
-    };
+    let tint: Color = if sure { colour::of_track(track.id) } else { colour::of_unsure_track(track.id) };
+    let text = label(track, velocity.norm(), position.z);
     stream.log(
         format!("{path}/position"),
         &Points3D::new([place])
             .with_colors([tint])
-            .with_labels([label])
+            .with_labels([text])
             .with_show_labels(true)
-            .with_radii([Radius::new_ui_points(5.0)]),
+            .with_radii([Radius::new_ui_points(2.0)]),
     )?;
     stream.log(
         format!("{path}/velocity"),
@@ -153,20 +138,34 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]])
     )?;
     stream.log(
         format!("{path}/trail"),
-        &LineStrips3D::new([trail.to_vec()])
-            .with_colors([colour::faint(track.id + 3, 200)])
-            .with_radii([Radius::new_ui_points(1.5)]),
+        &LineStrips3D::new([trail.to_vec()]).with_colors([tint]).with_radii([Radius::new_ui_points(1.5)]),
     )?;
-    if let Some((half_axes, rotation)) = ellipsoid(track) {
-        stream.log(
-            format!("{path}/covariance"),
-            &Ellipsoids3D::from_centers_and_half_sizes([place], [half_axes])
-                .with_quaternions([rotation])
-                .with_fill_mode(FillMode::MajorWireframe)
-                .with_colors([tint]),
-        )?;
-    }
+    // One that only one camera sees is anywhere along its sight line, which is drawn already.
+    let ellipsoid = ellipsoid(track).filter(|_| track.state() != TrackState::OneCamera);
+    let (half_axes, rotation): (Vec<_>, Vec<_>) = ellipsoid.into_iter().unzip();
+    let centres = half_axes.iter().map(|_| place);
+    stream.log(
+        format!("{path}/covariance"),
+        &Ellipsoids3D::from_centers_and_half_sizes(centres, half_axes.iter().copied())
+            .with_quaternions(rotation)
+            .with_fill_mode(FillMode::TransparentFillMajorWireframe)
+            .with_colors([tint]),
+    )?;
     Ok(())
+}
+
+/// What a track's label says: its number, and what it is or how fast, how high and how sure.
+fn label(track: &Track, speed: f64, height: f64) -> String {
+    let number = TrackNumber(track.id);
+    let what = match track.state() {
+        TrackState::Tentative => return format!("{number}?"),
+        TrackState::Coasting => "(coasting) ",
+        TrackState::OneCamera => return format!("{number} (one camera)"),
+        _ => "",
+    };
+    let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
+    let sd = variance.max(0.0).sqrt();
+    format!("{number}  {what}{height:.0} m  {speed:.0} m/s  \u{b1}{sd:.2}")
 }
 
 /// Half axes and turn of a track's ellipsoid of position.
@@ -181,7 +180,9 @@ fn ellipsoid(track: &Track) -> Option<([f32; 3], Quaternion)> {
         eigenvectors.column_mut(0).neg_mut();
     }
     let rotation = nalgebra::UnitQuaternion::from_matrix(&eigenvectors);
-    let half = |i: usize| (SIGMAS * eigenvalues[i].max(0.0).sqrt()).max(LEAST_HALF_AXIS_M) as f32;
+    let deviations = eigenvalues.map(|variance| variance.max(0.0).sqrt());
+    let factor = if deviations.max() < ENLARGED_UP_TO_M { ENLARGED * SIGMAS } else { SIGMAS };
+    let half = |i: usize| (factor * deviations[i]) as f32;
     let [x, y, z, w] = [rotation.i, rotation.j, rotation.k, rotation.w].map(|v| v as f32);
     Some(([half(0), half(1), half(2)], Quaternion::from_xyzw([x, y, z, w])))
 }

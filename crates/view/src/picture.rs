@@ -3,20 +3,20 @@ use std::time::Duration;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Health, Preview, Timestamp, TrackEvent,
-    TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, DecodeError, Health, ImageTrackState, Preview, Timestamp,
+    Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
 };
-use nalgebra::Point3;
-use rerun::components::MediaType;
-use rerun::{
-    Clear, Color, EncodedImage, Points3D, Radius, RecordingStream, Scalars, TextLog, TextLogLevel,
-    ViewCoordinates,
-};
+use nalgebra::{Point3, Vector3};
+use rerun::RecordingStream;
+use rerun_types::archetypes::{Clear, EncodedImage, Points3D, Scalars, TextLog, ViewCoordinates};
+use rerun_types::components::{Color, MediaType, Radius, TextLogLevel};
 
 use crate::arrivals::Arrivals;
+use crate::extent::Extent;
+use crate::image::{self, Region, Ring};
 use crate::limiter::Limiter;
 use crate::paths::{TIMELINE, image_path};
-use crate::{ViewError, ViewerWatch, blueprint, draw};
+use crate::{ViewError, ViewerWatch, blueprint, draw, ground, legend};
 
 /// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
 const PREVIEW_RATE_HZ: f64 = 5.0;
@@ -26,6 +26,8 @@ const TRACK_RATE_HZ: f64 = 15.0;
 const TRAIL_POINTS: usize = 150;
 /// Sight lines reach this far where no track says how far, m.
 const DEFAULT_REACH_M: f64 = 150.0;
+/// Targets fly about so high above the cameras, m, as long as no track says where.
+const AIR_M: f64 = 25.0;
 /// A track that has not been heard of for this long is not drawn any more, s: each is said twice a
 /// second, so the fusion centre that held it is gone.
 const GHOST_S: f64 = 3.0;
@@ -36,10 +38,13 @@ struct CameraView {
     scale: f64,
     /// Of the calibration that is drawn.
     hash: Vec<u8>,
+    /// Where in its images targets were.
+    region: Option<Region>,
 }
 
 /// Where a track is drawn.
 struct DrawnTrack {
+    track: Track,
     time: Timestamp,
     place: Point3<f64>,
     /// When it was last heard of.
@@ -55,6 +60,8 @@ pub struct Picture {
     limiter: Limiter,
     arrivals: Arrivals,
     viewer: ViewerWatch,
+    /// Where confirmed tracks have been.
+    flown: Extent,
     /// What the fusion centre has said last that a person should look at.
     problems: Vec<String>,
 }
@@ -67,6 +74,7 @@ impl Picture {
     pub fn new(stream: RecordingStream) -> Result<Self, ViewError> {
         stream.set_log_time_enabled(false);
         stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Z_UP())?;
+        legend::draw(&stream)?;
         Ok(Self {
             stream,
             cameras: BTreeMap::new(),
@@ -75,6 +83,7 @@ impl Picture {
             limiter: Limiter::default(),
             arrivals: Arrivals::default(),
             viewer: ViewerWatch::default(),
+            flown: Extent::default(),
             problems: Vec::new(),
         })
     }
@@ -105,11 +114,12 @@ impl Picture {
         }
     }
 
-    /// Waits until everything is drawn.
+    /// Lays the picture out anew about all that it shows, and waits until everything is drawn.
     ///
     /// # Errors
-    /// [`ViewError::Flush`].
+    /// [`ViewError`] if the stream does not take it.
     pub fn finish(self) -> Result<(), ViewError> {
+        self.lay_out()?;
         self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
@@ -145,17 +155,37 @@ impl Picture {
             camera: parsed.camera.clone(),
             scale: 1.0,
             hash: Vec::new(),
+            region: None,
         });
         view.camera = parsed.camera;
         if new || view.hash != message.hash {
             view.hash.clone_from(&message.hash);
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
             draw::residual_plot(&self.stream, &name, view.index)?;
-            let place = |(name, view): (&String, &CameraView)| (name.clone(), view.camera.pose().position());
-            let cameras: Vec<blueprint::NamedPlace> = self.cameras.iter().map(place).collect();
-            blueprint::send(&self.stream, &cameras)?;
+            self.lay_out()?;
         }
         Ok(())
+    }
+
+    /// Lays the picture out about what is known of cameras and tracks by now.
+    fn lay_out(&self) -> Result<(), ViewError> {
+        let mut extent = Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
+        if self.flown.is_empty() {
+            // Where targets are likely to be.
+            extent.include(extent.middle() + Vector3::z() * AIR_M);
+        } else {
+            self.flown.corners().for_each(|corner| extent.include(corner));
+        }
+        ground::draw(&self.stream, &extent)?;
+        let cameras: Vec<blueprint::CameraPanel> = self
+            .cameras
+            .iter()
+            .map(|(name, view)| blueprint::CameraPanel {
+                name: name.clone(),
+                shown: view.region.map(|region| region.shown(&view.camera, view.scale)),
+            })
+            .collect();
+        blueprint::send(&self.stream, &cameras, &extent)
     }
 
     fn preview(&mut self, preview: &Preview) -> Result<(), ViewError> {
@@ -179,7 +209,7 @@ impl Picture {
         self.arrivals.note(&frame.camera, frame.sequence, arrival);
         self.clear_ghosts(arrival, Timestamp::from_nanos(frame.capture_time_ns))?;
         let time = self.at(frame.capture_time_ns);
-        let Some(view) = self.cameras.get(&frame.camera) else {
+        let Some(view) = self.cameras.get_mut(&frame.camera) else {
             return Ok(());
         };
         if !self.limiter.allows(&format!("lines/{}", frame.camera), time, LINE_RATE_HZ) {
@@ -187,9 +217,13 @@ impl Picture {
         }
         // As far as the farthest track, so that the crossings are seen.
         let origin = view.camera.pose().position();
-        let farthest = self.drawn.values().map(|track| (track.place - origin).norm()).fold(0.0, f64::max);
+        let placed = self.drawn.values().filter(|drawn| drawn.track.state() != TrackState::OneCamera);
+        let farthest = placed.map(|drawn| (drawn.place - origin).norm()).fold(0.0, f64::max);
         let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
-        draw::bearings(&self.stream, frame, view.index, &view.camera, reach, view.scale)
+        let seen = frame.tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
+        seen.for_each(|track| Region::include(&mut view.region, [track.pixel_x, track.pixel_y]));
+        draw::bearings(&self.stream, frame, view.index, &view.camera, reach)?;
+        image::boxes(&self.stream, &frame.camera, view.index, &frame.tracks, view.scale)
     }
 
     fn tracks(&mut self, frame: &TrackFrame, arrival: Timestamp) -> Result<(), ViewError> {
@@ -217,12 +251,36 @@ impl Picture {
                 continue;
             }
             let trail = self.trails.entry(track.id).or_default();
-            trail.push_back([position.x as f32, position.y as f32, position.z as f32]);
+            // How far away it is one camera alone does not see: its way would be a guess.
+            if track.state() != TrackState::OneCamera {
+                trail.push_back([position.x as f32, position.y as f32, position.z as f32]);
+            }
             while trail.len() > TRAIL_POINTS {
                 trail.pop_front();
             }
-            self.drawn.insert(track.id, DrawnTrack { time, place: position.into(), heard: arrival });
+            let place = Point3::from(position);
             draw::track(&self.stream, track, trail.make_contiguous())?;
+            self.drawn.insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
+            if track.state() == TrackState::Confirmed {
+                let is_first = self.flown.is_empty();
+                self.flown.include(place);
+                if is_first {
+                    self.lay_out()?;
+                }
+            }
+        }
+        if self.limiter.allows("rings", time, LINE_RATE_HZ) {
+            self.rings()?;
+        }
+        Ok(())
+    }
+
+    /// Draws where each camera should see the tracks.
+    fn rings(&self) -> Result<(), ViewError> {
+        for (name, view) in &self.cameras {
+            let ring = |drawn: &DrawnTrack| Ring::of(&drawn.track, drawn.place, &view.camera);
+            let rings: Vec<Ring> = self.drawn.values().filter_map(ring).collect();
+            image::rings(&self.stream, name, &rings, view.scale)?;
         }
         Ok(())
     }

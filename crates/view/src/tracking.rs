@@ -1,6 +1,7 @@
 use crossfix_message::Timestamp;
-use rerun::components::MediaType;
-use rerun::{Boxes2D, Clear, Color, EncodedImage, Points2D, Radius, RecordingStream, Scalars};
+use rerun::RecordingStream;
+use rerun_types::archetypes::{Boxes2D, Clear, EncodedImage, Points2D, Scalars};
+use rerun_types::components::{Color, MediaType, Radius};
 
 use crate::paths::TIMELINE;
 use crate::{ViewError, blueprint};

@@ -2,11 +2,9 @@ use std::collections::BTreeMap;
 
 use crossfix_geometry::Camera;
 use nalgebra::Point3;
-use rerun::components::MediaType;
-use rerun::{
-    Boxes3D, Color, FillMode, Image, Points2D, Points3D, Radius, RecordingStream, TextDocument,
-    ViewCoordinates,
-};
+use rerun::RecordingStream;
+use rerun_types::archetypes::{Boxes3D, Image, Points2D, Points3D, TextDocument, ViewCoordinates};
+use rerun_types::components::{Color, FillMode, MediaType, Radius};
 
 use crate::{ViewError, blueprint, colour, draw};
 

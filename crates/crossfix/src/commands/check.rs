@@ -2,12 +2,13 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use crossfix_geometry::Camera;
-use crossfix_simulation::Scene;
 use crossfix_vision::TrackerConfig;
 use nalgebra::Vector3;
 
-use crate::config::{self, CameraFile, FusionFile, Kind, Site, load_network};
+use crate::config::{self, CameraFile, Kind, Site, load_network};
 use crate::output;
+#[cfg(not(feature = "centre"))]
+use crate::parts;
 
 /// Check configuration files before anything starts, and print what they resolve to.
 ///
@@ -36,7 +37,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             ));
         }
         for path in &site.fusion {
-            output::line(format!("fusion centre: {} is good", path.display()));
+            let verdict =
+                if cfg!(feature = "centre") { "is good" } else { "is for the fusion centre to check" };
+            output::line(format!("fusion centre: {} {verdict}", path.display()));
         }
         return Ok(());
     }
@@ -44,26 +47,39 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let resolved = match Kind::of(&keys) {
         Some(Kind::Camera) => check_camera(args)?,
         Some(Kind::Network) => toml::to_string(&load_network(&args.config)?)?,
-        Some(Kind::Scene) => {
-            let scene: Scene = config::load(&args.config, &args.sets, Kind::Scene)?;
-            scene.build().with_context(|| format!("the scene {} has an error", args.config.display()))?;
-            toml::to_string(&scene)?
-        }
         Some(Kind::Tracker) => {
             let tracker: TrackerConfig = config::load(&args.config, &args.sets, Kind::Tracker)?;
             tracker.validate().with_context(|| format!("{} has an error", args.config.display()))?;
             toml::to_string(&tracker)?
         }
-        Some(Kind::Fusion) | None => {
-            let file = FusionFile::load(Some(&args.config), &args.sets)?;
-            if let Some(network) = &file.network {
-                load_network(network).context("key `network`")?;
-            }
-            toml::to_string(&file)?
+        #[cfg(feature = "centre")]
+        Some(Kind::Scene) => check_scene(args)?,
+        #[cfg(feature = "centre")]
+        Some(Kind::Fusion) | None => check_fusion(args)?,
+        #[cfg(not(feature = "centre"))]
+        kind => {
+            let kind = kind.map_or("a file that is no camera's".to_owned(), |kind| kind.to_string());
+            return Err(parts::is_left_out(&format!("what checks {kind}"), "centre"));
         }
     };
     output::line(resolved.trim_end());
     Ok(())
+}
+
+#[cfg(feature = "centre")]
+fn check_scene(args: &Args) -> anyhow::Result<String> {
+    let scene: crossfix_simulation::Scene = config::load(&args.config, &args.sets, Kind::Scene)?;
+    scene.build().with_context(|| format!("the scene {} has an error", args.config.display()))?;
+    Ok(toml::to_string(&scene)?)
+}
+
+#[cfg(feature = "centre")]
+fn check_fusion(args: &Args) -> anyhow::Result<String> {
+    let file = config::FusionFile::load(Some(&args.config), &args.sets)?;
+    if let Some(network) = &file.network {
+        load_network(network).context("key `network`")?;
+    }
+    Ok(toml::to_string(&file)?)
 }
 
 fn check_camera(args: &Args) -> anyhow::Result<String> {

@@ -1,18 +1,96 @@
 //! The subcommands, a module each, each thin.
 
+use clap::Subcommand;
+
 pub mod agent;
 pub mod check;
-pub mod demo;
-pub mod evaluate;
-pub mod export;
-pub mod fuse;
-pub mod import;
 pub mod info;
 pub mod numbers;
-pub mod plan;
 pub mod record;
-pub mod replay;
-pub mod simulate;
 pub mod track;
+
+#[cfg(all(feature = "centre", feature = "viewer"))]
+pub mod demo;
+#[cfg(feature = "centre")]
+pub mod evaluate;
+#[cfg(feature = "centre")]
+pub mod export;
+#[cfg(feature = "centre")]
+pub mod fuse;
+#[cfg(feature = "centre")]
+pub mod import;
+#[cfg(feature = "centre")]
+pub mod plan;
+#[cfg(feature = "centre")]
+pub mod replay;
+#[cfg(feature = "centre")]
+pub mod simulate;
+#[cfg(feature = "centre")]
 pub mod validate;
+#[cfg(feature = "viewer")]
 pub mod view;
+
+/// All commands: a camera host's, and what the build's features add.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    #[cfg(all(feature = "centre", feature = "viewer"))]
+    Demo(demo::Args),
+    Agent(agent::Args),
+    Track(track::Args),
+    Record(record::Args),
+    Info(info::Args),
+    Check(check::Args),
+    #[cfg(feature = "viewer")]
+    View(view::Args),
+    #[cfg(feature = "centre")]
+    #[command(flatten)]
+    Centre(Centre),
+}
+
+/// What the fusion centre does, and whoever judges or plans a site.
+#[cfg(feature = "centre")]
+#[derive(Debug, Subcommand)]
+pub enum Centre {
+    Fuse(fuse::Args),
+    Replay(replay::Args),
+    Import(import::Args),
+    Export(export::Args),
+    Evaluate(evaluate::Args),
+    Plan(plan::Args),
+    Simulate(simulate::Args),
+    Validate(validate::Args),
+}
+
+#[cfg(feature = "centre")]
+impl Centre {
+    fn run(self) -> anyhow::Result<()> {
+        match self {
+            Self::Fuse(args) => fuse::run(&args),
+            Self::Replay(args) => replay::run(&args),
+            Self::Import(args) => import::run(&args),
+            Self::Export(args) => export::run(&args),
+            Self::Evaluate(args) => evaluate::run(&args),
+            Self::Plan(args) => plan::run(&args),
+            Self::Simulate(args) => simulate::run(&args),
+            Self::Validate(args) => validate::run(&args),
+        }
+    }
+}
+
+impl Command {
+    pub fn run(self) -> anyhow::Result<()> {
+        match self {
+            #[cfg(all(feature = "centre", feature = "viewer"))]
+            Self::Demo(args) => demo::run(&args),
+            Self::Agent(args) => agent::run(&args),
+            Self::Track(args) => track::run(&args),
+            Self::Record(args) => record::run(&args),
+            Self::Info(args) => info::run(&args),
+            Self::Check(args) => check::run(&args),
+            #[cfg(feature = "viewer")]
+            Self::View(args) => view::run(&args),
+            #[cfg(feature = "centre")]
+            Self::Centre(command) => command.run(),
+        }
+    }
+}

@@ -4,6 +4,7 @@ use anyhow::{Context, anyhow, ensure};
 use crossfix_calibration::intrinsics_from_yaml;
 use crossfix_geometry::{Camera, ImageSize, Pixel, PixelCovariance, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
+#[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
 use crossfix_video::FrameClock;
 use crossfix_vision::{PixelBox, TrackerConfig};
@@ -350,6 +351,7 @@ impl CameraFile {
     }
 
     /// Frames a second, where the file or its scene says so.
+    #[cfg(feature = "centre")]
     pub fn rate_hz(&self) -> anyhow::Result<Option<f64>> {
         match &self.source {
             SourceConfig::Video { rate_hz, .. } => Ok(Some(*rate_hz)),

@@ -115,7 +115,7 @@ fn explain(error: &toml::de::Error) -> anyhow::Error {
     anyhow!("{}{}", message.trim_end(), nearest.unwrap_or_default())
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "centre"))]
 mod tests {
     use crossfix_fusion::FusionConfig;
 

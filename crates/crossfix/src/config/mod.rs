@@ -2,10 +2,12 @@
 
 mod camera;
 mod file;
+#[cfg(feature = "centre")]
 mod fusion;
 mod site;
 
 pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
 pub use file::{Kind, load, parse};
+#[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use site::{Site, load_cameras, load_network};

@@ -6,7 +6,9 @@ use crossfix_geometry::Camera;
 use crossfix_message::CameraName;
 use crossfix_transport::NetworkConfig;
 
-use super::{CameraFile, FusionFile, Kind};
+#[cfg(feature = "centre")]
+use super::FusionFile;
+use super::{CameraFile, Kind};
 
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
@@ -81,9 +83,9 @@ impl Site {
             "{} holds no fusion centre's file: copy configs/site/fusion.toml",
             folder.display()
         );
-        for path in fusion {
-            site.add_fusion(path)?;
-        }
+        #[cfg(feature = "centre")]
+        fusion.iter().try_for_each(|path| check_fusion(path))?;
+        site.fusion = fusion;
         site.check_cameras()?;
         Ok(site)
     }
@@ -113,24 +115,6 @@ impl Site {
         Ok(())
     }
 
-    fn add_fusion(&mut self, path: PathBuf) -> anyhow::Result<()> {
-        let file = FusionFile::load(Some(&path), &[])?;
-        if let Some(network) = &file.network {
-            let network =
-                load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
-            for camera in file.cameras.iter().flatten() {
-                ensure!(
-                    network.cameras.contains_key(camera),
-                    "key `cameras` of {}: the network has no camera `{camera}`{}",
-                    path.display(),
-                    nearest(camera.as_str(), network.cameras.keys().map(CameraName::as_str))
-                );
-            }
-        }
-        self.fusion.push(path);
-        Ok(())
-    }
-
     /// What the cameras are together.
     fn check_cameras(&self) -> anyhow::Result<()> {
         for checked in self.cameras.values() {
@@ -152,7 +136,27 @@ impl Site {
     }
 }
 
+/// Checks a fusion centre's file, and that the network knows its cameras.
+#[cfg(feature = "centre")]
+fn check_fusion(path: &Path) -> anyhow::Result<()> {
+    let file = FusionFile::load(Some(path), &[])?;
+    let Some(network) = &file.network else {
+        return Ok(());
+    };
+    let network = load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
+    for camera in file.cameras.iter().flatten() {
+        ensure!(
+            network.cameras.contains_key(camera),
+            "key `cameras` of {}: the network has no camera `{camera}`{}",
+            path.display(),
+            nearest(camera.as_str(), network.cameras.keys().map(CameraName::as_str))
+        );
+    }
+    Ok(())
+}
+
 /// The known name that is most like a wrong one, as a question.
+#[cfg(feature = "centre")]
 fn nearest<'a>(wrong: &str, known: impl Iterator<Item = &'a str>) -> String {
     let likeness = |name: &&str| strsim::jaro_winkler(wrong, name);
     known

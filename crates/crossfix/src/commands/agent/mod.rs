@@ -1,3 +1,4 @@
+#[cfg(feature = "centre")]
 mod simulated;
 mod start;
 
@@ -10,17 +11,19 @@ use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfi
 use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
 
-use self::simulated::{SimulatedSource, TruthPublisher};
 use self::start::Start;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
 use crate::network;
 use crate::output;
+#[cfg(not(feature = "centre"))]
+use crate::parts;
 use crate::recorded::{self, Lacks};
 use crate::repeats::Repeats;
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
+#[cfg(feature = "centre")]
 pub use self::simulated::truth_frame;
 
 /// How often the calibration is said again, for those who came late.
@@ -187,24 +190,12 @@ impl Agent {
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
+            #[cfg(feature = "centre")]
             SourceConfig::Simulation { scene, publish_truth } => {
-                let mut source = SimulatedSource::open(scene, file, start.wall_s)?;
-                let truth = if *publish_truth {
-                    Some(TruthPublisher::new(&self.link, source.world.clone(), start.wall_s)?)
-                } else {
-                    None
-                };
-                let shutdown = self.shutdown.clone();
-                let from_s = start.joined_s;
-                let truth = truth.map(|truth| std::thread::spawn(move || truth.run(from_s, &shutdown)));
-                // Its frames carry wall times from the start on.
-                let begins = Timestamp::from_seconds(start.wall_s);
-                let seen = self.watch(file, &mut source, begins, start, 1.0);
-                if let Some(thread) = truth {
-                    let _ = thread.join();
-                }
-                seen
+                self.play_scene(file, scene, *publish_truth, start)
             }
+            #[cfg(not(feature = "centre"))]
+            SourceConfig::Simulation { .. } => Err(parts::is_left_out("the simulator", "centre")),
         }
     }
 

@@ -8,14 +8,14 @@ use crossfix_simulation::{Scene, SimulatedCamera, World};
 use crossfix_transport::{Delivery, Link, LinkPublisher};
 use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
 
+use super::{Agent, Start};
 use crate::config::{self, CameraFile};
 use crate::pace::Pace;
 use crate::shutdown::Shutdown;
 
 /// A simulated camera as a source of frames, with the times that its own clock shows.
-pub struct SimulatedSource {
-    /// The scene.
-    pub world: World,
+struct SimulatedSource {
+    world: World,
     camera: SimulatedCamera,
     start: Timestamp,
     next: u64,
@@ -23,7 +23,7 @@ pub struct SimulatedSource {
 
 impl SimulatedSource {
     /// A camera's view of a scene that begins `start` seconds after the Unix epoch.
-    pub fn open(path: &Path, file: &CameraFile, start: f64) -> anyhow::Result<Self> {
+    fn open(path: &Path, file: &CameraFile, start: f64) -> anyhow::Result<Self> {
         let scene: Scene = config::load(path, &[], config::Kind::Scene)?;
         let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
         let camera = world
@@ -51,8 +51,36 @@ impl FrameSource for SimulatedSource {
     }
 }
 
+impl Agent {
+    /// Follows what a scene shows its camera, in real time, until its end.
+    pub(super) fn play_scene(
+        &mut self,
+        file: &CameraFile,
+        scene: &Path,
+        publish_truth: bool,
+        start: &Start,
+    ) -> anyhow::Result<()> {
+        let mut source = SimulatedSource::open(scene, file, start.wall_s)?;
+        let truth = if publish_truth {
+            Some(TruthPublisher::new(&self.link, source.world.clone(), start.wall_s)?)
+        } else {
+            None
+        };
+        let shutdown = self.shutdown.clone();
+        let from_s = start.joined_s;
+        let truth = truth.map(|truth| std::thread::spawn(move || truth.run(from_s, &shutdown)));
+        // Its frames carry wall times from the start on.
+        let begins = Timestamp::from_seconds(start.wall_s);
+        let seen = self.watch(file, &mut source, begins, start, 1.0);
+        if let Some(thread) = truth {
+            let _ = thread.join();
+        }
+        seen
+    }
+}
+
 /// Publishes where the targets of a scene really are, ten times a second.
-pub struct TruthPublisher {
+struct TruthPublisher {
     publisher: LinkPublisher,
     world: World,
     start: f64,
@@ -62,12 +90,12 @@ impl TruthPublisher {
     const RATE_HZ: f64 = 10.0;
 
     /// For a scene that begins `start` seconds after the Unix epoch.
-    pub fn new(link: &Link, world: World, start: f64) -> anyhow::Result<Self> {
+    fn new(link: &Link, world: World, start: f64) -> anyhow::Result<Self> {
         Ok(Self { publisher: link.publisher(Channel::Truth, Delivery::Queued)?, world, start })
     }
 
     /// Publishes from so many seconds after the scene's beginning until its end.
-    pub fn run(self, from_s: f64, shutdown: &Shutdown) {
+    fn run(self, from_s: f64, shutdown: &Shutdown) {
         let pace = Pace::beginning_at(self.start, 1.0);
         for step in 0..(self.world.duration_s() * Self::RATE_HZ) as u32 {
             let t = f64::from(step) / Self::RATE_HZ;

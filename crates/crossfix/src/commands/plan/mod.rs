@@ -1,4 +1,5 @@
 mod geojson;
+#[cfg_attr(not(feature = "viewer"), path = "no_picture.rs")]
 mod picture;
 mod report;
 

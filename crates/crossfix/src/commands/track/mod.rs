@@ -1,5 +1,6 @@
 //! Following targets in a video, without a network.
 
+#[cfg_attr(not(feature = "viewer"), path = "no_picture.rs")]
 mod picture;
 mod table;
 

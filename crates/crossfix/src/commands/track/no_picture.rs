@@ -1,0 +1,26 @@
+//! In the place of the picture, in a build that leaves it out.
+
+use std::path::Path;
+
+use crossfix_correlation::Plane;
+use crossfix_video::Frame;
+use crossfix_vision::ImageTrack;
+
+use crate::parts;
+
+/// There is none.
+pub(super) enum Picture {}
+
+impl Picture {
+    pub(super) fn new(_: &Path, _: Option<&Path>) -> anyhow::Result<Self> {
+        Err(parts::is_left_out("pictures for Rerun", "viewer"))
+    }
+
+    pub(super) fn finish(self) -> anyhow::Result<()> {
+        match self {}
+    }
+
+    pub(super) fn show(&self, _: &Frame, _: &Plane, _: &[ImageTrack]) -> anyhow::Result<()> {
+        match *self {}
+    }
+}

@@ -1,0 +1,89 @@
+//! From where the world is looked at.
+
+use nalgebra::{Point3, Vector3};
+use rerun_types::blueprint::archetypes::EyeControls3D;
+use rerun_types::blueprint::components::Eye3DKind;
+
+use crate::extent::Extent;
+
+/// Half of Rerun's vertical field of view, as a tangent (55 degrees in all).
+const HALF_HEIGHT: f64 = 0.52;
+/// The same across, of a view that is wider than high.
+const HALF_WIDTH: f64 = 1.5 * HALF_HEIGHT;
+/// Room at the borders, for labels.
+const ROOM: f64 = 1.1;
+/// After so many the target moves by less than a pixel.
+const CENTRINGS: u32 = 4;
+/// Nothing is looked at from closer than this, m.
+const CLOSEST_M: f64 = 20.0;
+
+/// The eye that has all of a box in view, from the south and above, so that north is up in the picture.
+pub(crate) fn on(extent: &Extent) -> EyeControls3D {
+    let f32s = |point: Point3<f64>| [point.x as f32, point.y as f32, point.z as f32];
+    let (eye, target) = eye_and_target(extent);
+    EyeControls3D::new()
+        .with_kind(Eye3DKind::Orbital)
+        .with_position(f32s(eye))
+        .with_look_target(f32s(target))
+        .with_eye_up([0.0_f32, 0.0, 1.0])
+}
+
+/// Where the eye is, and what it looks at.
+fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
+    let towards_eye = Vector3::new(-0.35, -1.0, 0.75).normalize();
+    let right = Vector3::z().cross(&towards_eye).normalize();
+    let up = towards_eye.cross(&right);
+    let mut target = extent.middle();
+    let mut distance = CLOSEST_M;
+    // What is near looks larger, so the middle of the box is not that of the picture: the target is
+    // moved to where the picture's middle is, and the distance found anew.
+    for _ in 0..CENTRINGS {
+        // A corner is in view if it lies within the field's slope at its distance from the eye.
+        let needed = |corner: Point3<f64>| {
+            let from = corner - target;
+            let slope = (from.dot(&right).abs() / HALF_WIDTH).max(from.dot(&up).abs() / HALF_HEIGHT);
+            from.dot(&towards_eye) + slope
+        };
+        distance = extent.corners().map(needed).fold(CLOSEST_M, f64::max);
+        let seen = |corner: Point3<f64>, axis: &Vector3<f64>| {
+            let from = corner - target;
+            from.dot(axis) / (distance - from.dot(&towards_eye)).max(0.1 * distance)
+        };
+        let middle = |axis: &Vector3<f64>| {
+            let (low, high) = extent
+                .corners()
+                .map(|corner| seen(corner, axis))
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| (low.min(s), high.max(s)));
+            0.5 * (low + high) * distance
+        };
+        target += middle(&right) * right + middle(&up) * up;
+    }
+    (target + ROOM * distance * towards_eye, target)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_corners_of_a_site_are_in_view_and_one_is_near_the_border() {
+        for [width, depth, height] in [[100.0, 100.0, 30.0], [400.0, 20.0, 5.0], [10.0, 10.0, 300.0]] {
+            let extent =
+                Extent::of([Point3::new(-50.0, 7.0, 2.0), Point3::new(width - 50.0, 7.0 + depth, height)]);
+            let (place, target) = eye_and_target(&extent);
+            let forward = (target - place).normalize();
+            let right = forward.cross(&Vector3::z()).normalize();
+            let up = right.cross(&forward);
+            let shares: Vec<f64> = extent
+                .corners()
+                .map(|corner| {
+                    let from = corner - place;
+                    let across = from.dot(&right).abs() / HALF_WIDTH;
+                    across.max(from.dot(&up).abs() / HALF_HEIGHT) / from.dot(&forward)
+                })
+                .collect();
+            let most = shares.into_iter().fold(0.0, f64::max);
+            assert!((0.7..1.0).contains(&most), "{most}");
+        }
+    }
+}
