@@ -1,11 +1,29 @@
 //! Small linear filters and gates: what tracks a point, whatever the point is.
 //!
-//! [`AxisFilter`] is one axis of an image (papers 000 and 001);
+//! [`AxisFilter`] is one axis of an image (Herasymenko 2021 and Lytvynets 2020);
 //! [`KinematicState`] is position and velocity in space, [`Imm`] a bank of them
 //! that differ in how hard the target accelerates; [`SmoothedResidual`] and
-//! [`NormalisedInnovation`] tell when one filter is left behind (paper 004);
+//! [`NormalisedInnovation`] tell when one filter is left behind (Kalinov 2019);
 //! [`Gate`] decides whether a measurement can belong to a track, [`normal_score`] says how
 //! much one surprises where several were expected.
+//!
+//! A target that moves by 2 px from image to image, measured to half a pixel:
+//!
+//! ```
+//! use crossfix_filter::{AxisFilter, AxisMeasurement};
+//!
+//! let measured = |position: f64| AxisMeasurement { position, variance: 0.25 };
+//! // Thirty images a second, and an acceleration of some 20 px/s^2.
+//! let interval = 1.0 / 30.0;
+//! let mut filter = AxisFilter::start(measured(10.3), measured(11.8), interval, 20.0);
+//! for (image, position) in [14.2, 15.7, 18.4, 19.9, 22.1].into_iter().enumerate() {
+//!     filter.time_update(interval);
+//!     let innovation = filter.measurement_update(measured(position));
+//!     assert!(innovation.normalised_squared() < 4.0, "image {image} fits");
+//! }
+//! assert!((filter.position() - 22.0).abs() < 0.4);
+//! assert!((filter.velocity() - 60.0).abs() < 5.0, "pixels per second");
+//! ```
 
 mod axis;
 mod gate;

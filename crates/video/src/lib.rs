@@ -1,7 +1,43 @@
 //! Frames with their capture times, from files: PNG and JPEG sequences, Y4M,
 //! MP4 with H.264, AVI with Motion JPEG. Nothing but cargo dependencies.
 //!
-//! The seam is [`FrameSource`]. [`open`] finds the right one for a path.
+//! The seam is [`FrameSource`]. [`open`] finds the right one for a path; a camera of one's own is
+//! another:
+//!
+//! ```
+//! use crossfix_message::Timestamp;
+//! use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
+//!
+//! /// A grey wall, seen ten times a second.
+//! struct Wall {
+//!     next: u64,
+//! }
+//!
+//! impl FrameSource for Wall {
+//!     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+//!         let index = self.next;
+//!         self.next += 1;
+//!         let time = Timestamp::from_seconds(index as f64 / 10.0);
+//!         Ok((index < 3).then(|| Frame {
+//!             index,
+//!             // When it was exposed, and how well that is known.
+//!             capture: CaptureTime { time, sd_s: 0.001 },
+//!             width: 64,
+//!             height: 48,
+//!             pixels: Pixels::Gray8(vec![128; 64 * 48]),
+//!         }))
+//!     }
+//! }
+//!
+//! let mut wall = Wall { next: 0 };
+//! let mut frames = 0;
+//! while let Some(frame) = wall.next_frame()? {
+//!     assert_eq!(frame.brightness().len(), 64 * 48);
+//!     frames += 1;
+//! }
+//! assert_eq!(frames, 3);
+//! # Ok::<(), VideoError>(())
+//! ```
 
 mod avi;
 mod error;

@@ -5,6 +5,27 @@
 //! One [`Picture`] draws live messages and recorded ones alike: it is given
 //! the bytes of the wire. What it draws a second is bounded, so that a viewer
 //! left open does not fill the memory.
+//!
+//! A recording becomes a picture:
+//!
+//! ```
+//! use crossfix_recording::RecordingReader;
+//! use crossfix_view::{Picture, ViewError};
+//!
+//! # let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../../recordings/two-uavs.mcap").as_ref();
+//! # let folder = tempfile::tempdir()?;
+//! # let file = folder.path().join("two-uavs.rrd");
+//! let mut picture = Picture::new(crossfix_view::save(&file)?)?;
+//! RecordingReader::open(recording)?.for_each(|entry| {
+//!     // What is no message of this version is said, and left out.
+//!     let unread = picture.show(&entry.key.channel, entry.arrival, &entry.data)?;
+//!     assert!(unread.is_none());
+//!     Ok::<_, ViewError>(())
+//! })?;
+//! picture.finish()?;
+//! assert!(std::fs::metadata(&file)?.len() > 100_000);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod arrivals;
 mod blueprint;
