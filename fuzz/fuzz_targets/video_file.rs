@@ -9,7 +9,8 @@ pub fn drive(suffix: &str, data: &[u8]) {
     let mut file = tempfile::Builder::new().suffix(suffix).tempfile().expect("a temporary file");
     file.write_all(data).expect("room for it");
     let Ok(mut source) = open(file.path(), FrameClock::default()) else { return };
-    // Each frame may be read many times over, as a hostile index says; a few show what there is to see.
+    // Each frame may be read many times over, as a hostile index says; a few show what there is to
+    // see.
     for _ in 0..20 {
         match source.next_frame() {
             Ok(None) => return,

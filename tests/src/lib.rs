@@ -207,7 +207,8 @@ pub struct Site {
 impl Site {
     /// The demo's scene for so many seconds.
     pub fn new(duration_s: f64) -> Self {
-        let mut scene: Scene = toml::from_str(include_str!("../../configs/demo/scene.toml")).unwrap();
+        let mut scene: Scene =
+            toml::from_str(include_str!("../../configs/demo/scene.toml")).unwrap();
         scene.duration_s = duration_s;
         let world = scene.build().unwrap();
         let folder = tempfile::tempdir().unwrap();
@@ -221,7 +222,11 @@ impl Site {
             let name = camera.name().as_str();
             let lens = camera.camera().model().intrinsics();
             site.write(&format!("{name}.yaml"), &intrinsics_to_yaml(name, lens));
-            site.write_camera(name, "kind = \"recording\"\npath = \"source.mcap\"\nspeed = 2.0", "");
+            site.write_camera(
+                name,
+                "kind = \"recording\"\npath = \"source.mcap\"\nspeed = 2.0",
+                "",
+            );
         }
         site
     }

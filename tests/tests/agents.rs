@@ -48,14 +48,16 @@ fn an_agent_that_comes_late_joins_those_that_play() {
     let recorder = site.start_recorder("live.mcap");
     let fusion = site.start_fusion();
     // Twice as fast as life.
-    let mut agents: Vec<Process> = (0..2).map(|index| agent(&site, index, &["--no-wait"])).collect();
+    let mut agents: Vec<Process> =
+        (0..2).map(|index| agent(&site, index, &["--no-wait"])).collect();
     std::thread::sleep(Duration::from_secs(3));
     agents.push(agent(&site, 2, &[]));
     assert!(agents.iter_mut().all(Process::wait));
     assert!(fusion.stop() && recorder.stop());
     let late = site.world().cameras()[2].name().clone();
-    let of_late =
-        |file: &str| messages(Path::new(&site.path(file)), |c| *c == Channel::Bearings(late.clone()));
+    let of_late = |file: &str| {
+        messages(Path::new(&site.path(file)), |c| *c == Channel::Bearings(late.clone()))
+    };
     let (sent, published) = (of_late("source.mcap"), of_late("live.mcap"));
     let share = published.len() as f64 / sent.len() as f64;
     assert!((0.3..0.9).contains(&share), "{} of {}", published.len(), sent.len());
@@ -85,7 +87,8 @@ fn an_agent_whose_video_breaks_ends_with_an_error() {
     site.write_camera("north", source, "");
     // Two frames, then something else.
     let size = site.world().camera("north").unwrap().camera().model().intrinsics().size;
-    let mut bytes = format!("YUV4MPEG2 W{} H{} F25:1 Cmono\n", size.width, size.height).into_bytes();
+    let mut bytes =
+        format!("YUV4MPEG2 W{} H{} F25:1 Cmono\n", size.width, size.height).into_bytes();
     for _ in 0..2 {
         bytes.extend(b"FRAME\n");
         bytes.extend(vec![100_u8; (size.width * size.height) as usize]);
@@ -93,14 +96,20 @@ fn an_agent_whose_video_breaks_ends_with_an_error() {
     bytes.extend(b"NONSENSE\n");
     bytes.extend(vec![0_u8; 5000]);
     std::fs::write(site.path("north.y4m"), bytes).unwrap();
-    let mut agent = site.start_logged(&["agent", "-c", &site.path("north.toml"), "--no-wait"], "agent.log");
+    let mut agent =
+        site.start_logged(&["agent", "-c", &site.path("north.toml"), "--no-wait"], "agent.log");
     assert_eq!(agent.exit_code(), Some(1), "{}", site.text("agent.log"));
-    assert!(site.text("agent.log").contains("camera `north` sees no more"), "{}", site.text("agent.log"));
+    assert!(
+        site.text("agent.log").contains("camera `north` sees no more"),
+        "{}",
+        site.text("agent.log")
+    );
     // A folder of nothing but bad pictures.
     std::fs::create_dir(site.path("pictures")).unwrap();
     std::fs::write(site.path("pictures/1.png"), "no picture").unwrap();
     site.write_camera("north", "kind = \"video\"\npath = \"pictures\"\nspeed = 0.0", "");
-    let mut agent = site.start_logged(&["agent", "-c", &site.path("north.toml"), "--no-wait"], "agent.log");
+    let mut agent =
+        site.start_logged(&["agent", "-c", &site.path("north.toml"), "--no-wait"], "agent.log");
     assert_eq!(agent.exit_code(), Some(1), "{}", site.text("agent.log"));
 }
 
@@ -122,11 +131,18 @@ fn an_agent_that_is_behind_its_source_says_so() {
 #[test]
 fn who_waits_says_for_whom_within_five_seconds() {
     let site = Site::new(2.0);
-    let logged = |name: &str, arguments: &[&str]| (name.to_owned(), site.start_logged(arguments, name));
+    let logged =
+        |name: &str, arguments: &[&str]| (name.to_owned(), site.start_logged(arguments, name));
     let processes = [
         logged("fuse.log", &["fuse", "-c", &site.path("fusion.toml")]),
-        logged("record.log", &["record", "-c", &site.path("network.toml"), "-o", &site.path("a.mcap")]),
-        logged("view.log", &["view", "-c", &site.path("network.toml"), "--save", &site.path("a.rrd")]),
+        logged(
+            "record.log",
+            &["record", "-c", &site.path("network.toml"), "-o", &site.path("a.mcap")],
+        ),
+        logged(
+            "view.log",
+            &["view", "-c", &site.path("network.toml"), "--save", &site.path("a.rrd")],
+        ),
     ];
     for (log, _) in &processes {
         assert!(
@@ -153,7 +169,8 @@ fn a_second_program_under_a_cameras_name_is_named_in_health() {
     }
     std::thread::sleep(Duration::from_millis(300));
     let name = site.world().cameras()[0].name().clone();
-    let frame = BearingFrame { camera: name.to_string(), capture_time_ns: 1, ..Default::default() }.encode();
+    let frame = BearingFrame { camera: name.to_string(), capture_time_ns: 1, ..Default::default() }
+        .encode();
     let publish = |link: &Link| {
         let publisher = link.publisher(Channel::Bearings(name.clone()), Delivery::Queued).unwrap();
         (0..3).for_each(|_| publisher.put(frame.clone()).unwrap());
@@ -170,7 +187,9 @@ fn a_second_program_under_a_cameras_name_is_named_in_health() {
         health.iter().flat_map(|entry| decode::<Health>(&entry.data).unwrap().problems).collect();
     let [one, two] = [&one, &two].map(|link| link.run().to_string());
     let named = |problem: &String| {
-        problem.contains(&format!("{name}/bearings")) && problem.contains(&one) && problem.contains(&two)
+        problem.contains(&format!("{name}/bearings"))
+            && problem.contains(&one)
+            && problem.contains(&two)
     };
     assert!(problems.iter().any(named), "{problems:?}");
 }

@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
-    BearingFrame, BearingTrack, Channel, Health, ImageTrackState, Key, Payload, Vector3, Version, decode,
+    BearingFrame, BearingTrack, Channel, Health, ImageTrackState, Key, Payload, Vector3, Version,
+    decode,
 };
 use crossfix_tests::{PATIENCE, Site, crossfix, now_seconds};
 use crossfix_transport::{Link, Role};
@@ -55,7 +56,8 @@ fn hostile_messages_are_counted_and_the_fusion_centre_goes_on() {
     let fusion = site.start_fusion();
     let link = Link::open(site.network(), &Role::Cameras { and_fusion: false }).unwrap();
     let ear = site.ear();
-    let health = ear.subscribe(&[Key::new(ear.site().clone(), Channel::FusionHealth).to_string()]).unwrap();
+    let health =
+        ear.subscribe(&[Key::new(ear.site().clone(), Channel::FusionHealth).to_string()]).unwrap();
     link.wait_for(&[Channel::FusionAlive], PATIENCE, || true).unwrap();
     std::thread::sleep(Duration::from_millis(500));
 
@@ -79,8 +81,10 @@ fn hostile_messages_are_counted_and_the_fusion_centre_goes_on() {
     put("west", frame("west", 0, start + 1e6, ahead).encode());
     put("nobody", frame("nobody", 0, start, ahead).encode());
     put("north", vec![0xff; 40]);
-    let newer =
-        BearingFrame { version: Some(Version { major: 9, minor: 0 }), ..frame("north", 3, start, ahead) };
+    let newer = BearingFrame {
+        version: Some(Version { major: 9, minor: 0 }),
+        ..frame("north", 3, start, ahead)
+    };
     put("north", newer.encode_unstamped());
 
     let counted = counters(&health, |c| c.get("received_newer_version").is_some_and(|n| *n > 0));
@@ -100,7 +104,8 @@ fn no_message_of_any_size_costs_much_memory() {
     let recorder = site.start_recorder("live.mcap");
     let link = Link::open(site.network(), &Role::Cameras { and_fusion: false }).unwrap();
     let ear = site.ear();
-    let health = ear.subscribe(&[Key::new(ear.site().clone(), Channel::FusionHealth).to_string()]).unwrap();
+    let health =
+        ear.subscribe(&[Key::new(ear.site().clone(), Channel::FusionHealth).to_string()]).unwrap();
     link.wait_for(&[Channel::FusionAlive, Channel::RecorderAlive], PATIENCE, || true).unwrap();
     std::thread::sleep(Duration::from_millis(500));
     let before = [&fusion, &recorder].map(|process| process.peak_memory());
@@ -110,12 +115,16 @@ fn no_message_of_any_size_costs_much_memory() {
         link.put(&north, [0x42, 0x00].repeat(length / 2)).unwrap();
     }
     let counted = counters(&health, |counted| {
-        ["received_too_large", "received_too_long"].iter().filter_map(|name| counted.get(*name)).sum::<u64>()
+        ["received_too_large", "received_too_long"]
+            .iter()
+            .filter_map(|name| counted.get(*name))
+            .sum::<u64>()
             >= 3
     });
     assert!(counted["received_too_large"] >= 2, "{counted:?}");
     std::thread::sleep(Duration::from_secs(1));
-    for (what, process, before) in [("fuse", &fusion, before[0]), ("record", &recorder, before[1])] {
+    for (what, process, before) in [("fuse", &fusion, before[0]), ("record", &recorder, before[1])]
+    {
         let (Some(before), Some(after)) = (before, process.peak_memory()) else {
             eprintln!("SKIPPED: this system does not say how much memory a process has");
             continue;
@@ -136,7 +145,10 @@ fn a_full_disk_ends_the_recorder_with_a_clear_word() {
     let output = crossfix(&["record", "-c", &site.path("network.toml"), "-o", "/dev/full"]);
     assert_eq!(output.status.code(), Some(1));
     let stderr = String::from_utf8_lossy(&output.stderr);
-    assert!(stderr.contains("cannot write the recording") && stderr.contains("No space left"), "{stderr}");
+    assert!(
+        stderr.contains("cannot write the recording") && stderr.contains("No space left"),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -144,7 +156,8 @@ fn a_torn_recording_is_fused_up_to_the_tear() {
     let site = Site::new(4.0);
     let bytes = std::fs::read(site.path("source.mcap")).unwrap();
     std::fs::write(site.path("torn.mcap"), &bytes[..bytes.len() * 2 / 3]).unwrap();
-    let output = crossfix(&["replay", &site.path("torn.mcap"), "--fuse", "-o", &site.path("tracks.mcap")]);
+    let output =
+        crossfix(&["replay", &site.path("torn.mcap"), "--fuse", "-o", &site.path("tracks.mcap")]);
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && stderr.contains("is damaged"), "{stderr}");
 }
@@ -185,5 +198,8 @@ fn configurations_with_mistakes_are_explained_before_anything_starts() {
     check(&north, &["north.yaml", "fx", "positive"]);
     site.write("north.yaml", &yaml);
     site.write("zwilling.toml", &good);
-    check(&site.path(""), &["two cameras are called `north`", "zwilling.toml", "change the key `name`"]);
+    check(
+        &site.path(""),
+        &["two cameras are called `north`", "zwilling.toml", "change the key `name`"],
+    );
 }

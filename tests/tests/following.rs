@@ -51,7 +51,15 @@ fn what_moves_is_found_and_has_a_row_in_every_frame() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     video(&folder.path().join("a.y4m"), 80);
-    succeed(&["track", &path("a.y4m"), "--detect", "--csv", &path("a.csv"), "--save", &path("a.rrd")]);
+    succeed(&[
+        "track",
+        &path("a.y4m"),
+        "--detect",
+        "--csv",
+        &path("a.csv"),
+        "--save",
+        &path("a.rrd"),
+    ]);
     assert!(folder.path().join("a.rrd").metadata().unwrap().len() > 10_000);
 
     let rows = followed_rows(&folder.path().join("a.csv"));
@@ -85,7 +93,18 @@ fn boxes_are_numbered_in_their_order_from_a_later_frame_on() {
     video(&folder.path().join("a.y4m"), 60);
     let boxes = places(35).map(|[x, y]| format!("{},{},12,9", x - 5.5, y - 4.0));
     let [one, two] = &boxes;
-    succeed(&["track", &path("a.y4m"), "--from", "35", "--box", two, "--box", one, "--csv", &path("a.csv")]);
+    succeed(&[
+        "track",
+        &path("a.y4m"),
+        "--from",
+        "35",
+        "--box",
+        two,
+        "--box",
+        one,
+        "--csv",
+        &path("a.csv"),
+    ]);
     let rows = followed_rows(&folder.path().join("a.csv"));
     assert_eq!(rows.len(), 2 * 25);
     for (row, (frame, id)) in rows.iter().zip((35..60).flat_map(|frame| [(frame, 1), (frame, 2)])) {

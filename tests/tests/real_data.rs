@@ -22,7 +22,8 @@ fn three_cameras_follow_the_drone_of_the_drone_tracking_datasets() {
     let source = data.join("eth-multiview-drone").display().to_string();
     let cameras = [("gopro3", 1.0 / 59.94), ("sony5100", 1.0 / 29.97), ("sonyG", 1.0 / 50.0)];
     let names = cameras.map(|(name, _)| name).join(",");
-    let arguments = ["import", "drone-tracking-datasets", &source, "--dataset", "3", "--cameras", &names];
+    let arguments =
+        ["import", "drone-tracking-datasets", &source, "--dataset", "3", "--cameras", &names];
     succeed(&[&arguments[..], &["-o", &path("half.mcap")]].concat());
     succeed(&["-q", "replay", &path("half.mcap"), "--fuse", "-o", &path("tracks.mcap")]);
 
@@ -49,7 +50,14 @@ fn three_cameras_follow_the_drone_of_the_drone_tracking_datasets() {
     std::fs::write(path("times.csv"), times).unwrap();
     assert!((410..=430).contains(&truth.len()), "{} instants", truth.len());
 
-    succeed(&["export", &path("tracks.mcap"), "--csv", &path("tracks.csv"), "--times", &path("times.csv")]);
+    succeed(&[
+        "export",
+        &path("tracks.mcap"),
+        "--csv",
+        &path("tracks.csv"),
+        "--times",
+        &path("times.csv"),
+    ]);
     let mut best: BTreeMap<i64, f64> = BTreeMap::new();
     let mut rows = 0;
     for row in csv::Reader::from_path(path("tracks.csv")).unwrap().deserialize() {
@@ -79,11 +87,15 @@ fn silhouettes_are_those_of_the_reference() {
         let margin = template["margin"].as_u64().unwrap() as usize;
         let canvas = crossfix_simulation::Silhouette::new(width, height).canvas(margin);
         let rows = template["image"].as_array().unwrap();
-        let wanted = rows.iter().flat_map(|row| row.as_array().unwrap()).map(|b| b.as_f64().unwrap());
+        let wanted =
+            rows.iter().flat_map(|row| row.as_array().unwrap()).map(|b| b.as_f64().unwrap());
         let wanted: Vec<f64> = wanted.collect();
         assert_eq!(canvas.len(), wanted.len());
         for (drawn, wanted) in canvas.iter().zip(wanted) {
-            assert!((f64::from(*drawn) - wanted).abs() < 0.01, "{width}x{height}: {drawn} for {wanted}");
+            assert!(
+                (f64::from(*drawn) - wanted).abs() < 0.01,
+                "{width}x{height}: {drawn} for {wanted}"
+            );
         }
     }
 }
@@ -92,7 +104,8 @@ fn silhouettes_are_those_of_the_reference() {
 fn labels(clip: &Path) -> BTreeMap<u64, [f64; 4]> {
     let mut labels = BTreeMap::new();
     for row in csv::Reader::from_path(clip.with_extension("csv")).unwrap().deserialize() {
-        let (frame, x, y, w, h): (u64, Option<f64>, Option<f64>, Option<f64>, Option<f64>) = row.unwrap();
+        let (frame, x, y, w, h): (u64, Option<f64>, Option<f64>, Option<f64>, Option<f64>) =
+            row.unwrap();
         if let (Some(x), Some(y), Some(w), Some(h)) = (x, y, w, h) {
             labels.insert(frame, [x, y, w, h]);
         }
@@ -114,7 +127,8 @@ fn track(clip: &Path, arguments: &[&str]) -> Vec<FollowedRow> {
     followed_rows(Path::new(&table))
 }
 
-/// Follows a clip from its first labelled box on; returns the frames within 10 px, and those labelled.
+/// Follows a clip from its first labelled box on; returns the frames within 10 px, and those
+/// labelled.
 fn followed(clip: &Path) -> (usize, usize) {
     let labels = labels(clip);
     let (first, [x, y, w, h]) = labels.first_key_value().unwrap();
@@ -179,15 +193,16 @@ impl Finds {
         let mut near = BTreeSet::new();
         // Of each track its boxes, and those at the target.
         let mut tracks: BTreeMap<u64, (usize, usize)> = BTreeMap::new();
-        for row in rows.iter().filter(|row| row.certainty.is_some_and(|certainty| certainty > 0.5)) {
+        for row in rows.iter().filter(|row| row.certainty.is_some_and(|certainty| certainty > 0.5))
+        {
             let label = labels.get(&row.frame);
             let off = label.and_then(|label| off(row, *label));
             if off.is_some_and(|[x, y]| x.hypot(y) <= 10.0) {
                 near.insert(row.frame);
             }
-            let is_at = label
-                .zip(off)
-                .is_some_and(|([_, _, w, h], [x, y])| x.abs() <= w / 2.0 + 12.0 && y.abs() <= h / 2.0 + 12.0);
+            let is_at = label.zip(off).is_some_and(|([_, _, w, h], [x, y])| {
+                x.abs() <= w / 2.0 + 12.0 && y.abs() <= h / 2.0 + 12.0
+            });
             let (boxes, at) = tracks.entry(row.id.unwrap()).or_default();
             *boxes += 1;
             *at += usize::from(is_at);
@@ -203,8 +218,11 @@ impl Finds {
 #[test]
 fn drones_are_found_in_real_video_without_a_box() {
     let Some(data) = real_data() else { return };
-    // The tracks elsewhere in visible video, eight, are of three cars, a bird and a part of a drone of 170 px.
-    for (prefix, found, boxes, tracks) in [("IR_DRONE", 0.90, 0.05, 2.0), ("V_DRONE", 0.80, 0.2, 3.5)] {
+    // The tracks elsewhere in visible video, eight, are of three cars, a bird and a part of a drone
+    // of 170 px.
+    for (prefix, found, boxes, tracks) in
+        [("IR_DRONE", 0.90, 0.05, 2.0), ("V_DRONE", 0.80, 0.2, 3.5)]
+    {
         let mut finds = Finds::default();
         for clip in clips(&data, "svanstrom-drone-video", prefix) {
             finds.add(&clip);

@@ -52,7 +52,8 @@ fn labels_of(frames: &[BearingFrame]) -> BTreeMap<String, Labels> {
 
 /// Where the drone was, and when (s).
 fn truth_of(recording: &Path) -> Vec<(f64, Point3<f64>)> {
-    let place = |data: &[u8]| decode::<TruthFrame>(data).unwrap().targets[0].position.unwrap().into();
+    let place =
+        |data: &[u8]| decode::<TruthFrame>(data).unwrap().targets[0].position.unwrap().into();
     let entries = messages(recording, |channel| *channel == Channel::Truth);
     entries.into_iter().map(|entry| (entry.data_time.seconds(), place(&entry.data))).collect()
 }
@@ -66,24 +67,28 @@ fn two_real_targets_are_both_followed_and_never_taken_for_each_other() {
     let intervals =
         BTreeMap::from([("gopro3", 1.0 / 59.94), ("sony5100", 1.0 / 29.97), ("sonyG", 1.0 / 50.0)]);
     let names = intervals.keys().copied().collect::<Vec<_>>().join(",");
-    let arguments = ["import", "drone-tracking-datasets", &source, "--dataset", "3", "--cameras", &names];
+    let arguments =
+        ["import", "drone-tracking-datasets", &source, "--dataset", "3", "--cameras", &names];
     succeed(&[&arguments[..], &["-o", &half.display().to_string()]].concat());
 
     let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
     for entry in messages(&half, |channel| matches!(channel, Channel::Calibration(_))) {
         fusion.calibrate(&decode::<CameraCalibration>(&entry.data).unwrap()).unwrap();
     }
-    let frames: Vec<BearingFrame> = messages(&half, |channel| matches!(channel, Channel::Bearings(_)))
-        .into_iter()
-        .map(|entry| decode(&entry.data).unwrap())
-        .collect();
+    let frames: Vec<BearingFrame> =
+        messages(&half, |channel| matches!(channel, Channel::Bearings(_)))
+            .into_iter()
+            .map(|entry| decode(&entry.data).unwrap())
+            .collect();
     let labels = labels_of(&frames);
     let truth = truth_of(&half);
-    let all_see = |t: f64| intervals.iter().all(|(name, interval)| labels[*name].at(t, *interval).is_some());
+    let all_see =
+        |t: f64| intervals.iter().all(|(name, interval)| labels[*name].at(t, *interval).is_some());
 
     let mut history = TrackHistory::default();
     for frame in frames {
-        let later = labels[&frame.camera].at(time_of(&frame) + SHIFT_S, intervals[frame.camera.as_str()]);
+        let later =
+            labels[&frame.camera].at(time_of(&frame) + SHIFT_S, intervals[frame.camera.as_str()]);
         let mut both = frame;
         both.tracks.extend(later);
         for output in fusion.ingest(&both) {
@@ -95,12 +100,14 @@ fn two_real_targets_are_both_followed_and_never_taken_for_each_other() {
     let mut owners: BTreeMap<u64, BTreeSet<usize>> = BTreeMap::new();
     let (mut instants, mut squares, mut extra) = (0, Vec::new(), 0);
     for &(t, first) in truth.iter().filter(|(t, _)| all_see(*t) && all_see(t + SHIFT_S)) {
-        let Some((_, second)) = truth.iter().find(|(time, _)| (time - t - SHIFT_S).abs() < 1e-3) else {
+        let Some((_, second)) = truth.iter().find(|(time, _)| (time - t - SHIFT_S).abs() < 1e-3)
+        else {
             continue;
         };
         instants += 1;
         for estimate in history.at(Timestamp::from_seconds(t)) {
-            let distances = [first, *second].map(|place| (estimate.state.position() - place).norm());
+            let distances =
+                [first, *second].map(|place| (estimate.state.position() - place).norm());
             let nearest = usize::from(distances[1] < distances[0]);
             if distances[nearest] < NEAR_M {
                 owners.entry(estimate.id).or_default().insert(nearest);
@@ -133,10 +140,15 @@ struct Asked {
 }
 
 /// Poses and clocks come from the flight's first half; the fit's residual is declared as the poses'
-/// deviation, and the clocks are taken for exact. The limits are what is reached now and a little more: they
-/// guard it, and do not say that it is good.
+/// deviation, and the clocks are taken for exact. The limits are what is reached now and a little
+/// more: they guard it, and do not say that it is good.
 const ASKED: [Asked; 3] = [
-    Asked { dataset: "3", cameras: "gopro3,sony5100,sonyG", instants: 420, most: [0.114, 0.42, 4.0] },
+    Asked {
+        dataset: "3",
+        cameras: "gopro3,sony5100,sonyG",
+        instants: 420,
+        most: [0.114, 0.42, 4.0],
+    },
     Asked {
         dataset: "3",
         cameras: "gopro3,mate7,mate10,sony5n_1440x1080,sony5100,sonyG",
@@ -158,8 +170,15 @@ fn positions_velocities_and_nees_of_real_flights_are_what_the_readme_says() {
     let path = |name: &str| folder.path().join(name).display().to_string();
     let source = data.join("eth-multiview-drone").display().to_string();
     for Asked { dataset, cameras, instants, most } in ASKED {
-        let import =
-            ["import", "drone-tracking-datasets", &source, "--dataset", dataset, "--cameras", cameras];
+        let import = [
+            "import",
+            "drone-tracking-datasets",
+            &source,
+            "--dataset",
+            dataset,
+            "--cameras",
+            cameras,
+        ];
         succeed(&[&import[..], &["-o", &path("half.mcap")]].concat());
         succeed(&["-q", "replay", &path("half.mcap"), "--fuse", "-o", &path("tracks.mcap")]);
         let text = succeed(&["evaluate", &path("tracks.mcap"), "--min-cameras", "3", "--json"]);
@@ -171,6 +190,9 @@ fn positions_velocities_and_nees_of_real_flights_are_what_the_readme_says() {
         println!("data set {dataset}, {cameras}: position RMSE, velocity RMSE, NEES {reached:?}");
         assert_eq!(report["instants"], instants, "{cameras}");
         assert!(coverage >= 0.99, "{cameras}: coverage {coverage}");
-        assert!(reached.iter().zip(most).all(|(ours, most)| *ours <= most), "{cameras}: {reached:?}");
+        assert!(
+            reached.iter().zip(most).all(|(ours, most)| *ours <= most),
+            "{cameras}: {reached:?}"
+        );
     }
 }

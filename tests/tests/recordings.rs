@@ -6,8 +6,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Key, Payload, Preview, Timestamp, TrackFrame, Version,
-    decode,
+    BearingFrame, CameraCalibration, Channel, Health, Key, Payload, Preview, Timestamp, TrackFrame,
+    Version, decode,
 };
 use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
 use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
@@ -155,17 +155,22 @@ fn a_range_without_data_is_an_error() {
 fn a_fused_recording_keeps_previews_health_and_where_calibrations_change() {
     let site = Site::new(4.0);
     let source = site.path("source.mcap");
-    // The same flight with pictures and health, and a camera that is moved by a metre after two seconds.
+    // The same flight with pictures and health, and a camera that is moved by a metre after two
+    // seconds.
     let mut writer = RecordingWriter::create(Path::new(&site.path("rich.mcap"))).unwrap();
     let mut entries = messages(Path::new(&source), |_| true);
     let name = site.world().cameras()[0].name().clone();
-    let first = entries.iter().find(|entry| entry.key.channel == Channel::Calibration(name.clone())).unwrap();
+    let first = entries
+        .iter()
+        .find(|entry| entry.key.channel == Channel::Calibration(name.clone()))
+        .unwrap();
     let mut moved: CameraCalibration = decode(&first.data).unwrap();
     let at = Timestamp::from_seconds(2.0);
     moved.valid_from_ns = at.nanos();
     moved.position.as_mut().unwrap().x += 1.0;
     let key = |channel| Key { channel, ..first.key.clone() };
-    let preview = Preview { camera: name.to_string(), capture_time_ns: at.nanos(), ..Default::default() };
+    let preview =
+        Preview { camera: name.to_string(), capture_time_ns: at.nanos(), ..Default::default() };
     let health = Health { component: name.to_string(), time_ns: at.nanos(), ..Default::default() };
     let more = [
         (Channel::Calibration(name.clone()), moved.encode()),
@@ -234,7 +239,11 @@ fn the_recorder_says_what_it_did_not_get_and_nothing_lies_in_1970() {
     let second = Link::open(site.network(), &Role::Cameras { and_fusion: true });
     assert!(second.is_err(), "its endpoint is taken");
     let counted = |health: &Health, name: &str| {
-        health.counters.iter().find(|counter| counter.name == name).map_or(0, |counter| counter.value)
+        health
+            .counters
+            .iter()
+            .find(|counter| counter.name == name)
+            .map_or(0, |counter| counter.value)
     };
     let deadline = Instant::now() + PATIENCE;
     let mut said = Health::default();
@@ -243,7 +252,8 @@ fn the_recorder_says_what_it_did_not_get_and_nothing_lies_in_1970() {
         let Some(received) = health.next(Duration::from_millis(100)) else { continue };
         let health: Health = decode(&received.data).unwrap();
         said.clone_from(&health);
-        let foreign = counted(&health, "received_foreign_camera") + counted(&health, "received_dropped");
+        let foreign =
+            counted(&health, "received_foreign_camera") + counted(&health, "received_dropped");
         if foreign >= 70_000 {
             break health;
         }
@@ -255,9 +265,11 @@ fn the_recorder_says_what_it_did_not_get_and_nothing_lies_in_1970() {
     assert!(took < Duration::from_secs(2) && code == Some(0), "{took:?}");
 
     let recorded = messages(Path::new(&site.path("live.mcap")), |_| true);
-    let frames = recorded.iter().filter(|entry| matches!(entry.key.channel, Channel::Bearings(_))).count();
+    let frames =
+        recorded.iter().filter(|entry| matches!(entry.key.channel, Channel::Bearings(_))).count();
     assert_eq!(frames, 11, "the newer one is kept");
-    let early = recorded.iter().filter(|entry| entry.data_time < Timestamp::from_seconds(begun - 1.0));
+    let early =
+        recorded.iter().filter(|entry| entry.data_time < Timestamp::from_seconds(begun - 1.0));
     assert_eq!(early.map(|entry| entry.key.to_string()).collect::<Vec<_>>(), Vec::<String>::new());
     let info = succeed(&["info", &site.path("live.mcap")]);
     assert!(info.contains("written by crossfix") && info.contains("record, run "), "{info}");

@@ -1,6 +1,10 @@
 //! Real processes joined by Zenoh over loopback.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot set itself up has failed")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    reason = "a test that cannot set itself up has failed"
+)]
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -72,7 +76,10 @@ fn agents_wait_for_the_fusion_centre_and_a_new_one_picks_them_up() {
     while subscription.next(Duration::from_millis(200)).is_some() {}
     let second = site.start_fusion();
     let after = confirmed_within(Duration::from_secs(5)).expect("the second has tracks within 5 s");
-    assert!(after.iter().all(|id| !before.contains(id)), "{before:?} and {after:?}: no track is another's");
+    assert!(
+        after.iter().all(|id| !before.contains(id)),
+        "{before:?} and {after:?}: no track is another's"
+    );
     assert!(second.stop());
 }
 
@@ -91,7 +98,8 @@ fn the_agent_follows_what_the_track_command_follows() {
     let middle = camera.camera().project(target).unwrap();
     let (left, top) = (middle.x() - 9.5, middle.y() - 6.5);
     let place = format!("{left},{top},20,14");
-    let source = "kind = \"video\"\npath = \"video/north.y4m\"\nspeed = 0.0\n[preview]\nrate_hz = 0.0";
+    let source =
+        "kind = \"video\"\npath = \"video/north.y4m\"\nspeed = 0.0\n[preview]\nrate_hz = 0.0";
     site.write_camera("north", source, &format!("boxes = [[{left:.6}, {top:.6}, 20.0, 14.0]]"));
     let recorder = site.start_recorder("live.mcap");
     let fusion = site.start_fusion();
@@ -102,7 +110,8 @@ fn the_agent_follows_what_the_track_command_follows() {
     succeed(&["track", &video, "--box", &place, "--csv", &table]);
 
     let rows = followed_rows(Path::new(&table));
-    let frames = messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
+    let frames =
+        messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
     assert_eq!(frames.len(), 120);
     let mut compared = 0;
     for (entry, row) in frames.iter().zip(rows) {
@@ -110,8 +119,8 @@ fn the_agent_follows_what_the_track_command_follows() {
         let index = row.frame;
         assert_eq!(frame.sequence, index);
         let track = &frame.tracks[0];
-        // The table has the filter's estimate, the wire the measurement: of a target that is seen, they
-        // agree to a measurement's noise.
+        // The table has the filter's estimate, the wire the measurement: of a target that is seen,
+        // they agree to a measurement's noise.
         let [cx, cy] = row.middle().unwrap().map(|middle| middle - 0.5);
         assert!((track.pixel_x - cx).hypot(track.pixel_y - cy) < 0.5, "frame {index}: {track:?}");
         compared += 1;

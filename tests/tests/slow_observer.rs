@@ -9,14 +9,14 @@ use std::time::Duration;
 use crossfix_message::{Channel, Health, decode};
 use crossfix_tests::{Site, messages, program, succeed};
 
-/// How long the site is played: `CROSSFIX_SLOW_S` asks for more. What waits for the slow one fills its
-/// queues within the first twelve seconds.
+/// How long the site is played: `CROSSFIX_SLOW_S` asks for more. What waits for the slow one fills
+/// its queues within the first twelve seconds.
 const PLAYED_S: f64 = 30.0;
 /// Where the site is.
 const ADDRESS: &str = "10.213.0.1";
 
-/// Two namespaces joined by a link, the way from the first to the second of which is slow. They vanish
-/// with this.
+/// Two namespaces joined by a link, the way from the first to the second of which is slow. They
+/// vanish with this.
 struct Namespaces {
     site: String,
     far: String,
@@ -88,16 +88,18 @@ impl Drop for Running {
     }
 }
 
-/// Plays the site in the namespaces and returns the 99th percentile of bearing to track, ms, as a recorder
-/// beside the fusion centre sees it.
+/// Plays the site in the namespaces and returns the 99th percentile of bearing to track, ms, as a
+/// recorder beside the fusion centre sees it.
 fn p99_ms(names: &Namespaces, site: &Site, has_slow_one: bool) -> f64 {
     let network = site.path("network.toml");
     let (near, slow) = (site.path("near.mcap"), site.path("slow.mcap"));
     let fusion = names.start(&names.site, &["fuse", "-c", &site.path("fusion.toml")]);
-    let recorder = names.start(&names.site, &["record", "-c", &network, "-o", &near, "--overwrite"]);
+    let recorder =
+        names.start(&names.site, &["record", "-c", &network, "-o", &near, "--overwrite"]);
     let observer = has_slow_one
         .then(|| names.start(&names.far, &["record", "-c", &network, "-o", &slow, "--overwrite"]));
-    let mut replay = names.start(&names.site, &["replay", &site.path("source.mcap"), "--network", &network]);
+    let mut replay =
+        names.start(&names.site, &["replay", &site.path("source.mcap"), "--network", &network]);
     assert!(replay.0.wait().unwrap().success());
     std::thread::sleep(Duration::from_millis(500));
     recorder.stop();
@@ -113,10 +115,13 @@ fn p99_ms(names: &Namespaces, site: &Site, has_slow_one: bool) -> f64 {
 #[test]
 fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
     let Some(names) = Namespaces::new() else {
-        eprintln!("SKIPPED: network namespaces need root, `ip` and `tc` (apt-get install iproute2)");
+        eprintln!(
+            "SKIPPED: network namespaces need root, `ip` and `tc` (apt-get install iproute2)"
+        );
         return;
     };
-    let played_s = std::env::var("CROSSFIX_SLOW_S").ok().and_then(|s| s.parse().ok()).unwrap_or(PLAYED_S);
+    let played_s =
+        std::env::var("CROSSFIX_SLOW_S").ok().and_then(|s| s.parse().ok()).unwrap_or(PLAYED_S);
     let site = Site::new(played_s);
     let mut network = site.network().clone();
     for endpoint in network.cameras.values_mut().chain([&mut network.fusion]) {
@@ -132,11 +137,15 @@ fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
     // A publisher that waits for the slow one stalls for seconds; this is the machine's own noise.
     assert!(beside < 2.0 * alone + 100.0, "p99 {beside:.1} ms instead of {alone:.1} ms");
 
-    let frames = |file: &str| messages(Path::new(&site.path(file)), |c| *c == Channel::Tracks).len();
+    let frames =
+        |file: &str| messages(Path::new(&site.path(file)), |c| *c == Channel::Tracks).len();
     let (near, slow) = (frames("near.mcap"), frames("slow.mcap"));
     let health = messages(Path::new(&site.path("slow.mcap")), |c| *c == Channel::RecorderHealth);
     let last: Health = decode(&health.last().unwrap().data).unwrap();
     let counted = |name: &str| last.counters.iter().find(|c| c.name == name).map_or(0, |c| c.value);
-    println!("{slow} of {near} track frames reached it; it counted {} missing", counted("received_missing"));
+    println!(
+        "{slow} of {near} track frames reached it; it counted {} missing",
+        counted("received_missing")
+    );
     assert!(slow < near && counted("received_missing") > 0, "{slow} of {near}: {last:?}");
 }

@@ -1,6 +1,10 @@
 //! Whoever is asked to stop does so within two seconds, whatever comes in, and leaves whole files.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test that cannot set itself up has failed")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a test that cannot set itself up has failed"
+)]
 
 use std::path::Path;
 use std::sync::Arc;
@@ -32,7 +36,8 @@ impl Traffic {
                 (Arc::clone(&stop), Arc::clone(&link), name.clone(), template.clone());
             std::thread::spawn(move || {
                 let alive = link.declare_alive(Channel::Alive(name.clone())).unwrap();
-                let bearings = link.publisher(Channel::Bearings(name.clone()), Delivery::Queued).unwrap();
+                let bearings =
+                    link.publisher(Channel::Bearings(name.clone()), Delivery::Queued).unwrap();
                 let calibrations =
                     link.publisher(Channel::Calibration(name.clone()), Delivery::Queued).unwrap();
                 let calibration = CameraCalibration::new(&name, &camera, Timestamp::EPOCH).encode();
@@ -98,7 +103,8 @@ fn stop_under_traffic(cameras: usize, rate_hz: f64) {
     stop("fuse", fusion);
     drop(traffic);
     // Whole, with its index: `messages` wants no damage.
-    let recorded = messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
+    let recorded =
+        messages(Path::new(&site.path("live.mcap")), |c| matches!(c, Channel::Bearings(_)));
     assert!(recorded.len() > 10 * cameras, "{} frames of {cameras} cameras", recorded.len());
 }
 
@@ -121,7 +127,11 @@ fn a_fusion_centre_whose_router_is_not_there_says_so_and_ends_when_asked() {
     site.write("network.toml", &toml::to_string(&network).unwrap());
     let fusion = site.start_logged(&["fuse", "-c", &site.path("fusion.toml")], "fuse.log");
     let router = network.routers[0].as_str();
-    assert!(site.wait_for_line("fuse.log", router, Duration::from_secs(5)), "{}", site.text("fuse.log"));
+    assert!(
+        site.wait_for_line("fuse.log", router, Duration::from_secs(5)),
+        "{}",
+        site.text("fuse.log")
+    );
     assert!(site.text("fuse.log").contains("no Zenoh router answers"));
     let (took, _) = fusion.terminate();
     assert!(took < LIMIT, "{took:?}");
@@ -135,7 +145,8 @@ fn an_interrupted_replay_leaves_a_whole_file_that_ends_early() {
         .args(["-q", "replay", &source, "--fuse", "-o", &tracks])
         .spawn()
         .unwrap();
-    // It writes beside its output until that is whole. Stopped at its first tracks it has most of them to go.
+    // It writes beside its output until that is whole. Stopped at its first tracks it has most of
+    // them to go.
     let part = format!("{tracks}.{}.part", replay.id());
     wait_until_recorded(&part, 10_000);
     let pid = replay.id().to_string();

@@ -17,7 +17,8 @@ fn the_fusions_figures_come_as_text_json_and_plots() {
 
     let tables: serde_json::Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();
     let tables = tables.as_array().unwrap();
-    let names: BTreeSet<&str> = tables.iter().map(|table| table["name"].as_str().unwrap()).collect();
+    let names: BTreeSet<&str> =
+        tables.iter().map(|table| table["name"].as_str().unwrap()).collect();
     assert_eq!(names.len(), tables.len(), "each table has a name of its own");
     let experiments = ["detection-distance", "degenerate-position", "fusion-bound", "batch-bound"];
     for name in experiments.into_iter().chain(["fusion-degenerate-diverged", "manoeuvre-error"]) {

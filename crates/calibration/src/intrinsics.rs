@@ -58,19 +58,23 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
     };
     let file: CalibrationFile =
         serde_saphyr::from_str(text).map_err(|error| IntrinsicsError::Yaml(Box::new(error)))?;
-    let k: [f64; 9] = file.camera_matrix.data.as_slice().try_into().map_err(|_| IntrinsicsError::Shape {
-        key: "camera_matrix",
-        wanted: "9",
-        found: file.camera_matrix.data.len(),
-    })?;
+    let k: [f64; 9] =
+        file.camera_matrix.data.as_slice().try_into().map_err(|_| IntrinsicsError::Shape {
+            key: "camera_matrix",
+            wanted: "9",
+            found: file.camera_matrix.data.len(),
+        })?;
     // Some programs write the last bits of a fit.
     if k[1].abs() > 1e-3 {
         return Err(IntrinsicsError::Skew(k[1]));
     }
     let coefficients = &file.distortion_coefficients.data;
     let model = file.distortion_model.as_deref().unwrap_or("plumb_bob");
-    let shape =
-        |wanted| IntrinsicsError::Shape { key: "distortion_coefficients", wanted, found: coefficients.len() };
+    let shape = |wanted| IntrinsicsError::Shape {
+        key: "distortion_coefficients",
+        wanted,
+        found: coefficients.len(),
+    };
     let distortion = match model {
         "plumb_bob" | "pinhole" | "radtan" => match coefficients[..] {
             [] => Distortion::None,
@@ -137,7 +141,10 @@ mod tests {
             Distortion::Fisheye([0.1, 0.0, 0.0, 0.01]),
         ] {
             let intrinsics = Intrinsics { distortion, ..intrinsics_from_yaml(OPENCV).unwrap() };
-            assert_eq!(intrinsics_from_yaml(&intrinsics_to_yaml("a", &intrinsics)).unwrap(), intrinsics);
+            assert_eq!(
+                intrinsics_from_yaml(&intrinsics_to_yaml("a", &intrinsics)).unwrap(),
+                intrinsics
+            );
         }
     }
 
@@ -150,8 +157,10 @@ mod tests {
         ));
         let negative = OPENCV.replace("[ 1400.", "[ -1400.");
         assert!(matches!(intrinsics_from_yaml(&negative), Err(IntrinsicsError::Numbers(_))));
-        let model =
-            OPENCV.replace("distortion_coefficients", "distortion_model: rational\ndistortion_coefficients");
+        let model = OPENCV.replace(
+            "distortion_coefficients",
+            "distortion_model: rational\ndistortion_coefficients",
+        );
         assert!(matches!(intrinsics_from_yaml(&model), Err(IntrinsicsError::Model(_))));
         assert!(matches!(intrinsics_from_yaml("hello"), Err(IntrinsicsError::Yaml(_))));
     }

@@ -38,7 +38,14 @@ fn search(
     let options = FitOptions { steps: 2, ..FitOptions::default() };
     bencher.bench_local(|| {
         let measure = Similarity::ZeroMeanNormalised;
-        correlator.similarity(black_box(&gate), &reference, measure, Extent::Linear, 1.0, &mut scores);
+        correlator.similarity(
+            black_box(&gate),
+            &reference,
+            measure,
+            Extent::Linear,
+            1.0,
+            &mut scores,
+        );
         let peak = scores.peak();
         let fit = fitter.fit(&gate, &reference, peak.column as f64, peak.row as f64, options);
         fit.covariance(fit.residual_variance)
@@ -57,10 +64,20 @@ fn picture_of_720p_25x15(bencher: Bencher) {
 
 #[divan::bench(args = TEMPLATES)]
 fn directly(bencher: Bencher, (width, height): (usize, usize)) {
-    search(bencher, (3 * width, 3 * height), (width, height), Correlator::with_route(Route::Direct));
+    search(
+        bencher,
+        (3 * width, 3 * height),
+        (width, height),
+        Correlator::with_route(Route::Direct),
+    );
 }
 
 #[divan::bench(args = TEMPLATES)]
 fn by_transforms(bencher: Bencher, (width, height): (usize, usize)) {
-    search(bencher, (3 * width, 3 * height), (width, height), Correlator::with_route(Route::Spectral));
+    search(
+        bencher,
+        (3 * width, 3 * height),
+        (width, height),
+        Correlator::with_route(Route::Spectral),
+    );
 }

@@ -12,7 +12,7 @@ use crate::{Extent, Plane, Reference, Similarity, SpectralWeight};
 pub enum Route {
     /// Sample by sample.
     Direct,
-    /// By Fourier transforms (001, 3.6).
+    /// By Fourier transforms (Lytvynets 2020, eq. 3.6).
     Spectral,
 }
 
@@ -22,8 +22,8 @@ pub enum Route {
 const DIRECT_NS: f64 = 0.027;
 const SPECTRAL_NS: f64 = 0.30;
 
-/// Sides of the pieces into which the spectral route cuts a large gate: these transforms stay in the
-/// cache.
+/// Sides of the pieces into which the spectral route cuts a large gate: these transforms stay in
+/// the cache.
 const PIECE: Size = Size { width: 256, height: 128 };
 
 /// Correlates references with gates; keeps its plans and its memory, so that the statistics of a
@@ -65,9 +65,9 @@ impl Correlator {
 
     /// The similarity of a reference with a gate at every placement; larger is more alike.
     ///
-    /// `floor` is the noise's standard deviation, added in square to both variances of the zero-mean
-    /// measure: a flat gate correlates with nothing. What of the reference is larger than the gate is
-    /// cut off.
+    /// `floor` is the noise's standard deviation, added in square to both variances of the
+    /// zero-mean measure: a flat gate correlates with nothing. What of the reference is larger than
+    /// the gate is cut off.
     pub fn similarity(
         &mut self,
         gate: &Plane,
@@ -84,7 +84,9 @@ impl Correlator {
                 self.products(gate, reference.image(), extent, scores);
             }
             Similarity::Normalised => self.normalised(gate, reference, extent, scores),
-            Similarity::ZeroMeanNormalised => self.zero_mean(gate, reference, extent, floor, scores),
+            Similarity::ZeroMeanNormalised => {
+                self.zero_mean(gate, reference, extent, floor, scores);
+            }
             Similarity::Phase => {
                 let weight = SpectralWeight { whitening: 1.0, band: f32::INFINITY };
                 self.cross_spectrum(gate, reference, weight, extent, scores);
@@ -100,7 +102,9 @@ impl Correlator {
                 self.slide(LargestDifference, gate, reference.image(), extent, scores);
                 scores.samples_mut().iter_mut().for_each(|s| *s = -*s);
             }
-            Similarity::SquaredDifferences => self.squared_differences(gate, reference, extent, scores),
+            Similarity::SquaredDifferences => {
+                self.squared_differences(gate, reference, extent, scores);
+            }
         }
     }
 
@@ -203,7 +207,8 @@ impl Correlator {
 
     /// The placements inside the gate by transforms, a large gate piece by piece (overlap-save).
     fn linear_spectral(&mut self, gate: &Plane, kernel: &Plane, out: &mut Plane) {
-        let (width, height) = (gate.width() + 1 - kernel.width(), gate.height() + 1 - kernel.height());
+        let (width, height) =
+            (gate.width() + 1 - kernel.width(), gate.height() + 1 - kernel.height());
         out.reshape(width, height);
         // A piece holds at least three kernels: else most of it would be overlap.
         let side = |piece: usize, kernel: usize, gate: usize| piece.max(4 * kernel).min(gate);
@@ -244,7 +249,13 @@ impl Correlator {
         }
     }
 
-    fn normalised(&mut self, gate: &Plane, reference: &Reference, extent: Extent, scores: &mut Plane) {
+    fn normalised(
+        &mut self,
+        gate: &Plane,
+        reference: &Reference,
+        extent: Extent,
+        scores: &mut Plane,
+    ) {
         let plain = Reference::new(
             reference.image().clone(),
             crate::Window::uniform(reference.image().width(), reference.image().height()),
@@ -300,9 +311,10 @@ impl Correlator {
         weigh(&mut self.gate_spectrum, size, weight);
         let (width, height) = match extent {
             Extent::Circular => (size.width, size.height),
-            Extent::Linear => {
-                (size.width + 1 - reference.image().width(), size.height + 1 - reference.image().height())
-            }
+            Extent::Linear => (
+                size.width + 1 - reference.image().width(),
+                size.height + 1 - reference.image().height(),
+            ),
         };
         transform.inverse(&mut self.gate_spectrum, width, height, scores);
     }
@@ -338,10 +350,12 @@ fn fitting(gate: &Plane, reference: &Reference) -> Option<Reference> {
     let image = reference.image();
     let (width, height) = (image.width().min(gate.width()), image.height().min(gate.height()));
     let cut = (width, height) != (image.width(), image.height());
-    cut.then(|| Reference::new(image.crop(0, 0, width, height), crate::Window::uniform(width, height)))
+    cut.then(|| {
+        Reference::new(image.crop(0, 0, width, height), crate::Window::uniform(width, height))
+    })
 }
 
-/// Multiplies a cross-spectrum by a weight (001, 3.7).
+/// Multiplies a cross-spectrum by a weight (Lytvynets 2020, eq. 3.7).
 fn weigh(spectrum: &mut Spectrum, size: Size, weight: SpectralWeight) {
     let largest = spectrum.0.iter().map(|value| value.norm()).fold(0.0, f32::max);
     // What is below the rounding of the largest term has no phase.

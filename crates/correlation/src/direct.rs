@@ -15,15 +15,15 @@ pub(crate) trait Term: Copy {
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s;
 }
 
-/// The sum of products (001, 3.1).
+/// The sum of products (Lytvynets 2020, eq. 3.1).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Product;
 
-/// The sum of absolute differences (001, 3.10).
+/// The sum of absolute differences (Lytvynets 2020, eq. 3.10).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AbsoluteDifference;
 
-/// The largest absolute difference (001, 3.12).
+/// The largest absolute difference (Lytvynets 2020, eq. 3.12).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LargestDifference;
 

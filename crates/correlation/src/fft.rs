@@ -38,8 +38,8 @@ impl Size {
         Self { width: plane.width(), height: plane.height() }
     }
 
-    /// The least good size that holds so many columns and rows: multiples of 16 with no prime factor
-    /// above 5 are twice as fast as awkward sides.
+    /// The least good size that holds so many columns and rows: multiples of 16 with no prime
+    /// factor above 5 are twice as fast as awkward sides.
     pub(crate) fn holding(width: usize, height: usize) -> Self {
         let good = |side: usize| {
             let mut side = side.next_multiple_of(16);
@@ -95,7 +95,8 @@ impl Transform {
                 used.copy_from_slice(plane.row(first + y));
                 rest.fill(0.0);
                 // The lengths are the plan's own: it cannot refuse them.
-                let _ = self.row_forward.process_with_scratch(&mut self.row, out, &mut self.scratch);
+                let _ =
+                    self.row_forward.process_with_scratch(&mut self.row, out, &mut self.scratch);
             }
             for x in 0..half {
                 let column = &mut spectrum.0[x * height + first..x * height + first + count];
@@ -128,12 +129,14 @@ impl Transform {
                 }
             }
             for (y, row) in self.rows.chunks_exact_mut(half).take(count).enumerate() {
-                // A real row's first and middle terms are real up to rounding; realfft wants exactly.
+                // A real row's first and middle terms are real up to rounding; realfft wants
+                // exactly.
                 row[0].im = 0.0;
                 if self.size.width.is_multiple_of(2) {
                     row[half - 1].im = 0.0;
                 }
-                let _ = self.row_inverse.process_with_scratch(row, &mut self.row, &mut self.scratch);
+                let _ =
+                    self.row_inverse.process_with_scratch(row, &mut self.row, &mut self.scratch);
                 for (out, value) in plane.row_mut(first + y).iter_mut().zip(&self.row) {
                     *out = value * scale;
                 }

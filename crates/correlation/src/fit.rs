@@ -137,7 +137,12 @@ impl Fitter {
         };
         for _ in 0..options.steps {
             let (left, top) = (bx as f64 - place[0], by as f64 - place[1]);
-            reference.spline().sample_with_gradient(left, top, &mut self.resampler, &mut self.model);
+            reference.spline().sample_with_gradient(
+                left,
+                top,
+                &mut self.resampler,
+                &mut self.model,
+            );
             let normal = self.normal(options.freedom, place);
             let Some(step) = normal.solve(options, &mut fit) else { break };
             for axis in 0..2 {
@@ -172,7 +177,9 @@ impl Fitter {
         }
         let Sampled { value, by_x, by_y } = &self.model;
         let mut normal = match freedom {
-            Freedom::Shift => Arch::new().dispatch(Products([value, by_x, by_y, &self.image])).spread(),
+            Freedom::Shift => {
+                Arch::new().dispatch(Products([value, by_x, by_y, &self.image])).spread()
+            }
             Freedom::ShiftScaleTurn => {
                 let planes = [value, by_x, by_y, &self.by_scale, &self.by_turn, &self.image];
                 Arch::new().dispatch(Products(planes))
@@ -224,7 +231,8 @@ impl Normal {
         spread
     }
 
-    /// The step of the place, and what the fit is like before it. `None` if the image tells no step.
+    /// The step of the place, and what the fit is like before it. `None` if the image tells no
+    /// step.
     fn solve(&self, options: FitOptions, fit: &mut Fit) -> Option<[f64; 2]> {
         let p = &self.products;
         let energy = p[0][0];
@@ -251,8 +259,10 @@ impl Normal {
         fit.gain = gain;
         let freedoms = if shift_only { 4.0 } else { 6.0 };
         let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
-        let explained = if options.contrast.is_some() { gain * fitted[0] } else { solution.dot(&fitted) };
-        fit.residual_variance = ((p[5][5] - explained) / (fit.pixels as f64 - freedoms).max(1.0)).max(0.0);
+        let explained =
+            if options.contrast.is_some() { gain * fitted[0] } else { solution.dot(&fitted) };
+        fit.residual_variance =
+            ((p[5][5] - explained) / (fit.pixels as f64 - freedoms).max(1.0)).max(0.0);
         if gain <= 0.0 || !gain.is_finite() {
             return None;
         }
@@ -334,7 +344,10 @@ mod tests {
         let options = FitOptions { freedom: Freedom::ShiftScaleTurn, ..FitOptions::default() };
         let fit = Fitter::default().fit(&image, &reference(), 23.0, 16.0, options);
         assert!((fit.x - 23.3).abs() < 0.02 && (fit.y - 15.8).abs() < 0.02, "{fit:?}");
-        assert!((fit.log_scale - 0.05).abs() < 0.01 && (fit.turn_rad - 0.06).abs() < 0.015, "{fit:?}");
+        assert!(
+            (fit.log_scale - 0.05).abs() < 0.01 && (fit.turn_rad - 0.06).abs() < 0.015,
+            "{fit:?}"
+        );
     }
 
     #[test]

@@ -128,7 +128,13 @@ impl Resampler {
     }
 
     fn passes(&mut self, along: [f32; TAPS], across: [f32; TAPS], to: &mut Plane) {
-        Arch::new().dispatch(Passes { part: &self.part, along, across, lines: &mut self.lines, to });
+        Arch::new().dispatch(Passes {
+            part: &self.part,
+            along,
+            across,
+            lines: &mut self.lines,
+            to,
+        });
     }
 
     /// Cuts the samples out that a part is made of; returns the fractions.
@@ -168,7 +174,13 @@ impl Spline {
         let (taps, pad) = (prefilter(), MARGIN + REACH as isize);
         let wide = |side: usize, pad: isize| side + 2 * pad as usize;
         let (width, height) = (wide(plane.width(), MARGIN), wide(plane.height(), MARGIN));
-        plane.crop_into(-pad, -pad, wide(plane.width(), pad), wide(plane.height(), pad), &mut self.padded);
+        plane.crop_into(
+            -pad,
+            -pad,
+            wide(plane.width(), pad),
+            wide(plane.height(), pad),
+            &mut self.padded,
+        );
         self.lines.reshape(width, self.padded.height());
         self.coefficients.reshape(width, height);
         let Self { padded, lines, coefficients } = self;
@@ -188,7 +200,8 @@ impl Spline {
         to.by_x.reshape(width, height);
         to.by_y.reshape(width, height);
         let margin = MARGIN as f64;
-        let (fx, fy) = resampler.support(&self.coefficients, left + margin, top + margin, &to.value);
+        let (fx, fy) =
+            resampler.support(&self.coefficients, left + margin, top + margin, &to.value);
         let Resampler { part, lines } = resampler;
         Arch::new().dispatch(GradientPasses { part, fx, fy, lines, to });
     }
@@ -304,10 +317,12 @@ impl WithSimd for Turned<'_> {
                 let (i, j) = (x as usize, y as usize);
                 let (fx, fy) = (x - i as f32, y - j as f32);
                 let at = j * stride + i;
-                let Some([a, b]) = samples.get(at..at + 2).and_then(|pair| pair.first_chunk()) else {
+                let Some([a, b]) = samples.get(at..at + 2).and_then(|pair| pair.first_chunk())
+                else {
                     continue;
                 };
-                let below = samples.get(at + stride..at + stride + 2).and_then(|pair| pair.first_chunk());
+                let below =
+                    samples.get(at + stride..at + stride + 2).and_then(|pair| pair.first_chunk());
                 let Some([c, d]) = below else { continue };
                 let upper = a + fx * (b - a);
                 let lower = c + fx * (d - c);
@@ -349,7 +364,10 @@ mod tests {
         Resampler::default().sample(&plane, 6.3, 5.8, &mut part);
         for y in 0..4 {
             for x in 0..5 {
-                assert!((f64::from(part.row(y)[x]) - value(6.3 + x as f64, 5.8 + y as f64)).abs() < 1e-4);
+                assert!(
+                    (f64::from(part.row(y)[x]) - value(6.3 + x as f64, 5.8 + y as f64)).abs()
+                        < 1e-4
+                );
             }
         }
     }
@@ -359,7 +377,11 @@ mod tests {
         let plane = Plane::from_fn(30, 30, |x, y| (2 * x + 7 * y) as f32);
         let mut seen = Plane::from_fn(5, 3, |_, _| 0.0);
         let turn_rad = std::f64::consts::FRAC_PI_2;
-        Resampler::default().look(&plane, View { x: 15.0, y: 14.0, scale: 2.0, turn_rad }, &mut seen);
+        Resampler::default().look(
+            &plane,
+            View { x: 15.0, y: 14.0, scale: 2.0, turn_rad },
+            &mut seen,
+        );
         // Rows run down the plane, two samples a step; the next row lies to the left.
         assert!((seen.row(1)[4] - (2 * 15 + 7 * 18) as f32).abs() < 1e-3, "{seen:?}");
         assert!((seen.row(2)[2] - (2 * 13 + 7 * 14) as f32).abs() < 1e-3, "{seen:?}");

@@ -1,5 +1,5 @@
 //! Similarity of a reference image with a gate of the current image: the
-//! measures of 000 and 001 (chapter 3), by planned real FFTs or sample by
+//! measures of Herasymenko 2021 and Lytvynets 2020 (chapter 3), by planned real FFTs or sample by
 //! sample, and where they peak between the samples, with a covariance.
 //!
 //! ```

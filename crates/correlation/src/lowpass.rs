@@ -3,9 +3,9 @@ use crate::Plane;
 /// Half the length of the longest filter.
 const MOST_REACH: usize = 5;
 
-/// A Gaussian low-pass over both axes, the border going on beyond itself: what a noisy reference needs
-/// before it is interpolated, for between the samples its noise is less than at them, and a fit would
-/// go there.
+/// A Gaussian low-pass over both axes, the border going on beyond itself: what a noisy reference
+/// needs before it is interpolated, for between the samples its noise is less than at them, and a
+/// fit would go there.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LowPass {
     deviation: f32,
@@ -34,10 +34,12 @@ impl LowPass {
             .collect();
         let sum: f32 = taps.iter().sum();
         taps.iter_mut().for_each(|tap| *tap /= sum);
-        let at = |k: isize| usize::try_from(k).ok().and_then(|k| taps.get(k)).copied().unwrap_or(0.0);
+        let at =
+            |k: isize| usize::try_from(k).ok().and_then(|k| taps.get(k)).copied().unwrap_or(0.0);
         let squares: f32 = taps.iter().map(|tap| tap * tap).sum();
         let own = taps[reach];
-        // The central difference of one sample's weights with that of the sample: on its axis h(0) and h(2), across it h(0).
+        // The central difference of one sample's weights with that of the sample: on its axis h(0)
+        // and h(2), across it h(0).
         let cross = 0.5 * (own - at(reach as isize + 2)) * own;
         Self {
             deviation,
@@ -63,7 +65,8 @@ impl LowPass {
         self.own_weight
     }
 
-    /// Covariance of white noise's central difference along an axis before and after, over the noise's variance.
+    /// Covariance of white noise's central difference along an axis before and after, over the
+    /// noise's variance.
     pub fn cross_gradient_gain(&self) -> f32 {
         self.cross_gradient_gain
     }
@@ -77,7 +80,13 @@ impl LowPass {
         }
         let reach = (self.taps.len() / 2) as isize;
         let (width, height) = (from.width(), from.height());
-        from.crop_into(-reach, -reach, width + 2 * reach as usize, height + 2 * reach as usize, padded);
+        from.crop_into(
+            -reach,
+            -reach,
+            width + 2 * reach as usize,
+            height + 2 * reach as usize,
+            padded,
+        );
         lines.reshape(width, padded.height());
         to.reshape(width, height);
         for y in 0..padded.height() {

@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-/// How alike two images are: the measures of 001, chapter 3. `h` is the gate, `g` the reference
-/// placed at (x, y) of it; a map of similarity is largest where they are most alike.
+/// How alike two images are: the measures of Lytvynets 2020, chapter 3. `h` is the gate, `g` the
+/// reference placed at (x, y) of it; a map of similarity is largest where they are most alike.
 ///
 /// (3.1) and (3.6) as printed return the displacement with the wrong sign (erratum); here a peak at
 /// (x, y) always is the reference with its top left sample at (x, y) of the gate.
@@ -13,7 +13,7 @@ pub enum Similarity {
     /// Normalised cross-correlation `R = sum h g / sqrt(sum h^2 sum g^2)` (3.3), from 0 to 1 on
     /// brightness.
     Normalised,
-    /// (3.3) with the means removed, from -1 to 1: what the text means, by its range and its
+    /// (3.3) with the means removed, from -1 to 1: what is meant, by its range and its
     /// insensitivity to brightness (erratum). Weighted by the reference's window. The default.
     #[default]
     ZeroMeanNormalised,

@@ -94,7 +94,8 @@ fn accumulate(columns: &mut [f32], row: &[f32], squares: bool, sign: f32) {
     }
 }
 
-/// Sums of `width` samples from each place on, valid where all samples are there. The rows are memory.
+/// Sums of `width` samples from each place on, valid where all samples are there. The rows are
+/// memory.
 #[inline(always)]
 fn row_sums<'a>(samples: &[f32], rows: &'a mut [Vec<f32>; 2], width: usize) -> &'a [f32] {
     let [from, to] = rows;

@@ -23,8 +23,8 @@ pub struct SubPixelPeak {
 }
 
 impl Plane {
-    /// The largest sample; the first of several. NaNs are left out, and a plane of NaNs peaks at its
-    /// first sample.
+    /// The largest sample; the first of several. NaNs are left out, and a plane of NaNs peaks at
+    /// its first sample.
     pub fn peak(&self) -> Peak {
         let mut best = Peak { column: 0, row: 0, score: f32::NEG_INFINITY };
         for (index, &score) in self.samples().iter().enumerate() {
@@ -57,7 +57,8 @@ impl Peak {
         let inner_x = column > 0 && column + 1 < scores.width();
         let inner_y = row > 0 && row + 1 < scores.height();
         let here = scores.row(row);
-        let dx = if inner_x { vertex(here[column - 1], here[column], here[column + 1]) } else { 0.0 };
+        let dx =
+            if inner_x { vertex(here[column - 1], here[column], here[column + 1]) } else { 0.0 };
         let dy = if inner_y {
             vertex(scores.row(row - 1)[column], here[column], scores.row(row + 1)[column])
         } else {
@@ -73,8 +74,9 @@ mod tests {
 
     #[test]
     fn a_parabola_is_found_exactly_and_a_border_peak_stays() {
-        let scores =
-            Plane::from_fn(9, 7, |x, y| 1.0 - 0.01 * ((x as f32 - 4.3).powi(2) + (y as f32 - 2.8).powi(2)));
+        let scores = Plane::from_fn(9, 7, |x, y| {
+            1.0 - 0.01 * ((x as f32 - 4.3).powi(2) + (y as f32 - 2.8).powi(2))
+        });
         let peak = scores.peak().refined(&scores);
         assert!((peak.x - 4.3).abs() < 1e-4 && (peak.y - 2.8).abs() < 1e-4);
         let slope = Plane::from_fn(5, 5, |x, _| x as f32);

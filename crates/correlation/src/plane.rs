@@ -13,7 +13,8 @@ pub struct Plane {
 
 impl PartialEq for Plane {
     fn eq(&self, other: &Self) -> bool {
-        (self.width, self.height) == (other.width, other.height) && self.samples() == other.samples()
+        (self.width, self.height) == (other.width, other.height)
+            && self.samples() == other.samples()
     }
 }
 
@@ -33,7 +34,11 @@ impl Plane {
     }
 
     /// A plane of what a function says of column and row. Sides of zero are taken as one.
-    pub fn from_fn(width: usize, height: usize, mut sample: impl FnMut(usize, usize) -> f32) -> Self {
+    pub fn from_fn(
+        width: usize,
+        height: usize,
+        mut sample: impl FnMut(usize, usize) -> f32,
+    ) -> Self {
         let (width, height) = (width.max(1), height.max(1));
         let mut plane = Self { width, height, samples: vec![0.0; width * height + PADDING] };
         for (i, value) in plane.samples_mut().iter_mut().enumerate() {

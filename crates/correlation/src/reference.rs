@@ -18,8 +18,8 @@ impl Window {
         Self { columns, rows, uniform: true }
     }
 
-    /// A Gaussian about the middle, with a standard deviation of a share of each side: the target in
-    /// the middle counts, the background at the border little.
+    /// A Gaussian about the middle, with a standard deviation of a share of each side: the target
+    /// in the middle counts, the background at the border little.
     pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
         let weight = |index: usize, side: usize| {
             let distance = (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
@@ -101,7 +101,8 @@ impl Reference {
         let same = (image.width(), image.height()) == (window.width(), window.height());
         assert!(same, "window and image differ in size");
         let kernel = image.clone();
-        let mut reference = Self { image, window, kernel, spline: Spline::default(), variance: 0.0 };
+        let mut reference =
+            Self { image, window, kernel, spline: Spline::default(), variance: 0.0 };
         reference.prepare();
         reference
     }
@@ -112,7 +113,8 @@ impl Reference {
         let (columns, rows) = (window.columns.samples(), window.rows.samples());
         let mut mean = 0.0;
         for (y, &across) in rows.iter().enumerate() {
-            let line: f32 = image.row(y).iter().zip(columns).map(|(sample, along)| sample * along).sum();
+            let line: f32 =
+                image.row(y).iter().zip(columns).map(|(sample, along)| sample * along).sum();
             mean += across * line;
         }
         let mut sum = 0.0;
@@ -127,8 +129,8 @@ impl Reference {
         *variance = sum;
     }
 
-    /// Changes the image in place and prepares it anew; one that changes its size has a uniform window
-    /// from then on.
+    /// Changes the image in place and prepares it anew; one that changes its size has a uniform
+    /// window from then on.
     pub fn update(&mut self, change: impl FnOnce(&mut Plane)) {
         change(&mut self.image);
         let (width, height) = (self.image.width(), self.image.height());

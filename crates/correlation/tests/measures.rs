@@ -1,6 +1,8 @@
 //! Every similarity measure against its definition, on both routes.
 
-use crossfix_correlation::{Correlator, Extent, Plane, Reference, Route, Similarity, SpectralWeight, Window};
+use crossfix_correlation::{
+    Correlator, Extent, Plane, Reference, Route, Similarity, SpectralWeight, Window,
+};
 use proptest::prelude::*;
 
 fn noise(width: usize, height: usize, seed: u32) -> Plane {
@@ -24,13 +26,19 @@ const ALL: [Similarity; 8] = [
     Similarity::MaximumDifference,
 ];
 
-fn scores(route: Route, gate: &Plane, reference: &Reference, measure: Similarity, extent: Extent) -> Plane {
+fn scores(
+    route: Route,
+    gate: &Plane,
+    reference: &Reference,
+    measure: Similarity,
+    extent: Extent,
+) -> Plane {
     let mut scores = Plane::default();
     Correlator::with_route(route).similarity(gate, reference, measure, extent, 1.0, &mut scores);
     scores
 }
 
-/// The definitions of 001, sample by sample, of the measures that have one in samples.
+/// The definitions of Lytvynets 2020, sample by sample, of the measures that have one in samples.
 fn defined(gate: &Plane, reference: &Reference, measure: Similarity, extent: Extent) -> Plane {
     let (w, h) = (reference.image().width(), reference.image().height());
     let (width, height) = match extent {
@@ -42,7 +50,9 @@ fn defined(gate: &Plane, reference: &Reference, measure: Similarity, extent: Ext
         let places = || (0..h).flat_map(move |j| (0..w).map(move |i| (i, j)));
         let sum = |term: &dyn Fn(f32, f32, f32) -> f32| -> f32 {
             places()
-                .map(|(i, j)| term(part(i, j), reference.image().row(j)[i], reference.window().weight(i, j)))
+                .map(|(i, j)| {
+                    term(part(i, j), reference.image().row(j)[i], reference.window().weight(i, j))
+                })
                 .sum()
         };
         match measure {
@@ -53,14 +63,15 @@ fn defined(gate: &Plane, reference: &Reference, measure: Similarity, extent: Ext
             Similarity::ZeroMeanNormalised => {
                 let (a0, b0) = (sum(&|a, _, w| w * a), sum(&|_, b, w| w * b));
                 let cross = sum(&|a, b, w| w * (a - a0) * (b - b0));
-                let (va, vb) = (sum(&|a, _, w| w * (a - a0).powi(2)), sum(&|_, b, w| w * (b - b0).powi(2)));
+                let (va, vb) =
+                    (sum(&|a, _, w| w * (a - a0).powi(2)), sum(&|_, b, w| w * (b - b0).powi(2)));
                 cross / ((va + 1.0) * (vb + 1.0)).sqrt()
             }
             Similarity::AbsoluteDifferences => -sum(&|a, b, _| (a - b).abs()),
             Similarity::SquaredDifferences => -sum(&|a, b, _| (a - b).powi(2)).sqrt(),
-            Similarity::MaximumDifference => {
-                -places().map(|(i, j)| (part(i, j) - reference.image().row(j)[i]).abs()).fold(0.0, f32::max)
-            }
+            Similarity::MaximumDifference => -places()
+                .map(|(i, j)| (part(i, j) - reference.image().row(j)[i]).abs())
+                .fold(0.0, f32::max),
             Similarity::Phase | Similarity::CrossSpectrum(_) => 0.0,
         }
     })
@@ -100,7 +111,11 @@ fn every_measure_finds_a_known_shift_on_each_axis() {
         for measure in ALL.into_iter().filter(|m| *m != Similarity::CrossCorrelation) {
             for extent in [Extent::Linear, Extent::Circular] {
                 let peak = scores(Route::Direct, &gate, &reference, measure, extent).peak();
-                assert_eq!((peak.column, peak.row), (x as usize, y as usize), "{measure:?} {extent:?}");
+                assert_eq!(
+                    (peak.column, peak.row),
+                    (x as usize, y as usize),
+                    "{measure:?} {extent:?}"
+                );
             }
         }
     }

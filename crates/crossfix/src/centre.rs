@@ -1,12 +1,12 @@
-//! The fusion as its two shells need it, live and offline: what comes in is read, refused, counted and
-//! said in one way.
+//! The fusion as its two shells need it, live and offline: what comes in is read, refused, counted
+//! and said in one way.
 
 use std::time::Instant;
 
 use crossfix_fusion::{CameraReport, CameraStanding, ConfigError, Fusion, FusionConfig, Output};
 use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraHealth, CameraName, Channel, Counter, DecodeError, Health,
-    Payload, Timestamp, decode,
+    BearingFrame, CameraCalibration, CameraHealth, CameraName, Channel, Counter, DecodeError,
+    Health, Payload, Timestamp, decode,
 };
 
 use crate::repeats::Repeats;
@@ -77,7 +77,10 @@ fn read_of<M: OfCamera>(camera: &CameraName, data: &[u8]) -> Result<M, Unread> {
 
 impl Centre {
     /// A fusion that listens to some cameras, or to all.
-    pub fn new(config: FusionConfig, cameras: Option<Vec<CameraName>>) -> Result<Self, ConfigError> {
+    pub fn new(
+        config: FusionConfig,
+        cameras: Option<Vec<CameraName>>,
+    ) -> Result<Self, ConfigError> {
         Ok(Self {
             fusion: Fusion::new(config)?,
             cameras,
@@ -93,8 +96,8 @@ impl Centre {
         self.cameras.as_ref().is_none_or(|cameras| cameras.contains(camera))
     }
 
-    /// Takes a message in and returns what follows from it. `sender` is for the warning, where there is
-    /// something to warn of.
+    /// Takes a message in and returns what follows from it. `sender` is for the warning, where
+    /// there is something to warn of.
     pub fn take(&mut self, channel: &Channel, data: &[u8], sender: &str) -> Vec<Output> {
         let Some(camera) = channel.camera() else {
             return Vec::new();
@@ -107,27 +110,33 @@ impl Centre {
             return Vec::new();
         }
         let outputs = match channel {
-            Channel::Bearings(_) => match self.used(camera, read_of::<BearingFrame>(camera, data), sender) {
-                Some(frame) => self.fusion.ingest(&frame),
-                None => Vec::new(),
-            },
+            Channel::Bearings(_) => {
+                match self.used(camera, read_of::<BearingFrame>(camera, data), sender) {
+                    Some(frame) => self.fusion.ingest(&frame),
+                    None => Vec::new(),
+                }
+            }
             Channel::Calibration(_) => {
                 self.calibrate(camera, data, sender);
                 Vec::new()
             }
-            Channel::CameraHealth(_) => match self.used(camera, read_of::<Health>(camera, data), sender) {
-                Some(health) => self.hear_of(camera, &health),
-                None => Vec::new(),
-            },
+            Channel::CameraHealth(_) => {
+                match self.used(camera, read_of::<Health>(camera, data), sender) {
+                    Some(health) => self.hear_of(camera, &health),
+                    None => Vec::new(),
+                }
+            }
             _ => Vec::new(),
         };
         if let Some(why) = self.fusion.why_nothing() {
-            self.repeats.warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
+            self.repeats
+                .warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
         }
         self.follow(outputs)
     }
 
-    /// Takes a calibration in. An impossible one is counted, and what was known of the camera stays.
+    /// Takes a calibration in. An impossible one is counted, and what was known of the camera
+    /// stays.
     fn calibrate(&mut self, camera: &CameraName, data: &[u8], sender: &str) {
         let read = read_of::<CameraCalibration>(camera, data);
         let Some(message) = self.used(camera, read, sender) else {
@@ -156,8 +165,12 @@ impl Centre {
             Err(error) => error,
         };
         let (counter, kind) = match error {
-            Unread::Decode(DecodeError::Malformed { .. }) => (&mut self.refused.malformed, "malformed"),
-            Unread::Decode(DecodeError::TooLarge { .. }) => (&mut self.refused.too_large, "too large"),
+            Unread::Decode(DecodeError::Malformed { .. }) => {
+                (&mut self.refused.malformed, "malformed")
+            }
+            Unread::Decode(DecodeError::TooLarge { .. }) => {
+                (&mut self.refused.too_large, "too large")
+            }
             Unread::Decode(DecodeError::NewerMajor { .. }) => (&mut self.refused.newer, "newer"),
             Unread::Mismatched { .. } => (&mut self.refused.mismatched, "mismatched"),
         };
@@ -221,11 +234,13 @@ impl Centre {
             ("received_newer_version", refused.newer),
             ("received_too_large", refused.too_large),
         ];
-        let counted = own.into_iter().chain(counted.iter().copied()).chain(self.fusion.counters().iter());
+        let counted =
+            own.into_iter().chain(counted.iter().copied()).chain(self.fusion.counters().iter());
         let counters = counted.map(|(name, value)| Counter { name: name.to_owned(), value });
         let mut counters: Vec<Counter> = counters.collect();
         counters.sort_by(|a, b| a.name.cmp(&b.name));
-        let left_out = self.fusion.cameras().filter(|report| report.standing == CameraStanding::Excluded);
+        let left_out =
+            self.fusion.cameras().filter(|report| report.standing == CameraStanding::Excluded);
         let left_out = left_out.map(|report| format!("camera `{}` is left out", report.camera));
         let nothing = self.fusion.why_nothing().map(|why| format!("nothing is found: {why}"));
         Health {
@@ -277,7 +292,12 @@ mod tests {
     use super::*;
 
     fn count(centre: &Centre, name: &str) -> u64 {
-        centre.health(&[]).counters.iter().find(|counter| counter.name == name).map_or(0, |c| c.value)
+        centre
+            .health(&[])
+            .counters
+            .iter()
+            .find(|counter| counter.name == name)
+            .map_or(0, |c| c.value)
     }
 
     #[test]
@@ -285,8 +305,10 @@ mod tests {
         let [north, east]: [CameraName; 2] = ["north", "east"].map(|name| name.parse().unwrap());
         let mut centre = Centre::new(FusionConfig::default(), None).unwrap();
         let frame = BearingFrame { camera: "north".into(), ..Default::default() }.encode();
-        let calibration = CameraCalibration { camera: "north".into(), ..Default::default() }.encode();
-        let ended = Health { component: "north".into(), ended: true, ..Default::default() }.encode();
+        let calibration =
+            CameraCalibration { camera: "north".into(), ..Default::default() }.encode();
+        let ended =
+            Health { component: "north".into(), ended: true, ..Default::default() }.encode();
         let mut take = |channel: Channel, data: &[u8]| drop(centre.take(&channel, data, ""));
         take(Channel::Bearings(north.clone()), &frame);
         take(Channel::Bearings(east.clone()), &frame);

@@ -27,8 +27,8 @@ pub struct CameraIdentity {
 }
 
 impl CameraIdentity {
-    /// The message of one exposure, and how many tracks are not in it, as the lens shows no direction at
-    /// their pixels.
+    /// The message of one exposure, and how many tracks are not in it, as the lens shows no
+    /// direction at their pixels.
     pub fn bearing_frame(
         &self,
         sequence: u64,
@@ -50,9 +50,9 @@ impl CameraIdentity {
         (frame, unseen)
     }
 
-    /// A track as it goes over the wire: the measurement where there is one, else the prediction with
-    /// its own covariance, marked as such. The fusion wants measurements that are independent of each other, so it gets
-    /// the place in this image and not the image filter's estimate.
+    /// A track as it goes over the wire: the measurement where there is one, else the prediction
+    /// with its own covariance, marked as such. The fusion wants measurements that are independent
+    /// of each other, so it gets the place in this image and not the image filter's estimate.
     fn bearing_track(&self, track: &ImageTrack) -> Result<BearingTrack, GeometryError> {
         let Measurement { place, covariance } = track.measured.unwrap_or_else(|| predicted(track));
         let pixel = Pixel::new(place.x, place.y);
@@ -88,7 +88,8 @@ impl CameraIdentity {
             .map(|index| {
                 let (x, y) = (index % width * divisor, index / width * divisor);
                 // The mean of the block, so that a target of a few pixels does not vanish.
-                let block = (0..divisor * divisor).map(|i| image.row(y + i / divisor)[x + i % divisor]);
+                let block =
+                    (0..divisor * divisor).map(|i| image.row(y + i / divisor)[x + i % divisor]);
                 (block.sum::<f32>() / (divisor * divisor) as f32).round().clamp(0.0, 255.0) as u8
             })
             .collect();
@@ -108,9 +109,9 @@ impl CameraIdentity {
 /// Where a track that this image did not show is believed to be, and how well that is known: to a
 /// pixel where the tracker does not say.
 fn predicted(track: &ImageTrack) -> Measurement {
-    let covariance = track
-        .covariances
-        .map_or_else(Matrix2::identity, |[x, y]| Matrix2::from_diagonal(&Vector2::new(x.m11, y.m11)));
+    let covariance = track.covariances.map_or_else(Matrix2::identity, |[x, y]| {
+        Matrix2::from_diagonal(&Vector2::new(x.m11, y.m11))
+    });
     Measurement { place: track.position, covariance }
 }
 
@@ -118,7 +119,9 @@ fn predicted(track: &ImageTrack) -> Measurement {
 pub fn jpeg(brightness: &[u8], width: usize, height: usize) -> Option<Vec<u8>> {
     let mut data = Vec::new();
     let (width, height) = (u16::try_from(width).ok()?, u16::try_from(height).ok()?);
-    Encoder::new(&mut data, JPEG_QUALITY).encode(brightness, width, height, ColorType::Luma).ok()?;
+    Encoder::new(&mut data, JPEG_QUALITY)
+        .encode(brightness, width, height, ColorType::Luma)
+        .ok()?;
     Some(data)
 }
 
@@ -142,7 +145,8 @@ mod tests {
             cy: 239.5,
             distortion: Distortion::None,
         };
-        let pose = Pose::looking_at(Point3::new(100.0, 0.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
+        let pose =
+            Pose::looking_at(Point3::new(100.0, 0.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
         let identity = CameraIdentity {
             name: "north".parse().unwrap(),
             camera: Camera::new(intrinsics, pose).unwrap(),

@@ -25,7 +25,14 @@ pub struct LoggingArgs {
     #[arg(short, long, global = true, help_heading = "Logs", conflicts_with = "verbose")]
     quiet: bool,
     /// Form of the logs on stderr.
-    #[arg(long, global = true, help_heading = "Logs", value_enum, default_value_t, value_name = "FORMAT")]
+    #[arg(
+        long,
+        global = true,
+        help_heading = "Logs",
+        value_enum,
+        default_value_t,
+        value_name = "FORMAT"
+    )]
     log_format: LogFormat,
 }
 

@@ -11,7 +11,8 @@ const PERIOD: Duration = Duration::from_secs(60);
 /// Names in a line; the rest is a number.
 const NAMED: usize = 8;
 
-/// Looks who of those that a component needs is there, and says who comes, who goes, and that nobody is.
+/// Looks who of those that a component needs is there, and says who comes, who goes, and that
+/// nobody is.
 pub struct Lookout {
     presence: Presence,
     site: String,
@@ -31,7 +32,11 @@ struct Other {
 
 impl Lookout {
     /// For those who need cameras.
-    pub fn for_cameras(link: &Link, network: &NetworkConfig, cameras: &[CameraName]) -> anyhow::Result<Self> {
+    pub fn for_cameras(
+        link: &Link,
+        network: &NetworkConfig,
+        cameras: &[CameraName],
+    ) -> anyhow::Result<Self> {
         let others = cameras.iter().map(|camera| Other {
             name: format!("camera `{camera}`"),
             endpoint: network.cameras.get(camera).cloned().unwrap_or_default(),
@@ -87,8 +92,8 @@ impl Lookout {
         self.presence.is_alive(channel)
     }
 
-    /// The cameras of them that were there at the last two looks, by name: by the second, they hear what
-    /// is said of them.
+    /// The cameras of them that were there at the last two looks, by name: by the second, they hear
+    /// what is said of them.
     pub fn cameras_here(&self) -> Vec<String> {
         let here = self.others.iter().filter(|other| other.is_here && other.was_here);
         here.filter_map(|other| other.channel.camera()).map(ToString::to_string).collect()

@@ -1,7 +1,11 @@
 //! The one command of Crossfix.
 #![cfg_attr(
     not(all(feature = "centre", feature = "viewer")),
-    allow(dead_code, unused_imports, reason = "what only a part uses that this build leaves out is left in")
+    allow(
+        dead_code,
+        unused_imports,
+        reason = "what only a part uses that this build leaves out is left in"
+    )
 )]
 
 #[cfg(feature = "centre")]

@@ -11,13 +11,18 @@ const PATIENCE: Duration = Duration::from_secs(2);
 const PERIOD: Duration = Duration::from_secs(60);
 
 /// Opens a session; `None` if the program was asked to stop before a router answered.
-pub fn open(network: &NetworkConfig, role: &Role, shutdown: &Shutdown) -> anyhow::Result<Option<Link>> {
+pub fn open(
+    network: &NetworkConfig,
+    role: &Role,
+    shutdown: &Shutdown,
+) -> anyhow::Result<Option<Link>> {
     let begun = Instant::now();
     let mut said: Option<Instant> = None;
     let opened = Link::open_while(network, role, |error| {
         if begun.elapsed() >= PATIENCE && said.is_none_or(|said| said.elapsed() >= PERIOD) {
             said = Some(Instant::now());
-            let why = std::error::Error::source(error).map_or_else(String::new, |why| format!(" ({why})"));
+            let why = std::error::Error::source(error)
+                .map_or_else(String::new, |why| format!(" ({why})"));
             tracing::warn!("{error}{why}: trying again until one does");
         }
         !shutdown.requested()

@@ -26,8 +26,9 @@ pub fn error(error: &anyhow::Error) {
     }
 }
 
-/// A file that is being written. It has a name of its own until it is whole, so that what stood under the
-/// name that was asked for stays until then, and nobody takes half a file for a whole one.
+/// A file that is being written. It has a name of its own until it is whole, so that what stood
+/// under the name that was asked for stays until then, and nobody takes half a file for a whole
+/// one.
 #[derive(Debug)]
 pub struct Draft {
     path: PathBuf,
@@ -80,12 +81,14 @@ impl Drop for Draft {
 /// Names that are tried for a file whose own is taken.
 const MOST_NAMES: u32 = 10_000;
 
-/// The name that was asked for, and those that are tried where it is taken: `today-2.mcap`, `today-3.mcap` ..
+/// The name that was asked for, and those that are tried where it is taken: `today-2.mcap`,
+/// `today-3.mcap` ..
 pub fn names(asked: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
-    let others =
-        (2..MOST_NAMES).map(move |number| asked.with_file_name(format!("{stem}-{number}{extension}")));
+    let extension =
+        asked.extension().map(|e| format!(".{}", e.to_string_lossy())).unwrap_or_default();
+    let others = (2..MOST_NAMES)
+        .map(move |number| asked.with_file_name(format!("{stem}-{number}{extension}")));
     std::iter::once(asked.to_owned()).chain(others)
 }
 
@@ -103,7 +106,8 @@ pub fn say_other_name(asked: &Path, path: &Path) {
 /// Writes a whole file.
 pub fn write_file(path: &Path, inputs: &[&Path], bytes: &[u8]) -> anyhow::Result<()> {
     let draft = Draft::new(path, inputs)?;
-    std::fs::write(draft.path(), bytes).with_context(|| format!("cannot write {}", path.display()))?;
+    std::fs::write(draft.path(), bytes)
+        .with_context(|| format!("cannot write {}", path.display()))?;
     draft.keep()
 }
 
@@ -149,7 +153,11 @@ mod tests {
         std::fs::write(draft.path(), "half").unwrap();
         drop(draft);
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "before");
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left lying about");
+        assert_eq!(
+            std::fs::read_dir(folder.path()).unwrap().count(),
+            1,
+            "nothing is left lying about"
+        );
         write_file(&path, &[], b"after").unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "after");
     }

@@ -14,8 +14,8 @@ const POLL: Duration = Duration::from_millis(50);
 /// Waits longer than this are one of this length: a hundred years.
 const LONGEST_S: f64 = 3e9;
 
-/// When to handle what: data time runs `speed` times as fast as a clock that nobody sets, from `start` on;
-/// with a speed of 0 nothing waits.
+/// When to handle what: data time runs `speed` times as fast as a clock that nobody sets, from
+/// `start` on; with a speed of 0 nothing waits.
 #[derive(Clone, Copy, Debug)]
 pub struct Pace {
     start: Instant,
@@ -23,8 +23,8 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// Data that begin at a time of the wall's clock, seconds since the Unix epoch. The clock is read
-    /// once: what is done to it later changes nothing.
+    /// Data that begin at a time of the wall's clock, seconds since the Unix epoch. The clock is
+    /// read once: what is done to it later changes nothing.
     pub fn beginning_at(wall_s: f64, speed: f64) -> Self {
         Self::beginning_in(wall_s - wall_seconds(), speed)
     }
@@ -36,7 +36,8 @@ impl Pace {
         Self { start: start.unwrap_or(now), speed }
     }
 
-    /// Waits until it is time for what lies `data_s` after the data's beginning. Says whether to go on.
+    /// Waits until it is time for what lies `data_s` after the data's beginning. Says whether to go
+    /// on.
     pub fn wait(&self, data_s: f64, shutdown: &Shutdown) -> bool {
         if let Some(due) = self.due(data_s) {
             while !shutdown.requested() {

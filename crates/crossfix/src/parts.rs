@@ -9,8 +9,9 @@ const PARTS: [(&str, &str, bool); 2] = [
 /// A line for the help: what is left out, and how to have it; nothing of a whole build.
 pub fn left_out() -> String {
     let lines = PARTS.iter().filter(|(.., is_here)| !is_here);
-    let lines =
-        lines.map(|(part, feature, _)| format!("This build leaves out {part} (`--features {feature}`)."));
+    let lines = lines.map(|(part, feature, _)| {
+        format!("This build leaves out {part} (`--features {feature}`).")
+    });
     lines.collect::<Vec<_>>().join("\n")
 }
 

@@ -44,7 +44,11 @@ impl Lacks {
             tracing::warn!("{} is damaged {damage}; everything else was read", path.display());
         }
         if let Some(first) = &self.first_unreadable {
-            tracing::warn!("{} messages of {} cannot be read: {first}", self.unreadable, path.display());
+            tracing::warn!(
+                "{} messages of {} cannot be read: {first}",
+                self.unreadable,
+                path.display()
+            );
         }
     }
 
@@ -78,7 +82,8 @@ pub fn for_each(
     }
 }
 
-/// Hands messages of a recording on until it is asked to stop: a long file is not read to its end then.
+/// Hands messages of a recording on until it is asked to stop: a long file is not read to its end
+/// then.
 pub fn for_each_until(
     path: &Path,
     lacks: &mut Lacks,
@@ -95,7 +100,10 @@ pub fn for_each_until(
 }
 
 /// The first message of a recording for which there is an answer.
-pub fn find<T>(path: &Path, mut answer: impl FnMut(Entry) -> Option<T>) -> anyhow::Result<Option<T>> {
+pub fn find<T>(
+    path: &Path,
+    mut answer: impl FnMut(Entry) -> Option<T>,
+) -> anyhow::Result<Option<T>> {
     let mut found = None;
     let read = RecordingReader::open(path)?.for_each(|entry| {
         found = answer(entry);

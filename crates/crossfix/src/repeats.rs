@@ -8,8 +8,8 @@ const PERIOD: Duration = Duration::from_secs(60);
 /// Kinds that are told apart: names in them come from outside.
 const MAX_KINDS: usize = 1000;
 
-/// Says the first warning of a kind at once, and then how many more there were, once a minute: whoever can
-/// cause a warning must not be able to fill a disk with it.
+/// Says the first warning of a kind at once, and then how many more there were, once a minute:
+/// whoever can cause a warning must not be able to fill a disk with it.
 #[derive(Debug, Default)]
 pub struct Repeats {
     kinds: BTreeMap<String, Kind>,
@@ -87,7 +87,10 @@ mod tests {
         repeats.line("gap", now, String::new);
         repeats.line("gap", now, || "gap".to_owned());
         let kind = repeats.kinds.get_mut("gap").unwrap();
-        assert_eq!(kind.due(now + PERIOD).as_deref(), Some("gap (1 times since this was said last)"));
+        assert_eq!(
+            kind.due(now + PERIOD).as_deref(),
+            Some("gap (1 times since this was said last)")
+        );
         assert_eq!(kind.due(now + 3 * PERIOD), None);
     }
 

@@ -1,5 +1,5 @@
-//! Scenario folders of the format `passive-bearings/1`, as `simulate` writes and `import` reads them:
-//! `scenario.json`, `exposures.csv`, `detections.csv` and `truth.csv`.
+//! Scenario folders of the format `passive-bearings/1`, as `simulate` writes and `import` reads
+//! them: `scenario.json`, `exposures.csv`, `detections.csv` and `truth.csv`.
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -54,7 +54,8 @@ pub struct TruthRow {
     pub vz: f64,
 }
 
-/// From the format's camera axes, x left, y up, z forward, to ours, x right, y down, z forward; and back.
+/// From the format's camera axes, x left, y up, z forward, to ours, x right, y down, z forward; and
+/// back.
 pub fn turned(v: Vector3<f64>) -> Vector3<f64> {
     Vector3::new(-v.x, -v.y, v.z)
 }

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 
-/// How long a command may take to end after it has been asked to: people wait for it. What it does then
-/// of its own accord takes [`LAST_WORDS`] and half a second to take its leave of the network.
+/// How long a command may take to end after it has been asked to: people wait for it. What it does
+/// then of its own accord takes [`LAST_WORDS`] and half a second to take its leave of the network.
 const GRACE: Duration = Duration::from_millis(1800);
 /// How long a command that was asked to stop still takes in what is on its way to it.
 pub const LAST_WORDS: Duration = Duration::from_millis(700);
@@ -76,9 +76,11 @@ impl Shutdown {
     }
 }
 
-/// Runs a command, and leaves it behind if it does not end in time after it has been asked to: a disk that
-/// hangs, or a step that computes for long, must not make it immortal.
-pub fn supervise(command: impl FnOnce() -> anyhow::Result<()> + Send + 'static) -> anyhow::Result<()> {
+/// Runs a command, and leaves it behind if it does not end in time after it has been asked to: a
+/// disk that hangs, or a step that computes for long, must not make it immortal.
+pub fn supervise(
+    command: impl FnOnce() -> anyhow::Result<()> + Send + 'static,
+) -> anyhow::Result<()> {
     let (done, result) = channel();
     let worker = std::thread::Builder::new()
         .stack_size(STACK_BYTES)

@@ -5,8 +5,8 @@
 use assert_cmd::Command;
 
 const COMMANDS: [&str; 14] = [
-    "demo", "agent", "track", "fuse", "record", "replay", "view", "info", "simulate", "import", "export",
-    "evaluate", "check", "plan",
+    "demo", "agent", "track", "fuse", "record", "replay", "view", "info", "simulate", "import",
+    "export", "evaluate", "check", "plan",
 ];
 
 fn crossfix() -> Command {

@@ -46,8 +46,16 @@ fn a_small_target_is_fixed_in_fewer_cells_and_a_better_pose_gives_better_fixes()
         let seen = cell["cameras"].as_array().unwrap().len();
         assert_eq!(cell["accuracy"].is_null(), seen < 2, "{cell}");
     }
-    let exact =
-        json(&["--target-size", "1", "--rotation-sd-deg", "0", "--position-sd", "0", "--clock-sd", "0"]);
+    let exact = json(&[
+        "--target-size",
+        "1",
+        "--rotation-sd-deg",
+        "0",
+        "--position-sd",
+        "0",
+        "--clock-sd",
+        "0",
+    ]);
     assert!(median(&exact) < 0.5 * median(&large), "{} {}", median(&exact), median(&large));
     let late = json(&["--target-size", "1", "--clock-sd", "0.1"]);
     assert!(
@@ -74,7 +82,8 @@ fn the_map_is_geojson_with_its_corners_where_they_belong() {
     let ring = first["geometry"]["coordinates"][0].as_array().unwrap();
     assert_eq!(ring.len(), 5);
     assert_eq!(ring[0], ring[4], "closed");
-    let corner = |index: usize| [ring[index][0].as_f64().unwrap(), ring[index][1].as_f64().unwrap()];
+    let corner =
+        |index: usize| [ring[index][0].as_f64().unwrap(), ring[index][1].as_f64().unwrap()];
     // On the equator 30 m up: east by the equator's radius, north by the meridian's, 6 335 439 m.
     let east = (-60.0 / (6_378_137.0 + 30.0_f64)).to_degrees();
     let north = (-40.0 / (6_335_439.3 + 30.0_f64)).to_degrees();

@@ -42,22 +42,24 @@ impl TrackHistory {
         let time = Timestamp::from_nanos(frame.time_ns);
         self.times.insert(time);
         for track in &frame.tracks {
-            let bearings = track.residuals.iter().map(|r| Timestamp::from_nanos(r.time_ns)).collect();
+            let bearings =
+                track.residuals.iter().map(|r| Timestamp::from_nanos(r.time_ns)).collect();
             let said = Said { status: track.state(), bearings, state: state(track) };
             self.tracks.entry(track.id).or_default().insert(time, said);
         }
     }
 
-    /// The confirmed tracks at `time`, ordered by id: as last said at or before it, extrapolated with
-    /// their velocities. Their covariances grow with the velocity's alone.
+    /// The confirmed tracks at `time`, ordered by id: as last said at or before it, extrapolated
+    /// with their velocities. Their covariances grow with the velocity's alone.
     pub fn at(&self, time: Timestamp) -> Vec<Estimate> {
         let mut estimates = self.all_at(time);
-        estimates.retain(|said| matches!(said.status, TrackState::Confirmed | TrackState::Coasting));
+        estimates
+            .retain(|said| matches!(said.status, TrackState::Confirmed | TrackState::Coasting));
         estimates
     }
 
-    /// The same with the tracks that are not sure, and those that one camera alone follows: a direction whose
-    /// range is a guess.
+    /// The same with the tracks that are not sure, and those that one camera alone follows: a
+    /// direction whose range is a guess.
     pub fn all_at(&self, time: Timestamp) -> Vec<Estimate> {
         let said = self.tracks.iter().filter_map(|(&id, said)| {
             let (&then, said) = said.range(..=time).next_back()?;

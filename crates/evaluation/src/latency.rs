@@ -34,21 +34,25 @@ impl LatencyRecorder {
 
     /// The latency, if any pair has been seen.
     pub fn latency(&self) -> Option<Latency> {
-        let pairs = self
-            .tracks
-            .iter()
-            .filter_map(|(key, arrival)| Some(arrival.seconds_since(self.cause(key, *arrival)?) * 1e3));
+        let pairs = self.tracks.iter().filter_map(|(key, arrival)| {
+            Some(arrival.seconds_since(self.cause(key, *arrival)?) * 1e3)
+        });
         let mut milliseconds: Vec<f64> = pairs.collect();
         milliseconds.sort_by(f64::total_cmp);
         let last = milliseconds.len().checked_sub(1)?;
         let quantile = |q: f64| milliseconds[(q * last as f64).round() as usize];
         Some(Latency { p50_ms: quantile(0.5), p99_ms: quantile(0.99) })
     }
-    /// When the frame arrived from which tracks followed that arrived at a time: the last one before it,
-    /// or where they overtook it, the first.
+    /// When the frame arrived from which tracks followed that arrived at a time: the last one
+    /// before it, or where they overtook it, the first.
     fn cause(&self, key: &(String, u64), tracks: Timestamp) -> Option<Timestamp> {
         let arrivals = self.bearings.get(key)?;
-        arrivals.iter().rev().find(|arrival| **arrival <= tracks).or_else(|| arrivals.first()).copied()
+        arrivals
+            .iter()
+            .rev()
+            .find(|arrival| **arrival <= tracks)
+            .or_else(|| arrivals.first())
+            .copied()
     }
 }
 
@@ -67,6 +71,9 @@ mod tests {
             }
         }
         let latency = recorder.latency().unwrap();
-        assert!((latency.p50_ms - 20.0).abs() < 0.01 && (latency.p99_ms - 20.0).abs() < 0.01, "{latency:?}");
+        assert!(
+            (latency.p50_ms - 20.0).abs() < 0.01 && (latency.p99_ms - 20.0).abs() < 0.01,
+            "{latency:?}"
+        );
     }
 }

@@ -29,6 +29,8 @@ mod stretches;
 pub use history::TrackHistory;
 pub use latency::{Latency, LatencyRecorder};
 pub use metrics::{Estimate, Evaluator, Nees, Report, TargetReport, TrueTarget};
-pub use papers::{Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker};
+pub use papers::{
+    Limit, Row, Table, ValidationOptions, Verdict, validate_fusion, validate_tracker,
+};
 pub use sightings::Sightings;
 pub use stretches::Delays;

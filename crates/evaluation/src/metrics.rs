@@ -12,7 +12,8 @@ use crate::stretches::{Delays, Stretches, quantile};
 const COST_SCALE: f64 = 1e6;
 /// An answer farther than this from every target is far off for most uses, m.
 const FAR_OFF_M: f64 = 1.0;
-/// An answer farther off than this many of its own deviations has said that it was surer than it was.
+/// An answer farther off than this many of its own deviations has said that it was surer than it
+/// was.
 const SIGMAS: f64 = 4.0;
 
 /// Where a target really is.
@@ -46,9 +47,9 @@ impl Estimate {
     }
 }
 
-/// How large errors are against what the tracks said of them: errors squared by the stated covariance. The mean
-/// of honest ones is the number of their degrees of freedom; one instant of great confidence and great error
-/// spoils it, which the median does not show.
+/// How large errors are against what the tracks said of them: errors squared by the stated
+/// covariance. The mean of honest ones is the number of their degrees of freedom; one instant of
+/// great confidence and great error spoils it, which the median does not show.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Nees {
     /// Mean over the instants.
@@ -112,8 +113,8 @@ pub struct Report {
     pub false_answers: u64,
     /// Share of the answers that lay more than 1 m from the nearest target, however far.
     pub share_off_by_1_m: Option<f64>,
-    /// Share of the answers that lay farther from the nearest target than four times what they said themselves
-    /// (the root of the sum of the position's variances).
+    /// Share of the answers that lay farther from the nearest target than four times what they said
+    /// themselves (the root of the sum of the position's variances).
     pub share_beyond_4_sd: Option<f64>,
     /// How long the targets waited for an answer.
     pub delays: Delays,
@@ -150,12 +151,15 @@ impl Sums {
         self.velocity += velocity.norm_squared();
         let error = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
         // A covariance that cannot be inverted is not honest at any error.
-        let both = state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
+        let both =
+            state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
         let part = |from: usize, error: &Vector3<f64>| {
             let spread = state.covariance.fixed_view::<3, 3>(from, from).into_owned().cholesky();
             spread.map_or(f64::INFINITY, |c| error.dot(&c.solve(error)))
         };
-        for (list, value) in self.nees.iter_mut().zip([both, part(0, &position), part(3, &velocity)]) {
+        for (list, value) in
+            self.nees.iter_mut().zip([both, part(0, &position), part(3, &velocity)])
+        {
             list.push(value);
         }
         self.pairs += 1;
@@ -282,11 +286,13 @@ impl Evaluator {
         if truth.is_empty() {
             return Vec::new();
         }
-        let distance =
-            |row: usize, column: usize| (estimates[column].state.position() - truth[row].position).norm();
+        let distance = |row: usize, column: usize| {
+            (estimates[column].state.position() - truth[row].position).norm()
+        };
         let columns = estimates.len() + truth.len();
         let weights = Matrix::from_fn(truth.len(), columns, |(row, column)| {
-            let relative = if column < estimates.len() { distance(row, column) / self.cutoff } else { 1.0 };
+            let relative =
+                if column < estimates.len() { distance(row, column) / self.cutoff } else { 1.0 };
             (relative.min(1.0).powi(2) * COST_SCALE) as i64
         });
         let (_, column_of) = kuhn_munkres_min(&weights);
@@ -366,7 +372,11 @@ mod tests {
         let mut evaluator = Evaluator::new(5.0);
         // One pair 1 m apart, one miss, one false track.
         let now = Timestamp::EPOCH;
-        evaluator.add(now, &[target(1, 0.0), target(2, 100.0)], &[estimate(7, 1.0), estimate(8, 50.0)]);
+        evaluator.add(
+            now,
+            &[target(1, 0.0), target(2, 100.0)],
+            &[estimate(7, 1.0), estimate(8, 50.0)],
+        );
         let report = evaluator.report();
         assert_eq!(report.position_rmse_m, Some(1.0));
         assert_eq!(report.nees, Nees { mean: Some(1.0), median: Some(1.0) });

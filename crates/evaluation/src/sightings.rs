@@ -26,7 +26,8 @@ impl Sightings {
     pub fn cameras_at(&self, times: &[Timestamp]) -> Vec<usize> {
         let mut counts = vec![0; times.len()];
         for frames in self.cameras.values() {
-            let Some(longest_s) = usual_interval_s(frames).map(|usual| GAP_INTERVALS * usual) else {
+            let Some(longest_s) = usual_interval_s(frames).map(|usual| GAP_INTERVALS * usual)
+            else {
                 continue;
             };
             for (count, &time) in counts.iter_mut().zip(times) {
@@ -45,8 +46,11 @@ impl Sightings {
 
 /// The median time between a camera's frames, s; `None` of a single frame.
 fn usual_interval_s(frames: &BTreeMap<Timestamp, bool>) -> Option<f64> {
-    let mut intervals: Vec<f64> =
-        frames.keys().zip(frames.keys().skip(1)).map(|(from, to)| to.seconds_since(*from)).collect();
+    let mut intervals: Vec<f64> = frames
+        .keys()
+        .zip(frames.keys().skip(1))
+        .map(|(from, to)| to.seconds_since(*from))
+        .collect();
     intervals.sort_by(f64::total_cmp);
     intervals.get(intervals.len() / 2).copied()
 }
@@ -73,7 +77,8 @@ mod tests {
         let measured = Some(ImageTrackState::Tracking);
         for tenths in 0..10 {
             sightings.add(&frame("a", tenths, measured));
-            // `b` sees nothing in its frame of 0.3 s and guesses in that of 0.6 s; 0.8 s is missing.
+            // `b` sees nothing in its frame of 0.3 s and guesses in that of 0.6 s; 0.8 s is
+            // missing.
             let said = match tenths {
                 3 => None,
                 6 => Some(ImageTrackState::Coasting),

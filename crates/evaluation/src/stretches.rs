@@ -10,17 +10,18 @@ const GAP_S: f64 = 1.0;
 /// A stretch shorter than this is not held against anybody who gave no answer in it, s.
 const LEAST_S: f64 = 1.0;
 
-/// How long it took until a target was answered for, from the beginning of each stretch of instants that were
-/// asked for.
+/// How long it took until a target was answered for, from the beginning of each stretch of instants
+/// that were asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Delays {
-    /// From a target's first instant to its first answer, the longest of all targets, s; absent if one was never
-    /// answered for.
+    /// From a target's first instant to its first answer, the longest of all targets, s; absent if
+    /// one was never answered for.
     pub first_s: Option<f64>,
-    /// Stretches after a target's first one: it has gone out of what was asked for for more than a second, and come
-    /// back. Those of less than a second that got no answer do not count.
+    /// Stretches after a target's first one: it has gone out of what was asked for for more than a
+    /// second, and come back. Those of less than a second that got no answer do not count.
     pub returns: u64,
-    /// From a return to the next answer, the median, s; absent without a return, or if more than half got no answer.
+    /// From a return to the next answer, the median, s; absent without a return, or if more than
+    /// half got no answer.
     pub next_median_s: Option<f64>,
     /// The same, for nine returns of ten, s.
     pub next_p90_s: Option<f64>,
@@ -64,7 +65,8 @@ impl Stretches {
         };
         let first = |stretches: &Vec<Stretch>| {
             let answered = stretches.iter().find_map(|stretch| stretch.answered);
-            let waited = |begun: &Stretch| answered.map(|answered| answered.seconds_since(begun.from));
+            let waited =
+                |begun: &Stretch| answered.map(|answered| answered.seconds_since(begun.from));
             stretches.first().and_then(waited).unwrap_or(f64::INFINITY)
         };
         let first_s = self.0.values().map(first).fold(0.0, f64::max);

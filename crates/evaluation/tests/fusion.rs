@@ -59,7 +59,8 @@ fn nothing_diverges_where_one_period_does_not_determine_position_and_velocity() 
     for name in ["fusion-degenerate", "fusion-degenerate-diverged", "fusion-degenerate-confirmed"] {
         assert_eq!(failures(&tables, name), NONE);
     }
-    // Equal delays, one delay of nothing, all at once; the cameras' plane, and 5 and 1 degrees above it.
+    // Equal delays, one delay of nothing, all at once; the cameras' plane, and 5 and 1 degrees
+    // above it.
     let nees = &tables.iter().find(|table| table.name == "fusion-degenerate-nees").unwrap().rows;
     let asked = [
         "equal delays 0.2/0.2",

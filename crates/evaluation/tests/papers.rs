@@ -7,7 +7,8 @@ fn failures(only: &str, runs: usize) -> Vec<String> {
     assert!(!tables.is_empty(), "no experiment is called {only}");
     let asked = |table: &Table| table.rows.iter().filter(|row| row.limit.is_some()).count();
     assert!(tables.iter().map(asked).sum::<usize>() > 0, "nothing is asked of {only}");
-    let failed = tables.iter().flat_map(|table| &table.rows).filter(|row| row.verdict() == Verdict::Fail);
+    let failed =
+        tables.iter().flat_map(|table| &table.rows).filter(|row| row.verdict() == Verdict::Fail);
     failed.map(|row| format!("{row:?}")).collect()
 }
 
@@ -47,9 +48,9 @@ fn the_default_is_as_sure_as_it_is_right() {
         let of = move |name: &str| name.starts_with(what) && name.ends_with(flight);
         honesty.unwrap_or_default().iter().filter(move |row| of(&row.series)).collect::<Vec<_>>()
     };
-    // Standard errors of 30 runs are a tenth, and of 16 cells one may be off by three. With many runs the cells lie from 1.95 to
-    // 2.2 (NIS) and 1.8 to 2.4 (NEES); of a straight flight from 1.4 to 2.2, where 2 is asked
-    // as well.
+    // Standard errors of 30 runs are a tenth, and of 16 cells one may be off by three. With many
+    // runs the cells lie from 1.95 to 2.2 (NIS) and 1.8 to 2.4 (NEES); of a straight flight from
+    // 1.4 to 2.2, where 2 is asked as well.
     let within = |what, flight, [low, high]: [f64; 2]| {
         let rows = rows(what, flight);
         assert_eq!(rows.len(), 16, "{what} {flight}");
@@ -61,7 +62,7 @@ fn the_default_is_as_sure_as_it_is_right() {
     assert!((within("NIS", "texts", [1.6, 2.5]) - 2.0).abs() < 0.1);
     assert!((within("NEES", "texts", [1.5, 2.7]) - 2.0).abs() < 0.15);
     assert!((within("NIS", "straight", [1.4, 2.6]) - 2.0).abs() < 0.3);
-    // 2 is asked of straight flight too, and not reached: the filters allow for turns that do not come. What is held here is what is
-    // reached, 0.2 to 0.66 with many runs.
+    // 2 is asked of straight flight too, and not reached: the filters allow for turns that do not
+    // come. What is held here is what is reached, 0.2 to 0.66 with many runs.
     within("NEES", "straight", [0.15, 0.9]);
 }

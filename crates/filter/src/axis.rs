@@ -25,11 +25,11 @@ impl Innovation {
     }
 }
 
-/// Position and velocity on one axis: the second-order Kalman filter into which the
-/// fourth-order one of 000 (2)-(12) falls apart when the axes' errors are taken as independent.
+/// Position and velocity on one axis: the second-order Kalman filter into which the fourth-order
+/// one of Herasymenko 2021, eqs. 2-12 falls apart when the axes' errors are taken as independent.
 ///
 /// The motion is constant velocity driven by white acceleration of standard deviation `sigma_a`
-/// that is constant between two updates: `G = [T^2/2, T]'`, `Q = sigma_a^2` (erratum: the texts
+/// that is constant between two updates: `G = [T^2/2, T]'`, `Q = sigma_a^2` (erratum: the papers
 /// have `sigma_a` in both).
 ///
 /// ```
@@ -54,9 +54,14 @@ pub struct AxisFilter {
 }
 
 impl AxisFilter {
-    /// Starts from two measurements `interval` seconds apart (000 (13)-(14); erratum: the
-    /// velocity's variance has `sigma_a^2 T^2 / 4`).
-    pub fn start(first: AxisMeasurement, second: AxisMeasurement, interval: f64, sigma_a: f64) -> Self {
+    /// Starts from two measurements `interval` seconds apart (Herasymenko 2021, eqs. 13-14;
+    /// erratum: the velocity's variance has `sigma_a^2 T^2 / 4`).
+    pub fn start(
+        first: AxisMeasurement,
+        second: AxisMeasurement,
+        interval: f64,
+        sigma_a: f64,
+    ) -> Self {
         Self {
             position: second.position,
             velocity: (second.position - first.position) / interval,
@@ -80,7 +85,7 @@ impl AxisFilter {
         }
     }
 
-    /// Moves the state `interval` seconds on (000 (8), (10)).
+    /// Moves the state `interval` seconds on (Herasymenko 2021, eqs. 8 and 10).
     #[inline]
     pub fn time_update(&mut self, interval: f64) {
         self.position += interval * self.velocity;
@@ -101,7 +106,7 @@ impl AxisFilter {
         }
     }
 
-    /// Takes a measurement in (000 (9), (11), (12)) and returns its innovation.
+    /// Takes a measurement in (Herasymenko 2021, eqs. 9, 11 and 12) and returns its innovation.
     #[inline]
     pub fn measurement_update(&mut self, measurement: AxisMeasurement) -> Innovation {
         let innovation = self.innovation(measurement);
@@ -119,7 +124,8 @@ impl AxisFilter {
     /// Replaces what is known of the position by `posterior`; the velocity follows by regression,
     /// `x+ = x + P_xp / P_pp (m - p)`, `P+ = P - P_xp P_px / P_pp^2 (P_pp - c)`.
     ///
-    /// A measurement's update (000 (9)-(12)) is this with the product of prior and likelihood.
+    /// A measurement's update (Herasymenko 2021, eqs. 9-12) is this with the product of prior and
+    /// likelihood.
     pub fn condition(&mut self, posterior: AxisMeasurement) {
         let slope = self.cross / self.position_variance;
         self.velocity += slope * (posterior.position - self.position);
@@ -157,7 +163,8 @@ impl AxisFilter {
         Matrix2::new(self.position_variance, self.cross, self.cross, self.velocity_variance)
     }
 
-    /// Moves the origin of the axis: what was at a position is at that plus `by`, and all else stays.
+    /// Moves the origin of the axis: what was at a position is at that plus `by`, and all else
+    /// stays.
     pub fn move_by(&mut self, by: f64) {
         self.position += by;
     }
@@ -196,7 +203,11 @@ mod tests {
                 let acceleration = sigma_a * normal();
                 position += velocity + acceleration / 2.0;
                 velocity += acceleration;
-                (position, velocity, AxisMeasurement { position: position + normal(), variance: 1.0 })
+                (
+                    position,
+                    velocity,
+                    AxisMeasurement { position: position + normal(), variance: 1.0 },
+                )
             };
             let first = step(&mut normal).2;
             let second = step(&mut normal).2;

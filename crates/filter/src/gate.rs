@@ -1,5 +1,5 @@
 /// An ellipsoidal gate: the region in which a measurement falls with a given probability
-/// (001, 4.8-4.11: `r' D^-1 r <= l^2`).
+/// (Lytvynets 2020, eqs. 4.8-4.11: `r' D^-1 r <= l^2`).
 ///
 /// ```
 /// use crossfix_filter::Gate;

@@ -4,11 +4,12 @@ use crate::KinematicState;
 use crate::models::{MAX_MODELS, ModelWeights, MotionModels, Restlessness};
 
 /// Interacting multiple models (IMM): a bank of Kalman filters that differ in their process noise,
-/// weighted by how well each predicts (003, equations 10-17, with the errata; there for the
+/// weighted by how well each predicts (Solonar 2023, eqs. 10-17, with the errata; there for the
 /// brightness of a pixel, here for position and velocity).
 ///
-/// How often a target leaves its calm is learnt of each: one that has flown straight for minutes is expected to go
-/// on, and one that turns every few seconds to turn again before its bearings can show it.
+/// How often a target leaves its calm is learnt of each: one that has flown straight for minutes is
+/// expected to go on, and one that turns every few seconds to turn again before its bearings can
+/// show it.
 ///
 /// All models share the transition of constant velocity. So the moments of the prediction follow
 /// from those of the combined state in closed form, and a gate needs no mixing: see
@@ -42,8 +43,9 @@ pub struct Imm {
     probabilities: ModelWeights,
     combined: KinematicState,
     restlessness: Restlessness,
-    /// How probable calm can be, at most, since an axis of the motion is not seen: what it was before, and what the
-    /// transitions have made of it since. Measurements of the other axes may find less, and no more.
+    /// How probable calm can be, at most, since an axis of the motion is not seen: what it was
+    /// before, and what the transitions have made of it since. Measurements of the other axes may
+    /// find less, and no more.
     calm_most: Option<f64>,
 }
 
@@ -55,7 +57,13 @@ impl Imm {
             *probability = model.share;
         }
         let states = vec![state.clone(); models.models().len()];
-        Self { states, probabilities, combined: state, restlessness: Restlessness::UNKNOWN, calm_most: None }
+        Self {
+            states,
+            probabilities,
+            combined: state,
+            restlessness: Restlessness::UNKNOWN,
+            calm_most: None,
+        }
     }
 
     /// Mean and covariance over all models.
@@ -89,7 +97,8 @@ impl Imm {
     /// so these are the moments that mixing, predicting and combining would give.
     pub fn predicted(&self, interval: f64, models: &MotionModels) -> KinematicState {
         let weights = self.predicted_probabilities(interval, models);
-        let density = models.models().iter().zip(weights).map(|(model, weight)| model.density * weight).sum();
+        let density =
+            models.models().iter().zip(weights).map(|(model, weight)| model.density * weight).sum();
         self.combined.predicted(interval, density)
     }
 
@@ -106,13 +115,15 @@ impl Imm {
     ) -> Option<f64> {
         let transitions = models.transitions(interval, &self.restlessness);
         let weights = self.probabilities_after(&transitions);
-        let calm_before = self.calm_most.unwrap_or_else(|| models.calm_probability(self.probabilities()));
+        let calm_before =
+            self.calm_most.unwrap_or_else(|| models.calm_probability(self.probabilities()));
         let mut states: [Option<KinematicState>; MAX_MODELS] = Default::default();
         let mut logarithms = [f64::NEG_INFINITY; MAX_MODELS];
         for (j, (next, model)) in states.iter_mut().zip(models.models()).enumerate() {
             let mut predicted = self.mixed(j, &transitions);
             predicted.time_update(interval, model.density);
-            let updated = update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
+            let updated =
+                update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
             *next = Some(match updated {
                 Some((state, logarithm)) => {
                     logarithms[j] = logarithm + weights[j].ln();
@@ -140,8 +151,9 @@ impl Imm {
         Some(largest + sum.ln())
     }
 
-    /// Takes in that for the last `interval` seconds what the target did along an axis was not seen: it may have moved
-    /// by the models of `since` in place of those of `before`, and no measurement would have shown it.
+    /// Takes in that for the last `interval` seconds what the target did along an axis was not
+    /// seen: it may have moved by the models of `since` in place of those of `before`, and no
+    /// measurement would have shown it.
     pub fn relive(
         &mut self,
         interval: f64,
@@ -171,7 +183,8 @@ impl Imm {
     }
 
     /// Widens every model's knowledge to at least these standard deviations and forgets what ties
-    /// velocity to position: the covariance re-initialisation of 004 (equation 8), per block.
+    /// velocity to position: the covariance re-initialisation of Kalinov 2019 (equation 8), per
+    /// block.
     pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
         for state in &mut self.states {
             state.reinitialise(position_sd, velocity_sd);
@@ -179,8 +192,8 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Adds to every model's covariance, or takes from it, for what is learnt of errors that all models
-    /// share. What would leave a model less than nothing is not taken from it.
+    /// Adds to every model's covariance, or takes from it, for what is learnt of errors that all
+    /// models share. What would leave a model less than nothing is not taken from it.
     pub fn add_covariance(&mut self, change: &Matrix6<f64>) {
         for state in &mut self.states {
             let next = state.covariance + change;
@@ -191,15 +204,17 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Makes no model's covariance less than a part of it that all share: what is short of it grows by the
-    /// smallest share of the part that does. The growth is continuous, so that rounding decides nothing.
+    /// Makes no model's covariance less than a part of it that all share: what is short of it grows
+    /// by the smallest share of the part that does. The growth is continuous, so that rounding
+    /// decides nothing.
     pub fn exceed(&mut self, part: &Matrix6<f64>) {
         let mut grown = false;
         for state in &mut self.states {
             if (state.covariance - part).cholesky().is_some() {
                 continue;
             }
-            // P + a Q >= Q where (1 - a) m <= 1, m being the largest eigenvalue of L^-1 Q L^-T with P = L L'.
+            // P + a Q >= Q where (1 - a) m <= 1, m being the largest eigenvalue of L^-1 Q L^-T with
+            // P = L L'.
             let largest = state.covariance.cholesky().and_then(|factor| {
                 let half = factor.l().solve_lower_triangular(part)?;
                 let whole = factor.l().solve_lower_triangular(&half.transpose())?;
@@ -229,12 +244,15 @@ impl Imm {
         }
         let mut weights = [0.0; MAX_MODELS];
         let mut total = 0.0;
-        for ((weight, row), probability) in weights.iter_mut().zip(transitions).zip(self.probabilities()) {
+        for ((weight, row), probability) in
+            weights.iter_mut().zip(transitions).zip(self.probabilities())
+        {
             *weight = row[j] * probability;
             total += *weight;
         }
         if total <= 0.0 {
-            // Ruled out, and no time in which it could have come up again: its state counts for nothing.
+            // Ruled out, and no time in which it could have come up again: its state counts for
+            // nothing.
             return self.combined.clone();
         }
         combined(&self.states, &weights.map(|weight| weight / total))
@@ -246,7 +264,8 @@ fn combined(states: &[KinematicState], weights: &ModelWeights) -> KinematicState
     if let [only] = states {
         return only.clone();
     }
-    let mean: Vector6<f64> = states.iter().zip(weights).map(|(state, &weight)| state.mean * weight).sum();
+    let mean: Vector6<f64> =
+        states.iter().zip(weights).map(|(state, &weight)| state.mean * weight).sum();
     let mut covariance = Matrix6::zeros();
     for (state, &weight) in states.iter().zip(weights) {
         let difference = state.mean - mean;
@@ -270,7 +289,8 @@ mod tests {
     }
 
     fn running() -> Imm {
-        let start = KinematicState { mean: Vector6::repeat(1.0), covariance: Matrix6::identity() * 4.0 };
+        let start =
+            KinematicState { mean: Vector6::repeat(1.0), covariance: Matrix6::identity() * 4.0 };
         let mut imm = Imm::new(start, &models());
         for k in 0..4 {
             let z = Point3::new(f64::from(k * k), 0.5, -1.0);
@@ -289,7 +309,8 @@ mod tests {
             .iter()
             .enumerate()
             .map(|(j, model)| {
-                imm.mixed(j, &models.transitions(dt, &imm.restlessness)).predicted(dt, model.density)
+                imm.mixed(j, &models.transitions(dt, &imm.restlessness))
+                    .predicted(dt, model.density)
             })
             .collect();
         let (slow, fast) = (combined(&states, &weights), imm.predicted(dt, &models));

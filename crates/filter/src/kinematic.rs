@@ -70,9 +70,14 @@ impl KinematicState {
     }
 
     /// The state after a measurement of its position, with the logarithm of the measurement's
-    /// likelihood: a plain Kalman update, covariance in metres^2 (004, equations 6 and 9; erratum:
-    /// the update is `(I - K H) P`). `None` if the innovation's covariance is not positive definite.
-    pub fn position_updated(&self, measured: Point3<f64>, noise: &Matrix3<f64>) -> Option<(Self, f64)> {
+    /// likelihood: a plain Kalman update, covariance in metres^2 (Kalinov 2019, eqs. 6 and 9;
+    /// erratum: the update is `(I - K H) P`). `None` if the innovation's covariance is not positive
+    /// definite.
+    pub fn position_updated(
+        &self,
+        measured: Point3<f64>,
+        noise: &Matrix3<f64>,
+    ) -> Option<(Self, f64)> {
         let innovation = measured - self.position();
         let spread = self.position_covariance() + noise;
         let factor = spread.cholesky()?;
@@ -84,13 +89,13 @@ impl KinematicState {
             mean: self.mean + gain * innovation,
             covariance: (covariance + covariance.transpose()) / 2.0,
         };
-        let normaliser =
-            3.0 * (2.0 * std::f64::consts::PI).ln() + 2.0 * factor.l().diagonal().map(f64::ln).sum();
+        let normaliser = 3.0 * (2.0 * std::f64::consts::PI).ln()
+            + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         Some((state, -(nis + normaliser) / 2.0))
     }
 
     /// Forgets: position and velocity become independent, and no axis of either is known better
-    /// than the standard deviations given (004, equation 8).
+    /// than the standard deviations given (Kalinov 2019, eq. 8).
     pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
         let mut covariance = Matrix6::zeros();
         for (block, sd) in [(0, position_sd), (3, velocity_sd)] {

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use nalgebra::Vector3;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-/// 004's detector, mended: the running mean of the residuals against a multiple of the
+/// Kalinov's detector, mended: the running mean of the residuals against a multiple of the
 /// measurement's standard deviation, axis by axis (equations 6-7, with the absolute value that the
 /// text has and the equation lacks).
 ///
@@ -27,7 +27,8 @@ pub struct SmoothedResidual {
 
 impl SmoothedResidual {
     /// Over a window of this many residuals (at least 1), with the threshold in standard deviations
-    /// of one measurement; 004 has 0.81, which keeps false alarms few for windows of 8 and more.
+    /// of one measurement; Kalinov 2019 has 0.81, which keeps false alarms few for windows of 8 and
+    /// more.
     pub fn new(window: usize, scale: f64) -> Self {
         Self { window: window.max(1), scale, residuals: VecDeque::new() }
     }
@@ -104,7 +105,8 @@ mod tests {
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
         let mut detector = NormalisedInnovation::new(2, 0.01);
         let runs = 20_000;
-        let alarms = (0..runs).filter(|_| detector.see(normal().powi(2) + normal().powi(2), 2)).count();
+        let alarms =
+            (0..runs).filter(|_| detector.see(normal().powi(2) + normal().powi(2), 2)).count();
         // Sums over a window of two overlap and start anew after an alarm: slightly under 1 %.
         let share = alarms as f64 / f64::from(runs);
         assert!((0.006..0.012).contains(&share), "{share}");

@@ -2,12 +2,12 @@ use statrs::function::erf::{erfc, erfc_inv};
 
 use crate::AxisMeasurement;
 
-/// What a standard normal variable would have to be to surprise as much as `value` does where a mixture of normal
-/// distributions, given as weights and moments, was expected.
+/// What a standard normal variable would have to be to surprise as much as `value` does where a
+/// mixture of normal distributions, given as weights and moments, was expected.
 ///
-/// Of one distribution it is the normalised innovation; of several its square is chi-square with one degree of freedom if
-/// the mixture holds, which the squared innovation over the mixture's variance is not: a small weight on a wide part widens
-/// the variance, and hardly what is usual.
+/// Of one distribution it is the normalised innovation; of several its square is chi-square with
+/// one degree of freedom if the mixture holds, which the squared innovation over the mixture's
+/// variance is not: a small weight on a wide part widens the variance, and hardly what is usual.
 ///
 /// ```
 /// use crossfix_filter::{AxisMeasurement, normal_score};
@@ -28,7 +28,9 @@ pub fn normal_score<const N: usize>(value: f64, parts: [(f64, AxisMeasurement); 
         parts.iter().map(tail).sum::<f64>() / total
     };
     let (above, below) = (beyond(1.0), beyond(-1.0));
-    // The smaller tail is the one with the digits. Beyond the smallest number all surprises are alike.
-    let score = std::f64::consts::SQRT_2 * erfc_inv((2.0 * above.min(below)).clamp(f64::MIN_POSITIVE, 1.0));
+    // The smaller tail is the one with the digits. Beyond the smallest number all surprises are
+    // alike.
+    let score =
+        std::f64::consts::SQRT_2 * erfc_inv((2.0 * above.min(below)).clamp(f64::MIN_POSITIVE, 1.0));
     if above < below { score } else { -score }
 }

@@ -3,16 +3,16 @@
 /// More models than this say nothing that fewer do not.
 pub const MAX_MODELS: usize = 4;
 
-/// A target has left its calm when calm is less likely than this (a probability): when it is likelier that it has. Of
-/// half of it only hard manoeuvres would count, ...
+/// A target has left its calm when calm is less likely than this (a probability): when it is
+/// likelier that it has. Of half of it only hard manoeuvres would count, ...
 const UPSET: f64 = 0.5;
-/// ... and it has come to it again when calm is likelier than this. Well above the other, so that one manoeuvre in which
-/// the probability goes to and fro counts once.
+/// ... and it has come to it again when calm is likelier than this. Well above the other, so that
+/// one manoeuvre in which the probability goes to and fro counts once.
 const CALM: f64 = 0.9;
 
-/// How often a target counts as having left its calm, beside what has been seen, where an axis of its motion is not
-/// seen: Jeffreys' prior of a rate. The mean over all targets is right in the mean alone, and there nothing shows in
-/// time that it was wrong of this one.
+/// How often a target counts as having left its calm, beside what has been seen, where an axis of
+/// its motion is not seen: Jeffreys' prior of a rate. The mean over all targets is right in the
+/// mean alone, and there nothing shows in time that it was wrong of this one.
 const UNSEEN_UPSETS: f64 = 0.5;
 
 /// One way of flying: constant velocity driven by white acceleration.
@@ -29,10 +29,11 @@ pub struct MotionModel {
 /// How often targets go over from one way of flying to another.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModeRates {
-    /// From one model to another of the same kind, calm or not, 1/s: it is drawn anew from their shares.
+    /// From one model to another of the same kind, calm or not, 1/s: it is drawn anew from their
+    /// shares.
     pub switching_per_s: f64,
-    /// How often a target that is not calm comes to its calm, 1/s; by the shares this says how often it leaves
-    /// it in the mean over all targets.
+    /// How often a target that is not calm comes to its calm, 1/s; by the shares this says how
+    /// often it leaves it in the mean over all targets.
     pub calming_per_s: f64,
     /// What is believed of how often one target leaves its calm is worth so much calm flight, s.
     pub prior_s: f64,
@@ -40,9 +41,9 @@ pub struct ModeRates {
 
 /// The ways in which targets fly, and how often they change from one to another.
 ///
-/// Whether a target is calm is a Markov chain of two states in continuous time, and so is its model while it
-/// stays in one of them. So the transition over an interval is the same however it is cut. The rate at which a
-/// target leaves its calm is its own and is learnt: see [`crate::Imm`].
+/// Whether a target is calm is a Markov chain of two states in continuous time, and so is its model
+/// while it stays in one of them. So the transition over an interval is the same however it is cut.
+/// The rate at which a target leaves its calm is its own and is learnt: see [`crate::Imm`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionModels {
     models: Vec<MotionModel>,
@@ -67,7 +68,9 @@ impl MotionModels {
         let is_rate = |rate: f64| rate.is_finite() && (rate > 0.0 || models.len() == 1);
         let good = (1..=MAX_MODELS).contains(&models.len()) && models.iter().all(possible);
         let ModeRates { switching_per_s, calming_per_s, prior_s } = rates;
-        if !(good && [switching_per_s, calming_per_s, prior_s].into_iter().all(is_rate) && total.is_finite())
+        if !(good
+            && [switching_per_s, calming_per_s, prior_s].into_iter().all(is_rate)
+            && total.is_finite())
         {
             return None;
         }
@@ -88,17 +91,19 @@ impl MotionModels {
         &self.models
     }
 
-    /// The same where an axis of the motion is not seen: what is not calm may be as lively along it as the liveliest,
-    /// and that a target flies evenly across it is no evidence that it is calm.
+    /// The same where an axis of the motion is not seen: what is not calm may be as lively along it
+    /// as the liveliest, and that a target flies evenly across it is no evidence that it is calm.
     #[must_use]
     pub fn partial(&self) -> Self {
         let widest = self.widest();
         let density = |m: &MotionModel| if m.calm { m.density } else { widest };
-        let models = self.models.iter().map(|m| MotionModel { density: density(m), ..*m }).collect();
+        let models =
+            self.models.iter().map(|m| MotionModel { density: density(m), ..*m }).collect();
         Self { models, is_partial: true, ..*self }
     }
 
-    /// The probability of calm after an interval, by its transitions, of a target that is calm with some probability.
+    /// The probability of calm after an interval, by its transitions, of a target that is calm with
+    /// some probability.
     pub(crate) fn calm_after(&self, calm: f64, transitions: &[ModelWeights; MAX_MODELS]) -> f64 {
         let mut after = 0.0;
         for (is_calm, probability) in [(true, calm), (false, 1.0 - calm)] {
@@ -128,8 +133,8 @@ impl MotionModels {
         self.models.iter().map(|m| m.density).fold(0.0, f64::max)
     }
 
-    /// Probability of each model (columns) an interval of seconds after each (rows), for a target of some
-    /// restlessness.
+    /// Probability of each model (columns) an interval of seconds after each (rows), for a target
+    /// of some restlessness.
     pub(crate) fn transitions(
         &self,
         interval: f64,
@@ -141,11 +146,13 @@ impl MotionModels {
         let calming = if of_two { self.rates.calming_per_s } else { 0.0 };
         let usual = if of_two { calming * lively / calm } else { 0.0 };
         let unseen = if self.is_partial { UNSEEN_UPSETS } else { 0.0 };
-        let leaving = if of_two { restlessness.rate(usual, self.rates.prior_s, unseen) } else { 0.0 };
+        let leaving =
+            if of_two { restlessness.rate(usual, self.rates.prior_s, unseen) } else { 0.0 };
         // What is left of the difference between the two states after the interval.
         let kept = (-(leaving + calming) * interval).exp();
         let unswitched = (-self.rates.switching_per_s * interval).exp();
-        let never = [(-leaving * interval).exp(), (-calming * interval).exp()].map(|out| out * unswitched);
+        let never =
+            [(-leaving * interval).exp(), (-calming * interval).exp()].map(|out| out * unswitched);
         let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
         for (i, (row, from)) in transitions.iter_mut().zip(&self.models).enumerate() {
             let (out, back, share) =
@@ -171,8 +178,8 @@ impl MotionModels {
     }
 }
 
-/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each time that it does
-/// and each second that it does not sharpens.
+/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each
+/// time that it does and each second that it does not sharpens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Restlessness {
     is_calm: bool,
@@ -185,8 +192,8 @@ pub(crate) struct Restlessness {
 impl Restlessness {
     pub(crate) const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
 
-    /// The rate, 1/s, had it left its calm so many times more than has been seen; `usual` is the mean over all
-    /// targets, worth `prior_s` seconds of one.
+    /// The rate, 1/s, had it left its calm so many times more than has been seen; `usual` is the
+    /// mean over all targets, worth `prior_s` seconds of one.
     fn rate(&self, usual: f64, prior_s: f64, more: f64) -> f64 {
         (usual * prior_s + self.upsets + more) / (prior_s + self.calm_s)
     }
@@ -228,9 +235,13 @@ mod tests {
         let rates = ModeRates { switching_per_s: 0.3, calming_per_s: 0.1, prior_s: 20.0 };
         let models = MotionModels::new(&models, rates).unwrap();
         let restless = Restlessness { is_calm: true, upsets: 3.0, calm_s: 40.0 };
-        let at = |seconds| nalgebra::Matrix4::from_fn(|i, j| models.transitions(seconds, &restless)[i][j]);
+        let at = |seconds| {
+            nalgebra::Matrix4::from_fn(|i, j| models.transitions(seconds, &restless)[i][j])
+        };
         assert!((at(0.7) * at(1.8) - at(2.5)).amax() < 1e-12);
-        assert!((at(2.5) * nalgebra::Vector4::repeat(1.0)).iter().all(|sum| (sum - 1.0).abs() < 1e-12));
+        assert!(
+            (at(2.5) * nalgebra::Vector4::repeat(1.0)).iter().all(|sum| (sum - 1.0).abs() < 1e-12)
+        );
         assert!((at(0.0) - nalgebra::Matrix4::identity()).amax() < 1e-12);
     }
 
@@ -241,9 +252,13 @@ mod tests {
         let rates = ModeRates { switching_per_s: 0.3, calming_per_s: 0.1, prior_s: 20.0 };
         let models = MotionModels::new(&models, rates).unwrap();
         let partial = models.partial();
-        assert_eq!(partial.models().iter().map(|m| m.density).collect::<Vec<_>>(), [0.01, 20.0, 20.0]);
+        assert_eq!(
+            partial.models().iter().map(|m| m.density).collect::<Vec<_>>(),
+            [0.01, 20.0, 20.0]
+        );
         let weights = [0.9, 0.05, 0.05, 0.0];
-        for (weight, expected) in partial.no_calmer(0.5, weights).iter().zip([0.5, 0.25, 0.25, 0.0]) {
+        for (weight, expected) in partial.no_calmer(0.5, weights).iter().zip([0.5, 0.25, 0.25, 0.0])
+        {
             assert!((weight - expected).abs() < 1e-12);
         }
         assert_eq!(partial.no_calmer(0.95, weights), weights, "less calm it may be found to be");

@@ -1,8 +1,9 @@
 //! What whole sites cost: latency of each exposure, share of real time, memory; and beside it what
 //! of the targets is found, so that speed is not bought with quality.
 //!
-//! `cargo bench -p crossfix-fusion --bench site` runs the short cases; names or parts of names after
-//! `--` choose others, `all` runs everything: `cargo bench -p crossfix-fusion --bench site -- wide`.
+//! `cargo bench -p crossfix-fusion --bench site` runs the short cases; names or parts of names
+//! after `--` choose others, `all` runs everything: `cargo bench -p crossfix-fusion --bench site --
+//! wide`.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot set itself up has failed")]
 #![allow(clippy::print_stdout, reason = "a benchmark says what it has measured")]
@@ -146,10 +147,15 @@ impl Quality {
             self.epochs += 1;
             self.expected += expected.len();
             self.found += reached;
-            let alone: Vec<&Track> =
-                tracks.iter().zip(&target_of).filter(|(_, k)| k.is_none()).map(|(track, _)| *track).collect();
+            let alone: Vec<&Track> = tracks
+                .iter()
+                .zip(&target_of)
+                .filter(|(_, k)| k.is_none())
+                .map(|(track, _)| *track)
+                .collect();
             self.false_tracks += alone.len();
-            self.unsure += alone.iter().filter(|track| near_for_its_covariance(track, now, &truth)).count();
+            self.unsure +=
+                alone.iter().filter(|track| near_for_its_covariance(track, now, &truth)).count();
         }
     }
 
@@ -339,7 +345,12 @@ fn cases() -> Vec<Case> {
     });
     for targets in [100, 300, 1000] {
         let (site, config) = wide(targets, 1);
-        cases.push(Case { name: format!("wide-{targets}-targets-64-cameras"), site, config, short: false });
+        cases.push(Case {
+            name: format!("wide-{targets}-targets-64-cameras"),
+            site,
+            config,
+            short: false,
+        });
     }
     cases
 }

@@ -21,12 +21,14 @@ fn lines(cameras: usize) -> Vec<TimedLine> {
     (0..cameras)
         .map(|i| {
             let angle = 2.0 * std::f64::consts::PI * i as f64 / cameras as f64;
-            let origin = Point3::new(150.0 * angle.cos(), 150.0 * angle.sin(), 3.0 * (i % 4) as f64);
+            let origin =
+                Point3::new(150.0 * angle.cos(), 150.0 * angle.sin(), 3.0 * (i % 4) as f64);
             let time = 0.1 * i as f64;
             let target = Point3::new(10.0 * time, 5.0, 60.0);
             let direction = Unit::new_normalize(target - origin);
             let basis = tangent_basis(&direction);
-            let line = SightLine { origin, direction, basis, covariance: Matrix2::identity() * 1e-6 };
+            let line =
+                SightLine { origin, direction, basis, covariance: Matrix2::identity() * 1e-6 };
             TimedLine::exact(line, Timestamp::from_seconds(time))
         })
         .collect()

@@ -4,12 +4,12 @@
 //! scene FRAMES.txt OUT.txt [section.key=value ...]
 //! ```
 //!
-//! FRAMES.txt has a line each: `C name width height focal R11..R33 x y z rotation_sd_rad position_sd_m` (a
-//! camera: world from camera, optical axes, metres; both deviations 0: nobody has declared them), `F name
-//! sequence time_ns time_sd_s` (a frame, in the order of arrival), `B ux uy uz sigma_rad` (its bearings, camera
-//! frame). OUT.txt: `T time_ns id state x y z vx vy vz covariance(36) frame_index rank condition`, `E time_ns
-//! kind id`, `S frame_index camera standing`, then `R` what was refused, `N` the counters, `K` the cameras and
-//! `B` what it cost.
+//! FRAMES.txt has a line each: `C name width height focal R11..R33 x y z rotation_sd_rad
+//! position_sd_m` (a camera: world from camera, optical axes, metres; both deviations 0: nobody has
+//! declared them), `F name sequence time_ns time_sd_s` (a frame, in the order of arrival), `B ux uy
+//! uz sigma_rad` (its bearings, camera frame). OUT.txt: `T time_ns id state x y z vx vy vz
+//! covariance(36) frame_index rank condition`, `E time_ns kind id`, `S frame_index camera
+//! standing`, then `R` what was refused, `N` the counters, `K` the cameras and `B` what it cost.
 
 #![allow(clippy::print_stderr)]
 
@@ -48,7 +48,8 @@ fn configured(settings: &[String]) -> Result<FusionConfig, Failure> {
         let (path, value) = setting.split_once('=').ok_or("a setting is section.key=value")?;
         let (section, key) = path.split_once('.').ok_or("a setting is section.key=value")?;
         let parsed: toml::Table = format!("value = {value}").parse()?;
-        let section = table.get_mut(section).and_then(toml::Value::as_table_mut).ok_or("no such section")?;
+        let section =
+            table.get_mut(section).and_then(toml::Value::as_table_mut).ok_or("no such section")?;
         section.insert(key.to_owned(), parsed["value"].clone());
     }
     Ok(table.try_into()?)
@@ -128,13 +129,21 @@ impl Run {
                     }
                 }
                 Output::Event(event) => {
-                    writeln!(out, "E {} {} {}", event.time_ns, event.kind().as_str_name(), event.track_id)?;
+                    writeln!(
+                        out,
+                        "E {} {} {}",
+                        event.time_ns,
+                        event.kind().as_str_name(),
+                        event.track_id
+                    )?;
                 }
                 Output::Rejected(rejection) => {
                     let kind = format!("{} {}", rejection.camera, rejection.reason.counter());
                     *self.refused.entry(kind).or_default() += 1;
                 }
-                Output::Camera(camera, standing) => writeln!(out, "S {index} {camera} {standing:?}")?,
+                Output::Camera(camera, standing) => {
+                    writeln!(out, "S {index} {camera} {standing:?}")?;
+                }
             }
         }
         Ok(())

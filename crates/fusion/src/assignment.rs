@@ -17,12 +17,14 @@ pub(crate) struct Candidate {
     pub(crate) gain: f64,
 }
 
-/// The pairs (row, column) of greatest total gain, ordered by row; a gain of 0 and less is never taken.
+/// The pairs (row, column) of greatest total gain, ordered by row; a gain of 0 and less is never
+/// taken.
 ///
 /// Candidates that touch no other's row or column decide themselves; only knots of several are
 /// solved as a whole, so the cost grows with the knots and not with the site.
 pub(crate) fn assign(candidates: &[Candidate]) -> Vec<(usize, usize)> {
-    let mut pairs: Vec<(usize, usize)> = knots(candidates).iter().flat_map(|knot| solve(knot)).collect();
+    let mut pairs: Vec<(usize, usize)> =
+        knots(candidates).iter().flat_map(|knot| solve(knot)).collect();
     pairs.sort_unstable();
     pairs
 }
@@ -39,7 +41,8 @@ fn knots(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
     }
     let (mut rows, mut columns) = (BTreeMap::new(), BTreeMap::new());
     for (i, candidate) in candidates.iter().enumerate() {
-        for first in [*rows.entry(candidate.row).or_insert(i), *columns.entry(candidate.column).or_insert(i)]
+        for first in
+            [*rows.entry(candidate.row).or_insert(i), *columns.entry(candidate.column).or_insert(i)]
         {
             let (a, b) = (find(&mut leader, first), find(&mut leader, i));
             leader[a.max(b)] = a.min(b);
@@ -84,8 +87,11 @@ fn solve(knot: &[Candidate]) -> Vec<(usize, usize)> {
 
 fn greedy(knot: &[Candidate]) -> Vec<(usize, usize)> {
     let mut by_gain = knot.to_vec();
-    by_gain.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column)));
-    let (mut rows, mut columns) = (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
+    by_gain.sort_by(|a, b| {
+        b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column))
+    });
+    let (mut rows, mut columns) =
+        (std::collections::BTreeSet::new(), std::collections::BTreeSet::new());
     let mut pairs = Vec::new();
     for candidate in by_gain {
         if !rows.contains(&candidate.row) && !columns.contains(&candidate.column) {
@@ -102,7 +108,8 @@ mod tests {
     use super::*;
 
     fn all(gains: &[(usize, usize, f64)]) -> Vec<(usize, usize)> {
-        let candidate = |&(row, column, gain): &(usize, usize, f64)| Candidate { row, column, gain };
+        let candidate =
+            |&(row, column, gain): &(usize, usize, f64)| Candidate { row, column, gain };
         assign(&gains.iter().map(candidate).collect::<Vec<_>>())
     }
 

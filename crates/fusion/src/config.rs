@@ -27,9 +27,11 @@ pub struct Clocks {
     pub estimate: bool,
     /// Cameras whose clock is right by definition. Default none.
     pub trusted: Vec<CameraName>,
-    /// Clocks reported to be better than this are taken at their word, s. 1e-9 to 10. Default 0.001.
+    /// Clocks reported to be better than this are taken at their word, s. 1e-9 to 10. Default
+    /// 0.001.
     pub least_sd_s: f64,
-    /// Standard deviation of a clock's drift, s/s. 1e-12 to 0.1. Default 0.00003: quartzes are within 50 ppm.
+    /// Standard deviation of a clock's drift, s/s. 1e-12 to 0.1. Default 0.00003: quartzes are
+    /// within 50 ppm.
     pub drift_sd: f64,
 }
 
@@ -43,12 +45,13 @@ impl Default for Clocks {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EventTime {
-    /// How long to wait for a camera that is behind the others, or for a frame that a newer one of its
-    /// camera has overtaken where that has happened within the last 20 times this, s of capture time. 0.001
-    /// to 60. Default 0.5: longer than any network hiccup that a track would not survive anyway.
+    /// How long to wait for a camera that is behind the others, or for a frame that a newer one of
+    /// its camera has overtaken where that has happened within the last 20 times this, s of capture
+    /// time. 0.001 to 60. Default 0.5: longer than any network hiccup that a track would not
+    /// survive anyway.
     pub lateness_s: f64,
-    /// A frame this far ahead of what the cameras say together (the second newest, and what half of them
-    /// have reached) is from the future and refused, s. 0.001 to 3600. Default 10.
+    /// A frame this far ahead of what the cameras say together (the second newest, and what half of
+    /// them have reached) is from the future and refused, s. 0.001 to 3600. Default 10.
     pub max_ahead_s: f64,
 }
 
@@ -78,8 +81,8 @@ pub struct Bearings {
     /// The standard deviation with `equal`, rad an axis. 1e-9 to 0.1. Default 0.001, a pixel of a
     /// 1000-pixel lens.
     pub equal_sd_rad: f64,
-    /// What pose and lens leave unmodelled: added in square to each reported standard deviation, rad an
-    /// axis. 0 to 0.1. Default 0: calibrations are taken at their word.
+    /// What pose and lens leave unmodelled: added in square to each reported standard deviation,
+    /// rad an axis. 0 to 0.1. Default 0: calibrations are taken at their word.
     pub systematic_sd_rad: f64,
 }
 
@@ -93,9 +96,9 @@ impl Default for Bearings {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SpatialSolver {
-    /// Two receivers, ranges only (002, the alternative algorithm).
+    /// Two receivers, ranges only (Klochko 2020, the alternative algorithm).
     Pair,
-    /// Three receivers, ranges and velocity (002, the proposed algorithm).
+    /// Three receivers, ranges and velocity (Klochko 2020, the proposed algorithm).
     Triple,
     /// n receivers, ranges and velocity by unweighted least squares.
     Stacked,
@@ -112,7 +115,7 @@ pub enum InitiationMethod {
     /// periods, by likelihood; the best set of hypotheses without common bearings is confirmed.
     #[default]
     Hypotheses,
-    /// Each period is solved for fixes, and fixes are grouped by their residuals (002).
+    /// Each period is solved for fixes, and fixes are grouped by their residuals (Klochko 2020).
     Grouping,
 }
 
@@ -122,28 +125,30 @@ pub enum InitiationMethod {
 pub struct Initiation {
     /// `hypotheses` (default) or `grouping`.
     pub method: InitiationMethod,
-    /// New targets that a period is expected to bring, 1/m^3, for `hypotheses`. 1e-30 to 1. Default 1e-9:
-    /// one in a cubic kilometre.
+    /// New targets that a period is expected to bring, 1/m^3, for `hypotheses`. 1e-30 to 1. Default
+    /// 1e-9: one in a cubic kilometre.
     pub birth_density_per_m3: f64,
     /// `map` (default), `stacked`, `triple` or `pair`, for `grouping`.
     pub solver: SpatialSolver,
-    /// The shortest observation period, s; a period lasts until every camera that is heard has given an
-    /// exposure, and these lie as close together as they do. 0.0001 to 60. Default 0.05.
+    /// The shortest observation period, s; a period lasts until every camera that is heard has
+    /// given an exposure, and these lie as close together as they do. 0.0001 to 60. Default 0.05.
     pub period_s: f64,
     /// How many periods may make a group of fixes. 2 to 20, default 4; the papers have 5.
     pub periods: usize,
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
-    /// How long the bearings of two cameras must agree to start a track that no third camera sees, s, for
-    /// `hypotheses`. 0.001 to 3600. Default 1.
+    /// How long the bearings of two cameras must agree to start a track that no third camera sees,
+    /// s, for `hypotheses`. 0.001 to 3600. Default 1.
     pub pair_s: f64,
     /// Standard deviation of the velocity's prior, m/s an axis. 0.001 to 10000. Default 15.
     pub velocity_prior_sd_mps: f64,
     /// Fixes farther than this from a camera are ghosts, m. 0.01 to 1000000. Default 2000.
     pub max_range_m: f64,
-    /// Probability with which a true combination passes the gates of `hypotheses` and of `map`. Default 0.999.
+    /// Probability with which a true combination passes the gates of `hypotheses` and of `map`.
+    /// Default 0.999.
     pub spatial_gate_probability: f64,
-    /// The spatial gate of `pair`, `J <= beta`, m^2 (002, below equation 9). 1e-9 to 1e9. Default 16.
+    /// The spatial gate of `pair`, `J <= beta`, m^2 (Klochko 2020, below equation 9). 1e-9 to 1e9.
+    /// Default 16.
     pub pair_gate_m2: f64,
     /// The temporal gate of the papers, m. 1e-6 to 1000000. Absent (default): from the covariances.
     pub temporal_gate_m: Option<f64>,
@@ -178,7 +183,8 @@ pub enum Manoeuvres {
     /// Interacting multiple models, `models`.
     #[default]
     Models,
-    /// One model, `acceleration_density`, re-initialised when the smoothed residual is too large (004).
+    /// One model, `acceleration_density`, re-initialised when the smoothed residual is too large
+    /// (Kalinov 2019).
     SmoothedResidual,
     /// The same when the normalised innovation squared is too large.
     Innovation,
@@ -190,12 +196,13 @@ pub enum Manoeuvres {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlightModel {
-    /// Power spectral density of the white acceleration, m^2/s^3: its root is the change of velocity in a
-    /// second, m/s. 0 to 1000000.
+    /// Power spectral density of the white acceleration, m^2/s^3: its root is the change of
+    /// velocity in a second, m/s. 0 to 1000000.
     pub acceleration_density: f64,
     /// Share of the time that targets fly like this.
     pub share: f64,
-    /// Whether targets fly like this for long. How often one leaves its calm is learnt of each. Default false.
+    /// Whether targets fly like this for long. How often one leaves its calm is learnt of each.
+    /// Default false.
     #[serde(default)]
     pub calm: bool,
 }
@@ -206,51 +213,58 @@ pub struct FlightModel {
 pub struct Tracking {
     /// `models` (default), `smoothed-residual`, `innovation` or `none`.
     pub manoeuvres: Manoeuvres,
-    /// The ways of flying of `models`, one to four. Default: straight (1e-6, calm, 0.98 of the time), drifting
-    /// (0.3, 0.012), manoeuvring (5, 0.007) and hard turns (60, 0.001).
+    /// The ways of flying of `models`, one to four. Default: straight (1e-6, calm, 0.98 of the
+    /// time), drifting (0.3, 0.012), manoeuvring (5, 0.007) and hard turns (60, 0.001).
     pub models: Vec<FlightModel>,
-    /// How often a target that is not calm changes its way of flying, 1/s. 1e-9 to 100. Default 0.3.
+    /// How often a target that is not calm changes its way of flying, 1/s. 1e-9 to 100. Default
+    /// 0.3.
     pub switching_rate_per_s: f64,
-    /// How often a target that is not calm comes to its calm, 1/s. 1e-9 to 100. Default 0.02; by the shares targets
-    /// leave it every forty minutes in the mean.
+    /// How often a target that is not calm comes to its calm, 1/s. 1e-9 to 100. Default 0.02; by
+    /// the shares targets leave it every forty minutes in the mean.
     pub calming_rate_per_s: f64,
-    /// What this says of how often one target leaves its calm is worth so much of its flight, s. 0.001 to 1000000.
-    /// Default 20: one that has turned once is expected to turn again within so many seconds. With half of it the
-    /// track of a target that flies straight after one turn is noisier than it need be.
+    /// What this says of how often one target leaves its calm is worth so much of its flight, s.
+    /// 0.001 to 1000000. Default 20: one that has turned once is expected to turn again within so
+    /// many seconds. With half of it the track of a target that flies straight after one turn is
+    /// noisier than it need be.
     pub restlessness_prior_s: f64,
     /// Power spectral density of the white acceleration where there is one model, m^2/s^3. 1e-12 to
-    /// 1000000. Default 3, for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for what flies
-    /// straight.
+    /// 1000000. Default 3, for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for
+    /// what flies straight.
     pub acceleration_density: f64,
     /// Residuals that `smoothed-residual` takes the mean of. 1 to 1000. Default 8.
     pub residual_window: usize,
-    /// Its threshold in standard deviations of a bearing. 0.001 to 1000. Default 0.81, as in 004.
+    /// Its threshold in standard deviations of a bearing. 0.001 to 1000. Default 0.81, as in
+    /// Kalinov 2019.
     pub residual_scale: f64,
     /// Innovations that `innovation` sums. 1 to 1000. Default 2.
     pub innovation_window: usize,
     /// Probability of its false alarm. Default 0.0001.
     pub innovation_false_alarm: f64,
-    /// Probability with which a true bearing passes a track's gate. Default 0.999999: a target that begins to
-    /// turn must still be in it when the likelihoods have noticed.
+    /// Probability with which a true bearing passes a track's gate. Default 0.999999: a target that
+    /// begins to turn must still be in it when the likelihoods have noticed.
     pub gate_probability: f64,
     /// Probability that a camera reports a target in its field of view. Default 0.9.
     pub detection_probability: f64,
     /// Density of false bearings, 1/sr. 1e-9 to 1000000. Default 5.
     pub clutter_per_sr: f64,
-    /// Log-likelihood ratio (target against clutter) that confirms a track. 0.001 to 1000. Default 25.
+    /// Log-likelihood ratio (target against clutter) that confirms a track. 0.001 to 1000. Default
+    /// 25.
     pub confirm_score: f64,
-    /// A confirmed track not updated for this long is coasting, and a camera that has not seen a target for this
-    /// long does not hold its track in place any more, s. 0.001 to 3600. Default 1.5.
+    /// A confirmed track not updated for this long is coasting, and a camera that has not seen a
+    /// target for this long does not hold its track in place any more, s. 0.001 to 3600. Default
+    /// 1.5.
     pub coasting_after_s: f64,
     /// A track not updated for this long is lost, s. 0.001 to 3600. Default 4.
     pub lost_after_s: f64,
-    /// A track whose position is worse than this along any axis is lost, m. 0.001 to 100000. Default 20.
+    /// A track whose position is worse than this along any axis is lost, m. 0.001 to 100000.
+    /// Default 20.
     pub max_position_sd_m: f64,
 }
 
 impl Default for Tracking {
     fn default() -> Self {
-        let model = |acceleration_density, share, calm| FlightModel { acceleration_density, share, calm };
+        let model =
+            |acceleration_density, share, calm| FlightModel { acceleration_density, share, calm };
         Self {
             manoeuvres: Manoeuvres::default(),
             models: vec![

@@ -38,20 +38,20 @@ struct Source {
 /// The buffer that puts exposures into order.
 ///
 /// The time up to which exposures are released follows the reference: the second newest of the live
-/// cameras, and no more than half of them must be beyond what the others have reached. So a minority
-/// of wrong clocks cannot drag the others into the past. It is the time of the slowest camera that is
-/// still heard, or `lateness_s` behind the reference, whichever is later.
+/// cameras, and no more than half of them must be beyond what the others have reached. So a
+/// minority of wrong clocks cannot drag the others into the past. It is the time of the slowest
+/// camera that is still heard, or `lateness_s` behind the reference, whichever is later.
 ///
-/// Frames that are refused count for the reference too: where most cameras jump, time has jumped. If
-/// most of them have been behind what was released for a while, that was the mistake, and the order is
-/// taken up anew from their time.
+/// Frames that are refused count for the reference too: where most cameras jump, time has jumped.
+/// If most of them have been behind what was released for a while, that was the mistake, and the
+/// order is taken up anew from their time.
 ///
-/// A camera is live until the cameras heard since have gone on, on average, by [`PATIENCES`] times the
-/// lateness by their own clocks, jumps left out: there is no other clock here.
+/// A camera is live until the cameras heard since have gone on, on average, by [`PATIENCES`] times
+/// the lateness by their own clocks, jumps left out: there is no other clock here.
 ///
 /// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
-/// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be as
-/// far behind its newest frame as that one was.
+/// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be
+/// as far behind its newest frame as that one was.
 ///
 /// What is late is not measured by that word but by what has been worked on: an exposure that can
 /// still be taken in order is taken.
@@ -106,7 +106,8 @@ impl EventBuffer {
         }
     }
 
-    /// Says that a camera should be heard soon: in the beginning it is waited for as for the others.
+    /// Says that a camera should be heard soon: in the beginning it is waited for as for the
+    /// others.
     pub(crate) fn expect(&mut self, camera: &CameraName) {
         self.sources.entry(camera.clone()).or_default();
     }
@@ -180,7 +181,8 @@ impl EventBuffer {
         let is_live = |(since, stream): &(usize, &Stream)| {
             self.run_s - stream.heard_s <= patience_s * (*since).max(1) as f64
         };
-        let live: Vec<&Stream> = heard.into_iter().enumerate().take_while(is_live).map(|(_, s)| s).collect();
+        let live: Vec<&Stream> =
+            heard.into_iter().enumerate().take_while(is_live).map(|(_, s)| s).collect();
         let newest_first = |mut times: Vec<Timestamp>| {
             times.sort_by(|one, other| other.cmp(one));
             times
@@ -229,14 +231,14 @@ impl EventBuffer {
         *self = Self { sources, ..Self::new(self.config.clone()) };
     }
 
-    /// The time at which the order was taken up anew with the last frame, if it was: what has been made of
-    /// later times is to be forgotten.
+    /// The time at which the order was taken up anew with the last frame, if it was: what has been
+    /// made of later times is to be forgotten.
     pub(crate) fn take_restart(&mut self) -> Option<Timestamp> {
         self.restarted.take()
     }
 
-    /// By how much an exposure comes too late, s: what follows it has been worked on. What came out may
-    /// still wait for other clocks to be sure (its time is less the clock's offset then).
+    /// By how much an exposure comes too late, s: what follows it has been worked on. What came out
+    /// may still wait for other clocks to be sure (its time is less the clock's offset then).
     fn late_s(&self, exposure: &Exposure) -> Option<f64> {
         let corrected = exposure.time.plus_seconds(-exposure.correction_s);
         let is_late = exposure.time < self.released && corrected < self.passed;
@@ -248,8 +250,8 @@ impl EventBuffer {
         self.passed = self.passed.max(corrected);
     }
 
-    /// By how much a time, less the clock's offset, lies before what has been worked on, s: more than the
-    /// lateness, or `None`.
+    /// By how much a time, less the clock's offset, lies before what has been worked on, s: more
+    /// than the lateness, or `None`.
     pub(crate) fn passed_by_s(&self, corrected: Timestamp) -> Option<f64> {
         Some(self.passed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
     }
@@ -294,7 +296,9 @@ impl EventBuffer {
     fn remember(&mut self, order: (Timestamp, CameraName)) {
         self.taken.insert(order);
         let oldest = self.released.plus_seconds(-self.config.lateness_s);
-        while self.taken.len() > MAX_TAKEN || self.taken.first().is_some_and(|(time, _)| *time < oldest) {
+        while self.taken.len() > MAX_TAKEN
+            || self.taken.first().is_some_and(|(time, _)| *time < oldest)
+        {
             self.taken.pop_first();
         }
     }
@@ -310,8 +314,8 @@ impl EventBuffer {
         let patience = reference.plus_seconds(-lateness_s);
         let forgotten = reference.plus_seconds(-PATIENCES * lateness_s);
         let is_expected = |source: &Source| source.stream.is_none() && !source.ended;
-        let waits_for_new =
-            self.first.is_some_and(|first| first > forgotten) && self.sources.values().any(is_expected);
+        let waits_for_new = self.first.is_some_and(|first| first > forgotten)
+            && self.sources.values().any(is_expected);
         // A camera alone is not followed at once: the others may come back, or be heard at last.
         let is_alone = live == 1 && (heard == 1 || self.going_on().count() > 1);
         if waits_for_new || is_alone {
@@ -319,7 +323,8 @@ impl EventBuffer {
         }
         let lately = self.going_on().filter(|stream| stream.newest > forgotten);
         let slowest = lately.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
-        // Of the cameras that have ended, nothing more comes; of the others, nothing before `slowest`.
+        // Of the cameras that have ended, nothing more comes; of the others, nothing before
+        // `slowest`.
         Some(slowest.map_or(patience, |slowest| slowest.max(patience)))
     }
 }

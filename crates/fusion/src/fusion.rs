@@ -1,7 +1,8 @@
 mod jumps;
 
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent, TrackFrame,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent,
+    TrackFrame,
 };
 
 use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera};
@@ -85,8 +86,8 @@ impl Fusion {
         })
     }
 
-    /// Makes a camera known, or replaces what is known of it for the frames that it captures from the
-    /// calibration's `valid_from_ns` on.
+    /// Makes a camera known, or replaces what is known of it for the frames that it captures from
+    /// the calibration's `valid_from_ns` on.
     ///
     /// # Errors
     /// [`CalibrationError`] if the message describes no camera; what was known stays.
@@ -123,11 +124,14 @@ impl Fusion {
                     self.refuse(refused(frame, reason), outputs);
                 }
                 // As far as is known by now: it is settled when the exposure's turn comes.
-                exposure.correction_s = self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
+                exposure.correction_s =
+                    self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
                 let (camera, time) = (exposure.camera.clone(), exposure.time);
                 let arrival = self.buffer.insert(exposure);
-                let in_time =
-                    !matches!(arrival, Err(RejectionReason::Late { .. } | RejectionReason::Future { .. }));
+                let in_time = !matches!(
+                    arrival,
+                    Err(RejectionReason::Late { .. } | RejectionReason::Future { .. })
+                );
                 self.note_time(&camera, time, in_time, outputs);
                 if let Some(time) = self.buffer.take_restart() {
                     self.restart(time, outputs);
@@ -190,7 +194,10 @@ impl Fusion {
         self.tracker.tracks()
     }
 
-    fn read(&mut self, frame: &BearingFrame) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
+    fn read(
+        &mut self,
+        frame: &BearingFrame,
+    ) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
         let name: CameraName = frame.camera.parse().map_err(|_| RejectionReason::UnknownCamera)?;
         let captured = Timestamp::from_nanos(frame.capture_time_ns);
         let camera = self.cameras.at(&name, captured).ok_or(RejectionReason::UnknownCamera)?;
@@ -216,7 +223,8 @@ impl Fusion {
     }
 
     /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
-    /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to come.
+    /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to
+    /// come.
     fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
         self.clocks.see(&exposure.camera, &exposure.uncertainty);
         let Some(clock) = self.clock(&exposure.camera) else {
@@ -251,7 +259,8 @@ impl Fusion {
         self.now = Some(exposure.time);
         self.tracker.begin(exposure.time);
         for moved in self.cameras.advance(exposure.time) {
-            self.clocks.calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
+            self.clocks
+                .calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
             self.initiator.forget(&moved);
         }
         let Some(camera) = self.cameras.get_mut(&exposure.camera) else {
@@ -280,8 +289,8 @@ impl Fusion {
         self.say(&exposure, happenings, outputs);
     }
 
-    /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns how it fits the
-    /// tracks, and which has used which of its sightings (by index).
+    /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns
+    /// how it fits the tracks, and which has used which of its sightings (by index).
     fn follow(
         &mut self,
         exposure: &Exposure,
@@ -319,7 +328,9 @@ impl Fusion {
         }
         self.clocks.advance(exposure.time, &self.tracker);
         for (index, id) in used {
-            if let (Some(track), Some(sighting)) = (self.tracker.track(*id), exposure.sightings.get(*index)) {
+            if let (Some(track), Some(sighting)) =
+                (self.tracker.track(*id), exposure.sightings.get(*index))
+            {
                 self.clocks.update(track, exposure, &sighting.line);
             }
         }
@@ -342,7 +353,13 @@ impl Fusion {
     }
 
     /// Takes in whether a frame of a camera came in time.
-    fn note_time(&mut self, camera: &CameraName, time: Timestamp, in_time: bool, outputs: &mut Vec<Output>) {
+    fn note_time(
+        &mut self,
+        camera: &CameraName,
+        time: Timestamp,
+        in_time: bool,
+        outputs: &mut Vec<Output>,
+    ) {
         let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
             self.counters.count(match standing {

@@ -119,14 +119,21 @@ impl fmt::Display for Rejection {
             RejectionReason::Duplicate => f.write_str("its capture time came before"),
             RejectionReason::Time => f.write_str("its capture time or its SD is impossible"),
             RejectionReason::Crowded { left_out } => {
-                write!(f, "{left_out} bearings are not used: more than {MAX_BEARINGS} are no picture")
+                write!(
+                    f,
+                    "{left_out} bearings are not used: more than {MAX_BEARINGS} are no picture"
+                )
             }
             RejectionReason::Bearing(error) => write!(f, "a bearing is impossible: {error}"),
         }
     }
 }
 
-fn sighting(track: &BearingTrack, camera: &Camera, config: &Bearings) -> Result<Sighting, GeometryError> {
+fn sighting(
+    track: &BearingTrack,
+    camera: &Camera,
+    config: &Bearings,
+) -> Result<Sighting, GeometryError> {
     let vector = track.bearing.ok_or(GeometryError::NotUnit { length: 0.0 })?;
     let covariance = match config.weighting {
         Weighting::Equal => Matrix2::identity() * config.equal_sd_rad.powi(2),
@@ -136,7 +143,11 @@ fn sighting(track: &BearingTrack, camera: &Camera, config: &Bearings) -> Result<
         }
     };
     let bearing = Bearing::new(vector.into(), covariance)?;
-    Ok(Sighting { image_track: track.track_id, line: camera.sight_line(&bearing), rooted: Rooted::Unknown })
+    Ok(Sighting {
+        image_track: track.track_id,
+        line: camera.sight_line(&bearing),
+        rooted: Rooted::Unknown,
+    })
 }
 
 /// Reads a frame: what was measured, and what of it had to be left out.

@@ -11,8 +11,8 @@
 //! begin hypotheses that are followed until one reading of the bearings is by
 //! far the best. The papers' way can be chosen in its place ([`papers`]).
 //!
-//! Three cameras look at a place over which a target flies; two seconds of their bearings, no two of them of one
-//! time, are a track:
+//! Three cameras look at a place over which a target flies; two seconds of their bearings, no two
+//! of them of one time, are a track:
 //!
 //! ```
 //! use crossfix_fusion::{Fusion, FusionConfig};
@@ -79,8 +79,8 @@ mod visibility;
 pub use cameras::CameraStanding;
 pub use clocks::ClockEstimate;
 pub use config::{
-    Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation, InitiationMethod,
-    Manoeuvres, SpatialSolver, Tracking, Weighting,
+    Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation,
+    InitiationMethod, Manoeuvres, SpatialSolver, Tracking, Weighting,
 };
 pub use counters::Counters;
 pub use fusion::{CameraReport, Fusion, Output};

@@ -1,6 +1,8 @@
 //! How targets move between bearings, and what is done when one turns.
 
-use crossfix_filter::{ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual};
+use crossfix_filter::{
+    ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
+};
 
 use crate::{ConfigError, Manoeuvres, Tracking};
 
@@ -22,7 +24,7 @@ pub(crate) struct Motion {
     detector: Option<Detector>,
 }
 
-/// A detector of manoeuvres (004).
+/// A detector of manoeuvres (Kalinov 2019).
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Detector {
     /// The paper's.
@@ -55,8 +57,10 @@ impl Motion {
                 (single, Some(Detector::Residual(detector)))
             }
             Manoeuvres::Innovation => {
-                let detector =
-                    NormalisedInnovation::new(config.innovation_window, config.innovation_false_alarm);
+                let detector = NormalisedInnovation::new(
+                    config.innovation_window,
+                    config.innovation_false_alarm,
+                );
                 (single, Some(Detector::Innovation(detector)))
             }
         };

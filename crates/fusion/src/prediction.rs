@@ -17,7 +17,8 @@ pub(crate) struct BearingPrediction {
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
     steady: Matrix2<f64>,
-    /// What poses and clocks of the camera shift all its bearings by, rad^2, and how that goes with the track's error.
+    /// What poses and clocks of the camera shift all its bearings by, rad^2, and how that goes with
+    /// the track's error.
     shift: Matrix2<f64>,
     cross: Matrix2<f64>,
     /// What each model's process noise adds along both tangents, rad^2, and its probability.
@@ -31,13 +32,15 @@ pub(crate) struct BearingPrediction {
 pub(crate) struct Beginning {
     /// What of it the track leaves, rad.
     pub(crate) left: Vector2<f64>,
-    /// Covariances of the camera's shift, of the line's noise, and of the track's place as seen from there, rad^2.
+    /// Covariances of the camera's shift, of the line's noise, and of the track's place as seen
+    /// from there, rad^2.
     pub(crate) shift: Matrix2<f64>,
     pub(crate) noise: Matrix2<f64>,
     pub(crate) placed: Matrix2<f64>,
 }
 
-/// A bearing against a prediction, with what its camera shifts all of its bearings by apart, along the tangents.
+/// A bearing against a prediction, with what its camera shifts all of its bearings by apart, along
+/// the tangents.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GivenShift {
     /// Covariance of the shift, rad^2.
@@ -74,11 +77,12 @@ impl BearingPrediction {
         let model = BearingModel::new(origin, state.position())?;
         let by = model.by_position();
         let shifts = uncertainty.shifts(&model, state.velocity());
-        let common =
-            shifts * shifts.transpose() + uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
+        let common = shifts * shifts.transpose()
+            + uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
         let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
         let shift = shifts * shifts.transpose();
-        let steady = by * state.position_covariance() * by.transpose() + cross + cross.transpose() + common;
+        let steady =
+            by * state.position_covariance() * by.transpose() + cross + cross.transpose() + common;
         let range = model.range;
         let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
         let mut added = [0.0; MAX_MODELS];
@@ -97,9 +101,14 @@ impl BearingPrediction {
         })
     }
 
-    /// Where a camera at `origin` should see a target of a state, as of the state's time; the target
-    /// may have moved by `moved` (m, standard deviation an axis) between that time and the exposure.
-    pub(crate) fn of_state(state: &KinematicState, origin: Point3<f64>, moved: f64) -> Option<Self> {
+    /// Where a camera at `origin` should see a target of a state, as of the state's time; the
+    /// target may have moved by `moved` (m, standard deviation an axis) between that time and the
+    /// exposure.
+    pub(crate) fn of_state(
+        state: &KinematicState,
+        origin: Point3<f64>,
+        moved: f64,
+    ) -> Option<Self> {
         let model = BearingModel::new(origin, state.position())?;
         let by = model.by_position();
         let steady = by * state.position_covariance() * by.transpose()
@@ -120,12 +129,16 @@ impl BearingPrediction {
         &self.model.basis
     }
 
-    /// What a bearing is expected to be off by, where what the camera shifts all of its own by is known.
+    /// What a bearing is expected to be off by, where what the camera shifts all of its own by is
+    /// known.
     pub(crate) fn given_shift(&self, line: &SightLine, least_factor: f64) -> GivenShift {
-        let added: f64 = self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
+        let added: f64 =
+            self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
         let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
-        // Of the shift s the track has taken C V^-1 s in, with C the covariance of the two and V the shift's.
-        let taken = self.shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| self.cross * inverse);
+        // Of the shift s the track has taken C V^-1 s in, with C the covariance of the two and V
+        // the shift's.
+        let taken =
+            self.shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| self.cross * inverse);
         let left = Matrix2::identity() + taken;
         let spread = self.steady - left * self.shift * left.transpose();
         GivenShift { shift: self.shift, left, spread: spread + noise + Matrix2::identity() * added }
@@ -142,7 +155,8 @@ impl BearingPrediction {
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
         let innovation = self.model.offset(line)?;
         // No axis of the covariance is longer than its trace: most bearings need no more than this.
-        let longest = self.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
+        let longest =
+            self.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
         if innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
@@ -172,8 +186,9 @@ pub(crate) fn log_density(covariance: &Matrix2<f64>, vector: Vector2<f64>) -> Op
 fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Option<(f64, f64)> {
     let [xx, xy, yy] = [covariance.m11 + added, covariance.m12, covariance.m22 + added];
     let determinant = xx * yy - xy * xy;
-    let squared =
-        (yy * vector.x * vector.x - 2.0 * xy * vector.x * vector.y + xx * vector.y * vector.y) / determinant;
+    let squared = (yy * vector.x * vector.x - 2.0 * xy * vector.x * vector.y
+        + xx * vector.y * vector.y)
+        / determinant;
     // Of a matrix that is less than nothing the determinant is positive too.
     (determinant > 0.0 && xx > 0.0 && squared.is_finite()).then_some((squared, determinant))
 }
@@ -207,7 +222,8 @@ mod tests {
         )
         .unwrap();
         let gate = Gate::with_probability(0.9999);
-        let fit = |x: f64| prediction.fit(&line_at(camera, Point3::new(x, 0.0, 50.0), 1.0).line, gate);
+        let fit =
+            |x: f64| prediction.fit(&line_at(camera, Point3::new(x, 0.0, 50.0), 1.0).line, gate);
         let near = |x: f64| fit(x).unwrap();
         assert!(near(10.0).gate_distance < 1e-9);
         // Two metres aside: twelve sigma of the quiet model, 1.5 of the lively one.

@@ -1,11 +1,11 @@
 //! The coordinates in which one camera's bearings leave the range alone.
 //!
-//! Seen from a camera that stands still, a target at twice the distance and twice the speed gives the same
-//! bearings for ever. In Cartesian coordinates that direction of the state turns with every update, and a
-//! linearised filter takes the difference for knowledge: within seconds it is sure of a range that no
-//! bearing holds. In the direction, the logarithm of the range, and the velocity as a share of the range, it
-//! is one axis that never turns, a bearing is a linear measurement of the two others, and an uncertain range
-//! is nearly Gaussian.
+//! Seen from a camera that stands still, a target at twice the distance and twice the speed gives
+//! the same bearings for ever. In Cartesian coordinates that direction of the state turns with
+//! every update, and a linearised filter takes the difference for knowledge: within seconds it is
+//! sure of a range that no bearing holds. In the direction, the logarithm of the range, and the
+//! velocity as a share of the range, it is one axis that never turns, a bearing is a linear
+//! measurement of the two others, and an uncertain range is nearly Gaussian.
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::passing_ranges;
@@ -24,8 +24,8 @@ pub(crate) enum Chart {
     ByRange(RangeChart),
 }
 
-/// Direction (two tangents, rad), logarithm of the range, and velocity by range (1/s, world's axes), as
-/// differences from those of one state, seen from one place.
+/// Direction (two tangents, rad), logarithm of the range, and velocity by range (1/s, world's
+/// axes), as differences from those of one state, seen from one place.
 #[derive(Clone, Debug)]
 pub(crate) struct RangeChart {
     origin: Point3<f64>,
@@ -58,7 +58,8 @@ impl Chart {
         RangeChart::new(origin, state).map(Self::ByRange)
     }
 
-    /// A covariance of position and velocity, and theirs with some errors, in the chart's coordinates.
+    /// A covariance of position and velocity, and theirs with some errors, in the chart's
+    /// coordinates.
     pub(crate) fn expressed(
         &self,
         covariance: &Matrix6<f64>,
@@ -73,9 +74,9 @@ impl Chart {
         }
     }
 
-    /// Back from the chart at a point of it, after an update by a measurement of the place (`by`, on the first
-    /// three coordinates) with a gain: the covariance, what becomes of the state's covariance with any error,
-    /// and the gain, all of position and velocity.
+    /// Back from the chart at a point of it, after an update by a measurement of the place (`by`,
+    /// on the first three coordinates) with a gain: the covariance, what becomes of the state's
+    /// covariance with any error, and the gain, all of position and velocity.
     pub(crate) fn from(
         &self,
         point: &ChartPoint,
@@ -109,8 +110,8 @@ impl Chart {
         }
     }
 
-    /// The coordinate along the sight line at which this passes nearest to a line; `None` if that lies behind
-    /// either camera, or there is no such coordinate.
+    /// The coordinate along the sight line at which this passes nearest to a line; `None` if that
+    /// lies behind either camera, or there is no such coordinate.
     pub(crate) fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
         match self {
             Self::Cartesian(_) => None,
@@ -141,8 +142,9 @@ impl RangeChart {
         let aside = self.direction.into_inner() + self.tangents * coordinates.fixed_rows::<2>(0);
         let (direction, length) = Unit::new_and_get(aside);
         let range = self.range * coordinates[2].exp();
-        let across =
-            (self.tangents - direction.into_inner() * (direction.transpose() * self.tangents)) / length;
+        let across = (self.tangents
+            - direction.into_inner() * (direction.transpose() * self.tangents))
+            / length;
         let mut place_by = Matrix3::zeros();
         place_by.fixed_view_mut::<3, 2>(0, 0).copy_from(&(across * range));
         place_by.set_column(2, &(direction.into_inner() * range));
@@ -152,12 +154,18 @@ impl RangeChart {
         state_by.fixed_view_mut::<3, 1>(3, 2).copy_from(&velocity);
         state_by.fixed_view_mut::<3, 3>(3, 3).fill_with_identity();
         state_by.fixed_view_mut::<3, 3>(3, 3).scale_mut(range);
-        ChartPoint { place: self.origin + direction.into_inner() * range, velocity, place_by, state_by }
+        ChartPoint {
+            place: self.origin + direction.into_inner() * range,
+            velocity,
+            place_by,
+            state_by,
+        }
     }
 
     /// The logarithm of the range against the chart's own.
     fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
-        let [here, there] = passing_ranges((self.origin, &self.direction), (line.origin, &line.direction));
+        let [here, there] =
+            passing_ranges((self.origin, &self.direction), (line.origin, &line.direction));
         (here > 0.0 && there > 0.0).then(|| (here / self.range).ln())
     }
 }

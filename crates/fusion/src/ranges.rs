@@ -2,7 +2,9 @@
 //! that no number makes the fusion slow, or its sums too large or too small to be told apart.
 
 use crate::motion::Motion;
-use crate::{ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting};
+use crate::{
+    ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting,
+};
 
 /// A number of the configuration, and from where to where it makes sense.
 struct Range {
@@ -28,7 +30,8 @@ const OF_HYPOTHESES: &[Key] = &[
     ("initiation.birth_density_per_m3", |c| c.initiation.birth_density_per_m3),
     ("initiation.pair_s", |c| c.initiation.pair_s),
 ];
-const OF_ONE_MODEL: &[Key] = &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
+const OF_ONE_MODEL: &[Key] =
+    &[("tracking.acceleration_density", |c| c.tracking.acceleration_density)];
 const OF_MODELS: &[Key] = &[
     ("tracking.switching_rate_per_s", |c| c.tracking.switching_rate_per_s),
     ("tracking.calming_rate_per_s", |c| c.tracking.calming_rate_per_s),
@@ -56,7 +59,11 @@ impl Range {
 
 /// A number as people write it: with a power of ten where there would be many noughts.
 pub(crate) fn plain(value: f64) -> String {
-    if value == 0.0 || (1e-4..1e7).contains(&value) { value.to_string() } else { format!("{value:e}") }
+    if value == 0.0 || (1e-4..1e7).contains(&value) {
+        value.to_string()
+    } else {
+        format!("{value:e}")
+    }
 }
 
 impl FusionConfig {
@@ -72,16 +79,16 @@ impl FusionConfig {
         self.unused().map_or(Ok(()), Err)
     }
 
-    /// A number that says something else than the default and that nothing uses with the methods chosen: whoever has
-    /// set it thinks that it does something.
+    /// A number that says something else than the default and that nothing uses with the methods
+    /// chosen: whoever has set it thinks that it does something.
     fn unused(&self) -> Option<ConfigError> {
         let Self { bearings, initiation, tracking, .. } = self;
         let usual = Self::default();
         let grouping = initiation.method == InitiationMethod::Grouping;
         let pairs = grouping && initiation.solver == SpatialSolver::Pair;
         // The gate between fixes is from the covariances unless it is given.
-        let one_model =
-            tracking.manoeuvres != Manoeuvres::Models || (grouping && initiation.temporal_gate_m.is_none());
+        let one_model = tracking.manoeuvres != Manoeuvres::Models
+            || (grouping && initiation.temporal_gate_m.is_none());
         let keys = [
             (bearings.weighting == Weighting::Equal, OF_EQUAL_WEIGHTS),
             (pairs, OF_PAIRS),
@@ -93,7 +100,8 @@ impl FusionConfig {
             (tracking.manoeuvres == Manoeuvres::Innovation, OF_INNOVATION),
         ];
         let unused = keys.into_iter().filter(|(is_used, _)| !is_used).flat_map(|(_, keys)| keys);
-        let mut set = unused.filter(|(_, number)| number(self).to_bits() != number(&usual).to_bits());
+        let mut set =
+            unused.filter(|(_, number)| number(self).to_bits() != number(&usual).to_bits());
         set.next().map(|(key, number)| {
             let must = "left out: the method that is chosen does not use it".to_owned();
             ConfigError { key, value: number(self), must }
@@ -163,7 +171,11 @@ impl FusionConfig {
         ];
         for (key, value) in probabilities {
             if !(value > 0.0 && value < 1.0) {
-                return Err(ConfigError { key, value, must: "a probability between 0 and 1".to_owned() });
+                return Err(ConfigError {
+                    key,
+                    value,
+                    must: "a probability between 0 and 1".to_owned(),
+                });
             }
         }
         Ok(())
@@ -204,7 +216,10 @@ mod tests {
             refused(|c| c.event_time.lateness_s = f64::NAN),
             "`event_time.lateness_s` is NaN: it must be from 0.001 to 60"
         );
-        assert_eq!(refused(|c| c.initiation.fixes = 5), "`initiation.fixes` is 5: it must be from 1 to 4");
+        assert_eq!(
+            refused(|c| c.initiation.fixes = 5),
+            "`initiation.fixes` is 5: it must be from 1 to 4"
+        );
         assert_eq!(
             refused(|c| c.tracking.models[1].acceleration_density = f64::INFINITY),
             "`tracking.models.acceleration_density` is inf: it must be from 0 to 1000000"
@@ -218,7 +233,8 @@ mod tests {
     #[test]
     fn nothing_that_is_not_a_number_is_taken_anywhere() {
         let config = FusionConfig::default();
-        let tables = [config.time_and_bearings(), config.initiation_ranges(), config.tracking_ranges()];
+        let tables =
+            [config.time_and_bearings(), config.initiation_ranges(), config.tracking_ranges()];
         for range in tables.iter().flatten() {
             assert_eq!(range.check(), Ok(()), "the default is in its range");
             for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -1.0, 1e150] {

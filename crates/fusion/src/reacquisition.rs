@@ -1,5 +1,5 @@
-//! Tracks that one camera alone follows, seen by a second one again: every bearing that crosses the sight
-//! line may be the target's, so each is followed as a leaf of its own until one is sure.
+//! Tracks that one camera alone follows, seen by a second one again: every bearing that crosses the
+//! sight line may be the target's, so each is followed as a leaf of its own until one is sure.
 
 use std::collections::BTreeMap;
 
@@ -11,16 +11,18 @@ use crate::track::{Track, TrackId};
 use crate::tracker::{log_likelihood_ratio, missed};
 use crate::{Exposure, Tracking};
 
-/// A leaf is the track when the bearings are so many times (logarithm) likelier the target's than strangers:
-/// a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on a stranger.
+/// A leaf is the track when the bearings are so many times (logarithm) likelier the target's than
+/// strangers: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on a
+/// stranger.
 pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
 /// A leaf less likely than this (logarithm) is given up.
 const GIVEN_UP: f64 = -3.0;
-/// Leaves of one track that are followed at a time, the best ones: strangers cannot fill the memory.
+/// Leaves of one track that are followed at a time, the best ones: strangers cannot fill the
+/// memory.
 const MAX_LEAVES: usize = 4;
 
-/// A track with bearings of a second camera taken in, and how much likelier (logarithm) it is that these are
-/// the target's.
+/// A track with bearings of a second camera taken in, and how much likelier (logarithm) it is that
+/// these are the target's.
 #[derive(Clone, Debug)]
 struct Leaf {
     track: Track,
@@ -46,17 +48,18 @@ pub(crate) struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// The sightings (by index) that may be a track's, with their log-likelihood ratios against strangers,
-    /// the best first.
+    /// The sightings (by index) that may be a track's, with their log-likelihood ratios against
+    /// strangers, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
         let Self { exposure, known, motion, config, .. } = self;
         let seen_from = (&exposure.camera, known.camera.pose().position());
-        let Some(expected) = track.expectation(exposure.time, seen_from, &exposure.uncertainty, motion)
+        let Some(expected) =
+            track.expectation(exposure.time, seen_from, &exposure.uncertainty, motion)
         else {
             return Vec::new();
         };
-        let detection =
-            track.visible_to(&exposure.camera, exposure.time, motion) * config.detection_probability;
+        let detection = track.visible_to(&exposure.camera, exposure.time, motion)
+            * config.detection_probability;
         let open = exposure.sightings.iter().enumerate();
         let open = open.filter(|(i, _)| self.owners[*i].is_none_or(|id| id == owner));
         let fit = |(i, sighting): (usize, &crate::Sighting)| {
@@ -76,7 +79,12 @@ impl Look<'_> {
     fn taken(&self, track: &Track, index: usize) -> Option<Track> {
         let Exposure { camera, time, uncertainty, sightings, .. } = self.exposure;
         let mut track = track.clone();
-        track.measurement_update(camera, &sightings[index].line, (*time, uncertainty), self.motion)?;
+        track.measurement_update(
+            camera,
+            &sightings[index].line,
+            (*time, uncertainty),
+            self.motion,
+        )?;
         track.look(camera, *time, true, self.config.detection_probability, self.motion);
         Some(track)
     }
@@ -105,16 +113,19 @@ impl Look<'_> {
         if !track.is_lost_sight_of_by(&self.exposure.camera, self.motion) {
             return Vec::new();
         }
-        let fits = self.fits(track, track.id).into_iter().filter(|(_, i)| self.owners[*i].is_none());
+        let fits =
+            self.fits(track, track.id).into_iter().filter(|(_, i)| self.owners[*i].is_none());
         fits.take(MAX_LEAVES)
-            .filter_map(|(log_ratio, i)| Some((Leaf { track: self.taken(track, i)?, log_ratio }, Some(i))))
+            .filter_map(|(log_ratio, i)| {
+                Some((Leaf { track: self.taken(track, i)?, log_ratio }, Some(i)))
+            })
             .collect()
     }
 }
 
 impl Reacquisition {
-    /// Goes on with the leaves of the tracks that one camera alone follows; returns those that are found
-    /// again, with the sighting (by index) that has settled it.
+    /// Goes on with the leaves of the tracks that one camera alone follows; returns those that are
+    /// found again, with the sighting (by index) that has settled it.
     pub(crate) fn advance(
         &mut self,
         tracks: &BTreeMap<TrackId, Track>,

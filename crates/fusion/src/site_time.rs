@@ -1,29 +1,35 @@
-//! A step of all clocks at once: the source of time that the cameras share was off and has been set right.
+//! A step of all clocks at once: the source of time that the cameras share was off and has been set
+//! right.
 //!
-//! A camera's frames are numbered and come in a rhythm. Where the numbers go on and the time does not go on with
-//! them, its clock has stepped, or it has stood still. Where all cameras that are heard do so by as much, within the
-//! time for which late frames are waited for anyway, it is the site's time: agents of one host, or hosts that follow
-//! one source. Until that is clear the frames of those that have stepped wait; where it does not become clear each
-//! clock has stepped for itself.
+//! A camera's frames are numbered and come in a rhythm. Where the numbers go on and the time does
+//! not go on with them, its clock has stepped, or it has stood still. Where all cameras that are
+//! heard do so by as much, within the time for which late frames are waited for anyway, it is the
+//! site's time: agents of one host, or hosts that follow one source. Until that is clear the frames
+//! of those that have stepped wait; where it does not become clear each clock has stepped for
+//! itself.
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{BearingFrame, CameraName, Timestamp};
 
-/// A frame that is off its camera's rhythm by less than this has only been late, s. With half of it the frames of
-/// phones, which have no rate, are held up.
+/// A frame that is off its camera's rhythm by less than this has only been late, s. With half of it
+/// the frames of phones, which have no rate, are held up.
 const LEAST_STEP_S: f64 = 0.25;
-/// The same in its periods. With half of it a frame or two that were numbered and not sent are a step.
+/// The same in its periods. With half of it a frame or two that were numbered and not sent are a
+/// step.
 const LEAST_STEP_PERIODS: f64 = 4.0;
-/// Frames after which a camera's rhythm is known. With half of it two frames close together make a rhythm.
+/// Frames after which a camera's rhythm is known. With half of it two frames close together make a
+/// rhythm.
 const KNOWN_RHYTHM: u32 = 5;
-/// The share of a frame in the running mean of its camera's period. With half of it a new rate is learnt in a second.
+/// The share of a frame in the running mean of its camera's period. With half of it a new rate is
+/// learnt in a second.
 const PERIOD_SHARE: f64 = 0.1;
-/// Cameras that were silent for longer than this are not asked, and after a longer gap a rhythm says nothing, s. With
-/// half of it cameras of 1 Hz are asked by chance.
+/// Cameras that were silent for longer than this are not asked, and after a longer gap a rhythm
+/// says nothing, s. With half of it cameras of 1 Hz are asked by chance.
 const LIVE_S: f64 = 2.0;
-/// The share of the time for which late frames are waited for that a decision may take. With half of it hosts whose
-/// frames are a tenth of a second apart on their way do not step together; with all of it what waits is late.
+/// The share of the time for which late frames are waited for that a decision may take. With half
+/// of it hosts whose frames are a tenth of a second apart on their way do not step together; with
+/// all of it what waits is late.
 const SHARE_OF_LATENESS: f64 = 0.5;
 /// No more frames than this wait, of no more bearings: memory is bounded.
 const MOST_WAITING: usize = 200;
@@ -53,16 +59,19 @@ impl Rhythm {
         Self { sequence, time, period_s: 0.0, frames: 0, gone_s: 0.0, heard_s: 0.0 }
     }
 
-    /// By how much the next frame's time is off the rhythm, s, where that is no matter of frames that were late.
+    /// By how much the next frame's time is off the rhythm, s, where that is no matter of frames
+    /// that were late.
     fn step(&self, sequence: u64, time: Timestamp) -> Option<f64> {
-        let numbers =
-            sequence.checked_sub(self.sequence).filter(|n| *n > 0 && self.frames >= KNOWN_RHYTHM)?;
+        let numbers = sequence
+            .checked_sub(self.sequence)
+            .filter(|n| *n > 0 && self.frames >= KNOWN_RHYTHM)?;
         let due_s = numbers as f64 * self.period_s;
         let since_s = time.seconds_since(self.time);
         let step = since_s - due_s;
         // Where numbers are missing for long, the rhythm does not say when the next was due.
         let is_known = due_s <= LIVE_S && (step > 0.0 || since_s < 0.0);
-        (is_known && step.abs() > LEAST_STEP_S.max(LEAST_STEP_PERIODS * self.period_s)).then_some(step)
+        (is_known && step.abs() > LEAST_STEP_S.max(LEAST_STEP_PERIODS * self.period_s))
+            .then_some(step)
     }
 
     /// Takes the next frame in; returns how far the camera has gone on with it, s.
@@ -70,7 +79,8 @@ impl Rhythm {
         let numbers = sequence.saturating_sub(self.sequence);
         let since_s = time.seconds_since(self.time) - step.unwrap_or(0.0);
         if numbers == 0 || step.is_some() || since_s <= 0.0 {
-            // Numbered anew, out of order, or at another rate from now on: the rhythm has to show again.
+            // Numbered anew, out of order, or at another rate from now on: the rhythm has to show
+            // again.
             (self.period_s, self.frames) = (0.0, 0);
         } else {
             let share = PERIOD_SHARE.max(f64::from(self.frames + 1).recip());
@@ -100,7 +110,8 @@ pub(crate) enum Turn {
     Now,
     /// It waits.
     Waits,
-    /// What waited is taken, and it after that: all clocks have stepped by so much, s, or each for itself.
+    /// What waited is taken, and it after that: all clocks have stepped by so much, s, or each for
+    /// itself.
     Together(Vec<BearingFrame>, Option<f64>),
 }
 
@@ -124,15 +135,19 @@ impl SiteTime {
     /// Takes a known camera's frame.
     pub(crate) fn see(&mut self, camera: &CameraName, frame: &BearingFrame) -> Turn {
         let (sequence, time) = (frame.sequence, Timestamp::from_nanos(frame.capture_time_ns));
-        let rhythm = self.rhythms.entry(camera.clone()).or_insert(Rhythm::beginning(sequence, time));
+        let rhythm =
+            self.rhythms.entry(camera.clone()).or_insert(Rhythm::beginning(sequence, time));
         let (before, step) = (*rhythm, rhythm.step(sequence, time));
         self.gone_s += rhythm.go_on(sequence, time, step);
         rhythm.heard_s = self.gone_s;
         // A clock that was none of the site's steps for itself.
         if let Some(step) = step.filter(|_| self.is_of_site(camera, before.time)) {
-            let gone_s = || self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect();
-            let pending =
-                self.pending.get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
+            let gone_s = || {
+                self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect()
+            };
+            let pending = self
+                .pending
+                .get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
             pending.steps.insert(camera.clone(), step);
         }
         let Some(pending) = &mut self.pending else {
@@ -187,7 +202,10 @@ impl SiteTime {
         steps.sort_unstable_by(f64::total_cmp);
         let step = steps[steps.len() / 2];
         let is_alike = steps.iter().all(|other| (other - step).abs() < LEAST_STEP_S);
-        if is_alike && steps.len() >= 2 && self.live().all(|(name, _)| pending.steps.contains_key(name)) {
+        if is_alike
+            && steps.len() >= 2
+            && self.live().all(|(name, _)| pending.steps.contains_key(name))
+        {
             return Some(Some(step));
         }
         let gone_s = |(name, rhythm): (&CameraName, &Rhythm)| {

@@ -18,8 +18,8 @@ use crate::visibility::Visibility;
 pub(crate) use expectation::Expectation;
 use ties::Ties;
 
-/// Two cameras alone must place a target at least this well (root of the sum over the axes, as a share of the
-/// range): nearly parallel lines of two targets cross too.
+/// Two cameras alone must place a target at least this well (root of the sum over the axes, as a
+/// share of the range): nearly parallel lines of two targets cross too.
 const MAX_PAIR_SHARE: f64 = 0.03;
 /// What the bearings tell apart is looked at this often, s: eigenvalues cost more than an update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
@@ -28,8 +28,8 @@ const INFORMATION_S: f64 = 1.0;
 /// A position is observable if it is known better than this, m.
 const POSITION_SCALE_M: f64 = 20.0;
 
-/// Identity of a 3D track, unique over restarts: see [`crossfix_message::track_id`]. Shown as its number
-/// within its run.
+/// Identity of a 3D track, unique over restarts: see [`crossfix_message::track_id`]. Shown as its
+/// number within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TrackId(pub u64);
 
@@ -120,8 +120,8 @@ struct Innovation {
 }
 
 impl Track {
-    /// A tentative track at a fix of these lines, each with what is uncertain of its camera; the lines'
-    /// covariances hold that already.
+    /// A tentative track at a fix of these lines, each with what is uncertain of its camera; the
+    /// lines' covariances hold that already.
     pub(crate) fn start<'a>(
         fix: &Fix,
         lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine, CameraUncertainty)>,
@@ -188,7 +188,8 @@ impl Track {
         let factor = noise.cholesky()?;
         let nis = factor.l().solve_lower_triangular(&offset)?.norm_squared();
         let inverse = factor.inverse();
-        self.residuals.insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
+        self.residuals
+            .insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
         let mut by = Matrix2x6::zeros();
         by.fixed_view_mut::<2, 3>(0, 0).copy_from(&model.by_position());
         by.fixed_view_mut::<2, 3>(0, 3).copy_from(&(model.by_position() * dt));
@@ -209,10 +210,11 @@ impl Track {
         self.state().covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
     }
 
-    /// Whether the bearings' own noise leaves the place in no doubt; what poses and clocks shift the whole
-    /// track by is left out.
+    /// Whether the bearings' own noise leaves the place in no doubt; what poses and clocks shift
+    /// the whole track by is left out.
     pub(crate) fn is_placed(&self) -> bool {
-        let shared: f64 = self.ties.values().map(|t| t.covariance.fixed_rows::<3>(0).norm_squared()).sum();
+        let shared: f64 =
+            self.ties.values().map(|t| t.covariance.fixed_rows::<3>(0).norm_squared()).sum();
         let sd = (self.position_sd().powi(2) - shared).max(0.0).sqrt();
         sd <= MAX_PAIR_SHARE * self.range()
     }
@@ -247,11 +249,13 @@ impl Track {
 
     /// Whether a camera has lately given the track a bearing.
     fn is_followed_by(&self, camera: &CameraName, motion: &Motion) -> bool {
-        self.ties.get(camera).is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
+        self.ties
+            .get(camera)
+            .is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
     }
 
-    /// Whether the track is too uncertain for a camera that has not been following it: any line that
-    /// crosses another camera's sight line would pass for its target.
+    /// Whether the track is too uncertain for a camera that has not been following it: any line
+    /// that crosses another camera's sight line would pass for its target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &Motion) -> bool {
         !self.held
             && !self.is_followed_by(camera, motion)
@@ -260,7 +264,8 @@ impl Track {
 
     /// Whether the range is unknown as one camera alone has lately followed the target.
     pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &Motion) -> bool {
-        let vague = |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
+        let vague =
+            |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
         !self.held && self.follower.is_some_and(vague)
     }
 
@@ -270,8 +275,8 @@ impl Track {
         Some(Innovation { offset: model.offset(line)?, model })
     }
 
-    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as they are
-    /// found to.
+    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as
+    /// they are found to.
     fn nis(
         &self,
         innovation: &Innovation,
@@ -299,8 +304,8 @@ impl Track {
         self.ties.get(camera).map_or(Visibility::UNKNOWN, visibility)
     }
 
-    /// Whether another camera has seen the target since this one looked for it last. Where nobody has, what
-    /// hides it hides it from all, and one camera's miss says no more than another's.
+    /// Whether another camera has seen the target since this one looked for it last. Where nobody
+    /// has, what hides it hides it from all, and one camera's miss says no more than another's.
     pub(crate) fn is_seen_since_look_of(&self, camera: &CameraName) -> bool {
         self.ties.get(camera).is_none_or(|ties| self.updated > ties.visibility.last_look())
     }
@@ -322,13 +327,15 @@ impl Track {
         }
     }
 
-    /// Takes evidence (a log-likelihood ratio) for or against the track in; its score is at most `most`.
+    /// Takes evidence (a log-likelihood ratio) for or against the track in; its score is at most
+    /// `most`.
     pub(crate) fn judge(&mut self, change: f64, most: f64) {
         self.score = (self.score + change).min(most);
     }
 
-    /// Takes a bearing in, and tells whether the target has begun to manoeuvre. `None` if the numbers
-    /// fail: then no bearing is taken in, though a detector may have widened the covariance.
+    /// Takes a bearing in, and tells whether the target has begun to manoeuvre. `None` if the
+    /// numbers fail: then no bearing is taken in, though a detector may have widened the
+    /// covariance.
     pub(crate) fn measurement_update(
         &mut self,
         camera: &CameraName,
@@ -338,7 +345,8 @@ impl Track {
     ) -> Option<Taken> {
         let interval = time.seconds_since(self.updated);
         let innovation = self.innovation(time, line)?;
-        let manoeuvre = self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
+        let manoeuvre =
+            self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
             self.keep_ties_possible();
@@ -371,7 +379,8 @@ impl Track {
         if was_held && !is_held {
             // By now it shows that one camera alone has seen it for so long.
             let others = self.ties.iter().filter(|(name, _)| *name != camera);
-            let silent_s = others.filter_map(|(_, ties)| ties.silent_s(time)).fold(f64::INFINITY, f64::min);
+            let silent_s =
+                others.filter_map(|(_, ties)| ties.silent_s(time)).fold(f64::INFINITY, f64::min);
             if silent_s.is_finite() {
                 self.imm.relive(
                     silent_s.max(0.0),
@@ -405,8 +414,14 @@ impl Track {
         })
     }
 
-    /// Adds what a bearing says of position and velocity to what those of the last second have said.
-    fn gather_information(&mut self, interval: f64, line: &SightLine, uncertainty: &CameraUncertainty) {
+    /// Adds what a bearing says of position and velocity to what those of the last second have
+    /// said.
+    fn gather_information(
+        &mut self,
+        interval: f64,
+        line: &SightLine,
+        uncertainty: &CameraUncertainty,
+    ) {
         let old = &self.information;
         let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
         let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
@@ -422,7 +437,8 @@ impl Track {
             let mut position = next.fixed_view_mut::<3, 3>(0, 0);
             position += told;
         }
-        self.information = if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
+        self.information =
+            if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
     }
 
     /// Whether two cameras have lately seen the target. One alone tells nothing of the range, and
@@ -458,7 +474,10 @@ impl Track {
 
     /// Whether it was confirmed once and is not lost.
     pub fn is_confirmed(&self) -> bool {
-        matches!(self.status, TrackStatus::Confirmed | TrackStatus::Coasting | TrackStatus::OneCamera)
+        matches!(
+            self.status,
+            TrackStatus::Confirmed | TrackStatus::Coasting | TrackStatus::OneCamera
+        )
     }
 }
 

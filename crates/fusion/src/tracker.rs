@@ -95,8 +95,8 @@ impl Tracker {
         }
     }
 
-    /// Says when the run begins: at the first exposure that it handles. The tracks' identities count from
-    /// there.
+    /// Says when the run begins: at the first exposure that it handles. The tracks' identities
+    /// count from there.
     pub(crate) fn begin(&mut self, time: Timestamp) {
         self.began.get_or_insert(time);
     }
@@ -106,8 +106,8 @@ impl Tracker {
         self.tracks.values()
     }
 
-    /// The tracks whose state should go out now, ordered by id: those just updated, those whose status
-    /// has changed, and each at least every half second.
+    /// The tracks whose state should go out now, ordered by id: those just updated, those whose
+    /// status has changed, and each at least every half second.
     pub(crate) fn due(&mut self, now: Timestamp) -> Vec<TrackId> {
         let mut due = Vec::new();
         for track in self.tracks.values_mut() {
@@ -148,9 +148,11 @@ impl Tracker {
         let origin = known.camera.pose().position();
         let nearest = |track: &Track| {
             let camera = (&exposure.camera, origin);
-            let expected = track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+            let expected =
+                track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
             let fits = exposure.sightings.iter().enumerate();
-            let fits = fits.filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
+            let fits = fits
+                .filter_map(|(i, s)| Some((expected.fit(&s.line, self.gate)?.gate_distance, i)));
             fits.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, nearest)| nearest)
         };
         let (mut fittings, mut used) = (Fittings::default(), Vec::new());
@@ -187,35 +189,44 @@ impl Tracker {
         self.tracks.values_mut().for_each(|track| track.step_time(step_s));
     }
 
-    /// How well an exposure fits the sure tracks: the log-likelihood ratio of its bearings being theirs against
-    /// being nobody's, each track's best.
+    /// How well an exposure fits the sure tracks: the log-likelihood ratio of its bearings being
+    /// theirs against being nobody's, each track's best.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
         let camera = (&exposure.camera, known.camera.pose().position());
         let best = |track: &Track| {
-            let expected = track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
+            let expected =
+                track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
             let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
-            fits.map(|fit| log_likelihood_ratio(&fit, 1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
+            fits.map(|fit| log_likelihood_ratio(&fit, 1.0, self.config.clutter_per_sr))
+                .max_by(f64::total_cmp)
         };
         self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
     }
 
     /// Takes in one exposure: what of it belongs to tracks updates them.
-    pub(crate) fn step(&mut self, exposure: &Exposure, known: &KnownCamera, cameras: &Cameras) -> Step {
+    pub(crate) fn step(
+        &mut self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        cameras: &Cameras,
+    ) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
-        // Where all cameras were silent for long, nothing has told the tracks yet that they are lost.
+        // Where all cameras were silent for long, nothing has told the tracks yet that they are
+        // lost.
         let mut noted = Noted { happenings: self.review(exposure.time), ..Noted::default() };
         for ids in self.in_order_of_choice() {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
         let Noted { mut happenings, fittings, third_differences } = noted;
         self.reacquire(exposure, known, &mut owners);
-        let used = owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
+        let used =
+            owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
         let strangers = owners.iter().filter(|owner| owner.is_none()).count();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
-            // What one camera alone follows is offered as if it were nobody's: if the others see the
-            // target elsewhere, it must be found again.
+            // What one camera alone follows is offered as if it were nobody's: if the others see
+            // the target elsewhere, it must be found again.
             let weak = owner.filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_held()));
             if owner.is_none() || weak.is_some() {
                 claims.extend(weak.map(|id| (free.len(), id)));
@@ -245,7 +256,12 @@ impl Tracker {
     }
 
     /// Takes up what a second camera sees of the tracks that one alone follows.
-    fn reacquire(&mut self, exposure: &Exposure, known: &KnownCamera, owners: &mut [Option<TrackId>]) {
+    fn reacquire(
+        &mut self,
+        exposure: &Exposure,
+        known: &KnownCamera,
+        owners: &mut [Option<TrackId>],
+    ) {
         let look = Look {
             exposure,
             known,
@@ -264,13 +280,14 @@ impl Tracker {
     }
 }
 
-/// Log-likelihood ratio of a bearing being a target's that is seen with a probability against being one of
-/// so many false ones, 1/sr.
+/// Log-likelihood ratio of a bearing being a target's that is seen with a probability against being
+/// one of so many false ones, 1/sr.
 pub(crate) fn log_likelihood_ratio(fit: &Fit, detection: f64, clutter_per_sr: f64) -> f64 {
     detection.ln() + fit.log_density - clutter_per_sr.ln()
 }
 
-/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a probability.
+/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a
+/// probability.
 pub(crate) fn missed(visible: f64, detection: f64) -> f64 {
     (1.0 - visible * detection).ln()
 }

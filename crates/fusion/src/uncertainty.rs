@@ -3,15 +3,17 @@
 use crossfix_geometry::{BearingModel, tangent_basis};
 use nalgebra::{Matrix2, Matrix2x3, Matrix6, Rotation3, Unit, Vector2, Vector3};
 
-/// Variances that differ by less than this share of them are one: what turning them leaves is far less.
+/// Variances that differ by less than this share of them are one: what turning them leaves is far
+/// less.
 const ROUNDING: f64 = 1e-9;
 
-/// Covariance of a camera's pose in the world's axes as declared: rotation (rad), then position (m).
+/// Covariance of a camera's pose in the world's axes as declared: rotation (rad), then position
+/// (m).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PoseUncertainty {
     covariance: Matrix6<f64>,
-    /// The variances of rotation and position where all axes are alike and nothing is tied, as most poses are
-    /// declared: then all bearings are shifted alike, and no matrices need be multiplied.
+    /// The variances of rotation and position where all axes are alike and nothing is tied, as most
+    /// poses are declared: then all bearings are shifted alike, and no matrices need be multiplied.
     alike: Option<[f64; 2]>,
 }
 
@@ -33,8 +35,9 @@ impl PoseUncertainty {
         Matrix6::from_diagonal(&[rotation, rotation, rotation, position, position, position].into())
     }
 
-    /// Covariance of a pose of which nobody has said how sure it is: what a careful survey reaches, 1 mrad and 5 cm
-    /// an axis. A camera of which half as much were assumed would be believed before the others are.
+    /// Covariance of a pose of which nobody has said how sure it is: what a careful survey reaches,
+    /// 1 mrad and 5 cm an axis. A camera of which half as much were assumed would be believed
+    /// before the others are.
     pub(crate) fn of_careful_survey() -> Matrix6<f64> {
         const ROTATION_SD_RAD: f64 = 1e-3;
         const POSITION_SD_M: f64 = 0.05;
@@ -58,8 +61,8 @@ pub(crate) struct CameraUncertainty {
     pub(crate) pose: Option<PoseUncertainty>,
     /// ... and how many times that is what the camera's lines have shown.
     pub(crate) pose_scale: f64,
-    /// Whether the clock's error is taken for noise of each bearing: where the velocity is not known yet, what
-    /// it shifts the bearings by is not either.
+    /// Whether the clock's error is taken for noise of each bearing: where the velocity is not
+    /// known yet, what it shifts the bearings by is not either.
     pub(crate) clock_is_noise: bool,
     /// World from camera: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,
@@ -78,9 +81,10 @@ impl CameraUncertainty {
         }
     }
 
-    /// How the camera's shared errors (two of its pose, one of its clock) shift a
-    /// bearing, rad, each in units of its own deviation: what pose and clock are off by hits every bearing of the camera alike, and more bearings do not average it
-    /// away. `own` is the covariance that the bearing reports.
+    /// How the camera's shared errors (two of its pose, one of its clock) shift a bearing, rad,
+    /// each in units of its own deviation: what pose and clock are off by hits every bearing of the
+    /// camera alike, and more bearings do not average it away. `own` is the covariance that the
+    /// bearing reports.
     pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Matrix2x3<f64> {
         let mut shifts = Matrix2x3::zeros();
         let pose = self.declared_pose(model) * self.pose_scale.sqrt();
@@ -98,8 +102,11 @@ impl CameraUncertainty {
         velocity: Vector3<f64>,
         own: &Matrix2<f64>,
     ) -> Matrix2<f64> {
-        let clock =
-            if self.clock_is_noise { model.by_time(velocity) * self.time_sd_s } else { Vector2::zeros() };
+        let clock = if self.clock_is_noise {
+            model.by_time(velocity) * self.time_sd_s
+        } else {
+            Vector2::zeros()
+        };
         own * self.factor + clock * clock.transpose()
     }
 
@@ -119,8 +126,8 @@ impl CameraUncertainty {
         }
     }
 
-    /// From tangents in the camera's own axes to the model's: the columns of a root in the former keep to the
-    /// camera's axes as the direction changes.
+    /// From tangents in the camera's own axes to the model's: the columns of a root in the former
+    /// keep to the camera's axes as the direction changes.
     fn turn(&self, model: &BearingModel) -> Matrix2<f64> {
         let direction = Unit::new_unchecked(self.axes.inverse() * model.direction.into_inner());
         model.basis.transpose() * (self.axes.matrix() * tangent_basis(&direction))
@@ -175,8 +182,9 @@ mod tests {
         assert!(shared.m12.abs() < 1e-12);
     }
 
-    /// A calibration from landmarks ties rotation to position: a camera thought to stand too far left is
-    /// turned too far right. Drawn from such a covariance, bearings scatter as `shared` says.
+    /// A calibration from landmarks ties rotation to position: a camera thought to stand too far
+    /// left is turned too far right. Drawn from such a covariance, bearings scatter as `shared`
+    /// says.
     #[test]
     fn a_correlated_pose_shifts_bearings_as_a_thousand_drawn_poses_do() {
         const RUNS: usize = 4000;
@@ -187,8 +195,10 @@ mod tests {
         factor[(3, 3)] = 0.2;
         factor[(2, 3)] = 0.2 / 40.0;
         let pose = factor * factor.transpose();
-        let camera =
-            CameraUncertainty { pose: Some(PoseUncertainty::new(pose)), ..CameraUncertainty::of_time(0.0) };
+        let camera = CameraUncertainty {
+            pose: Some(PoseUncertainty::new(pose)),
+            ..CameraUncertainty::of_time(0.0)
+        };
         let expected = camera.shared(&model, Vector3::zeros());
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let mut sum = Matrix2::zeros();

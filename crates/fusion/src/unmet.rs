@@ -1,7 +1,8 @@
 //! Why nothing is found where cameras see something at the same time.
 //!
-//! Poses that are wrong, clocks that are off and targets beyond all range have one face: no track. While there is
-//! none, the lines of every two cameras are compared, and what most comparisons show is said in one sentence.
+//! Poses that are wrong, clocks that are off and targets beyond all range have one face: no track.
+//! While there is none, the lines of every two cameras are compared, and what most comparisons show
+//! is said in one sentence.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -78,7 +79,10 @@ impl fmt::Display for WhyNothing {
         match self.lines {
             UnmetLines::Apart { by_m } => {
                 let digits = usize::from(by_m < 10.0);
-                write!(f, "but their lines miss each other by {by_m:.digits$} m: check poses and clocks")
+                write!(
+                    f,
+                    "but their lines miss each other by {by_m:.digits$} m: check poses and clocks"
+                )
             }
             UnmetLines::Nowhere { max_range_m } => {
                 let km = max_range_m / 1000.0;
@@ -156,8 +160,8 @@ impl Unmet {
         (self.since, self.concluded, self.why) = (None, None, None);
     }
 
-    /// Takes in an exposure's bearings that belong to no track; returns what each comparison has shown, by the name
-    /// of its counter.
+    /// Takes in an exposure's bearings that belong to no track; returns what each comparison has
+    /// shown, by the name of its counter.
     pub(crate) fn see(&mut self, exposure: &Exposure) -> Vec<&'static str> {
         let now = exposure.time;
         let since = *self.since.get_or_insert(now);
@@ -226,11 +230,15 @@ impl Unmet {
         lines
     }
 
-    /// What most comparisons of the cameras that see something have shown, and in which two it shows most clearly.
+    /// What most comparisons of the cameras that see something have shown, and in which two it
+    /// shows most clearly.
     fn conclusion(&self) -> Option<WhyNothing> {
-        let both = |pair: &Pair| pair.shown.iter().filter(|shown| matches!(shown, Shown::Lines(_))).count();
+        let both = |pair: &Pair| {
+            pair.shown.iter().filter(|shown| matches!(shown, Shown::Lines(_))).count()
+        };
         let steady = self.pairs.iter().filter(|(_, pair)| {
-            pair.shown.len() * 2 >= REMEMBERED && both(pair) as f64 >= LEAST_SHARE * pair.shown.len() as f64
+            pair.shown.len() * 2 >= REMEMBERED
+                && both(pair) as f64 >= LEAST_SHARE * pair.shown.len() as f64
         });
         let steady: Vec<(&[CameraName; 2], &Pair)> = steady.collect();
         let kind = |passing: Passing| match passing {
@@ -240,7 +248,9 @@ impl Unmet {
         };
         let count = |pair: &Pair, wanted: usize| {
             let lines = pair.shown.iter();
-            lines.filter(|shown| matches!(shown, Shown::Lines(passing) if kind(*passing) == wanted)).count()
+            lines
+                .filter(|shown| matches!(shown, Shown::Lines(passing) if kind(*passing) == wanted))
+                .count()
         };
         let total = |wanted| steady.iter().map(|(_, pair)| count(pair, wanted)).sum::<usize>();
         let most = (0..3).filter(|&k| total(k) > 0).max_by_key(|&k| total(k))?;

@@ -1,5 +1,5 @@
-//! One bearing into one state: an iterated extended Kalman update in the coordinates of [`RangeChart`], with
-//! the camera's shared errors considered (Schmidt) and not estimated.
+//! One bearing into one state: an iterated extended Kalman update in the coordinates of
+//! [`RangeChart`], with the camera's shared errors considered (Schmidt) and not estimated.
 
 use std::f64::consts::PI;
 
@@ -12,11 +12,11 @@ use crate::uncertainty::CameraUncertainty;
 
 /// Rounds of the iterated update: from a range known to a factor of three it takes four or five.
 const MAX_ROUNDS: usize = 10;
-/// The linearisation has settled when what a round leaves out, the square of the angle of its step, is
-/// less than this share of the bearing's noise.
+/// The linearisation has settled when what a round leaves out, the square of the angle of its step,
+/// is less than this share of the bearing's noise.
 const SETTLED: f64 = 0.01;
-/// A range known worse than this (standard deviation of its logarithm) is looked for along the sight line
-/// first: from its middle the iteration may not find the crossing.
+/// A range known worse than this (standard deviation of its logarithm) is looked for along the
+/// sight line first: from its middle the iteration may not find the crossing.
 pub(crate) const VAGUE_LOG_RANGE_SD: f64 = 0.1;
 
 /// A bearing with what its camera is uncertain of.
@@ -24,7 +24,8 @@ pub(crate) const VAGUE_LOG_RANGE_SD: f64 = 0.1;
 pub(crate) struct Measured<'a> {
     pub(crate) line: &'a SightLine,
     pub(crate) camera: &'a CameraUncertainty,
-    /// Covariance of the state with the camera's shared errors, each of these in its own deviations.
+    /// Covariance of the state with the camera's shared errors, each of these in its own
+    /// deviations.
     pub(crate) ties: &'a Matrix6x3<f64>,
 }
 
@@ -42,8 +43,8 @@ pub(crate) struct Updated {
     pub(crate) gained: Matrix6x3<f64>,
 }
 
-/// The state after a bearing of its time; `seen_from` is where the camera stands that follows the target alone,
-/// so that the range is uncertain from there. `None` if the numbers fail.
+/// The state after a bearing of its time; `seen_from` is where the camera stands that follows the
+/// target alone, so that the range is uncertain from there. `None` if the numbers fail.
 pub(crate) fn updated(
     prior: &KinematicState,
     seen_from: Option<Point3<f64>>,
@@ -71,8 +72,8 @@ pub(crate) fn updated(
         let seen: Matrix6x2<f64> = covariance.fixed_columns::<3>(0) * by.transpose();
         let across = seen + tied;
         let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
-        let noise =
-            camera.noise(&model, point.velocity, &model.covariance_of(line)) + shifts * shifts.transpose();
+        let noise = camera.noise(&model, point.velocity, &model.covariance_of(line))
+            + shifts * shifts.transpose();
         let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
         let determinant = spread.determinant();
         let inverse = spread.try_inverse()?;
@@ -93,8 +94,10 @@ pub(crate) fn updated(
         let point = chart.point(&coordinates);
         let (covariance, carried, gain) =
             chart.from(&point, covariance - gain * across.transpose(), &by, gain);
-        let state =
-            KinematicState { mean: point.mean(), covariance: (covariance + covariance.transpose()) / 2.0 };
+        let state = KinematicState {
+            mean: point.mean(),
+            covariance: (covariance + covariance.transpose()) / 2.0,
+        };
         // Where a place was known to no kilometre, rounding may leave of it less than nothing.
         let positive = state.covariance.cholesky().is_some();
         return (positive && state.is_finite() && nis.is_finite()).then(|| Updated {

@@ -11,15 +11,15 @@ pub(crate) fn independent_share(interval_s: f64) -> f64 {
     (interval_s / HIDDEN_S).clamp(0.0, 1.0)
 }
 
-/// How often a visible target is hidden from a camera (by a tree, a house, glare) within the time for which a
-/// camera's bearing holds a track: once in twenty seconds. With half of it a camera that is blind for a target
-/// costs its track too much.
+/// How often a visible target is hidden from a camera (by a tree, a house, glare) within the time
+/// for which a camera's bearing holds a track: once in twenty seconds. With half of it a camera
+/// that is blind for a target costs its track too much.
 const HIDDEN: f64 = 0.075;
 /// How often one that is hidden comes into sight again within that time: every two seconds.
 const APPEARS: f64 = 0.75;
 
-/// Whether a camera can see a target: a chain of two states, visible and hidden. A camera that misses a target
-/// ten times running has it behind something; that is one event and not ten.
+/// Whether a camera can see a target: a chain of two states, visible and hidden. A camera that
+/// misses a target ten times running has it behind something; that is one event and not ten.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Visibility {
     visible: f64,
@@ -43,7 +43,8 @@ impl Visibility {
         self.time
     }
 
-    /// The probability that the target is visible at a time; a bearing holds a track for `holding_s`.
+    /// The probability that the target is visible at a time; a bearing holds a track for
+    /// `holding_s`.
     pub(crate) fn at(&self, time: Timestamp, holding_s: f64) -> f64 {
         let interval = time.seconds_since(self.time).max(0.0) / holding_s;
         let kept = (-(HIDDEN + APPEARS) * interval).exp();
@@ -55,8 +56,8 @@ impl Visibility {
         self.time = self.time.plus_seconds(step_s);
     }
 
-    /// The camera has been exposed and has seen the target or not; `detection` is the probability that it
-    /// reports one that is visible.
+    /// The camera has been exposed and has seen the target or not; `detection` is the probability
+    /// that it reports one that is visible.
     pub(crate) fn look(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {
         let before = self.at(time, holding_s);
         let missed = before * (1.0 - detection);

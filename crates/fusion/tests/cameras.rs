@@ -31,13 +31,18 @@ fn circling() -> common::Path {
 }
 
 /// The frames with the times that these clocks give them, in the order in which they are taken.
-fn with_clocks(frames: Vec<BearingFrame>, clocks: &[(&str, Clock)], sd_s: f64) -> Vec<BearingFrame> {
+fn with_clocks(
+    frames: Vec<BearingFrame>,
+    clocks: &[(&str, Clock)],
+    sd_s: f64,
+) -> Vec<BearingFrame> {
     frames
         .into_iter()
         .map(|mut frame| {
             if let Some((_, clock)) = clocks.iter().find(|(camera, _)| *camera == frame.camera) {
                 let time = frame.capture_time_ns as f64 / 1e9;
-                frame.capture_time_ns += ((clock.offset_s + clock.drift * time) * 1e9).round() as i64;
+                frame.capture_time_ns +=
+                    ((clock.offset_s + clock.drift * time) * 1e9).round() as i64;
                 frame.capture_time_sd_s = sd_s;
             }
             frame
@@ -51,7 +56,10 @@ fn clock_of(fusion: &Fusion, camera: &str) -> ClockEstimate {
 
 #[test]
 fn offsets_of_200_ms_and_drifts_of_50_ppm_are_recovered_within_a_minute() {
-    let wrong = [("b", Clock { offset_s: 0.2, drift: 5e-5 }), ("c", Clock { offset_s: -0.2, drift: -5e-5 })];
+    let wrong = [
+        ("b", Clock { offset_s: 0.2, drift: 5e-5 }),
+        ("c", Clock { offset_s: -0.2, drift: -5e-5 }),
+    ];
     let mut squares = Vec::new();
     for seed in 0..4 {
         let mut scene = Scene::new(vec![circling()], 60.0);
@@ -67,7 +75,10 @@ fn offsets_of_200_ms_and_drifts_of_50_ppm_are_recovered_within_a_minute() {
         for (camera, clock) in wrong {
             let estimate = clock_of(&fusion, camera);
             let error = estimate.offset_s - (clock.offset_s + clock.drift * 60.0);
-            assert!(error.abs() < 4.0 * estimate.sd_s, "seed {seed}, {camera}: {error} s, {estimate:?}");
+            assert!(
+                error.abs() < 4.0 * estimate.sd_s,
+                "seed {seed}, {camera}: {error} s, {estimate:?}"
+            );
             squares.push(error * error);
         }
         assert!(clock_of(&fusion, "a").sd_s.abs() < 1e-12, "a clock without deviation is right");
@@ -96,8 +107,8 @@ fn what_all_clocks_have_in_common_stays_unknown_and_is_said() {
 #[test]
 fn a_trusted_camera_sets_the_time_of_the_others() {
     let scene = Scene::new(vec![circling()], 40.0);
-    let all =
-        [("a", 0.0), ("b", 0.03), ("c", -0.05)].map(|(c, offset_s)| (c, Clock { offset_s, drift: 0.0 }));
+    let all = [("a", 0.0), ("b", 0.03), ("c", -0.05)]
+        .map(|(c, offset_s)| (c, Clock { offset_s, drift: 0.0 }));
     let trusted: CameraName = "a".parse().unwrap();
     let clocks = Clocks { trusted: vec![trusted], ..Clocks::default() };
     let mut fusion = fusion_of(FusionConfig { clocks, ..FusionConfig::default() }, &scene.eyes);
@@ -123,13 +134,14 @@ fn five() -> Vec<Eye> {
 fn a_camera_that_was_knocked_is_left_out_and_comes_back_when_it_is_straightened() {
     let scene = Scene { eyes: five(), ..Scene::new(vec![circling()], 60.0) };
     let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
-    let standing = |fusion: &Fusion| fusion.cameras().find(|r| r.camera.as_str() == "b").unwrap().standing;
+    let standing =
+        |fusion: &Fusion| fusion.cameras().find(|r| r.camera.as_str() == "b").unwrap().standing;
     for mut frame in scene.frames(5) {
         let time = frame.capture_time_ns as f64 / 1e9;
         if frame.camera == "b" && (15.0..35.0).contains(&time) {
             for track in &mut frame.tracks {
-                let turned =
-                    Rotation3::from_euler_angles(0.0, 0.02, 0.0) * Vector3::from(track.bearing.unwrap());
+                let turned = Rotation3::from_euler_angles(0.0, 0.02, 0.0)
+                    * Vector3::from(track.bearing.unwrap());
                 track.bearing = Some(turned.into());
             }
         }
@@ -171,7 +183,8 @@ fn a_camera_worse_than_it_says_counts_less() {
     assert!(others.clone().all(|report| report.standing == CameraStanding::Good), "{reports:?}");
 }
 
-/// The calibration of a camera whose pose is off by deviations of its rotation (rad) and place (m) along each axis.
+/// The calibration of a camera whose pose is off by deviations of its rotation (rad) and place (m)
+/// along each axis.
 fn wrongly_posed(
     eye: &Eye,
     (rotation_sd, position_sd): (f64, f64),
@@ -207,7 +220,8 @@ fn nees_with_wrong_poses(runs: u32, rotation_sd: f64, position_sd: f64) -> f64 {
         });
         let frame = last.unwrap();
         let track = &frame.tracks[0];
-        let covariance = Matrix6::from_row_slice(&track.covariance).fixed_view::<3, 3>(0, 0).into_owned();
+        let covariance =
+            Matrix6::from_row_slice(&track.covariance).fixed_view::<3, 3>(0, 0).into_owned();
         let place: Point3<f64> = track.position.unwrap().into();
         let truth = scene.paths[0](frame.time_ns as f64 / 1e9).unwrap();
         let error = place - truth;
@@ -227,7 +241,8 @@ fn the_uncertainty_of_poses_is_in_the_covariance_however_many_bearings_there_are
 }
 
 #[test]
-fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_are_worse_than_they_say() {
+fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_are_worse_than_they_say()
+ {
     let mut squares = Vec::new();
     for seed in 0..30 {
         let mut rng = ChaCha8Rng::seed_from_u64(100 + seed);
@@ -243,8 +258,8 @@ fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_ar
         }
         let tracks: Vec<_> = fusion.tracks().filter(|track| track.is_confirmed()).collect();
         let [track] = tracks[..] else {
-            // Lines that miss each other by too much for any two begin no track; two pairs of cameras may each have
-            // one that fits them.
+            // Lines that miss each other by too much for any two begin no track; two pairs of
+            // cameras may each have one that fits them.
             assert_eq!(
                 tracks.is_empty(),
                 fusion.why_nothing().is_some(),
@@ -257,11 +272,12 @@ fn where_half_of_the_cameras_see_something_steadily_beside_a_target_the_poses_ar
         assert!(cameras >= 3, "seed {seed}: {cameras} cameras agree");
         let error = track.state().position() - circling()(track.updated.seconds()).unwrap();
         assert!(error.norm() < 2.0, "seed {seed}: {error}");
-        squares.push(error.dot(&(track.state().position_covariance().try_inverse().unwrap() * error)));
+        squares
+            .push(error.dot(&(track.state().position_covariance().try_inverse().unwrap() * error)));
     }
     squares.sort_by(f64::total_cmp);
     assert!(squares.len() >= 15, "{squares:?}");
-    // Three degrees of freedom: a median of 2.4 would be honest. It is 42, and six tracks have two cameras, where
-    // nobody asks what the others see beside.
+    // Three degrees of freedom: a median of 2.4 would be honest. It is 42, and six tracks have two
+    // cameras, where nobody asks what the others see beside.
     assert!(squares[squares.len() / 2] < 30.0, "{squares:?}");
 }

@@ -14,7 +14,8 @@ use bound::{Way, bound};
 use common::{Path, Scene, found, fusion_of, site};
 use crossfix_fusion::{CameraStanding, ClockEstimate, Fusion, FusionConfig};
 use paths::{
-    a_minute_in_sight, circle, fast_pass, pass, racing, scene, shuttle, six, six_passes, spiral, weaving,
+    a_minute_in_sight, circle, fast_pass, pass, racing, scene, shuttle, six, six_passes, spiral,
+    weaving,
 };
 use tally::{Clock, Tally, random_clocks};
 
@@ -44,15 +45,15 @@ fn assert_near_the_bound(tally: &Tally, bound_s: f64) {
     assert!((0.85..1.15).contains(&(tally.stated() / bound_s)), "{}", tally.line(""));
 }
 
-/// The track is there all the time but for a second or so at its beginning, while clocks that are off
-/// by 200 ms leave the lines of three cameras apart.
+/// The track is there all the time but for a second or so at its beginning, while clocks that are
+/// off by 200 ms leave the lines of three cameras apart.
 fn assert_there(tally: &Tally) {
     assert!(tally.there as f64 >= 0.98 * tally.asked as f64, "{}", tally.line(""));
 }
 
-// The bounds are of all bearings of the 60 s at once, with the drift's prior of 30 ppm: for straight
-// flight with six unknowns of the target, for turns with a white jerk of 1 m^2/s^5. A straight pass
-// is seen by three cameras for 20 s of the 60, and then the drift goes on unseen.
+// The bounds are of all bearings of the 60 s at once, with the drift's prior of 30 ppm: for
+// straight flight with six unknowns of the target, for turns with a white jerk of 1 m^2/s^5. A
+// straight pass is seen by three cameras for 20 s of the 60, and then the drift goes on unseen.
 
 #[test]
 fn a_straight_pass_teaches_the_clocks_as_well_as_its_bearings_can() {
@@ -84,7 +85,11 @@ fn turning_targets_teach_them_too() {
     ] {
         let mut tally = Tally::default();
         for seed in 0..6 {
-            tally.fly(&scene(site(), vec![path()], rate_hz), &random_clocks(&["b", "c"], seed), seed);
+            tally.fly(
+                &scene(site(), vec![path()], rate_hz),
+                &random_clocks(&["b", "c"], seed),
+                seed,
+            );
         }
         assert_honest(&tally);
         assert_near_the_bound(&tally, bound_s);
@@ -136,8 +141,8 @@ fn poses_that_are_off_are_not_taken_for_clocks() {
         for seed in 0..8 {
             tally.fly(&scene, &random_clocks(&["b", "c"], seed), seed);
         }
-        // That the pass is straight nobody knows: a pose that is off makes it a curve. Were it known,
-        // the bound were 12 ms instead of 23.
+        // That the pass is straight nobody knows: a pose that is off makes it a curve. Were it
+        // known, the bound were 12 ms instead of 23.
         let bound_s = bound(&scene, &random_clocks(&["b", "c"], 0), tally.pose_sd, Way::Turning);
         let line = tally.line(&format!("bound {:.2} ms", 1e3 * bound_s));
         // The two clocks of a flight err together: eight flights are eight errors.
@@ -148,9 +153,10 @@ fn poses_that_are_off_are_not_taken_for_clocks() {
     }
 }
 
-/// A target of 10 m/s or more in sight of three cameras for 60 s. How well that can teach two clocks is
-/// a matter of rates more than of speed: cameras that see a longer way stand farther off or see it at
-/// flatter angles. With clocks of unknown drift and bearings of 0.5 mrad the bound is, in ms:
+/// A target of 10 m/s or more in sight of three cameras for 60 s. How well that can teach two
+/// clocks is a matter of rates more than of speed: cameras that see a longer way stand farther off
+/// or see it at flatter angles. With clocks of unknown drift and bearings of 0.5 mrad the bound is,
+/// in ms:
 ///
 /// | | 5 Hz | 10 Hz | 30 Hz |
 /// |---|---|---|---|
@@ -161,7 +167,8 @@ fn poses_that_are_off_are_not_taken_for_clocks() {
 /// | 15 m/s | 2.07 | 1.60 | 1.18 |
 /// | 20 m/s | 1.74 | 1.38 | 1.06 |
 ///
-/// So a millisecond (one standard deviation) is within reach at 30 Hz from near by, and nowhere else.
+/// So a millisecond (one standard deviation) is within reach at 30 Hz from near by, and nowhere
+/// else.
 #[test]
 fn a_straight_flight_in_sight_for_a_minute_teaches_them_as_well_as_its_bearings_can() {
     for (speed, rate_hz) in [(10.0, 10.0), (10.0, 30.0), (15.0, 10.0), (20.0, 10.0)] {
@@ -198,8 +205,9 @@ fn a_clock_that_jumps_is_learnt_anew_within_twenty_seconds() {
     }
 }
 
-/// Four cameras before a circling target for 40 s, of which `d` changes at 15 s: its clock is ahead by
-/// 20 ms from then on, and it says so. What the others say, s; returns the fusion centre at the end.
+/// Four cameras before a circling target for 40 s, of which `d` changes at 15 s: its clock is ahead
+/// by 20 ms from then on, and it says so. What the others say, s; returns the fusion centre at the
+/// end.
 fn losing_its_time(others_sd_s: f64) -> Fusion {
     let mut eyes = site();
     eyes.push(six().remove(3));
@@ -238,7 +246,10 @@ fn a_clock_that_loses_its_source_of_time_and_says_so_is_learnt_from_then_on() {
         let [a, d] = ["a", "d"].map(|camera| clock_of(&fusion, camera));
         let error = d.offset_s - a.offset_s - 0.02;
         assert!(d.relative_sd_s < 2e-3, "{d:?}");
-        assert!(error.abs() < 3.5 * d.relative_sd_s.hypot(a.relative_sd_s), "{others_sd_s}: {a:?} {d:?}");
+        assert!(
+            error.abs() < 3.5 * d.relative_sd_s.hypot(a.relative_sd_s),
+            "{others_sd_s}: {a:?} {d:?}"
+        );
         assert!(fusion.cameras().all(|report| report.standing != CameraStanding::Excluded));
     }
 }
@@ -271,7 +282,12 @@ fn right_clocks_of_which_little_is_said_cost_a_turning_track_next_to_nothing() {
     };
     let (unsure, sure) = (flown(&right(0.05)), flown(&right(0.0)));
     assert_honest(&unsure);
-    assert!(unsure.distance() < 1.05 * sure.distance(), "{} {}", unsure.distance(), sure.distance());
+    assert!(
+        unsure.distance() < 1.05 * sure.distance(),
+        "{} {}",
+        unsure.distance(),
+        sure.distance()
+    );
 }
 
 /// A scene of the table, and its clocks by the seed.
@@ -284,7 +300,9 @@ fn cases(rate_hz: f64) -> Vec<Case> {
     for (name, path) in paths::PATHS {
         cases.push((format!("{name}, {rate_hz} Hz"), scene(site(), vec![path()], rate_hz), two));
     }
-    for (speed, farther) in [(10.0, 1.0), (15.0, 1.0), (20.0, 1.0), (10.0, 3.0), (15.0, 3.0), (20.0, 3.0)] {
+    for (speed, farther) in
+        [(10.0, 1.0), (15.0, 1.0), (20.0, 1.0), (10.0, 3.0), (15.0, 3.0), (20.0, 3.0)]
+    {
         let scene = a_minute_in_sight(speed, farther, rate_hz);
         let bound_ms = 1e3 * bound(&scene, &two(0), (0.0, 0.0), Way::Straight);
         let distance = 150.0 * farther;
@@ -294,7 +312,9 @@ fn cases(rate_hz: f64) -> Vec<Case> {
             two,
         ));
     }
-    for (name, path) in [("pass", pass as paths::MakePath), ("circle", circle), ("six passes", six_passes)] {
+    for (name, path) in
+        [("pass", pass as paths::MakePath), ("circle", circle), ("six passes", six_passes)]
+    {
         let alone = || scene(site(), vec![path()], rate_hz);
         let mut add = |what: &str, scene, clocks| {
             cases.push((format!("{name}, {rate_hz} Hz, {what}"), scene, clocks));
@@ -309,9 +329,9 @@ fn cases(rate_hz: f64) -> Vec<Case> {
     cases
 }
 
-/// `RUNS` flights of each scene whose name begins with `CASES`, before cameras that are turned by `TURNED`
-/// rad (and moved by 50 m times that):
-/// `RUNS=48 CASES=circle cargo test -p crossfix-fusion --test clocks -- --ignored --nocapture`.
+/// `RUNS` flights of each scene whose name begins with `CASES`, before cameras that are turned by
+/// `TURNED` rad (and moved by 50 m times that): `RUNS=48 CASES=circle cargo test -p crossfix-fusion
+/// --test clocks -- --ignored --nocapture`.
 #[test]
 #[ignore = "a table to be read, of minutes"]
 fn table() {

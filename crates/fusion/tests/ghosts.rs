@@ -47,8 +47,8 @@ fn confirmed_over_time(fusion: &mut Fusion, frames: &[BearingFrame]) -> Vec<usiz
     counts
 }
 
-/// Ghosts and looks, where each camera sees fifteen targets that the two others do not, 675 pairs of lines; the poses are
-/// known to so much, rad and m.
+/// Ghosts and looks, where each camera sees fifteen targets that the two others do not, 675 pairs
+/// of lines; the poses are known to so much, rad and m.
 fn ghosts_of_strangers((rotation_sd, position_sd): (f64, f64)) -> (usize, usize) {
     let eyes = quick_site();
     let (mut epochs, mut ghosts) = (0, 0);
@@ -56,14 +56,19 @@ fn ghosts_of_strangers((rotation_sd, position_sd): (f64, f64)) -> (usize, usize)
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut frames: Vec<BearingFrame> = Vec::new();
         for eye in &eyes {
-            let scene =
-                Scene { eyes: vec![eye.clone()], clutter: 1.0, ..Scene::new(crowd(15, &mut rng), 8.0) };
+            let scene = Scene {
+                eyes: vec![eye.clone()],
+                clutter: 1.0,
+                ..Scene::new(crowd(15, &mut rng), 8.0)
+            };
             frames.extend(scene.frames(seed));
         }
         frames.sort_by_key(|frame| frame.capture_time_ns);
         let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
         for eye in &eyes {
-            fusion.calibrate(&common::calibration(eye).with_pose_sd(rotation_sd, position_sd)).unwrap();
+            fusion
+                .calibrate(&common::calibration(eye).with_pose_sd(rotation_sd, position_sd))
+                .unwrap();
         }
         let counts = confirmed_over_time(&mut fusion, &frames);
         epochs += counts.len();
@@ -78,7 +83,8 @@ fn targets_that_one_camera_each_sees_make_next_to_no_tracks() {
     // Before lines were held against each camera's own: 308 in 60.
     assert!(ghosts * 2 <= epochs, "{ghosts} ghosts in {epochs} epochs");
     let (ghosts, epochs) = ghosts_of_strangers((1e-3, 0.05));
-    // Lines that pass each other by the poses' 30 cm cross as true ones do. Before a shift counted once: 1299 in 60.
+    // Lines that pass each other by the poses' 30 cm cross as true ones do. Before a shift counted
+    // once: 1299 in 60.
     assert!(ghosts <= epochs * 2, "{ghosts} ghosts in {epochs} epochs");
 }
 
@@ -112,7 +118,8 @@ fn a_track_that_only_one_of_the_cameras_goes_on_seeing_is_a_direction_and_says_s
     }
 }
 
-/// Flies straight until a time, then accelerates by 3 m/s^2 for three seconds along the sight line of the first camera.
+/// Flies straight until a time, then accelerates by 3 m/s^2 for three seconds along the sight line
+/// of the first camera.
 fn along_the_sight_line(x: f64, onset_s: f64) -> Path {
     let eye = Point3::new(-150.0, -20.0, 2.0);
     let (from, velocity) = (Point3::new(x, 10.0, 40.0), Vector3::new(2.0, 1.0, 0.1));
@@ -154,7 +161,8 @@ fn what_a_target_does_along_the_last_cameras_sight_line_lies_within_what_is_clai
 fn what_two_cameras_see_one_after_the_other_is_one_target_only_if_it_is() {
     let (mut ghosts, mut crossings) = (0, 0);
     for seed in 0..40 {
-        // The first camera sees one target and loses it; the second one sees another, elsewhere, from then on.
+        // The first camera sees one target and loses it; the second one sees another, elsewhere,
+        // from then on.
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let scene = Scene { detection: 0.9, ..Scene::new(crowd(2, &mut rng), 8.0) };
         let others = [(0, "a", 0.0..4.0), (1, "b", 4.0..8.0)].map(|(path, camera, time_s)| {

@@ -53,8 +53,10 @@ fn ingest_all(fusion: &mut Fusion, frames: &[BearingFrame]) -> Vec<Output> {
 
 /// Two targets that fly straight, for some seconds from a time on.
 fn two_targets(time_s: Range<f64>) -> Scene {
-    let paths =
-        vec![straight([-25.0, 5.0, 40.0], [2.0, 1.0, 0.2]), straight([20.0, 15.0, 50.0], [-1.0, -2.0, 0.0])];
+    let paths = vec![
+        straight([-25.0, 5.0, 40.0], [2.0, 1.0, 0.2]),
+        straight([20.0, 15.0, 50.0], [-1.0, -2.0, 0.0]),
+    ];
     Scene { time_s, ..Scene::new(paths, 0.0) }
 }
 
@@ -82,7 +84,8 @@ fn what_comes_twice_is_counted_once_and_changes_nothing() {
     let expected = ingest_all(&mut once, &frames);
     let doubled: Vec<BearingFrame> = frames.iter().flat_map(|f| [f.clone(), f.clone()]).collect();
     let outputs = ingest_all(&mut twice, &doubled);
-    let useful: Vec<Output> = outputs.into_iter().filter(|o| !matches!(o, Output::Rejected(_))).collect();
+    let useful: Vec<Output> =
+        outputs.into_iter().filter(|o| !matches!(o, Output::Rejected(_))).collect();
     assert_eq!(useful, expected);
     assert_eq!(twice.counters().get("rejected_duplicate"), frames.len() as u64);
     finds_an_ordinary_target(&mut twice, 4.0);
@@ -139,7 +142,10 @@ fn a_camera_whose_clock_jumps_is_refused_while_it_is_wrong_and_stops_nobody() {
         fusion.ingest(&frame);
         // Two cameras are enough to go on with.
         if second > 1 {
-            assert!(scene.paths.iter().all(|path| found(&fusion, path).is_some()), "second {second}");
+            assert!(
+                scene.paths.iter().all(|path| found(&fusion, path).is_some()),
+                "second {second}"
+            );
         }
     }
     assert_eq!(fusion.counters().get("rejected_future"), 10);
@@ -285,7 +291,9 @@ fn flooded(fusion: &mut Fusion, mut more: impl FnMut(&Eye) -> Vec<Vector3<f64>>)
     for mut frame in scene.frames(6) {
         if (2.0..2.5).contains(&(frame.capture_time_ns as f64 / 1e9)) {
             let eye = scene.eyes.iter().find(|eye| eye.name.as_str() == frame.camera).unwrap();
-            frame.tracks.extend(more(eye).into_iter().zip(100..).map(|(towards, id)| bearing(towards, id)));
+            frame
+                .tracks
+                .extend(more(eye).into_iter().zip(100..).map(|(towards, id)| bearing(towards, id)));
             floods += 1;
         }
         let start = Instant::now();
@@ -315,7 +323,8 @@ fn ten_thousand_false_bearings_of_every_camera_are_survived_in_bounded_time() {
 fn a_frame_of_more_bearings_than_a_picture_has_is_cut_and_told() {
     let mut fusion = of_the_site();
     let one = bearing(Vector3::z(), 1);
-    let frame = BearingFrame { camera: "a".into(), tracks: vec![one; 10_300], ..Default::default() };
+    let frame =
+        BearingFrame { camera: "a".into(), tracks: vec![one; 10_300], ..Default::default() };
     let outputs = fusion.ingest(&frame);
     let reasons = outputs.iter().filter_map(|output| match output {
         Output::Rejected(rejection) => Some(&rejection.reason),
@@ -337,7 +346,8 @@ fn of_a_camera_alone_little_waits() {
     for k in 0..200 {
         let tracks = vec![bearing(Vector3::z(), 1); 20];
         let capture_time_ns = k * 33_000_000;
-        let frame = BearingFrame { camera: "a".into(), capture_time_ns, tracks, ..Default::default() };
+        let frame =
+            BearingFrame { camera: "a".into(), capture_time_ns, tracks, ..Default::default() };
         fusion.ingest(&frame);
         assert!(waiting(&fusion) <= 17, "{}", waiting(&fusion));
     }
@@ -357,12 +367,14 @@ fn of_a_learnt_clock_that_is_flooded_no_more_waits_than_may() {
         last = last.max(frame.capture_time_ns);
         fusion.ingest(&frame);
     }
-    let learnt = fusion.cameras().filter_map(|camera| camera.clock).any(|clock| clock.offset_s > 0.15);
+    let learnt =
+        fusion.cameras().filter_map(|camera| camera.clock).any(|clock| clock.offset_s > 0.15);
     assert!(learnt, "{:?}", fusion.cameras().collect::<Vec<_>>());
     for k in 1..=20_000 {
         let camera = if k % 2 == 0 { "b" } else { "a" }.into();
         let capture_time_ns = last + 1_000 * k;
-        let frame = BearingFrame { camera, capture_time_ns, capture_time_sd_s: 0.2, ..Default::default() };
+        let frame =
+            BearingFrame { camera, capture_time_ns, capture_time_sd_s: 0.2, ..Default::default() };
         fusion.ingest(&frame);
     }
     // Six thousand for their order, and as many for the clocks.
@@ -371,7 +383,8 @@ fn of_a_learnt_clock_that_is_flooded_no_more_waits_than_may() {
 
 #[test]
 fn two_hundred_bearings_that_are_all_alike_are_survived_in_bounded_time_by_every_method() {
-    let solvers = [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
+    let solvers =
+        [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
     let mut configs = vec![FusionConfig::default(); 5];
     for (config, solver) in configs.iter_mut().zip(solvers) {
         (config.initiation.method, config.initiation.solver) = (InitiationMethod::Grouping, solver);
@@ -381,7 +394,8 @@ fn two_hundred_bearings_that_are_all_alike_are_survived_in_bounded_time_by_every
         let mut fusion = fusion_of(config, &site());
         // All cameras' lines meet, so that every combination is as good as any other.
         let place = Point3::new(5.0, -10.0, 60.0);
-        let slowest = flooded(&mut fusion, |eye| vec![eye.camera.pose().camera_from_world(place); 200]);
+        let slowest =
+            flooded(&mut fusion, |eye| vec![eye.camera.pose().camera_from_world(place); 200]);
         println!("{method:?}: the slowest frame took {slowest:?}");
         assert!(slowest < BOUNDED, "{method:?}: {slowest:?}");
     }

@@ -61,7 +61,8 @@ fn assert_alike(ours: &[Seen], theirs: &[Seen], tolerance: f64) {
 /// The site and its frames with other names.
 fn renamed(frames: &[BearingFrame], names: [&str; 3]) -> (Vec<Eye>, Vec<BearingFrame>) {
     let mut eyes = site();
-    let new_name: BTreeMap<String, &str> = eyes.iter().map(|eye| eye.name.to_string()).zip(names).collect();
+    let new_name: BTreeMap<String, &str> =
+        eyes.iter().map(|eye| eye.name.to_string()).zip(names).collect();
     eyes.iter_mut().for_each(|eye| eye.name = new_name[eye.name.as_str()].parse().unwrap());
     let mut renamed = frames.to_vec();
     renamed.iter_mut().for_each(|frame| frame.camera = new_name[&frame.camera].into());
@@ -73,7 +74,8 @@ fn moved(eyes: &[Eye], rotation: &Rotation3<f64>, shift: Vector3<f64>, scale: f6
         let pose = eye.camera.pose();
         let turned = (rotation * pose.rotation()).into_inner();
         let position = rotation * pose.position() * scale + shift;
-        let camera = Camera::new(*eye.camera.model().intrinsics(), Pose::new(turned, position).unwrap());
+        let camera =
+            Camera::new(*eye.camera.model().intrinsics(), Pose::new(turned, position).unwrap());
         Eye { camera: camera.unwrap(), ..eye.clone() }
     };
     eyes.iter().map(moved).collect()
@@ -103,7 +105,8 @@ fn scaled_config(s: f64, u: f64) -> FusionConfig {
     config
 }
 
-/// Each camera's frames in their order, but late by up to `delays` of seconds; the first come in time.
+/// Each camera's frames in their order, but late by up to `delays` of seconds; the first come in
+/// time.
 fn delayed(frames: &[BearingFrame], delays: &[f64]) -> Vec<BearingFrame> {
     let mut last: BTreeMap<&str, f64> = BTreeMap::new();
     let mut arrivals: Vec<(f64, &BearingFrame)> = Vec::new();
@@ -121,8 +124,8 @@ fn delayed(frames: &[BearingFrame], delays: &[f64]) -> Vec<BearingFrame> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 16, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Coordinates of up to 1500 m are exact to 2e-13 m, and a state that is solved from differences
-    /// of them magnifies that by some thousands, as its variances differ by so much.
+    /// Coordinates of up to 1500 m are exact to 2e-13 m, and a state that is solved from
+    /// differences of them magnifies that by some thousands, as its variances differ by so much.
     #[test]
     fn turning_and_shifting_the_world_turns_and_shifts_the_answer(
         axis in prop::array::uniform3(-1.0..1.0),
@@ -162,9 +165,9 @@ proptest! {
         prop_assert_eq!(tracks(&other), tracks(&plain));
     }
 
-    /// The state of the clocks is against the camera that was heard first, whatever it is called; but
-    /// sums over all cameras go by their names. A window's information (in m^2 and s^2) has a condition
-    /// of some 1e9: rounding of 1e-16 is up to 1e-7 of a standard deviation.
+    /// The state of the clocks is against the camera that was heard first, whatever it is called;
+    /// but sums over all cameras go by their names. A window's information (in m^2 and s^2) has a
+    /// condition of some 1e9: rounding of 1e-16 is up to 1e-7 of a standard deviation.
     #[test]
     fn nor_does_it_where_clocks_are_unsure(
         names in Just(["a", "m", "z"]).prop_shuffle(),

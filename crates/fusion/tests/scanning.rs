@@ -1,4 +1,4 @@
-//! Receivers that scan (002, equation 2): each meets the target at a time of its own.
+//! Receivers that scan (Klochko 2020, eq. 2): each meets the target at a time of its own.
 
 use crossfix_fusion::{Fusion, FusionConfig, Output};
 use crossfix_geometry::{
@@ -63,8 +63,10 @@ fn meeting(
 #[test]
 fn three_scanning_receivers_make_a_track_of_angles_met_at_different_times() {
     let mut fusion = Fusion::new(FusionConfig::default()).unwrap();
-    let receivers = [("a", 120.0, -90.0), ("b", -130.0, -80.0), ("c", 10.0, 140.0)]
-        .map(|(name, x, y)| (name.parse::<CameraName>().unwrap(), receiver(Point3::new(x, y, 2.0)).unwrap()));
+    let receivers =
+        [("a", 120.0, -90.0), ("b", -130.0, -80.0), ("c", 10.0, 140.0)].map(|(name, x, y)| {
+            (name.parse::<CameraName>().unwrap(), receiver(Point3::new(x, y, 2.0)).unwrap())
+        });
     for (name, receiver) in &receivers {
         let exact = CameraCalibration::new(name, receiver, Timestamp::EPOCH).with_pose_sd(0.0, 0.0);
         fusion.calibrate(&exact).unwrap();

@@ -2,8 +2,8 @@
 //! and come back; cameras that fail, hardly overlap, are only two, are slow or quick. Truth and
 //! noise are known; each scene says who is who afterwards and how far each track is off.
 //!
-//! Bearings have a standard deviation of half a milliradian, 7.5 cm at 150 m: three cameras at 10 Hz
-//! hold a target that flies straight to a few centimetres, and 0.25 m is far beyond chance.
+//! Bearings have a standard deviation of half a milliradian, 7.5 cm at 150 m: three cameras at 10
+//! Hz hold a target that flies straight to a few centimetres, and 0.25 m is far beyond chance.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
@@ -89,7 +89,8 @@ fn two_targets_that_one_camera_at_a_time_sees_are_both_found() {
         ];
         let scene = Scene::new(paths, 12.0);
         let mut flight = Flight::with(FusionConfig::default(), scene, seed, |frame| {
-            if frame.camera != ["a", "b", "c"][(frame.capture_time_ns / 2_000_000_000) as usize % 3] {
+            if frame.camera != ["a", "b", "c"][(frame.capture_time_ns / 2_000_000_000) as usize % 3]
+            {
                 frame.tracks.clear();
             }
             true
@@ -115,7 +116,8 @@ fn meeting(side: f64, near: f64) -> Path {
 fn targets_that_fly_together_for_ten_seconds_part_with_their_numbers() {
     for seed in SEEDS {
         // Together they are 2 m apart.
-        let mut flight = Flight::new(good_day(vec![meeting(-15.0, -1.0), meeting(15.0, 1.0)], 24.0), seed);
+        let mut flight =
+            Flight::new(good_day(vec![meeting(-15.0, -1.0), meeting(15.0, 1.0)], 24.0), seed);
         let before = assert_one_each(flight.until(3.0), 2, seed);
         let together = assert_one_each(flight.until(12.0), 2, seed);
         let after = assert_one_each(flight.until(23.5), 2, seed);
@@ -129,13 +131,15 @@ fn hidden(path: Path, from_s: f64, to_s: f64) -> Path {
     Box::new(move |t| path(t).filter(|_| !(from_s..to_s).contains(&t)))
 }
 
-/// False bearings of a frame, on average, where a target is away: nothing that could be taken for it,
-/// and 60 a second that could.
+/// False bearings of a frame, on average, where a target is away: nothing that could be taken for
+/// it, and 60 a second that could.
 const NOTHING_AND_CLUTTER: [f64; 2] = [0.0, 2.0];
 
 #[test]
 fn a_target_out_of_sight_for_three_seconds_keeps_its_number() {
-    for (clutter, seed) in NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed))) {
+    for (clutter, seed) in
+        NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed)))
+    {
         let path = || straight([-30.0, 10.0, 40.0], [5.0, -1.0, 0.0]);
         let scene = Scene { clutter, ..good_day(vec![hidden(path(), 5.0, 8.0)], 12.0) };
         let mut flight = Flight::new(scene, seed);
@@ -153,14 +157,21 @@ fn however_many_cameras_miss_it_a_hidden_target_keeps_its_number() {
     for cameras in [4, 8, 16] {
         let eyes: Vec<Eye> = (0..cameras)
             .map(|i| {
-                let (sin, cos) = (f64::from(i) / f64::from(cameras) * std::f64::consts::TAU).sin_cos();
+                let (sin, cos) =
+                    (f64::from(i) / f64::from(cameras) * std::f64::consts::TAU).sin_cos();
                 let phase_s = 0.1 * f64::from(i) / f64::from(cameras);
-                eye(&format!("ring-{i}"), [150.0 * cos, 150.0 * sin, 3.0], [0.0, 0.0, 40.0], phase_s)
+                eye(
+                    &format!("ring-{i}"),
+                    [150.0 * cos, 150.0 * sin, 3.0],
+                    [0.0, 0.0, 40.0],
+                    phase_s,
+                )
             })
             .collect();
         for seed in 0..3 {
             let path = straight([-20.0, 10.0, 40.0], [4.0, -1.0, 0.0]);
-            let scene = Scene { eyes: eyes.clone(), ..good_day(vec![hidden(path, 4.0, 7.0)], 10.0) };
+            let scene =
+                Scene { eyes: eyes.clone(), ..good_day(vec![hidden(path, 4.0, 7.0)], 10.0) };
             let mut flight = Flight::new(scene, seed);
             let before = assert_one_each(flight.until(4.0), 1, seed);
             let after = assert_one_each(flight.until(9.5), 1, seed);
@@ -171,8 +182,11 @@ fn however_many_cameras_miss_it_a_hidden_target_keeps_its_number() {
 
 #[test]
 fn a_target_that_leaves_the_field_of_view_for_long_is_lost_and_found_as_another() {
-    for (clutter, seed) in NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed))) {
-        // Up out of all cameras' sight, which ends at some 105 m, and down again, within half a minute.
+    for (clutter, seed) in
+        NOTHING_AND_CLUTTER.into_iter().flat_map(|c| SEEDS.map(move |seed| (c, seed)))
+    {
+        // Up out of all cameras' sight, which ends at some 105 m, and down again, within half a
+        // minute.
         let path: Path = Box::new(|t| {
             let turn = (t - 4.0).clamp(0.0, 30.0) / 30.0 * std::f64::consts::TAU;
             Some(Point3::new(-20.0 + t, 5.0, 140.0 - 100.0 * turn.cos()))
@@ -196,23 +210,28 @@ fn a_camera_that_dies_and_comes_back_costs_no_track() {
             straight([20.0, 25.0, 50.0], [-1.0, -3.0, 0.0]),
         ];
         let dead = |seconds: f64| (5.0..10.0).contains(&seconds);
-        let mut flight = Flight::with(FusionConfig::default(), good_day(paths, 16.0), seed, |frame| {
-            frame.camera != "b" || !dead(frame.capture_time_ns as f64 / 1e9)
-        });
+        let mut flight =
+            Flight::with(FusionConfig::default(), good_day(paths, 16.0), seed, |frame| {
+                frame.camera != "b" || !dead(frame.capture_time_ns as f64 / 1e9)
+            });
         let before = assert_one_each(flight.until(5.0), 2, seed);
         for second in [9.5, 15.5] {
             assert_eq!(assert_one_each(flight.until(second), 2, seed), before, "seed {seed}");
             assert!((0..2).all(|target| flight.error(target) < CLOSE_M), "seed {seed}");
         }
         let counters = flight.fusion.counters();
-        assert_eq!((counters.get("tracks_born"), counters.get("rejected_late")), (2, 0), "seed {seed}");
+        assert_eq!(
+            (counters.get("tracks_born"), counters.get("rejected_late")),
+            (2, 0),
+            "seed {seed}"
+        );
     }
 }
 
 #[test]
 fn a_target_is_handed_from_pair_to_pair_of_cameras_that_hardly_overlap() {
-    // Along a road, each camera looks straight across it and sees some 100 m of it; neighbours share
-    // a fifth of that with the next pair.
+    // Along a road, each camera looks straight across it and sees some 100 m of it; neighbours
+    // share a fifth of that with the next pair.
     let eyes: Vec<Eye> = (0..6)
         .map(|i| {
             let (pair, second) = (f64::from(i / 2), f64::from(i % 2));
@@ -223,17 +242,23 @@ fn a_target_is_handed_from_pair_to_pair_of_cameras_that_hardly_overlap() {
         .collect();
     for seed in SEEDS {
         let path = straight([-35.0, 0.0, 20.0], [12.0, 0.0, 0.1]);
-        let mut flight = Flight::new(Scene { eyes: eyes.clone(), ..good_day(vec![path], 18.0) }, seed);
+        let mut flight =
+            Flight::new(Scene { eyes: eyes.clone(), ..good_day(vec![path], 18.0) }, seed);
         let first = assert_one_each(flight.until(2.0), 1, seed);
         for second in 3..18 {
-            assert_eq!(assert_one_each(flight.until(f64::from(second)), 1, seed), first, "seed {seed}");
+            assert_eq!(
+                assert_one_each(flight.until(f64::from(second)), 1, seed),
+                first,
+                "seed {seed}"
+            );
             assert!(flight.error(0) < CLOSE_M, "seed {seed}, {second} s");
         }
         assert_eq!(flight.fusion.counters().get("tracks_born"), 1, "seed {seed}");
     }
 }
 
-/// A flight that starts at about walking pace, driven by white acceleration of a power spectral density, m^2/s^3, in steps of 10 ms.
+/// A flight that starts at about walking pace, driven by white acceleration of a power spectral
+/// density, m^2/s^3, in steps of 10 ms.
 fn drawn(density: f64, seconds: f64, seed: u64) -> Path {
     const STEP_S: f64 = 0.01;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -252,8 +277,8 @@ fn drawn(density: f64, seconds: f64, seed: u64) -> Path {
     })
 }
 
-/// Of 200 flights drawn from the filter's own model how many are found within ten seconds, their mean NEES and
-/// the mean variance of a position, m^2.
+/// Of 200 flights drawn from the filter's own model how many are found within ten seconds, their
+/// mean NEES and the mean variance of a position, m^2.
 fn honesty(eyes: &[Eye]) -> (u32, f64, f64) {
     const RUNS: u32 = 200;
     const DENSITY: f64 = 0.3;
@@ -262,7 +287,8 @@ fn honesty(eyes: &[Eye]) -> (u32, f64, f64) {
     config.tracking.acceleration_density = DENSITY;
     let (mut found, mut nees, mut variance) = (0, 0.0, 0.0);
     for seed in 0..u64::from(RUNS) {
-        let scene = Scene { eyes: eyes.to_vec(), ..good_day(vec![drawn(DENSITY, 10.1, seed)], 10.0) };
+        let scene =
+            Scene { eyes: eyes.to_vec(), ..good_day(vec![drawn(DENSITY, 10.1, seed)], 10.0) };
         let mut flight = Flight::with(config.clone(), scene, 1000 + seed, |_| true);
         if let Some(track) = flight.until(10.0).track(0) {
             variance += track.state().position_covariance().trace() / 3.0;

@@ -19,7 +19,8 @@ fn path() -> Path {
     straight([-60.0, 10.0, 45.0], [5.0, 0.0, 0.2])
 }
 
-/// The frames of a target that flies straight, with the times that the cameras' clocks give them, of which these step.
+/// The frames of a target that flies straight, with the times that the cameras' clocks give them,
+/// of which these step.
 fn stepped(step_s: f64, sd_s: f64, cameras: &[&str]) -> (Scene, Vec<BearingFrame>) {
     let scene = Scene::new(vec![path()], UNTIL_S);
     let mut frames = scene.frames(3);
@@ -64,7 +65,11 @@ fn a_track_outlives_a_step_of_all_clocks_either_way() {
         assert_eq!(numbers.len(), 1, "{step_s}");
         assert!(error_m(&fusion, step_s) < 0.3, "{step_s}: {}", error_m(&fusion, step_s));
         let count = |name| fusion.counters().get(name);
-        assert_eq!((count("site_time_steps"), count("exposures")), (1, frames.len() as u64), "{step_s}");
+        assert_eq!(
+            (count("site_time_steps"), count("exposures")),
+            (1, frames.len() as u64),
+            "{step_s}"
+        );
     }
 }
 
@@ -87,8 +92,10 @@ fn cameras_that_stand_still_for_a_while_are_no_step() {
         let shown = path(0.0).unwrap() + (path(1.0).unwrap() - path(0.0).unwrap()) * UNTIL_S;
         let scene = Scene::new(vec![path], UNTIL_S);
         let mut frames = scene.frames(3);
-        let (slept, awake) = (AT_S..AT_S + 1.0, |frame: &BearingFrame| !cameras.contains(&&*frame.camera));
-        frames.retain(|frame| awake(frame) || !slept.contains(&(frame.capture_time_ns as f64 / 1e9)));
+        let (slept, awake) =
+            (AT_S..AT_S + 1.0, |frame: &BearingFrame| !cameras.contains(&&*frame.camera));
+        frames
+            .retain(|frame| awake(frame) || !slept.contains(&(frame.capture_time_ns as f64 / 1e9)));
         // Numbered without a gap, as by a host that slept.
         for frame in frames.iter_mut().filter(|frame| !awake(frame)) {
             frame.sequence -= if frame.capture_time_ns as f64 / 1e9 > AT_S { 10 } else { 0 };
@@ -98,6 +105,10 @@ fn cameras_that_stand_still_for_a_while_are_no_step() {
         let end = fusion.tracks().next().unwrap().state().position();
         assert!((end - shown).norm() < 1.0, "{cameras:?}: {end} {shown}");
         let count = |name| fusion.counters().get(name);
-        assert_eq!((count("site_time_steps"), count("exposures")), (0, frames.len() as u64), "{cameras:?}");
+        assert_eq!(
+            (count("site_time_steps"), count("exposures")),
+            (0, frames.len() as u64),
+            "{cameras:?}"
+        );
     }
 }

@@ -9,7 +9,8 @@ use crossfix_fusion::{Fusion, FusionConfig, UnmetLines};
 use crossfix_message::BearingFrame;
 use nalgebra::{Rotation3, Vector3};
 
-/// Feeds frames, each changed by `spoil`, and returns when it was said why nothing is found, s after the first.
+/// Feeds frames, each changed by `spoil`, and returns when it was said why nothing is found, s
+/// after the first.
 fn said(scene: &Scene, spoil: impl Fn(&mut BearingFrame)) -> (Fusion, Option<f64>) {
     let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
     let mut when = None;
@@ -38,17 +39,23 @@ fn lines_that_miss_each_other_are_said_within_ten_seconds_and_by_how_much() {
     // 0.1 rad of a camera that is knocked, at some 150 m: 15 m.
     let (fusion, when) = said(&scene, |frame| {
         for track in frame.tracks.iter_mut().filter(|_| frame.camera == "b") {
-            let turned = Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
+            let turned =
+                Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
             track.bearing = Some(turned.into());
         }
     });
     assert!(when.is_some_and(|when| when < 10.0), "{when:?}");
     let why = fusion.why_nothing().unwrap();
     assert_eq!(why.cameras.each_ref().map(|camera| camera.as_str()), ["a", "b"]);
-    assert!(matches!(why.lines, UnmetLines::Apart { by_m } if (10.0..20.0).contains(&by_m)), "{why:?}");
+    assert!(
+        matches!(why.lines, UnmetLines::Apart { by_m } if (10.0..20.0).contains(&by_m)),
+        "{why:?}"
+    );
     let text = why.to_string();
     assert!(
-        text.starts_with("cameras `a` and `b` see something at the same time, but their lines miss"),
+        text.starts_with(
+            "cameras `a` and `b` see something at the same time, but their lines miss"
+        ),
         "{text}"
     );
     assert!(fusion.counters().get("unfound_lines_miss_each_other") > 10);
@@ -59,7 +66,8 @@ fn nothing_is_said_any_more_when_the_target_or_a_camera_is_gone() {
     let scene = Scene { time_s: 0.0..25.0, ..two_cameras() };
     let knocked = |frame: &mut BearingFrame| {
         for track in frame.tracks.iter_mut().filter(|_| frame.camera == "b") {
-            let turned = Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
+            let turned =
+                Rotation3::from_euler_angles(0.1, 0.0, 0.0) * Vector3::from(track.bearing.unwrap());
             track.bearing = Some(turned.into());
         }
     };
@@ -90,7 +98,8 @@ fn where_a_target_is_found_nothing_is_said() {
 #[test]
 fn clutter_is_not_something() {
     let scene = Scene { paths: Vec::new(), clutter: 5.0, ..two_cameras() };
-    // What an agent follows has a number; what it takes up and drops in one picture never has the same again.
+    // What an agent follows has a number; what it takes up and drops in one picture never has the
+    // same again.
     let (_, when) = said(&scene, |frame| {
         for (i, track) in frame.tracks.iter_mut().enumerate() {
             track.track_id = frame.sequence * 1000 + i as u64;

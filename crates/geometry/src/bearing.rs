@@ -71,11 +71,12 @@ pub struct SightLine {
     pub covariance: Matrix2<f64>,
 }
 
-/// Squared sine below which two directions are parallel: their lines pass nearest at a range beyond all use.
+/// Squared sine below which two directions are parallel: their lines pass nearest at a range beyond
+/// all use.
 const PARALLEL: f64 = 1e-9;
 
-/// The ranges (m) at which two rays pass nearest to each other, each given by its origin and direction; negative
-/// where that is behind the origin.
+/// The ranges (m) at which two rays pass nearest to each other, each given by its origin and
+/// direction; negative where that is behind the origin.
 ///
 /// ```
 /// use crossfix_geometry::passing_ranges;
@@ -101,7 +102,11 @@ impl SightLine {
     pub fn miss_distance(&self, point: Point3<f64>) -> f64 {
         let offset = point - self.origin;
         let along = offset.dot(&self.direction);
-        if along < 0.0 { offset.norm() } else { (offset - self.direction.into_inner() * along).norm() }
+        if along < 0.0 {
+            offset.norm()
+        } else {
+            (offset - self.direction.into_inner() * along).norm()
+        }
     }
 
     /// The direction to a point as an offset from this ray on its tangent plane, rad.
@@ -140,7 +145,10 @@ mod tests {
     fn impossible_bearings_are_refused() {
         let covariance = Matrix2::identity() * 1e-6;
         let refused = |v, c| Bearing::new(v, c).unwrap_err();
-        assert!(matches!(refused(Vector3::new(0.0, 0.0, 1.1), covariance), GeometryError::NotUnit { .. }));
+        assert!(matches!(
+            refused(Vector3::new(0.0, 0.0, 1.1), covariance),
+            GeometryError::NotUnit { .. }
+        ));
         assert!(matches!(
             refused(Vector3::new(0.0, f64::NAN, 1.0), covariance),
             GeometryError::NotFinite { .. }

@@ -86,7 +86,12 @@ pub struct CameraModel {
     brown_conrady: RosOpenCvIntrinsics<f64>,
 }
 
-fn check(what: &'static str, value: f64, good: bool, must: &'static str) -> Result<(), GeometryError> {
+fn check(
+    what: &'static str,
+    value: f64,
+    good: bool,
+    must: &'static str,
+) -> Result<(), GeometryError> {
     if good { Ok(()) } else { Err(GeometryError::Intrinsics { what, value, must }) }
 }
 
@@ -121,7 +126,8 @@ impl CameraModel {
         for &k in coefficients {
             check("a distortion coefficient", k, k.is_finite(), "it must be a finite number")?;
         }
-        let brown_conrady = RosOpenCvIntrinsics::from_params_with_distortion(fx, 0.0, fy, cx, cy, opencv);
+        let brown_conrady =
+            RosOpenCvIntrinsics::from_params_with_distortion(fx, 0.0, fy, cx, cy, opencv);
         Ok(Self { intrinsics, brown_conrady })
     }
 
@@ -191,11 +197,17 @@ impl CameraModel {
     ///
     /// # Errors
     /// [`GeometryError`] where the lens model cannot be undone or the covariance is impossible.
-    pub fn bearing(&self, pixel: Pixel, covariance: PixelCovariance) -> Result<Bearing, GeometryError> {
+    pub fn bearing(
+        &self,
+        pixel: Pixel,
+        covariance: PixelCovariance,
+    ) -> Result<Bearing, GeometryError> {
         let direction = self.direction(pixel)?;
         let no_inverse = || GeometryError::NoInverse { x: pixel.x(), y: pixel.y() };
-        let tangent_per_pixel =
-            self.pixels_per_radian(&direction).and_then(|j| j.try_inverse()).ok_or_else(no_inverse)?;
+        let tangent_per_pixel = self
+            .pixels_per_radian(&direction)
+            .and_then(|j| j.try_inverse())
+            .ok_or_else(no_inverse)?;
         let tangent = tangent_per_pixel * covariance.0 * tangent_per_pixel.transpose();
         Bearing::new(direction.into_inner(), tangent)
     }
@@ -271,7 +283,11 @@ impl Camera {
     ///
     /// Unlike [`Camera::sees`] it is not deceived by a lens polynomial that folds directions far
     /// outside the field of view back into the image.
-    pub fn sight_line_to(&self, point: Point3<f64>, covariance: PixelCovariance) -> Option<SightLine> {
+    pub fn sight_line_to(
+        &self,
+        point: Point3<f64>,
+        covariance: PixelCovariance,
+    ) -> Option<SightLine> {
         let place = self.pose.camera_from_world(point);
         if !self.model.sees(&place) {
             return None;
@@ -380,7 +396,10 @@ mod tests {
             (Intrinsics { size: ImageSize { width: 0, height: 1 }, ..good }, "the image width"),
         ] {
             let error = CameraModel::new(bad).unwrap_err();
-            assert!(matches!(error, GeometryError::Intrinsics { what, .. } if what == name), "{error}");
+            assert!(
+                matches!(error, GeometryError::Intrinsics { what, .. } if what == name),
+                "{error}"
+            );
         }
     }
 }

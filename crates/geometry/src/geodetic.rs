@@ -8,7 +8,8 @@ const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
 const FLATTENING: f64 = 1.0 / 298.257_223_563;
 /// Square of its first eccentricity.
 const ECCENTRICITY_SQUARED: f64 = FLATTENING * (2.0 - FLATTENING);
-/// Steps of the latitude's iteration: each is 200 times as exact as the last, the first is good to 1e-5.
+/// Steps of the latitude's iteration: each is 200 times as exact as the last, the first is good to
+/// 1e-5.
 const LATITUDE_STEPS: usize = 6;
 
 /// A place on or above the Earth: WGS84, with the height above the ellipsoid.
@@ -24,7 +25,11 @@ impl Geodetic {
     ///
     /// # Errors
     /// [`GeometryError::Geodetic`] naming the number that is on no map.
-    pub fn from_degrees(latitude_deg: f64, longitude_deg: f64, height_m: f64) -> Result<Self, GeometryError> {
+    pub fn from_degrees(
+        latitude_deg: f64,
+        longitude_deg: f64,
+        height_m: f64,
+    ) -> Result<Self, GeometryError> {
         let check = |what, value: f64, most: f64, must| {
             // A NaN is in no range.
             let good = (-most..=most).contains(&value);
@@ -111,7 +116,8 @@ impl LocalFrame {
         let (sin_latitude, cos_latitude) = anchor.latitude.sin_cos();
         let (sin_longitude, cos_longitude) = anchor.longitude.sin_cos();
         let east = Vector3::new(-sin_longitude, cos_longitude, 0.0);
-        let up = Vector3::new(cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude);
+        let up =
+            Vector3::new(cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude);
         let earth_from_local = Matrix3::from_columns(&[east, up.cross(&east), up]);
         Self { origin: anchor.earth_centred(), earth_from_local }
     }
@@ -133,16 +139,22 @@ mod tests {
 
     use super::*;
 
-    /// 53 deg 48' 33.820" N, 2 deg 07' 46.380" E, 73 m: the worked example of IOGP's guidance note 7-2, 4.1.1.
+    /// 53 deg 48' 33.820" N, 2 deg 07' 46.380" E, 73 m: the worked example of IOGP's guidance note
+    /// 7-2, 4.1.1.
     fn example() -> Geodetic {
         let degrees = |d: f64, m: f64, s: f64| d + m / 60.0 + s / 3600.0;
-        Geodetic::from_degrees(degrees(53.0, 48.0, 33.820), degrees(2.0, 7.0, 46.380), 73.0).unwrap()
+        Geodetic::from_degrees(degrees(53.0, 48.0, 33.820), degrees(2.0, 7.0, 46.380), 73.0)
+            .unwrap()
     }
 
     #[test]
     fn the_guidance_notes_example_in_the_earths_axes() {
         let published = Point3::new(3_771_793.968, 140_253.342, 5_124_304.349);
-        assert!((example().earth_centred() - published).norm() < 2e-3, "{}", example().earth_centred());
+        assert!(
+            (example().earth_centred() - published).norm() < 2e-3,
+            "{}",
+            example().earth_centred()
+        );
     }
 
     #[test]

@@ -2,14 +2,15 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix3x2, Point3, Unit, 
 
 use crate::{SightLine, tangent_basis};
 
-/// The bearing model: how a camera at `origin` sees a place, and how that changes with the place, with the
-/// camera's pose and with its clock.
+/// The bearing model: how a camera at `origin` sees a place, and how that changes with the place,
+/// with the camera's pose and with its clock.
 ///
 /// A bearing is compared as an offset on the tangent plane at the expected direction, measured less
-/// expected. The Jacobians say how that offset changes with a true value that the expectation does not know:
-/// `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is the true place less the
-/// expected one (m, world), `de` the true pose less the stated one (a small rotation vector about the
-/// world's axes, rad, then the position, m) and `dt` the stated capture time less the true one (s).
+/// expected. The Jacobians say how that offset changes with a true value that the expectation does
+/// not know: `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is the
+/// true place less the expected one (m, world), `de` the true pose less the stated one (a small
+/// rotation vector about the world's axes, rad, then the position, m) and `dt` the stated capture
+/// time less the true one (s).
 ///
 /// ```
 /// use crossfix_geometry::BearingModel;
@@ -59,9 +60,9 @@ impl BearingModel {
         self.basis.transpose() / self.range
     }
 
-    /// Change with the pose: rad/rad, then rad/m. A camera that is turned by `d` more than it says measures
-    /// in its stated axes the direction turned back by `d`; one that stands farther by `c` sees the place
-    /// moved by `-c`.
+    /// Change with the pose: rad/rad, then rad/m. A camera that is turned by `d` more than it says
+    /// measures in its stated axes the direction turned back by `d`; one that stands farther by `c`
+    /// sees the place moved by `-c`.
     pub fn by_pose(&self) -> Matrix2x6<f64> {
         let tangents = self.basis.transpose();
         let cross: Matrix3<f64> = self.direction.cross_matrix();
@@ -71,7 +72,8 @@ impl BearingModel {
         jacobian
     }
 
-    /// Change with the clock, rad/s: one that is ahead shows the target of `velocity` (m/s) where it was.
+    /// Change with the clock, rad/s: one that is ahead shows the target of `velocity` (m/s) where
+    /// it was.
     pub fn by_time(&self, velocity: Vector3<f64>) -> Vector2<f64> {
         -(self.by_position() * velocity)
     }

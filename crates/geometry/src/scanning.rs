@@ -1,4 +1,4 @@
-//! The receivers of paper 002: an optical one whose image lies behind the
+//! The receivers of Klochko 2020: an optical one whose image lies behind the
 //! lens, and a scanning thermal one that gives two angles. Their axes are the
 //! paper's: z towards the object, y up, so x points to the left of a camera
 //! that looks along z.
@@ -42,7 +42,7 @@ pub fn camera_from_paper(vector: Vector3<f64>) -> Vector3<f64> {
     Vector3::new(-vector.x, -vector.y, vector.z)
 }
 
-/// The direction from an image point of an optical receiver (002, equation 1), paper's axes.
+/// The direction from an image point of an optical receiver (Klochko 2020, eq. 1), paper's axes.
 ///
 /// `x`, `y` and the focal length `f` in one unit; the image is upside down, hence the signs.
 /// `None` if the focal length is not positive.
@@ -61,7 +61,7 @@ pub struct ScanAngles {
 }
 
 impl ScanAngles {
-    /// The direction of the angles (002, equation 2).
+    /// The direction of the angles (Klochko 2020, eq. 2).
     pub fn bearing(self) -> Unit<Vector3<f64>> {
         let (sin_azimuth, cos_azimuth) = self.azimuth.sin_cos();
         let (sin_elevation, cos_elevation) = self.elevation.sin_cos();
@@ -72,8 +72,8 @@ impl ScanAngles {
         ))
     }
 
-    /// The angles of a direction (002, equation 3; erratum: without the factor mu in the azimuth,
-    /// and with the quadrant).
+    /// The angles of a direction (Klochko 2020, eq. 3; erratum: without the factor mu in the
+    /// azimuth, and with the quadrant).
     pub fn of(bearing: &Unit<Vector3<f64>>) -> Self {
         Self { azimuth: bearing.x.atan2(bearing.z), elevation: bearing.y.clamp(-1.0, 1.0).asin() }
     }
@@ -89,7 +89,7 @@ impl ScanAngles {
     }
 
     /// The angles to which an image point cues the scanning receiver beside its optical one
-    /// (002, equation 3 mended: phi = atan2(-x, f)).
+    /// (Klochko 2020, eq. 3 mended: phi = atan2(-x, f)).
     pub fn cue(x: f64, y: f64, f: f64) -> Option<Self> {
         optical_bearing(x, y, f).map(|bearing| Self::of(&bearing))
     }

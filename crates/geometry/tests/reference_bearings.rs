@@ -73,7 +73,8 @@ fn real_labels_become_the_reference_bearings() {
         ) = row.unwrap();
         let description = &poses[dataset.to_string()]["half"]["cameras"][&camera];
         let name = description["name"].as_str().unwrap();
-        let model = models.entry((dataset, camera.clone())).or_insert_with(|| model(&data, name, dataset));
+        let model =
+            models.entry((dataset, camera.clone())).or_insert_with(|| model(&data, name, dataset));
         // The file was made with five fixed-point steps of the inverse. Where those do not converge
         // (the corners of the wide lens) its direction does not fall back on its own pixel.
         let theirs = model.project(&Vector3::new(u_norm, v_norm, 1.0)).unwrap();
@@ -82,9 +83,11 @@ fn real_labels_become_the_reference_bearings() {
             continue;
         }
         let rotation = &description["R_world_to_cam"];
-        let camera_from_world =
-            Matrix3::from_row_slice(&(0..3).flat_map(|r| numbers(&rotation[r])).collect::<Vec<_>>());
-        let ours = camera_from_world.transpose() * model.direction(Pixel::new(x, y)).unwrap().into_inner();
+        let camera_from_world = Matrix3::from_row_slice(
+            &(0..3).flat_map(|r| numbers(&rotation[r])).collect::<Vec<_>>(),
+        );
+        let ours =
+            camera_from_world.transpose() * model.direction(Pixel::new(x, y)).unwrap().into_inner();
         let error = (ours - Vector3::new(e, n, u)).norm();
         let slot = worst.entry(format!("{dataset}/{name}")).or_default();
         *slot = slot.max(error);

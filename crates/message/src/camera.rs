@@ -4,7 +4,9 @@ use prost::Message;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::{CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3};
+use crate::{
+    CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3,
+};
 
 /// A [`CameraCalibration`] that has been read and found possible.
 #[derive(Clone, Debug)]
@@ -102,9 +104,9 @@ impl CameraCalibration {
             DistortionModel::BrownConrady => Distortion::BrownConrady(
                 self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
             ),
-            DistortionModel::Fisheye => {
-                Distortion::Fisheye(self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?)
-            }
+            DistortionModel::Fisheye => Distortion::Fisheye(
+                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
+            ),
         };
         let intrinsics = Intrinsics {
             size: ImageSize { width: self.width, height: self.height },
@@ -114,16 +116,21 @@ impl CameraCalibration {
             cy: self.cy,
             distortion,
         };
-        let rotation: [f64; 9] = self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
+        let rotation: [f64; 9] =
+            self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
         let position = self.position.ok_or_else(|| shape("position"))?;
-        let pose = Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
+        let pose =
+            Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
         let pose_covariance = match self.pose_covariance.as_slice() {
             [] => None,
             values => {
                 let values = values.try_into().map_err(|_| shape("pose_covariance"))?;
                 let covariance = read_pose_covariance(values, &camera);
-                Some(covariance.ok_or_else(|| CalibrationError::Covariance { camera: name.clone() })?)
+                Some(
+                    covariance
+                        .ok_or_else(|| CalibrationError::Covariance { camera: name.clone() })?,
+                )
             }
         };
         let valid_from = Timestamp::from_nanos(self.valid_from_ns);
@@ -196,7 +203,8 @@ mod tests {
             cy: 240.0,
             distortion: Distortion::BrownConrady([-0.1, 0.02, 1e-4, -2e-4, 0.0]),
         };
-        let pose = Pose::looking_at(Point3::new(10.0, 20.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
+        let pose =
+            Pose::looking_at(Point3::new(10.0, 20.0, 2.0), Point3::new(0.0, 0.0, 50.0)).unwrap();
         let camera = Camera::new(intrinsics, pose).unwrap();
         CameraCalibration::new(&"north".parse().unwrap(), &camera, Timestamp::EPOCH)
     }
@@ -218,10 +226,15 @@ mod tests {
     fn an_uncertain_pose_is_read_in_the_worlds_axes_and_an_impossible_one_is_named() {
         let uncertain = message().with_pose_sd(0.01, 0.1);
         let covariance = uncertain.parse().unwrap().pose_covariance.unwrap();
-        assert!((covariance[(1, 1)] - 1e-4).abs() < 1e-12 && (covariance[(4, 4)] - 0.01).abs() < 1e-12);
+        assert!(
+            (covariance[(1, 1)] - 1e-4).abs() < 1e-12 && (covariance[(4, 4)] - 0.01).abs() < 1e-12
+        );
         let mut torn = uncertain.clone();
         torn.pose_covariance.pop();
-        assert!(matches!(torn.parse(), Err(CalibrationError::Shape { part: "pose_covariance", .. })));
+        assert!(matches!(
+            torn.parse(),
+            Err(CalibrationError::Shape { part: "pose_covariance", .. })
+        ));
         let mut negative = uncertain;
         negative.pose_covariance[0] = -1.0;
         assert!(matches!(negative.parse(), Err(CalibrationError::Covariance { .. })));

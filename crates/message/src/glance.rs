@@ -1,7 +1,7 @@
 use crate::size::{Value, fields};
 use crate::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Health, Payload, Preview, Timestamp, TrackEvent,
-    TrackFrame, TruthFrame, VERSION,
+    BearingFrame, CameraCalibration, Channel, DecodeError, Health, Payload, Preview, Timestamp,
+    TrackEvent, TrackFrame, TruthFrame, VERSION,
 };
 
 /// What a recorder must know of a message: no more than that is read of it, so that a message of a
@@ -14,7 +14,8 @@ pub struct Glance {
     pub is_readable: bool,
 }
 
-/// Looks at the bytes of a channel's message without decoding it; `None` for channels that carry none.
+/// Looks at the bytes of a channel's message without decoding it; `None` for channels that carry
+/// none.
 ///
 /// # Errors
 /// [`DecodeError::Malformed`] if the bytes are no protobuf message.
@@ -31,7 +32,9 @@ pub fn glance(channel: &Channel, bytes: &[u8]) -> Result<Option<Glance>, DecodeE
         Channel::Bearings(_) => of::<BearingFrame>(bytes),
         Channel::Calibration(_) => of::<CameraCalibration>(bytes),
         Channel::Preview(_) => of::<Preview>(bytes),
-        Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => of::<Health>(bytes),
+        Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
+            of::<Health>(bytes)
+        }
         Channel::Tracks => of::<TrackFrame>(bytes),
         Channel::Events => of::<TrackEvent>(bytes),
         Channel::Truth => of::<TruthFrame>(bytes),
@@ -75,7 +78,8 @@ mod tests {
         let camera = || "north".parse().unwrap();
         let time = Timestamp::from_nanos(1_790_000_000_000_000_007);
         let ns = time.nanos();
-        let shown = |channel: Channel, bytes: Vec<u8>| glance(&channel, &bytes).unwrap().unwrap().time;
+        let shown =
+            |channel: Channel, bytes: Vec<u8>| glance(&channel, &bytes).unwrap().unwrap().time;
         let messages = [
             (
                 Channel::Bearings(camera()),
@@ -85,8 +89,14 @@ mod tests {
                 Channel::Calibration(camera()),
                 CameraCalibration { valid_from_ns: ns, ..Default::default() }.encode(),
             ),
-            (Channel::Preview(camera()), Preview { capture_time_ns: ns, ..Default::default() }.encode()),
-            (Channel::CameraHealth(camera()), Health { time_ns: ns, ..Default::default() }.encode()),
+            (
+                Channel::Preview(camera()),
+                Preview { capture_time_ns: ns, ..Default::default() }.encode(),
+            ),
+            (
+                Channel::CameraHealth(camera()),
+                Health { time_ns: ns, ..Default::default() }.encode(),
+            ),
             (Channel::Tracks, TrackFrame { time_ns: ns, ..Default::default() }.encode()),
             (Channel::Events, TrackEvent { time_ns: ns, ..Default::default() }.encode()),
             (Channel::Truth, TruthFrame { time_ns: ns, ..Default::default() }.encode()),

@@ -159,8 +159,8 @@ mod tests {
     use super::*;
 
     fn channels() -> impl Strategy<Value = Channel> {
-        let camera =
-            "[A-Za-z0-9_-]{1,64}".prop_filter_map("reserved", |text| text.parse::<CameraName>().ok());
+        let camera = "[A-Za-z0-9_-]{1,64}"
+            .prop_filter_map("reserved", |text| text.parse::<CameraName>().ok());
         prop_oneof![
             camera.clone().prop_map(Channel::Bearings),
             camera.clone().prop_map(Channel::Calibration),

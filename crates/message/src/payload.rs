@@ -3,7 +3,8 @@ use thiserror::Error;
 
 use crate::size::{self, MAX_DECODED_BYTES, Repeated};
 use crate::{
-    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION, Version,
+    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION,
+    Version,
 };
 
 /// A message that stands alone on the wire and in recordings.
@@ -90,7 +91,9 @@ pub enum DecodeError {
         source: prost::DecodeError,
     },
     /// The message would take more memory than any true one.
-    #[error("a {schema} of {wire_bytes} bytes would take more than {MAX_DECODED_BYTES} bytes of memory")]
+    #[error(
+        "a {schema} of {wire_bytes} bytes would take more than {MAX_DECODED_BYTES} bytes of memory"
+    )]
     TooLarge {
         /// The message that was expected.
         schema: &'static str,
@@ -122,9 +125,11 @@ pub fn decode<M: Payload>(bytes: &[u8]) -> Result<M, DecodeError> {
     }
     let message = M::of_bytes(bytes).map_err(malformed)?;
     match message.version() {
-        Some(version) if version.major > VERSION.major => {
-            Err(DecodeError::NewerMajor { schema: M::SCHEMA, theirs: version.major, ours: VERSION.major })
-        }
+        Some(version) if version.major > VERSION.major => Err(DecodeError::NewerMajor {
+            schema: M::SCHEMA,
+            theirs: version.major,
+            ours: VERSION.major,
+        }),
         _ => Ok(message),
     }
 }

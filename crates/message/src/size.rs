@@ -9,12 +9,12 @@ use crate::{BearingTrack, CameraHealth, CameraResidual, Counter, Track, TrueStat
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB).
 pub const MAX_MESSAGE_BYTES: usize = 8 << 20;
 
-/// The most that a message may take once it is decoded, bytes: 80 000 bearings. Lists double as they
-/// grow, so that decoding one takes twice as much for a moment.
+/// The most that a message may take once it is decoded, bytes: 80 000 bearings. Lists double as
+/// they grow, so that decoding one takes twice as much for a moment.
 pub const MAX_DECODED_BYTES: usize = 16 << 20;
 
-/// A list in a message that may be longer in memory than on the wire: an element that says nothing has
-/// two bytes there and its whole size here.
+/// A list in a message that may be longer in memory than on the wire: an element that says nothing
+/// has two bytes there and its whole size here.
 #[derive(Debug)]
 pub struct Repeated {
     /// Number of the field.
@@ -31,7 +31,8 @@ const fn list<T>(tag: u32, inside: &'static [Repeated]) -> Repeated {
 
 pub(crate) const NOTHING: &[Repeated] = &[];
 pub(crate) const BEARING_FRAME: &[Repeated] = &[list::<BearingTrack>(8, NOTHING)];
-pub(crate) const TRACK_FRAME: &[Repeated] = &[list::<Track>(6, &[list::<CameraResidual>(6, NOTHING)])];
+pub(crate) const TRACK_FRAME: &[Repeated] =
+    &[list::<Track>(6, &[list::<CameraResidual>(6, NOTHING)])];
 pub(crate) const HEALTH: &[Repeated] = &[
     list::<Counter>(5, NOTHING),
     list::<CameraHealth>(7, NOTHING),
@@ -40,15 +41,21 @@ pub(crate) const HEALTH: &[Repeated] = &[
 ];
 pub(crate) const TRUTH_FRAME: &[Repeated] = &[list::<TrueState>(3, NOTHING)];
 
-/// Bytes that a message takes once it is decoded, at least as many as it has on the wire. Stops early
-/// when it is more than `limit`.
+/// Bytes that a message takes once it is decoded, at least as many as it has on the wire. Stops
+/// early when it is more than `limit`.
 ///
 /// # Errors
 /// If the bytes are no protobuf message.
-pub(crate) fn decoded_bytes(wire: &[u8], lists: &[Repeated], limit: usize) -> Result<usize, DecodeError> {
+pub(crate) fn decoded_bytes(
+    wire: &[u8],
+    lists: &[Repeated],
+    limit: usize,
+) -> Result<usize, DecodeError> {
     let mut total = wire.len();
     fields(wire, |tag, value| {
-        if let (Some(list), Value::Bytes(element)) = (lists.iter().find(|list| list.tag == tag), value) {
+        if let (Some(list), Value::Bytes(element)) =
+            (lists.iter().find(|list| list.tag == tag), value)
+        {
             total += list.bytes;
             if !list.inside.is_empty() {
                 total += decoded_bytes(element, list.inside, limit)? - element.len();
@@ -104,11 +111,14 @@ mod tests {
     use prost_types::field_descriptor_proto::{Label, Type};
 
     use super::*;
-    use crate::{BearingFrame, Health, Payload, TrackFrame, TruthFrame, decode, file_descriptor_set};
+    use crate::{
+        BearingFrame, Health, Payload, TrackFrame, TruthFrame, decode, file_descriptor_set,
+    };
 
     /// The tags of the lists of messages and texts of a message, with the name of what is in them.
     fn described(set: &FileDescriptorSet, name: &str) -> Vec<(u32, String)> {
-        let message = set.file.iter().flat_map(|f| &f.message_type).find(|m| m.name() == name).unwrap();
+        let message =
+            set.file.iter().flat_map(|f| &f.message_type).find(|m| m.name() == name).unwrap();
         let grows = |kind| matches!(kind, Type::Message | Type::String | Type::Bytes);
         message
             .field
@@ -122,7 +132,9 @@ mod tests {
         let described = described(set, name);
         let ours: Vec<u32> = lists.iter().map(|list| list.tag).collect();
         assert_eq!(described.iter().map(|(tag, _)| *tag).collect::<Vec<_>>(), ours, "{name}");
-        for ((_, inner), list) in described.iter().zip(lists).filter(|((_, inner), _)| !inner.is_empty()) {
+        for ((_, inner), list) in
+            described.iter().zip(lists).filter(|((_, inner), _)| !inner.is_empty())
+        {
             agrees(set, inner, list.inside);
         }
     }
@@ -154,8 +166,13 @@ mod tests {
 
     #[test]
     fn a_thousand_tracks_seen_by_64_cameras_are_not_too_large() {
-        let residual = CameraResidual { camera: "a-camera".into(), time_ns: 1, ..Default::default() };
-        let track = Track { covariance: vec![1.0; 36], residuals: vec![residual; 64], ..Default::default() };
+        let residual =
+            CameraResidual { camera: "a-camera".into(), time_ns: 1, ..Default::default() };
+        let track = Track {
+            covariance: vec![1.0; 36],
+            residuals: vec![residual; 64],
+            ..Default::default()
+        };
         let frame = TrackFrame { tracks: vec![track; 1000], ..Default::default() };
         assert_eq!(decode::<TrackFrame>(&frame.encode_to_vec()).unwrap().tracks.len(), 1000);
     }

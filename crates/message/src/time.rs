@@ -13,7 +13,9 @@ use serde::{Deserialize, Serialize};
 /// assert_eq!(start.seconds(), 1.5);
 /// assert_eq!(Timestamp::from_seconds(2.0).seconds_since(start), 0.5);
 /// ```
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[serde(transparent)]
 pub struct Timestamp(i64);
 

@@ -2,15 +2,16 @@ use std::fmt;
 
 use crate::Timestamp;
 
-/// Tracks of one run of the fusion centre. A run that makes more goes on into the numbers of a run that
-/// began a second later, and is unique among runs that did not.
+/// Tracks of one run of the fusion centre. A run that makes more goes on into the numbers of a run
+/// that began a second later, and is unique among runs that did not.
 const TRACKS_A_RUN: u64 = 1 << 20;
 
-/// The identity of the `number`-th track (from 1) of a run of the fusion centre that began at a data time.
+/// The identity of the `number`-th track (from 1) of a run of the fusion centre that began at a
+/// data time.
 ///
-/// It follows from the data alone, so that the same bearings give the same tracks live and replayed; and
-/// a fusion centre that was started again, which begins at a later time, gives other identities. Less
-/// than 2^53, which JSON's readers take without loss.
+/// It follows from the data alone, so that the same bearings give the same tracks live and
+/// replayed; and a fusion centre that was started again, which begins at a later time, gives other
+/// identities. Less than 2^53, which JSON's readers take without loss.
 pub fn track_id(run_began: Timestamp, number: u64) -> u64 {
     // Data without absolute time begin at the epoch: their tracks are 1, 2, 3.
     let seconds = u64::try_from(run_began.nanos()).unwrap_or(0) / 1_000_000_000;

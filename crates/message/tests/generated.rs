@@ -16,7 +16,8 @@ fn generated() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/generated")
 }
 
-/// Compares a committed file with what the definitions give now, or writes it where that is asked for.
+/// Compares a committed file with what the definitions give now, or writes it where that is asked
+/// for.
 fn check(name: &str, fresh: &[u8]) {
     let committed = generated().join(name);
     if std::env::var_os("CROSSFIX_GENERATE").is_some() {

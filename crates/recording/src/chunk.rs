@@ -11,7 +11,8 @@ pub(crate) const HEAD_BYTES: usize = 9;
 /// A record longer than this is skipped, and a chunk that says it holds more is not unpacked. The
 /// writer closes a chunk at half a megabyte and takes no message above 8, so its own are shorter.
 pub(crate) const MAX_RECORD_BYTES: u64 = 64 << 20;
-/// Of a chunk: head, first and last time, size, checksum, the name of the compression and its length.
+/// Of a chunk: head, first and last time, size, checksum, the name of the compression and its
+/// length.
 pub(crate) const LOOKS_BYTES: usize = HEAD_BYTES + 8 + 8 + 8 + 4 + 4 + COMPRESSION.len() + 8;
 /// The only compression that Crossfix writes.
 const COMPRESSION: &[u8] = b"zstd";
@@ -48,18 +49,22 @@ pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
     let u64_at = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
     (0..bytes.len().saturating_sub(LOOKS_BYTES - 1)).find(|&at| {
         let name = at + LOOKS_BYTES - 8 - COMPRESSION.len();
-        // Its kind may be what is damaged. The record's length and that of its packed part must agree.
+        // Its kind may be what is damaged. The record's length and that of its packed part must
+        // agree.
         bytes[name - 4..name] == [4, 0, 0, 0]
             && bytes[name..].starts_with(COMPRESSION)
-            && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(|(length, packed)| {
-                length == packed.saturating_add(FIXED_BYTES)
-                    && length <= MAX_RECORD_BYTES
-                    && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
-            })
+            && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(
+                |(length, packed)| {
+                    length == packed.saturating_add(FIXED_BYTES)
+                        && length <= MAX_RECORD_BYTES
+                        && length <= left.saturating_sub((at + HEAD_BYTES) as u64)
+                },
+            )
     })
 }
 
-/// How much of a record's body is the chunk's own, by what the chunk says: of one that was read well.
+/// How much of a record's body is the chunk's own, by what the chunk says: of one that was read
+/// well.
 pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     match mcap::parse_record(op::CHUNK, body) {
         Ok(Record::Chunk { header, .. }) => {
@@ -70,8 +75,8 @@ pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     }
 }
 
-/// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a damaged
-/// chunk none is handed on.
+/// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a
+/// damaged chunk none is handed on.
 ///
 /// # Errors
 /// The inner error is what is wrong with the chunk, the outer one what the handler says.
@@ -80,7 +85,8 @@ pub(crate) fn for_each_record<E>(
     mut handle: impl FnMut(u8, &[u8]) -> Result<(), E>,
 ) -> Result<McapResult<()>, E> {
     // The library would reserve as much memory as a damaged length says.
-    let name_bytes = body.get(28..32).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
+    let name_bytes =
+        body.get(28..32).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
     if name_bytes.is_none_or(|bytes| bytes as usize > LONGEST_NAME) {
         return Ok(Err(McapError::UnexpectedEoc));
     }

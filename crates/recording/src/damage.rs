@@ -18,8 +18,12 @@ pub struct Damage {
 impl Damage {
     /// Adds a damaged place to what is known.
     pub(crate) fn note(known: &mut Option<Self>, at: u64, bytes: u64, what: &str) {
-        let damage =
-            known.get_or_insert_with(|| Self { places: 0, bytes: 0, first_at: at, first: what.to_owned() });
+        let damage = known.get_or_insert_with(|| Self {
+            places: 0,
+            bytes: 0,
+            first_at: at,
+            first: what.to_owned(),
+        });
         damage.places += 1;
         damage.bytes += bytes;
     }

@@ -41,7 +41,8 @@ pub enum ReadFailure<E: std::error::Error + 'static> {
 }
 
 /// Reads a recording from its first to its last message, in constant memory. Damage costs the chunk
-/// that it is in, about a second: the next one is found again, by its place or by what it looks like.
+/// that it is in, about a second: the next one is found again, by its place or by what it looks
+/// like.
 #[derive(Debug)]
 pub struct RecordingReader<R: Read + Seek> {
     source: R,
@@ -123,11 +124,13 @@ impl<R: Read + Seek> RecordingReader<R> {
                 return Err(RecordingError::NotMcap { path: self.path.clone() });
             }
         }
-        // The channels are said in the first chunk, and again at the end: first, in case that chunk is lost.
+        // The channels are said in the first chunk, and again at the end: first, in case that chunk
+        // is lost.
         self.learn_channels()
     }
 
-    /// Hands every message on, in the order of the file, until the end or the handler's first error.
+    /// Hands every message on, in the order of the file, until the end or the handler's first
+    /// error.
     ///
     /// # Errors
     /// [`ReadFailure`]; damage is no error but a report.
@@ -162,8 +165,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(self.report)
     }
 
-    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it claims;
-    /// a chunk that was read well says again inside, under its checksum, how long it is.
+    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it
+    /// claims; a chunk that was read well says again inside, under its checksum, how long it is.
     fn go_on(&mut self, opcode: u8, body: &[u8], mut next: u64, read: Result<(), String>) {
         if opcode == op::CHUNK && read.is_ok() {
             next = next.min(self.at + HEAD_BYTES as u64 + chunk::own_bytes(body));
@@ -191,8 +194,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         }
     }
 
-    /// One record of a chunk; what is wrong with it is the inner error. The library's parser is given
-    /// nothing else, as it believes what damaged records say of their lengths.
+    /// One record of a chunk; what is wrong with it is the inner error. The library's parser is
+    /// given nothing else, as it believes what damaged records say of their lengths.
     fn take_inner<E: std::error::Error + 'static>(
         &mut self,
         opcode: u8,
@@ -217,7 +220,8 @@ impl<R: Read + Seek> RecordingReader<R> {
                     }
                     None => return Ok(Err("a message is of a channel that was lost".to_owned())),
                 };
-                let time = |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
+                let time =
+                    |nanos: u64| Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX));
                 let entry = Entry {
                     key: key.clone(),
                     data_time: time(header.log_time),
@@ -242,7 +246,9 @@ impl<R: Read + Seek> RecordingReader<R> {
     ) -> Result<Result<(), String>, ReadFailure<E>> {
         match opcode {
             // What is written in chunks has no message beside them: it is another record, damaged.
-            op::MESSAGE if self.sure_until > 0 => Ok(Err("a message lies between chunks".to_owned())),
+            op::MESSAGE if self.sure_until > 0 => {
+                Ok(Err("a message lies between chunks".to_owned()))
+            }
             op::CHANNEL | op::MESSAGE => self.take_inner(opcode, body, handle),
             op::METADATA => {
                 let texts = Texts::read(body);
@@ -286,7 +292,8 @@ impl<R: Read + Seek> RecordingReader<R> {
             return Ok(());
         }
         let begins = self.at;
-        let Ok(Record::Footer(found)) = mcap::parse_record(op::FOOTER, &footer[HEAD_BYTES..HEAD_BYTES + 20])
+        let Ok(Record::Footer(found)) =
+            mcap::parse_record(op::FOOTER, &footer[HEAD_BYTES..HEAD_BYTES + 20])
         else {
             return Ok(());
         };
@@ -402,8 +409,12 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(true)
     }
 
-    fn io<T>(&mut self, action: impl FnOnce(&mut R) -> std::io::Result<T>) -> Result<T, RecordingError> {
-        action(&mut self.source).map_err(|source| RecordingError::Read { path: self.path.clone(), source })
+    fn io<T>(
+        &mut self,
+        action: impl FnOnce(&mut R) -> std::io::Result<T>,
+    ) -> Result<T, RecordingError> {
+        action(&mut self.source)
+            .map_err(|source| RecordingError::Read { path: self.path.clone(), source })
     }
 
     fn note(&mut self, at: u64, bytes: u64, what: &str) {

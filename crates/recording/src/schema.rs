@@ -1,5 +1,6 @@
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame, TruthFrame,
+    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame,
+    TruthFrame,
 };
 
 /// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.
@@ -8,7 +9,9 @@ pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
         Channel::Bearings(_) => BearingFrame::SCHEMA,
         Channel::Calibration(_) => CameraCalibration::SCHEMA,
         Channel::Preview(_) => Preview::SCHEMA,
-        Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => Health::SCHEMA,
+        Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
+            Health::SCHEMA
+        }
         Channel::Tracks => TrackFrame::SCHEMA,
         Channel::Events => TrackEvent::SCHEMA,
         Channel::Truth => TruthFrame::SCHEMA,

@@ -22,7 +22,11 @@ pub struct Source {
 impl Source {
     /// A command of this build, without a run: one that is not on a network.
     pub fn of(command: &str) -> Self {
-        Self { command: command.to_owned(), version: env!("CARGO_PKG_VERSION").to_owned(), ..Self::default() }
+        Self {
+            command: command.to_owned(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            ..Self::default()
+        }
     }
 
     pub(crate) fn write(&self) -> Metadata {

@@ -9,7 +9,8 @@ use mcap::{Compression, McapResult, WriteOptions, Writer};
 
 use crate::{CHANNELS, Entry, RecordingError, Source, schema};
 
-/// The fastest: what fills recordings is floating-point numbers, which higher levels hardly make smaller.
+/// The fastest: what fills recordings is floating-point numbers, which higher levels hardly make
+/// smaller.
 const COMPRESSION_LEVEL: u32 = 1;
 /// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
 const CHUNK_BYTES: u64 = 512 * 1024;
@@ -76,11 +77,14 @@ impl<W: Write + Seek> RecordingWriter<W> {
     /// Writes one message. Keys that carry no message (liveliness) are left out.
     ///
     /// # Errors
-    /// [`RecordingError::TooLong`]: the message is left out; [`RecordingError::Write`]: nothing can be
-    /// written any more.
+    /// [`RecordingError::TooLong`]: the message is left out; [`RecordingError::Write`]: nothing can
+    /// be written any more.
     pub fn write(&mut self, entry: &Entry) -> Result<(), RecordingError> {
         if entry.data.len() > MAX_MESSAGE_BYTES {
-            return Err(RecordingError::TooLong { topic: entry.key.to_string(), bytes: entry.data.len() });
+            return Err(RecordingError::TooLong {
+                topic: entry.key.to_string(),
+                bytes: entry.data.len(),
+            });
         }
         let Some(name) = schema::of(&entry.key.channel) else {
             return Ok(());
@@ -109,14 +113,15 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.writer.add_channel(schema, &key.to_string(), "protobuf", &BTreeMap::new())
     }
 
-    /// Says the channels outside of the chunks: of a torn file, which has no end to say them again, a
-    /// damaged first chunk must not take all later ones with it.
+    /// Says the channels outside of the chunks: of a torn file, which has no end to say them again,
+    /// a damaged first chunk must not take all later ones with it.
     fn say_channels(&mut self) -> McapResult<()> {
         if !std::mem::take(&mut self.has_new_channels) {
             return Ok(());
         }
         let said = self.channels.iter().map(|(key, (id, _))| (id.to_string(), key.to_string()));
-        self.writer.write_metadata(&Metadata { name: CHANNELS.to_owned(), metadata: said.collect() })
+        self.writer
+            .write_metadata(&Metadata { name: CHANNELS.to_owned(), metadata: said.collect() })
     }
 
     /// Closes the chunk and hands all bytes to the system.

@@ -226,8 +226,8 @@ impl Seek for SmallDisk {
 fn a_full_disk_is_an_error_and_what_was_flushed_is_readable() {
     let mut disk = SmallDisk { bytes: Cursor::new(Vec::new()), room: 12_000 };
     let mut writer = RecordingWriter::new(&mut disk).unwrap();
-    let failed =
-        (0..10_000).find_map(|sequence| writer.write(&entry(sequence)).and_then(|()| writer.flush()).err());
+    let failed = (0..10_000)
+        .find_map(|sequence| writer.write(&entry(sequence)).and_then(|()| writer.flush()).err());
     assert!(matches!(failed, Some(RecordingError::Write(_))));
     drop(writer);
     let (entries, report) = read(disk.bytes.get_ref()).unwrap();

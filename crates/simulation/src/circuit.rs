@@ -53,8 +53,8 @@ impl Circuit {
         let Airspace { half, heights: [low, high], speeds: [slow, fast], turn } = *airspace;
         let speed = rng.random_range(slow..=fast);
         let turn_back = turn.max(LEAST_TURN_BACK);
-        // From a side nobody goes farther beyond the inner border than one leg and the radius of the
-        // way back; from a corner it may be as much again (0.751 of it was seen).
+        // From a side nobody goes farther beyond the inner border than one leg and the radius of
+        // the way back; from a corner it may be as much again (0.751 of it was seen).
         let margin = speed * LEG_S + speed / turn_back;
         let inner = half.map(|side| side - margin.min(0.75 * side));
         let mut place = Vector2::from_fn(|axis, _| inner[axis] * rng.random_range(-1.0..=1.0));
@@ -110,7 +110,8 @@ impl Leg {
 /// Which way to turn (1 left, -1 right) to come back within the inner border; `None` if there is no
 /// need.
 fn way_back(place: Vector2<f64>, heading: f64, inner: Vector2<f64>) -> Option<f64> {
-    let beyond = Vector2::from_fn(|axis, _| place[axis] - place[axis].clamp(-inner[axis], inner[axis]));
+    let beyond =
+        Vector2::from_fn(|axis, _| place[axis] - place[axis].clamp(-inner[axis], inner[axis]));
     if beyond == Vector2::zeros() {
         return None;
     }

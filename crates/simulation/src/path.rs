@@ -37,9 +37,11 @@ impl FlightPath {
             }
             Self::Curved { centre_m, amplitude_m, period_s, phase_turns } => {
                 let angle = |axis: usize| TAU * (t / period_s[axis] + phase_turns[axis]);
-                let position =
-                    Point3::from(Vector3::from_fn(|i, _| centre_m[i] + amplitude_m[i] * angle(i).sin()));
-                let velocity = Vector3::from_fn(|i, _| amplitude_m[i] * TAU / period_s[i] * angle(i).cos());
+                let position = Point3::from(Vector3::from_fn(|i, _| {
+                    centre_m[i] + amplitude_m[i] * angle(i).sin()
+                }));
+                let velocity =
+                    Vector3::from_fn(|i, _| amplitude_m[i] * TAU / period_s[i] * angle(i).cos());
                 (position, velocity)
             }
         }
@@ -52,7 +54,8 @@ impl FlightPath {
                 from_m.iter().chain(velocity_mps).all(|v| v.is_finite())
             }
             Self::Curved { centre_m, amplitude_m, period_s, phase_turns } => {
-                let finite = centre_m.iter().chain(amplitude_m).chain(phase_turns).all(|v| v.is_finite());
+                let finite =
+                    centre_m.iter().chain(amplitude_m).chain(phase_turns).all(|v| v.is_finite());
                 finite && period_s.iter().all(|p| p.is_finite() && *p > 0.0)
             }
         }

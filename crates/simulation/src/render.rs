@@ -70,7 +70,8 @@ pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appe
 /// How much of a pixel the smeared, blurred silhouette covers.
 fn cover(x: usize, y: usize, half: f64, soft: f64, target: &Appearance) -> f64 {
     // The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma.
-    const NODES: [(f64, f64); 3] = [(-1.732_050_8, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_8, 1.0 / 6.0)];
+    const NODES: [(f64, f64); 3] =
+        [(-1.732_050_8, 1.0 / 6.0), (0.0, 2.0 / 3.0), (1.732_050_8, 1.0 / 6.0)];
     let mut sum = 0.0;
     for step in 0..SMEAR_STEPS {
         let along = (step as f64 + 0.5) / SMEAR_STEPS as f64;
@@ -109,13 +110,23 @@ mod tests {
             x += dark * (index % width) as f64;
             y += dark * (index / width) as f64;
         }
-        assert!((x / sum - 30.3).abs() < 0.03 && (y / sum - 24.6).abs() < 0.03, "{} {}", x / sum, y / sum);
+        assert!(
+            (x / sum - 30.3).abs() < 0.03 && (y / sum - 24.6).abs() < 0.03,
+            "{} {}",
+            x / sum,
+            y / sum
+        );
     }
 
     #[test]
     fn a_target_outside_the_image_changes_nothing() {
         let mut image = vec![100.0_f32; 400];
-        draw(&mut image, 20, 20, &Appearance { from: [-50.0, 5.0], to: [-50.0, 5.0], span: 10.0, blur: 1.0 });
+        draw(
+            &mut image,
+            20,
+            20,
+            &Appearance { from: [-50.0, 5.0], to: [-50.0, 5.0], span: 10.0, blur: 1.0 },
+        );
         assert!(image.iter().all(|v| *v == 100.0));
     }
 }

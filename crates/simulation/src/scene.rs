@@ -121,7 +121,11 @@ impl SceneCamera {
             fy: self.focal_px,
             cx: (f64::from(width) - 1.0) / 2.0,
             cy: (f64::from(height) - 1.0) / 2.0,
-            distortion: if straight { Distortion::None } else { Distortion::BrownConrady(self.distortion) },
+            distortion: if straight {
+                Distortion::None
+            } else {
+                Distortion::BrownConrady(self.distortion)
+            },
         };
         let pose = Pose::looking_at(Point3::from(self.position_m), Point3::from(self.look_at_m))?;
         Camera::new(intrinsics, pose)
@@ -148,7 +152,12 @@ impl Scene {
         let mut seen = BTreeSet::new();
         for target in &self.targets {
             let whose = |key: &str| format!("{key} of target {}", target.id);
-            number(whose("span_m"), target.span_m, positive(target.span_m), "a positive number of metres")?;
+            number(
+                whose("span_m"),
+                target.span_m,
+                positive(target.span_m),
+                "a positive number of metres",
+            )?;
             if !target.path.is_possible() {
                 return Err(SceneError::Path { target: target.id });
             }
@@ -166,11 +175,21 @@ impl Scene {
                 "from 0.01 to 1000 frames a second",
             )?;
             let noise = camera.noise_levels;
-            number(whose("noise_levels"), noise, (0.0..=100.0).contains(&noise), "from 0 to 100 levels")?;
+            number(
+                whose("noise_levels"),
+                noise,
+                (0.0..=100.0).contains(&noise),
+                "from 0 to 100 levels",
+            )?;
             let blur = camera.blur_px;
             number(whose("blur_px"), blur, (0.0..=20.0).contains(&blur), "from 0 to 20 px")?;
             let exposure = camera.exposure_s;
-            number(whose("exposure_s"), exposure, (0.0..=1.0).contains(&exposure), "from 0 to 1 s")?;
+            number(
+                whose("exposure_s"),
+                exposure,
+                (0.0..=1.0).contains(&exposure),
+                "from 0 to 1 s",
+            )?;
             let most = camera.size_px.iter().copied().max().unwrap_or(0);
             number(whose("size_px"), f64::from(most), most <= 8192, "at most 8192 px")?;
             if !seen.insert(camera.name.to_string()) {

@@ -1,5 +1,5 @@
-//! Drone silhouettes of the sizes, contrasts and energies of 001's table 1, drawn at any place, size
-//! and angle.
+//! Drone silhouettes of the sizes, contrasts and energies of Lytvynets 2020, table 1, drawn at any
+//! place, size and angle.
 
 /// Sub-samples a pixel and axis.
 const SUPERSAMPLING: usize = 8;
@@ -10,13 +10,13 @@ const MARGIN: f64 = 4.0;
 /// The silhouette fills this share of half the box.
 const FILL: f64 = 0.47;
 
-/// The sizes of 000, Fig. 3 and 001, Fig. 6.1.
+/// The sizes of Herasymenko 2021, Fig. 3 and Lytvynets 2020, Fig. 6.1.
 pub const TEMPLATE_SIZES: [[usize; 2]; 4] = [[50, 30], [25, 15], [18, 12], [10, 6]];
 
 /// A silhouette as brightness above the background, from 0 to about 1.
 ///
-/// It is drawn once on a grid of an eighth of a pixel, blurred, and averaged over pixels about every
-/// sub-sample; a pixel at any place is then interpolated.
+/// It is drawn once on a grid of an eighth of a pixel, blurred, and averaged over pixels about
+/// every sub-sample; a pixel at any place is then interpolated.
 ///
 /// ```
 /// use crossfix_simulation::Silhouette;
@@ -36,7 +36,8 @@ pub struct Silhouette {
     reach: [f64; 2],
 }
 
-/// The standard deviation of brightness inside the box (001, table 1; 18x12 is not in it).
+/// The standard deviation of brightness inside the box (Lytvynets 2020, table 1; 18x12 is not in
+/// it).
 fn table_deviation(width: usize) -> f64 {
     match width {
         ..=12 => 0.2943,
@@ -76,7 +77,9 @@ impl Silhouette {
         let canvas = plain.canvas(MARGIN as usize);
         let wide = width + 2 * MARGIN as usize;
         let inside: Vec<f64> = (0..height)
-            .flat_map(|y| (0..width).map(move |x| (y + MARGIN as usize) * wide + x + MARGIN as usize))
+            .flat_map(|y| {
+                (0..width).map(move |x| (y + MARGIN as usize) * wide + x + MARGIN as usize)
+            })
             .map(|i| f64::from(canvas[i]))
             .collect();
         let mean = inside.iter().sum::<f64>() / inside.len() as f64;
@@ -94,7 +97,8 @@ impl Silhouette {
         let step = 1.0 / SUPERSAMPLING as f64;
         let (cos, sin) = (angle_rad.cos(), angle_rad.sin());
         let half = sides.map(|side| scale * side as f64 / 2.0);
-        let spans = [half[0] * cos.abs() + half[1] * sin.abs(), half[0] * sin.abs() + half[1] * cos.abs()];
+        let spans =
+            [half[0] * cos.abs() + half[1] * sin.abs(), half[0] * sin.abs() + half[1] * cos.abs()];
         let reach = spans.map(|span| (span + MARGIN).ceil());
         let [columns, rows] = reach.map(|r| 2 * r as usize * SUPERSAMPLING);
         let units = [0, 1].map(|i| scale * FILL * sides[i] as f64);
@@ -108,7 +112,8 @@ impl Silhouette {
             .collect();
         let sigma = BLUR * SUPERSAMPLING as f64;
         let span = (4.0 * sigma).ceil() as isize;
-        let gaussian: Vec<f64> = (-span..=span).map(|k| (-0.5 * (k as f64 / sigma).powi(2)).exp()).collect();
+        let gaussian: Vec<f64> =
+            (-span..=span).map(|k| (-0.5 * (k as f64 / sigma).powi(2)).exp()).collect();
         // The mean over a pixel whose middle is the upper left corner of a sub-sample.
         let pixel = vec![1.0; SUPERSAMPLING];
         for kernel in [gaussian, pixel] {
@@ -127,7 +132,11 @@ impl Silhouette {
         let place = |at: f64, reach: f64| (at + reach) * SUPERSAMPLING as f64;
         let (column, row) = (place(x, self.reach[0]), place(y, self.reach[1]));
         let rows = self.fine.len() / self.fine_width;
-        if column < 0.0 || row < 0.0 || column >= (self.fine_width - 1) as f64 || row >= (rows - 1) as f64 {
+        if column < 0.0
+            || row < 0.0
+            || column >= (self.fine_width - 1) as f64
+            || row >= (rows - 1) as f64
+        {
             return 0.0;
         }
         let (i, j) = (column as usize, row as usize);
@@ -148,7 +157,8 @@ impl Silhouette {
         };
         for y in range(centre[1], self.reach[1], height) {
             for x in range(centre[0], self.reach[0], width) {
-                image[y * width + x] += strength * self.pixel(x as f64 - centre[0], y as f64 - centre[1]);
+                image[y * width + x] +=
+                    strength * self.pixel(x as f64 - centre[0], y as f64 - centre[1]);
             }
         }
     }
@@ -167,21 +177,23 @@ impl Silhouette {
 fn filtered(samples: &[f32], columns: usize, kernel: &[f64]) -> Vec<f32> {
     let sum: f64 = kernel.iter().sum();
     let (rows, half) = (samples.len() / columns, kernel.len() / 2);
-    let pass = |from: &[f32], stride: usize, count: usize, index: &dyn Fn(usize) -> usize| -> Vec<f32> {
-        (0..from.len())
-            .map(|i| {
-                let at = index(i);
-                let mut value = 0.0;
-                for (k, tap) in kernel.iter().enumerate() {
-                    let there = at + k;
-                    if there >= half && there - half < count {
-                        value += tap * f64::from(from[i + there * stride - half * stride - at * stride]);
+    let pass =
+        |from: &[f32], stride: usize, count: usize, index: &dyn Fn(usize) -> usize| -> Vec<f32> {
+            (0..from.len())
+                .map(|i| {
+                    let at = index(i);
+                    let mut value = 0.0;
+                    for (k, tap) in kernel.iter().enumerate() {
+                        let there = at + k;
+                        if there >= half && there - half < count {
+                            value += tap
+                                * f64::from(from[i + there * stride - half * stride - at * stride]);
+                        }
                     }
-                }
-                (value / sum) as f32
-            })
-            .collect()
-    };
+                    (value / sum) as f32
+                })
+                .collect()
+        };
     let along = pass(samples, 1, columns, &|i| i % columns);
     pass(&along, columns, rows, &|i| i / columns)
 }
@@ -192,7 +204,7 @@ mod tests {
 
     #[test]
     fn energies_are_those_of_the_table() {
-        // 001, table 1: 136.6, 36.8 and 5.2; 19.4 follows from the assumed deviation.
+        // Lytvynets 2020, table 1: 136.6, 36.8 and 5.2; 19.4 follows from the assumed deviation.
         for ([width, height], wanted) in TEMPLATE_SIZES.into_iter().zip([136.6, 36.8, 19.4, 5.2]) {
             let silhouette = Silhouette::new(width, height);
             let canvas = silhouette.canvas(0);
@@ -210,7 +222,8 @@ mod tests {
             silhouette.draw(&mut image, 60, [x, y], 1.0);
             let sum: f64 = image.iter().map(|b| f64::from(*b)).sum();
             let first = |of: &dyn Fn(usize) -> usize| {
-                image.iter().enumerate().map(|(i, b)| of(i) as f64 * f64::from(*b)).sum::<f64>() / sum
+                image.iter().enumerate().map(|(i, b)| of(i) as f64 * f64::from(*b)).sum::<f64>()
+                    / sum
             };
             (first(&|i| i % 60), first(&|i| i / 60))
         };

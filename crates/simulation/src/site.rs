@@ -7,8 +7,8 @@ use crossfix_geometry::{
     Bearing, Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose, tangent_basis,
 };
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState, Payload,
-    Timestamp,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState,
+    Payload, Timestamp,
 };
 use nalgebra::{Matrix2, Point3, Unit, Vector2, Vector3};
 use rand::seq::SliceRandom;
@@ -42,8 +42,8 @@ pub struct Site {
     pub seed: u64,
     /// How long it lasts, s. Default 20.
     pub duration_s: f64,
-    /// Sides of the area that targets keep within, east and north, m; in a corner they may go beyond
-    /// it by three quarters of the radius of their turn. Default 600 x 600.
+    /// Sides of the area that targets keep within, east and north, m; in a corner they may go
+    /// beyond it by three quarters of the radius of their turn. Default 600 x 600.
     pub area_m: [f64; 2],
     /// Lowest and highest that they fly, m. Default 40 to 160.
     pub heights_m: [f64; 2],
@@ -137,7 +137,8 @@ impl Site {
     /// [`SceneError`] naming the number that makes no sense.
     pub fn build(&self) -> Result<SimulatedSite, SceneError> {
         self.check()?;
-        let cameras = (0..self.cameras).map(|index| self.camera(index)).collect::<Result<_, _>>()?;
+        let cameras =
+            (0..self.cameras).map(|index| self.camera(index)).collect::<Result<_, _>>()?;
         let airspace = Airspace {
             half: Vector2::from(self.area_m) / 2.0,
             heights: self.heights_m,
@@ -156,7 +157,11 @@ impl Site {
     fn check(&self) -> Result<(), SceneError> {
         let in_range = |what: &str, value: f64, low: f64, high: f64, must| {
             let good = (low..=high).contains(&value);
-            if good { Ok(()) } else { Err(SceneError::Number { what: what.to_owned(), value, must }) }
+            if good {
+                Ok(())
+            } else {
+                Err(SceneError::Number { what: what.to_owned(), value, must })
+            }
         };
         in_range("duration_s", self.duration_s, 1e-3, 1e5, "from 0.001 to 100000 s")?;
         for side in self.area_m {
@@ -222,7 +227,8 @@ impl Site {
                 let columns = (self.cameras as f64).sqrt().ceil() as usize;
                 let rows = self.cameras.div_ceil(columns);
                 let (column, row) = (index % columns, index / columns);
-                let along = |i: usize, n: usize| if n < 2 { 0.5 } else { i as f64 / (n - 1) as f64 };
+                let along =
+                    |i: usize, n: usize| if n < 2 { 0.5 } else { i as f64 / (n - 1) as f64 };
                 let east = half.x * (2.0 * along(column, columns) - 1.0);
                 let north = half.y * (2.0 * along(row, rows) - 1.0);
                 let inwards = |i: usize| if i.is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -288,7 +294,8 @@ impl SimulatedSite {
         // The targets' flights have the streams before these.
         rng.set_stream((1 << 32) + index);
         let mut bearings = self.detections(camera, time_s, &mut rng);
-        bearings.extend(self.clutter(camera, &mut rng).into_iter().map(|direction| (direction, None)));
+        bearings
+            .extend(self.clutter(camera, &mut rng).into_iter().map(|direction| (direction, None)));
         // Nobody must tell them by their order.
         bearings.shuffle(&mut rng);
         let numbered = (sequence * NUMBERS_PER_EXPOSURE..).zip(&bearings);
@@ -336,7 +343,8 @@ impl SimulatedSite {
     /// Directions in the camera's frame in which nothing is.
     fn clutter(&self, camera: &Camera, rng: &mut ChaCha8Rng) -> Vec<Unit<Vector3<f64>>> {
         // A mean of zero has no distribution, and no clutter.
-        let count = Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
+        let count =
+            Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
         let [width, height] = self.description.size_px.map(|side| f64::from(side) - 1.0);
         let direction = |_| {
             let pixel = Pixel::new(rng.random_range(0.0..=width), rng.random_range(0.0..=height));

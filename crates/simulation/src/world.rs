@@ -42,9 +42,10 @@ pub struct SimulatedCamera {
 impl World {
     pub(crate) fn new(scene: &Scene) -> Result<Self, SceneError> {
         let camera = |(index, description): (usize, &SceneCamera)| {
-            let camera = description
-                .camera()
-                .map_err(|source| SceneError::Camera { camera: description.name.clone(), source })?;
+            let camera = description.camera().map_err(|source| SceneError::Camera {
+                camera: description.name.clone(),
+                source,
+            })?;
             // Each camera its own random numbers, from the one seed.
             let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
             let [width, height] = description.size_px.map(|side| side as usize);
@@ -78,7 +79,11 @@ impl World {
 
     /// Where every target is at a true time; those that have not appeared are not there.
     pub fn truth(&self, t: f64) -> Vec<TargetState> {
-        self.targets.iter().filter(|target| t >= target.appears_s).map(|target| state(target, t)).collect()
+        self.targets
+            .iter()
+            .filter(|target| t >= target.appears_s)
+            .map(|target| state(target, t))
+            .collect()
     }
 }
 
@@ -163,7 +168,8 @@ mod tests {
     use super::*;
 
     fn world() -> World {
-        let scene: Scene = toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        let scene: Scene =
+            toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
         scene.build().unwrap()
     }
 
@@ -193,7 +199,8 @@ mod tests {
 
     #[test]
     fn a_scene_with_two_cameras_of_one_name_is_refused() {
-        let mut scene: Scene = toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        let mut scene: Scene =
+            toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
         scene.cameras[1].name = scene.cameras[0].name.clone();
         assert!(matches!(scene.build(), Err(SceneError::Twice { .. })));
         scene.cameras.clear();

@@ -79,7 +79,8 @@ pub enum Role {
 }
 
 fn is_endpoint(text: &str) -> bool {
-    let Some((host, port)) = text.strip_prefix("tcp/").and_then(|rest| rest.rsplit_once(':')) else {
+    let Some((host, port)) = text.strip_prefix("tcp/").and_then(|rest| rest.rsplit_once(':'))
+    else {
         return false;
     };
     !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0)
@@ -95,11 +96,16 @@ impl NetworkConfig {
             return Err(NetworkError::NoRouter);
         }
         if let Some(router) = self.routers.iter().find(|router| !is_endpoint(router)) {
-            return Err(NetworkError::Endpoint { of: "routers".to_owned(), endpoint: router.clone() });
+            return Err(NetworkError::Endpoint {
+                of: "routers".to_owned(),
+                endpoint: router.clone(),
+            });
         }
         let mut seen: BTreeMap<&str, String> = BTreeMap::new();
         let fusion = std::iter::once(("fusion".to_owned(), &self.fusion));
-        for (of, endpoint) in fusion.chain(self.cameras.iter().map(|(name, e)| (name.to_string(), e))) {
+        for (of, endpoint) in
+            fusion.chain(self.cameras.iter().map(|(name, e)| (name.to_string(), e)))
+        {
             if !is_endpoint(endpoint) {
                 return Err(NetworkError::Endpoint { of, endpoint: endpoint.clone() });
             }
@@ -111,7 +117,10 @@ impl NetworkConfig {
     }
 
     /// Where a session listens and whom it connects to.
-    pub(crate) fn endpoints(&self, role: &Role) -> Result<(Vec<String>, Vec<String>), NetworkError> {
+    pub(crate) fn endpoints(
+        &self,
+        role: &Role,
+    ) -> Result<(Vec<String>, Vec<String>), NetworkError> {
         if self.mode == Mode::Client {
             return Ok((Vec::new(), self.routers.clone()));
         }
@@ -119,7 +128,10 @@ impl NetworkConfig {
         Ok(match role {
             Role::Camera(name) => {
                 let own = self.cameras.get(name);
-                (vec![own.cloned().ok_or_else(|| NetworkError::UnknownCamera(name.clone()))?], Vec::new())
+                (
+                    vec![own.cloned().ok_or_else(|| NetworkError::UnknownCamera(name.clone()))?],
+                    Vec::new(),
+                )
             }
             Role::Fusion => (vec![self.fusion.clone()], cameras()),
             Role::Observer => {

@@ -15,16 +15,18 @@ use zenoh::{Config, Session, Wait};
 use crate::subscription::Intake;
 use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
 
-/// Batches of 64 kB that wait for one slow receiver of bearings and tracks before it loses the next: 1 MB,
-/// the most that Zenoh takes. Half as much, and a burst of a thousand tracks is lost to a good receiver.
+/// Batches of 64 kB that wait for one slow receiver of bearings and tracks before it loses the
+/// next: 1 MB, the most that Zenoh takes. Half as much, and a burst of a thousand tracks is lost to
+/// a good receiver.
 const QUEUED_BATCHES: u32 = 16;
 /// The same of pictures: what a slow receiver sees is at most this much old.
 const PICTURE_BATCHES: u32 = 4;
-/// Bytes that the system holds for one receiver beyond that. Left to itself it takes four megabytes, and a
-/// receiver behind 5 kB a second would be told of tracks a quarter of an hour old before it loses one.
+/// Bytes that the system holds for one receiver beyond that. Left to itself it takes four
+/// megabytes, and a receiver behind 5 kB a second would be told of tracks a quarter of an hour old
+/// before it loses one.
 const SEND_BUFFER_BYTES: u32 = 256 << 10;
-/// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three seconds.
-/// Whoever waits for a router that does not answer at all has a word of it within five.
+/// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three
+/// seconds. Whoever waits for a router that does not answer at all has a word of it within five.
 const OPEN_TIMEOUT_MS: u32 = 4000;
 /// A peer that has not been heard for this long is gone, ms.
 const LEASE_MS: u32 = 3000;
@@ -95,10 +97,11 @@ fn why_not(error: &io::Error) -> String {
 /// What becomes of a message when a receiver is slow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// It waits for that receiver, and if too many wait, that receiver loses it and counts it. Nobody
-    /// else is held up: for all that is published while life goes on.
+    /// It waits for that receiver, and if too many wait, that receiver loses it and counts it.
+    /// Nobody else is held up: for all that is published while life goes on.
     Queued,
-    /// The publisher waits, and so do all other receivers: for sources that are played as fast as it goes.
+    /// The publisher waits, and so do all other receivers: for sources that are played as fast as
+    /// it goes.
     Every,
     /// As queued, but behind everything else: pictures.
     Picture,
@@ -119,7 +122,8 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
         Mode::Peer => "peer",
         Mode::Client => "client",
     };
-    // A client is told at once that no router is there, and tries again itself: Zenoh would not come back.
+    // A client is told at once that no router is there, and tries again itself: Zenoh would not
+    // come back.
     let patience = match network.mode {
         Mode::Peer => "-1",
         Mode::Client => "0",
@@ -159,11 +163,12 @@ impl Link {
     /// Opens a session. Those it connects to need not be there yet, but for a router.
     ///
     /// # Errors
-    /// [`LinkError`] if the configuration is impossible, an endpoint cannot be listened on, or no router
-    /// answers.
+    /// [`LinkError`] if the configuration is impossible, an endpoint cannot be listened on, or no
+    /// router answers.
     pub fn open(network: &NetworkConfig, role: &Role) -> Result<Self, LinkError> {
         let config = config(network, role)?;
-        let session = zenoh::open(config).wait().map_err(|source| explain(network, role, &source))?;
+        let session =
+            zenoh::open(config).wait().map_err(|source| explain(network, role, &source))?;
         // The first half of what Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
@@ -181,7 +186,9 @@ impl Link {
     ) -> Result<Self, LinkError> {
         loop {
             match Self::open(network, role) {
-                Err(error @ LinkError::NoRouter { .. }) if go_on(&error) => std::thread::sleep(RETRY_PERIOD),
+                Err(error @ LinkError::NoRouter { .. }) if go_on(&error) => {
+                    std::thread::sleep(RETRY_PERIOD);
+                }
                 opened => return opened,
             }
         }
@@ -201,7 +208,11 @@ impl Link {
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
-    pub fn publisher(&self, channel: Channel, delivery: Delivery) -> Result<LinkPublisher, LinkError> {
+    pub fn publisher(
+        &self,
+        channel: Channel,
+        delivery: Delivery,
+    ) -> Result<LinkPublisher, LinkError> {
         let key = Key::new(self.site.clone(), channel).to_string();
         let (control, priority) = match delivery {
             Delivery::Queued => (CongestionControl::Drop, Priority::Data),
@@ -218,7 +229,8 @@ impl Link {
         Ok(LinkPublisher { publisher, run: self.run, published: AtomicU64::new(0) })
     }
 
-    /// Publishes one message on any key of any site, without saying who sends it, as other programs do.
+    /// Publishes one message on any key of any site, without saying who sends it, as other programs
+    /// do.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -360,10 +372,12 @@ impl LinkPublisher {
     /// # Errors
     /// [`LinkError::Zenoh`] if the session is closed.
     pub fn put(&self, data: Vec<u8>) -> Result<(), LinkError> {
-        let origin = Origin { run: self.run, sequence: self.published.fetch_add(1, Ordering::Relaxed) };
+        let origin =
+            Origin { run: self.run, sequence: self.published.fetch_add(1, Ordering::Relaxed) };
         let put = self.publisher.put(data).attachment(origin.to_bytes());
-        put.wait()
-            .map_err(|source| zenoh(format!("cannot publish on `{}`", self.publisher.key_expr()))(source))
+        put.wait().map_err(|source| {
+            zenoh(format!("cannot publish on `{}`", self.publisher.key_expr()))(source)
+        })
     }
 
     /// Whether anybody subscribes to it.

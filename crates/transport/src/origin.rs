@@ -13,8 +13,8 @@ impl fmt::Display for RunId {
     }
 }
 
-/// Who sent a message, and the how manieth it was on its key: goes beside the message, so that what is
-/// lost on the way to one receiver is counted by that receiver, whatever the message is.
+/// Who sent a message, and the how manieth it was on its key: goes beside the message, so that what
+/// is lost on the way to one receiver is counted by that receiver, whatever the message is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Origin {
     /// The sender's run.

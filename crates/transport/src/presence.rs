@@ -8,7 +8,8 @@ use zenoh::sample::SampleKind;
 /// Components that are kept count of; more is an attack.
 const MAX_COMPONENTS: usize = 10_000;
 
-/// Who is there: the components of a site that have said that they are alive and not been lost since.
+/// Who is there: the components of a site that have said that they are alive and not been lost
+/// since.
 #[derive(Clone, Debug)]
 pub struct Presence {
     alive: Alive,
@@ -35,7 +36,8 @@ impl Presence {
             };
         };
         let liveliness = session.liveliness();
-        let subscriber = liveliness.declare_subscriber(expression).history(true).callback(note).wait()?;
+        let subscriber =
+            liveliness.declare_subscriber(expression).history(true).callback(note).wait()?;
         Ok(Self { alive, _subscriber: Arc::new(subscriber) })
     }
 

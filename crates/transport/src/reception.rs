@@ -9,12 +9,14 @@ use crate::{Origin, RunId};
 const RUNS_A_KEY: usize = 4;
 /// Keys that are kept count of. A site of 1000 cameras has 5000; more is an attack.
 const MAX_KEYS: usize = 10_000;
-/// A gap of more than this is no loss but a number that makes no sense: three hours of 100 a second.
+/// A gap of more than this is no loss but a number that makes no sense: three hours of 100 a
+/// second.
 const LARGEST_GAP: u64 = 1_000_000;
 /// Two runs that took turns on a key less than this ago are at it still.
 const RIVALRY: Duration = Duration::from_secs(10);
 
-/// Counts what did not arrive of what was published on each key, and notices two that publish on one.
+/// Counts what did not arrive of what was published on each key, and notices two that publish on
+/// one.
 ///
 /// ```
 /// use std::time::Instant;
@@ -113,7 +115,8 @@ mod tests {
     #[test]
     fn one_that_was_overtaken_is_not_counted_twice() {
         let (mut reception, key) = (Reception::default(), key());
-        let mut see = |sequence| reception.see(&key, Origin { run: RunId(1), sequence }, Instant::now());
+        let mut see =
+            |sequence| reception.see(&key, Origin { run: RunId(1), sequence }, Instant::now());
         assert_eq!([5, 3, 6].map(&mut see), [0, 0, 0]);
     }
 

@@ -9,8 +9,8 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::Origin;
 
-/// Messages, and their bytes, that wait for the program before new ones are dropped and counted: two
-/// minutes of a site of 16 cameras at 30 Hz, half as many pictures.
+/// Messages, and their bytes, that wait for the program before new ones are dropped and counted:
+/// two minutes of a site of 16 cameras at 30 Hz, half as many pictures.
 const MAX_WAITING: usize = 1 << 16;
 const MAX_WAITING_BYTES: usize = 64 << 20;
 
@@ -63,7 +63,8 @@ impl Intake {
     pub(crate) fn new() -> (Self, Subscription) {
         let (sender, receiver) = sync_channel(MAX_WAITING);
         let counts = Arc::new(Counts::default());
-        let subscription = Subscription { receiver, counts: Arc::clone(&counts), subscribers: Vec::new() };
+        let subscription =
+            Subscription { receiver, counts: Arc::clone(&counts), subscribers: Vec::new() };
         (Self { sender, counts }, subscription)
     }
 

@@ -11,7 +11,8 @@ const MOTION_JPEG: [&[u8; 4]; 4] = [b"MJPG", b"mjpg", b"AVI1", b"JPEG"];
 
 /// An AVI file with Motion JPEG: its first stream of video.
 ///
-/// Chunks are read in the order of the file, so an index is not needed, and one that lies does no harm.
+/// Chunks are read in the order of the file, so an index is not needed, and one that lies does no
+/// harm.
 #[derive(Debug)]
 pub struct AviSource {
     chunks: Chunks,
@@ -115,9 +116,19 @@ impl AviSource {
                     }
                     let number = streams.saturating_sub(1);
                     let stream = [b'0' + number / 10 % 10, b'0' + number % 10];
-                    let rate_hz =
-                        if (0.01..=1e5).contains(&rate_hz) { rate_hz } else { clock.fallback_rate_hz };
-                    return Ok(Self { chunks, path: path.to_owned(), stream, rate_hz, next: 0, clock });
+                    let rate_hz = if (0.01..=1e5).contains(&rate_hz) {
+                        rate_hz
+                    } else {
+                        clock.fallback_rate_hz
+                    };
+                    return Ok(Self {
+                        chunks,
+                        path: path.to_owned(),
+                        stream,
+                        rate_hz,
+                        next: 0,
+                        clock,
+                    });
                 }
                 _ => chunks.skip(size),
             }
@@ -136,7 +147,9 @@ impl FrameSource for AviSource {
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
         let index = self.next;
         let damaged = |what: String| VideoError::Damaged { path: self.path.clone(), what };
-        while let Some((name, size)) = self.chunks.next().map_err(|error| damaged(error.to_string()))? {
+        while let Some((name, size)) =
+            self.chunks.next().map_err(|error| damaged(error.to_string()))?
+        {
             let is_frame = name[..2] == self.stream && matches!(&name[2..], b"dc" | b"db");
             if !is_frame {
                 self.chunks.skip(size);
@@ -144,13 +157,20 @@ impl FrameSource for AviSource {
             }
             self.next += 1;
             let frame = |what: String| VideoError::Frame { path: self.path.clone(), index, what };
-            let bytes = self.chunks.read(size, MOST_BYTES).map_err(|error| frame(error.to_string()))?;
+            let bytes =
+                self.chunks.read(size, MOST_BYTES).map_err(|error| frame(error.to_string()))?;
             if bytes.is_empty() {
                 return Err(frame("it was left out by the recorder".to_owned()));
             }
             let (width, height, pixels) = decode_still(&bytes).map_err(frame)?;
             let CaptureTime { time, sd_s } = self.clock.at(index as f64 / self.rate_hz);
-            return Ok(Some(Frame { index, capture: CaptureTime { time, sd_s }, width, height, pixels }));
+            return Ok(Some(Frame {
+                index,
+                capture: CaptureTime { time, sd_s },
+                width,
+                height,
+                pixels,
+            }));
         }
         Ok(None)
     }

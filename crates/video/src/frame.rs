@@ -43,8 +43,9 @@ pub struct Frame {
 }
 
 fn weighted<T: Copy>(samples: &[T], scale: f32, as_f32: impl Fn(T) -> f32) -> Vec<f32> {
-    let brightness =
-        |p: &[T]| (LUMA[0] * as_f32(p[0]) + LUMA[1] * as_f32(p[1]) + LUMA[2] * as_f32(p[2])) * scale;
+    let brightness = |p: &[T]| {
+        (LUMA[0] * as_f32(p[0]) + LUMA[1] * as_f32(p[1]) + LUMA[2] * as_f32(p[2])) * scale
+    };
     samples.chunks_exact(3).map(brightness).collect()
 }
 
@@ -53,7 +54,9 @@ impl Frame {
     pub fn brightness(&self) -> Vec<f32> {
         match &self.pixels {
             Pixels::Gray8(samples) => samples.iter().map(|&s| f32::from(s)).collect(),
-            Pixels::Gray16(samples) => samples.iter().map(|&s| f32::from(s) * SIXTEEN_TO_EIGHT).collect(),
+            Pixels::Gray16(samples) => {
+                samples.iter().map(|&s| f32::from(s) * SIXTEEN_TO_EIGHT).collect()
+            }
             Pixels::Rgb8(samples) => weighted(samples, 1.0, f32::from),
             Pixels::Rgb16(samples) => weighted(samples, SIXTEEN_TO_EIGHT, f32::from),
         }

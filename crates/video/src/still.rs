@@ -34,7 +34,8 @@ fn drop_alpha<T: Copy>(samples: &[T], channels: usize, kept: usize) -> Vec<T> {
 
 fn decode_png(bytes: &[u8]) -> Result<Still, String> {
     let text = |error: png::DecodingError| error.to_string();
-    let mut decoder = png::Decoder::new_with_limits(Cursor::new(bytes), png::Limits { bytes: 64 << 20 });
+    let mut decoder =
+        png::Decoder::new_with_limits(Cursor::new(bytes), png::Limits { bytes: 64 << 20 });
     let (width, height) = decoder.read_header_info().map_err(text)?.size();
     check_size(u64::from(width), u64::from(height))?;
     decoder.set_transformations(png::Transformations::EXPAND);
@@ -51,7 +52,8 @@ fn decode_png(bytes: &[u8]) -> Result<Still, String> {
         png::ColorType::Indexed => return Err("its palette was not resolved".to_owned()),
     };
     let pixels = if info.bit_depth == png::BitDepth::Sixteen {
-        let samples: Vec<u16> = buffer.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect();
+        let samples: Vec<u16> =
+            buffer.chunks_exact(2).map(|b| u16::from_be_bytes([b[0], b[1]])).collect();
         let samples = drop_alpha(&samples, channels, kept);
         if kept == 1 { Pixels::Gray16(samples) } else { Pixels::Rgb16(samples) }
     } else {

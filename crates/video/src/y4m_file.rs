@@ -77,7 +77,15 @@ impl Y4mSource {
         };
         let bits = if sixteen { 16 } else { decoder.get_bit_depth() as u32 };
         let path = path.to_owned();
-        Ok(Self { decoder, read, path, next: 0, rate_hz, shift: 16_u32.saturating_sub(bits), clock })
+        Ok(Self {
+            decoder,
+            read,
+            path,
+            next: 0,
+            rate_hz,
+            shift: 16_u32.saturating_sub(bits),
+            clock,
+        })
     }
 }
 
@@ -96,7 +104,10 @@ impl FrameSource for Y4mSource {
                 return Err(VideoError::Frame { path: self.path.clone(), index, what });
             }
             Err(error) => {
-                return Err(VideoError::Damaged { path: self.path.clone(), what: error.to_string() });
+                return Err(VideoError::Damaged {
+                    path: self.path.clone(),
+                    what: error.to_string(),
+                });
             }
         };
         let plane = frame.get_y_plane();

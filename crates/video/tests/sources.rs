@@ -7,7 +7,13 @@ use std::path::Path;
 use crossfix_video::{Frame, FrameClock, Pixels, VideoError, decode_still, open};
 use proptest::prelude::*;
 
-fn png(width: u32, height: u32, color: png::ColorType, depth: png::BitDepth, samples: &[u8]) -> Vec<u8> {
+fn png(
+    width: u32,
+    height: u32,
+    color: png::ColorType,
+    depth: png::BitDepth,
+    samples: &[u8],
+) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(color);
@@ -22,7 +28,8 @@ fn gray(value: u8) -> Vec<u8> {
 
 /// All frames and all errors of a source.
 fn read(path: &Path) -> (Vec<Frame>, Vec<VideoError>) {
-    let mut source = open(path, FrameClock { fallback_rate_hz: 10.0, ..FrameClock::default() }).unwrap();
+    let mut source =
+        open(path, FrameClock { fallback_rate_hz: 10.0, ..FrameClock::default() }).unwrap();
     let (mut frames, mut errors) = (Vec::new(), Vec::new());
     loop {
         match source.next_frame() {
@@ -166,7 +173,8 @@ fn a_thousand_damaged_mp4_files_end_with_frames_or_an_error() {
     let mut random = 1_u64;
     let mut draw = |below: usize| {
         // Numbers from a page of Knuth's: the same on every machine.
-        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        random =
+            random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (random >> 33) as usize % below
     };
     let (mut good, mut bad) = (0, 0);
@@ -247,7 +255,8 @@ fn an_avi_file_with_motion_jpeg_is_read_at_its_rate_past_its_sound() {
         );
     }
     let brightness = frames[0].brightness();
-    let (least, most) = brightness.iter().fold((255.0_f32, 0.0_f32), |(l, m), b| (l.min(*b), m.max(*b)));
+    let (least, most) =
+        brightness.iter().fold((255.0_f32, 0.0_f32), |(l, m), b| (l.min(*b), m.max(*b)));
     assert!(least < 40.0 && most > 200.0, "a test picture has dark and bright: {least} to {most}");
 }
 
@@ -260,9 +269,11 @@ fn what_an_avi_file_holds_that_is_not_read_is_named_with_what_converts_it() {
     let text = refused(&data("other.avi"));
     assert!(text.contains("FMP4") && text.contains("ffmpeg -i"), "{text}");
     let folder = tempfile::tempdir().unwrap();
-    for (name, bytes) in
-        [("film.mkv", b"\x1a\x45\xdf\xa3".as_slice()), ("empty.avi", b""), ("text.avi", b"RIFF, not")]
-    {
+    for (name, bytes) in [
+        ("film.mkv", b"\x1a\x45\xdf\xa3".as_slice()),
+        ("empty.avi", b""),
+        ("text.avi", b"RIFF, not"),
+    ] {
         let path = folder.path().join(name);
         fs::write(&path, bytes).unwrap();
         assert!(refused(&path).contains("ffmpeg -i"), "{name}");

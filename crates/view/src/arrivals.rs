@@ -2,7 +2,8 @@ use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;
 
-/// Frames of a camera that are remembered: half a minute of 30 a second, and tracks follow within one.
+/// Frames of a camera that are remembered: half a minute of 30 a second, and tracks follow within
+/// one.
 const FRAMES_A_CAMERA: usize = 1000;
 
 /// When each camera's frames arrived, until the tracks come that follow from them.

@@ -1,7 +1,8 @@
 use nalgebra::Point3;
 use rerun::blueprint::{
-    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
-    Spatial2DView, Spatial3DView, TextDocumentView, TextLogView, TimePanel, TimeSeriesView, Vertical,
+    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal,
+    SelectionPanel, Spatial2DView, Spatial3DView, TextDocumentView, TextLogView, TimePanel,
+    TimeSeriesView, Vertical,
 };
 use rerun::external::re_log_types::BlueprintActivationCommand;
 use rerun::log::LogMsg;
@@ -19,7 +20,8 @@ use crate::{ViewError, eye};
 pub(crate) struct CameraPanel {
     /// The camera.
     pub(crate) name: String,
-    /// The part of its pictures that is shown, low and high corner in the picture's pixels; all without.
+    /// The part of its pictures that is shown, low and high corner in the picture's pixels; all
+    /// without.
     pub(crate) shown: Option<[[f64; 2]; 2]>,
 }
 
@@ -46,7 +48,8 @@ pub(crate) fn send(
         ContainerLike::from(TextLogView::new("events").with_origin("/events")),
     ])
     .with_row_shares([5.0, 1.0]);
-    let root = Horizontal::new([ContainerLike::from(left), right.into()]).with_column_shares([1.9, 1.0]);
+    let root =
+        Horizontal::new([ContainerLike::from(left), right.into()]).with_column_shares([1.9, 1.0]);
     let time = TimePanel::new()
         .with_state(PanelState::Collapsed)
         .with_timeline(TIMELINE)
@@ -55,7 +58,9 @@ pub(crate) fn send(
     let zooms: Vec<(EntityPath, VisualBounds2D)> = image_paths
         .into_iter()
         .zip(shown)
-        .filter_map(|(path, shown)| Some((EntityPath::from(format!("{}/VisualBounds2D", path?)), shown?)))
+        .filter_map(|(path, shown)| {
+            Some((EntityPath::from(format!("{}/VisualBounds2D", path?)), shown?))
+        })
         .collect();
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &zooms)
 }
@@ -82,7 +87,10 @@ fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
 }
 
 /// Lays a volume out: the site on the left, the scale of colours and the words on the right.
-pub(crate) fn send_volume(stream: &RecordingStream, places: &[Point3<f64>]) -> Result<(), ViewError> {
+pub(crate) fn send_volume(
+    stream: &RecordingStream,
+    places: &[Point3<f64>],
+) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
     let right = Horizontal::new([
         ContainerLike::from(Spatial2DView::new("SD [m]").with_origin("/scale")),
@@ -110,8 +118,8 @@ fn path_of(view: &ContainerLike) -> Option<EntityPath> {
     }
 }
 
-/// Sends a blueprint whose view of the world has all of a box in view, before a dark background and without
-/// Rerun's grid, which has no end and no scale.
+/// Sends a blueprint whose view of the world has all of a box in view, before a dark background and
+/// without Rerun's grid, which has no end and no scale.
 fn send_site(
     stream: &RecordingStream,
     blueprint: &Blueprint,
@@ -119,17 +127,20 @@ fn send_site(
     extent: &Extent,
     zooms: &[(EntityPath, VisualBounds2D)],
 ) -> Result<(), ViewError> {
-    let background = Background::new(BackgroundKind::SolidColor).with_color(Color::from_rgb(18, 20, 28));
+    let background =
+        Background::new(BackgroundKind::SolidColor).with_color(Color::from_rgb(18, 20, 28));
     let grid = LineGrid3D::new().with_visible(false);
     let eye = eye::on(extent);
     let of_site: [(&str, &dyn AsComponents); 3] =
         [("EyeControls3D", &eye), ("Background", &background), ("LineGrid3D", &grid)];
     let mut properties: Vec<(EntityPath, &dyn AsComponents)> = Vec::new();
     if let Some(path) = site_path {
-        let places = of_site.map(|(name, property)| (EntityPath::from(format!("{path}/{name}")), property));
+        let places =
+            of_site.map(|(name, property)| (EntityPath::from(format!("{path}/{name}")), property));
         properties.extend(places);
     }
-    properties.extend(zooms.iter().map(|(path, bounds)| (path.clone(), bounds as &dyn AsComponents)));
+    properties
+        .extend(zooms.iter().map(|(path, bounds)| (path.clone(), bounds as &dyn AsComponents)));
     send_with(stream, blueprint, &properties)
 }
 
@@ -161,7 +172,9 @@ fn send_with(
     let mut messages: Vec<LogMsg> = memory
         .take()
         .into_iter()
-        .filter(|m| m.store_id().is_blueprint() && !matches!(m, LogMsg::BlueprintActivationCommand(_)))
+        .filter(|m| {
+            m.store_id().is_blueprint() && !matches!(m, LogMsg::BlueprintActivationCommand(_))
+        })
         .collect();
     store.disconnect();
     let Some(id) = messages.first().map(|m| m.store_id().clone()) else {
@@ -176,7 +189,8 @@ fn send_with(
     }
     messages.extend(memory.take().into_iter().filter(|m| matches!(m, LogMsg::ArrowMsg(..))));
     store.disconnect();
-    let activation = BlueprintActivationCommand { blueprint_id: id, make_active: true, make_default: true };
+    let activation =
+        BlueprintActivationCommand { blueprint_id: id, make_active: true, make_default: true };
     stream.send_blueprint(messages, activation);
     Ok(())
 }

@@ -57,7 +57,9 @@ pub(crate) fn scale(share: f64) -> [u8; 3] {
     let low = place as usize;
     let [from, to] = [low, low + 1].map(|index| SCALE[index.min(SCALE.len() - 1)]);
     let part = place - low as f64;
-    std::array::from_fn(|i| (f64::from(from[i]) * (1.0 - part) + f64::from(to[i]) * part).round() as u8)
+    std::array::from_fn(|i| {
+        (f64::from(from[i]) * (1.0 - part) + f64::from(to[i]) * part).round() as u8
+    })
 }
 
 #[cfg(test)]

@@ -17,8 +17,9 @@ use crate::{ViewError, colour};
 const FRUSTUM_M: f32 = 12.0;
 /// An ellipsoid's half axes, standard deviations.
 pub(crate) const SIGMAS: f64 = 3.0;
-/// Ellipsoids of tracks that are known to within [`ENLARGED_UP_TO_M`] are drawn so many times too large, as
-/// the legend says: five centimetres are less than a point of the screen in a site of 100 m.
+/// Ellipsoids of tracks that are known to within [`ENLARGED_UP_TO_M`] are drawn so many times too
+/// large, as the legend says: five centimetres are less than a point of the screen in a site of 100
+/// m.
 pub(crate) const ENLARGED: f64 = 30.0;
 /// Standard deviation along the worst axis, m: enlarged it would be as large as the site.
 pub(crate) const ENLARGED_UP_TO_M: f64 = 0.5;
@@ -72,7 +73,11 @@ pub(crate) fn camera(
 }
 
 /// What the plot of a camera's residuals looks like.
-pub(crate) fn residual_plot(stream: &RecordingStream, name: &str, index: u64) -> Result<(), ViewError> {
+pub(crate) fn residual_plot(
+    stream: &RecordingStream,
+    name: &str,
+    index: u64,
+) -> Result<(), ViewError> {
     stream.log_static(
         format!("plots/residual/{name}"),
         &SeriesLines::new().with_names([name]).with_colors([colour::of(index)]),
@@ -88,7 +93,8 @@ pub(crate) fn bearings(
     camera: &Camera,
     reach_m: f64,
 ) -> Result<(), ViewError> {
-    let measured = |track: &&BearingTrack| track.state() == crossfix_message::ImageTrackState::Tracking;
+    let measured =
+        |track: &&BearingTrack| track.state() == crossfix_message::ImageTrackState::Tracking;
     let origin = camera.pose().position();
     let strips: Vec<[[f32; 3]; 2]> = frame
         .tracks
@@ -110,7 +116,11 @@ pub(crate) fn bearings(
 }
 
 /// A track: where it is, how fast, how sure, and where it has been.
-pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]]) -> Result<(), ViewError> {
+pub(crate) fn track(
+    stream: &RecordingStream,
+    track: &Track,
+    trail: &[[f32; 3]],
+) -> Result<(), ViewError> {
     let (Some(position), Some(velocity)) = (track.position, track.velocity) else {
         return Ok(());
     };
@@ -119,7 +129,8 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]])
     let place = f32s(&position.coords);
     let path = format!("world/tracks/{}", track.id);
     let sure = track.state() == TrackState::Confirmed;
-    let tint: Color = if sure { colour::of_track(track.id) } else { colour::of_unsure_track(track.id) };
+    let tint: Color =
+        if sure { colour::of_track(track.id) } else { colour::of_unsure_track(track.id) };
     let text = label(track, velocity.norm(), position.z);
     stream.log(
         format!("{path}/position"),
@@ -138,7 +149,9 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track, trail: &[[f32; 3]])
     )?;
     stream.log(
         format!("{path}/trail"),
-        &LineStrips3D::new([trail.to_vec()]).with_colors([tint]).with_radii([Radius::new_ui_points(1.5)]),
+        &LineStrips3D::new([trail.to_vec()])
+            .with_colors([tint])
+            .with_radii([Radius::new_ui_points(1.5)]),
     )?;
     // One that only one camera sees is anywhere along its sight line, which is drawn already.
     let ellipsoid = ellipsoid(track).filter(|_| track.state() != TrackState::OneCamera);

@@ -36,8 +36,9 @@ impl Extent {
     pub(crate) fn corners(&self) -> impl Iterator<Item = Point3<f64>> + use<> {
         let (low, high) = self.bounds();
         let pick = move |upper: bool, axis: usize| if upper { high[axis] } else { low[axis] };
-        (0..8_usize)
-            .map(move |corner| Point3::from(Vector3::from_fn(|axis, _| pick(corner >> axis & 1 == 1, axis))))
+        (0..8_usize).map(move |corner| {
+            Point3::from(Vector3::from_fn(|axis, _| pick(corner >> axis & 1 == 1, axis)))
+        })
     }
 
     /// Its middle.

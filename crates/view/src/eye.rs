@@ -17,7 +17,8 @@ const CENTRINGS: u32 = 4;
 /// Nothing is looked at from closer than this, m.
 const CLOSEST_M: f64 = 20.0;
 
-/// The eye that has all of a box in view, from the south and above, so that north is up in the picture.
+/// The eye that has all of a box in view, from the south and above, so that north is up in the
+/// picture.
 pub(crate) fn on(extent: &Extent) -> EyeControls3D {
     let f32s = |point: Point3<f64>| [point.x as f32, point.y as f32, point.z as f32];
     let (eye, target) = eye_and_target(extent);
@@ -41,7 +42,8 @@ fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
         // A corner is in view if it lies within the field's slope at its distance from the eye.
         let needed = |corner: Point3<f64>| {
             let from = corner - target;
-            let slope = (from.dot(&right).abs() / HALF_WIDTH).max(from.dot(&up).abs() / HALF_HEIGHT);
+            let slope =
+                (from.dot(&right).abs() / HALF_WIDTH).max(from.dot(&up).abs() / HALF_HEIGHT);
             from.dot(&towards_eye) + slope
         };
         distance = extent.corners().map(needed).fold(CLOSEST_M, f64::max);
@@ -53,7 +55,9 @@ fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
             let (low, high) = extent
                 .corners()
                 .map(|corner| seen(corner, axis))
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| (low.min(s), high.max(s)));
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| {
+                    (low.min(s), high.max(s))
+                });
             0.5 * (low + high) * distance
         };
         target += middle(&right) * right + middle(&up) * up;
@@ -67,9 +71,13 @@ mod tests {
 
     #[test]
     fn all_corners_of_a_site_are_in_view_and_one_is_near_the_border() {
-        for [width, depth, height] in [[100.0, 100.0, 30.0], [400.0, 20.0, 5.0], [10.0, 10.0, 300.0]] {
-            let extent =
-                Extent::of([Point3::new(-50.0, 7.0, 2.0), Point3::new(width - 50.0, 7.0 + depth, height)]);
+        for [width, depth, height] in
+            [[100.0, 100.0, 30.0], [400.0, 20.0, 5.0], [10.0, 10.0, 300.0]]
+        {
+            let extent = Extent::of([
+                Point3::new(-50.0, 7.0, 2.0),
+                Point3::new(width - 50.0, 7.0 + depth, height),
+            ]);
             let (place, target) = eye_and_target(&extent);
             let forward = (target - place).normalize();
             let right = forward.cross(&Vector3::z()).normalize();

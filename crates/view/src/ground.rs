@@ -8,7 +8,8 @@ use rerun_types::components::{Color, Radius};
 use crate::ViewError;
 use crate::extent::Extent;
 
-/// Cells of the grid along its longer side, about: enough to count by, few enough not to hide anything.
+/// Cells of the grid along its longer side, about: enough to count by, few enough not to hide
+/// anything.
 const CELLS: f64 = 8.0;
 
 /// The largest of 1, 2 and 5 times a power of ten that is not above a length.

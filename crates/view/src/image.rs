@@ -11,7 +11,8 @@ use crate::draw::SIGMAS;
 use crate::paths::image_path;
 use crate::{ViewError, colour};
 
-/// A ring is at least so large, pixels of the camera: a target of a few pixels must be seen inside it.
+/// A ring is at least so large, pixels of the camera: a target of a few pixels must be seen inside
+/// it.
 const LEAST_RING_PX: f64 = 12.0;
 /// Corners of a ring.
 const CORNERS: usize = 24;
@@ -34,8 +35,8 @@ impl Region {
         }
     }
 
-    /// What to show of a picture of this scale, from a low to a high corner: the region with room about it
-    /// for the rings, in the image.
+    /// What to show of a picture of this scale, from a low to a high corner: the region with room
+    /// about it for the rings, in the image.
     pub(crate) fn shown(&self, camera: &Camera, scale: f64) -> [[f64; 2]; 2] {
         let size = camera.model().intrinsics().size;
         let side = Vector2::new(f64::from(size.width), f64::from(size.height));
@@ -147,8 +148,14 @@ mod tests {
 
     fn camera() -> Camera {
         let size = ImageSize { width: 1000, height: 500 };
-        let lens =
-            Intrinsics { size, fx: 800.0, fy: 800.0, cx: 499.5, cy: 249.5, distortion: Distortion::None };
+        let lens = Intrinsics {
+            size,
+            fx: 800.0,
+            fy: 800.0,
+            cx: 499.5,
+            cy: 249.5,
+            distortion: Distortion::None,
+        };
         Camera::new(lens, Pose::new(Matrix3::identity(), Point3::origin()).unwrap()).unwrap()
     }
 

@@ -29,8 +29,9 @@ mod tests {
     #[test]
     fn a_hundred_a_second_become_ten() {
         let mut limiter = Limiter::default();
-        let passed =
-            (0..200).filter(|i| limiter.allows("x", Timestamp::from_nanos(i * 10_000_000), 10.0)).count();
+        let passed = (0..200)
+            .filter(|i| limiter.allows("x", Timestamp::from_nanos(i * 10_000_000), 10.0))
+            .count();
         assert_eq!(passed, 20);
     }
 }

@@ -3,8 +3,8 @@ use std::time::Duration;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Health, ImageTrackState, Preview, Timestamp,
-    Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
+    BearingFrame, CameraCalibration, Channel, DecodeError, Health, ImageTrackState, Preview,
+    Timestamp, Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
 };
 use nalgebra::{Point3, Vector3};
 use rerun::RecordingStream;
@@ -123,12 +123,15 @@ impl Picture {
         self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    /// Waits a moment until everything is drawn, as a viewer that does not look must not hold us up.
+    /// Waits a moment until everything is drawn, as a viewer that does not look must not hold us
+    /// up.
     ///
     /// # Errors
     /// [`ViewError::Flush`].
     pub fn finish_within(self, patience: Duration) -> Result<(), ViewError> {
-        self.stream.flush_with_timeout(patience).map_err(|error| ViewError::Flush(error.to_string()))
+        self.stream
+            .flush_with_timeout(patience)
+            .map_err(|error| ViewError::Flush(error.to_string()))
     }
 
     /// Whether the viewer is gone for good; to be asked about once a second.
@@ -169,7 +172,8 @@ impl Picture {
 
     /// Lays the picture out about what is known of cameras and tracks by now.
     fn lay_out(&self) -> Result<(), ViewError> {
-        let mut extent = Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
+        let mut extent =
+            Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
         if self.flown.is_empty() {
             // Where targets are likely to be.
             extent.include(extent.middle() + Vector3::z() * AIR_M);
@@ -217,7 +221,8 @@ impl Picture {
         }
         // As far as the farthest track, so that the crossings are seen.
         let origin = view.camera.pose().position();
-        let placed = self.drawn.values().filter(|drawn| drawn.track.state() != TrackState::OneCamera);
+        let placed =
+            self.drawn.values().filter(|drawn| drawn.track.state() != TrackState::OneCamera);
         let farthest = placed.map(|drawn| (drawn.place - origin).norm()).fold(0.0, f64::max);
         let reach = if farthest > 0.0 { 1.1 * farthest } else { DEFAULT_REACH_M };
         let seen = frame.tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
@@ -260,7 +265,8 @@ impl Picture {
             }
             let place = Point3::from(position);
             draw::track(&self.stream, track, trail.make_contiguous())?;
-            self.drawn.insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
+            self.drawn
+                .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
             if track.state() == TrackState::Confirmed {
                 let is_first = self.flown.is_empty();
                 self.flown.include(place);
@@ -285,17 +291,17 @@ impl Picture {
         Ok(())
     }
 
-    /// Takes away the tracks of which nobody speaks any more while bearings still come. They must be old
-    /// by their arrival, as one camera's clock may be wrong, and in the data, as a recording's tracks may
-    /// have been made long after its bearings.
+    /// Takes away the tracks of which nobody speaks any more while bearings still come. They must
+    /// be old by their arrival, as one camera's clock may be wrong, and in the data, as a
+    /// recording's tracks may have been made long after its bearings.
     fn clear_ghosts(&mut self, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
         self.clear_if(|drawn| {
             arrival.seconds_since(drawn.heard) > GHOST_S && time.seconds_since(drawn.time) > GHOST_S
         })
     }
 
-    /// Takes away the tracks of which nobody has spoken for a while, in a live picture to which nothing
-    /// comes any more; `now` is the clock that the arrivals were read from.
+    /// Takes away the tracks of which nobody has spoken for a while, in a live picture to which
+    /// nothing comes any more; `now` is the clock that the arrivals were read from.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -317,7 +323,12 @@ impl Picture {
         Ok(())
     }
 
-    fn plots(&mut self, frame: &TrackFrame, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
+    fn plots(
+        &mut self,
+        frame: &TrackFrame,
+        arrival: Timestamp,
+        time: Timestamp,
+    ) -> Result<(), ViewError> {
         if let Some(bearing) = self.arrivals.take(&frame.camera, frame.camera_sequence) {
             let latency = arrival.seconds_since(bearing) * 1e3;
             if latency > 0.0 && self.limiter.allows("latency", time, LINE_RATE_HZ) {
@@ -340,10 +351,13 @@ impl Picture {
 
     fn event(&mut self, event: &TrackEvent) -> Result<(), ViewError> {
         self.at(event.time_ns);
-        let what = event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_").to_lowercase();
+        let what =
+            event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_").to_lowercase();
         let text = match event.other_id {
             0 => format!("track {} {what}", TrackNumber(event.track_id)),
-            other => format!("track {} {what} into {}", TrackNumber(event.track_id), TrackNumber(other)),
+            other => {
+                format!("track {} {what} into {}", TrackNumber(event.track_id), TrackNumber(other))
+            }
         };
         Ok(self.stream.log("events", &TextLog::new(text))?)
     }
@@ -355,7 +369,8 @@ impl Picture {
         }
         self.at(health.time_ns);
         for problem in health.problems.iter().filter(|problem| !self.problems.contains(problem)) {
-            self.stream.log("events", &TextLog::new(problem.as_str()).with_level(TextLogLevel::WARN))?;
+            self.stream
+                .log("events", &TextLog::new(problem.as_str()).with_level(TextLogLevel::WARN))?;
         }
         self.problems.clone_from(&health.problems);
         Ok(())

@@ -63,8 +63,8 @@ pub fn save(path: &Path) -> Result<RecordingStream, ViewError> {
     Ok(builder().save(path)?)
 }
 
-/// A picture without an end that is written to an `.rrd` file. It has no index, which Rerun would keep in
-/// memory until the file's end and which grows by a gigabyte an hour.
+/// A picture without an end that is written to an `.rrd` file. It has no index, which Rerun would
+/// keep in memory until the file's end and which grows by a gigabyte an hour.
 ///
 /// # Errors
 /// [`ViewError`] if the file cannot be made.
@@ -77,17 +77,21 @@ pub fn save_without_end(path: &Path) -> Result<RecordingStream, ViewError> {
     Ok(stream)
 }
 
-/// A picture in a viewer that listens at an address of this machine or another. A viewer that does not
-/// take the picture makes drawing wait; what waits is bounded.
+/// A picture in a viewer that listens at an address of this machine or another. A viewer that does
+/// not take the picture makes drawing wait; what waits is bounded.
 ///
 /// # Errors
 /// [`ViewError::NobodyListens`]: the stream would wait for ever.
 pub fn connect(address: SocketAddr) -> Result<RecordingStream, ViewError> {
     TcpStream::connect_timeout(&address, Duration::from_millis(500))
         .map_err(|_| ViewError::NobodyListens(address))?;
-    let bounded =
-        ChunkBatcherConfig { max_bytes_in_flight: MOST_IN_FLIGHT, ..ChunkBatcherConfig::LOW_LATENCY };
-    Ok(builder().batcher_config(bounded).connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
+    let bounded = ChunkBatcherConfig {
+        max_bytes_in_flight: MOST_IN_FLIGHT,
+        ..ChunkBatcherConfig::LOW_LATENCY
+    };
+    Ok(builder()
+        .batcher_config(bounded)
+        .connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
 }
 
 /// Whether the viewer at the end of a stream is gone for good: Rerun does not connect again.

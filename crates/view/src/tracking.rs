@@ -49,8 +49,8 @@ pub struct FollowedTarget {
     pub nis: Option<f64>,
 }
 
-/// Draws a tracker's work on one video: the pictures, boxes, measurements, the label where there is one, and
-/// curves of each target's score, certainty and innovation beside them.
+/// Draws a tracker's work on one video: the pictures, boxes, measurements, the label where there is
+/// one, and curves of each target's score, certainty and innovation beside them.
 pub struct TrackingPicture {
     stream: RecordingStream,
 }
@@ -79,7 +79,8 @@ fn name(target: &FollowedTarget) -> String {
 }
 
 fn boxes(drawn: impl Iterator<Item = (ImageBox, Color, String)>) -> Boxes2D {
-    let (mut corners, mut sides, mut colours, mut names) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut corners, mut sides, mut colours, mut names) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (ImageBox { x, y, width, height }, colour, name) in drawn {
         corners.push((x as f32, y as f32));
         sides.push((width as f32, height as f32));
@@ -117,7 +118,10 @@ impl TrackingPicture {
     ) -> Result<(), ViewError> {
         let stream = &self.stream;
         stream.set_timestamp_nanos_since_epoch(TIMELINE, time.nanos());
-        stream.log("video", &EncodedImage::from_file_contents(jpeg).with_media_type(MediaType::jpeg()))?;
+        stream.log(
+            "video",
+            &EncodedImage::from_file_contents(jpeg).with_media_type(MediaType::jpeg()),
+        )?;
         match label {
             Some(label) => {
                 let [red, green, blue] = LABEL;
@@ -130,10 +134,12 @@ impl TrackingPicture {
             "video/targets",
             &boxes(targets.iter().map(|target| (target.place, colour(target.sight), name(target)))),
         )?;
-        let measured = targets.iter().filter_map(|target| Some((target.measured?, colour(target.sight))));
+        let measured =
+            targets.iter().filter_map(|target| Some((target.measured?, colour(target.sight))));
         let (places, colours): (Vec<_>, Vec<_>) =
             measured.map(|([x, y], colour)| ((x as f32, y as f32), colour)).unzip();
-        let crosses = Points2D::new(places).with_colors(colours).with_radii([Radius::new_ui_points(2.0)]);
+        let crosses =
+            Points2D::new(places).with_colors(colours).with_radii([Radius::new_ui_points(2.0)]);
         stream.log("video/measured", &crosses)?;
         for target in targets {
             let number = target.number;

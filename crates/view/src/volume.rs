@@ -59,7 +59,8 @@ struct Scale {
 
 impl Scale {
     fn of(cells: &[VolumeCell]) -> Self {
-        let mut deviations: Vec<f64> = cells.iter().map(|cell| cell.sd_m).filter(|sd| *sd > 0.0).collect();
+        let mut deviations: Vec<f64> =
+            cells.iter().map(|cell| cell.sd_m).filter(|sd| *sd > 0.0).collect();
         deviations.sort_by(f64::total_cmp);
         let at = |share: f64| {
             let index = share * deviations.len().saturating_sub(1) as f64;

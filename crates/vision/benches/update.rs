@@ -5,7 +5,9 @@
 
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
-use crossfix_vision::{ImageTracker, ImmConfig, PixelBox, PixelImm, ReferenceStrategy, TrackerConfig};
+use crossfix_vision::{
+    ImageTracker, ImmConfig, PixelBox, PixelImm, ReferenceStrategy, TrackerConfig,
+};
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 
@@ -27,9 +29,10 @@ fn pictures(width: f32, height: f32) -> Vec<Plane> {
                 state ^= state >> 17;
                 state ^= state << 5;
                 let noise = (state >> 24) as f32 / 16.0;
-                let (u, v) = ((column as f32 - x) / (0.3 * width), (row as f32 - y) / (0.3 * height));
-                let body =
-                    (-0.5 * (u * u + v * v)).exp() + 0.5 * (-0.5 * (u * u + 9.0 * (v + 0.6).powi(2))).exp();
+                let (u, v) =
+                    ((column as f32 - x) / (0.3 * width), (row as f32 - y) / (0.3 * height));
+                let body = (-0.5 * (u * u + v * v)).exp()
+                    + 0.5 * (-0.5 * (u * u + 9.0 * (v + 0.6).powi(2))).exp();
                 90.0 + noise + 80.0 * body
             })
         })

@@ -16,17 +16,18 @@ const LOW_PASSES: [f32; 5] = [0.0, 0.6, 0.9, 1.2, 1.6];
 const CLEAR_NOISE_SHARE: f32 = 0.01;
 /// Least low-pass for the comparison with the anchor, px.
 const ANCHOR_LOW_PASS: f32 = 0.6;
-/// Share of noise in the anchor's energy above which it is still averaged. Then it stays: whatever is
-/// added to it, it drifts with.
+/// Share of noise in the anchor's energy above which it is still averaged. Then it stays: whatever
+/// is added to it, it drifts with.
 const ANCHOR_NOISE_SHARE: f32 = 0.02;
 /// Correlation with the anchor below which the target has become another.
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
 /// Stiffness of scale and turn in that comparison.
 const ANCHOR_STIFFNESS: f64 = 0.02;
-/// When so much of the reference is new, what is correlated is made anew: a few images' worth. Reasoned: with half of it that
-/// is done, and costs, twice as often.
+/// When so much of the reference is new, what is correlated is made anew: a few images' worth.
+/// Reasoned: with half of it that is done, and costs, twice as often.
 const MOST_CHANGED: f32 = 0.1;
-/// An image counts as at least this share of what is new: its size and direction are, where nothing is learned.
+/// An image counts as at least this share of what is new: its size and direction are, where nothing
+/// is learned.
 const SHAPE_SHARE: f32 = 0.03;
 /// Least of what a reference's slopes answer to: one of noise alone tells no place.
 const LEAST_STEEPNESS: f64 = 0.15;
@@ -76,8 +77,8 @@ pub(crate) struct Appearance {
     /// See [`Self::steepness`] and [`Self::taken`].
     steepness: [f64; 2],
     taken: f32,
-    /// The share of images in the reference that are not in what is correlated yet, whether that has its shape, and whether the
-    /// reference was like the anchor when it was compared.
+    /// The share of images in the reference that are not in what is correlated yet, whether that
+    /// has its shape, and whether the reference was like the anchor when it was compared.
     changed: f32,
     is_in_shape: bool,
     is_like_anchor: bool,
@@ -108,28 +109,36 @@ fn energy(plane: &Plane) -> f32 {
     plane.samples().iter().map(|s| s * s).sum()
 }
 
-/// What a reference's slopes answer to where the target is displaced, over what they would if it were the reference: the sums
-/// of the products of its slopes G with the target's, on either axis, over those of G with itself.
+/// What a reference's slopes answer to where the target is displaced, over what they would if it
+/// were the reference: the sums of the products of its slopes G with the target's, on either axis,
+/// over those of G with itself.
 ///
-/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the target's slopes. The bound
-/// `sigma^2 (G'G)^-1` is taken at the contrast with which the reference fits best, which is as many times the target's own as the
-/// target has the reference in it: so that is divided by. T is known with noise; the means of its products, `answers` a pixel
-/// of slopes and of values, are taken out.
+/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the
+/// target's slopes. The bound `sigma^2 (G'G)^-1` is taken at the contrast with which the reference
+/// fits best, which is as many times the target's own as the target has the reference in it: so
+/// that is divided by. T is known with noise; the means of its products, `answers` a pixel of
+/// slopes and of values, are taken out.
 fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
     let [noise_answer, value_answer] = answers;
-    let product: f64 =
-        reference.samples().iter().zip(target.samples()).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+    let product: f64 = reference
+        .samples()
+        .iter()
+        .zip(target.samples())
+        .map(|(a, b)| f64::from(a * b))
+        .sum::<f64>();
     let count = target.samples().len() as f64;
-    let contrast =
-        ((product - value_answer * count) / f64::from(energy(reference)).max(1e-12)).max(LEAST_STEEPNESS);
+    let contrast = ((product - value_answer * count) / f64::from(energy(reference)).max(1e-12))
+        .max(LEAST_STEEPNESS);
     let (width, height) = (reference.width(), reference.height());
     let (mut own, mut with) = ([0.0_f64; 2], [0.0_f64; 2]);
     for y in 1..height.saturating_sub(1) {
         let rows = |plane| [y - 1, y, y + 1].map(|row| Plane::row(plane, row));
-        let ([above, row, below], [target_above, target_row, target_below]) = (rows(reference), rows(target));
+        let ([above, row, below], [target_above, target_row, target_below]) =
+            (rows(reference), rows(target));
         for x in 1..width - 1 {
             let slopes = [row[x + 1] - row[x - 1], below[x] - above[x]];
-            let of_target = [target_row[x + 1] - target_row[x - 1], target_below[x] - target_above[x]];
+            let of_target =
+                [target_row[x + 1] - target_row[x - 1], target_below[x] - target_above[x]];
             for axis in 0..2 {
                 own[axis] += f64::from(slopes[axis] * slopes[axis]) / 4.0;
                 with[axis] += f64::from(slopes[axis] * of_target[axis]) / 4.0;
@@ -202,12 +211,15 @@ impl Appearance {
         appearance
     }
 
-    /// Correlation of two looks with each other, each in its size and direction, their noise taken out.
+    /// Correlation of two looks with each other, each in its size and direction, their noise taken
+    /// out.
     pub(crate) fn likeness(&self, other: &Self) -> f32 {
         let (one, two) = (self.working.image(), other.working.image());
         let (width, height) = (one.width().min(two.width()), one.height().min(two.height()));
-        let rows = (0..height).map(|y| (middle(one, width, height, y), middle(two, width, height, y)));
-        let product: f32 = rows.flat_map(|(one, two)| one.iter().zip(two)).map(|(a, b)| a * b).sum();
+        let rows =
+            (0..height).map(|y| (middle(one, width, height, y), middle(two, width, height, y)));
+        let product: f32 =
+            rows.flat_map(|(one, two)| one.iter().zip(two)).map(|(a, b)| a * b).sum();
         let clear = self.clear_share() * other.clear_share();
         product / (self.energy() * other.energy() * clear).max(1e-12).sqrt()
     }
@@ -259,14 +271,16 @@ impl Appearance {
         self.taken
     }
 
-    /// Share of its energy that is the target's: a noisy reference finds the target fainter than it is.
+    /// Share of its energy that is the target's: a noisy reference finds the target fainter than it
+    /// is.
     pub(crate) fn clear_share(&self) -> f32 {
         let noise = self.noise() * self.pixels();
         (1.0 - noise / self.energy().max(f32::MIN_POSITIVE)).clamp(0.2, 1.0)
     }
 
-    /// Takes the target's image in, with a certainty that it shows the target. Returns its share in what measurements refer to:
-    /// the anchor, or while the target is another than that, the reference.
+    /// Takes the target's image in, with a certainty that it shows the target. Returns its share in
+    /// what measurements refer to: the anchor, or while the target is another than that, the
+    /// reference.
     pub(crate) fn learn(
         &mut self,
         image: &Plane,
@@ -283,10 +297,12 @@ impl Appearance {
         mend(&mut view);
         without_mean(&mut view);
         let noise = noise * noise_kept(place);
-        let own_share = self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
+        let own_share =
+            self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
         let mut anchor_share = 0.0;
 
-        let noise_share = self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
+        let noise_share =
+            self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
         if noise_share > ANCHOR_NOISE_SHARE {
             anchor_share = certainty / (self.anchor_images + 1.0);
             for (old, new) in self.anchor.samples_mut().iter_mut().zip(view.samples()) {
@@ -331,8 +347,13 @@ impl Appearance {
         let Workshop { memory, filtered, .. } = workshop;
         for (index, filter) in self.low_passes.iter().enumerate() {
             filter.apply(&self.own, memory, filtered);
-            let taken: f32 =
-                self.own.samples().iter().zip(filtered.samples()).map(|(a, b)| (a - b) * (a - b)).sum();
+            let taken: f32 = self
+                .own
+                .samples()
+                .iter()
+                .zip(filtered.samples())
+                .map(|(a, b)| (a - b) * (a - b))
+                .sum();
             let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
@@ -345,7 +366,8 @@ impl Appearance {
             }
         }
         let filter = &self.low_passes[self.chosen];
-        let answers = [filter.cross_gradient_gain(), filter.own_weight()].map(|gain| f64::from(noise * gain));
+        let answers =
+            [filter.cross_gradient_gain(), filter.own_weight()].map(|gain| f64::from(noise * gain));
         self.steepness = steepness(&self.smooth, &self.own, answers);
         let (width, height) = (self.own.width() as f64, self.own.height() as f64);
         let Self { smooth, working, scale, turn_rad, .. } = self;
@@ -353,13 +375,18 @@ impl Appearance {
             image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
             let middle = [width, height].map(|side| (side - 1.0) / 2.0);
             let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
-            workshop.resampler.look(smooth, View { x: middle[0], y: middle[1], scale, turn_rad }, image);
+            workshop.resampler.look(
+                smooth,
+                View { x: middle[0], y: middle[1], scale, turn_rad },
+                image,
+            );
             without_mean(image);
         });
     }
 
     /// How the reference has drifted: each image was taken at an estimated place, and their errors
-    /// add up; the anchor, to which almost nothing is added any more, stays. Returns whether they are alike at all.
+    /// add up; the anchor, to which almost nothing is added any more, stays. Returns whether they
+    /// are alike at all.
     fn compare_with_anchor(&mut self, workshop: &mut Workshop) -> bool {
         let index = self
             .low_passes

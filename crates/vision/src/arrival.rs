@@ -1,7 +1,8 @@
 //! Whether what a target's reference is found on has come there, or was there before.
 //!
-//! A reference alone cannot tell: in a cloud it becomes cloud, and finds it again with certainty. What tells is the
-//! scene's own pictures ([`crate::scene`]): under a target that has come from elsewhere one of them shows what it hides.
+//! A reference alone cannot tell: in a cloud it becomes cloud, and finds it again with certainty.
+//! What tells is the scene's own pictures ([`crate::scene`]): under a target that has come from
+//! elsewhere one of them shows what it hides.
 
 use crossfix_correlation::{Plane, Resampler, View};
 
@@ -9,14 +10,16 @@ use crate::ImagePoint;
 use crate::crop::mend;
 use crate::scene::Picture;
 
-/// What has not changed may seem to have by this share of the reference: registration, compression. With half of it
-/// textured scenes count for targets, with twice as much faint targets for scene.
+/// What has not changed may seem to have by this share of the reference: registration, compression.
+/// With half of it textured scenes count for targets, with twice as much faint targets for scene.
 const UNCHANGED: f64 = 0.1;
-/// How much of a target's usual contrast the scene itself may have in its place: as much as half, often.
+/// How much of a target's usual contrast the scene itself may have in its place: as much as half,
+/// often.
 const SCENE_SHARE: f64 = 0.5;
-/// Standard deviation by which the scenes behind what lies on the lens change its contrast, as a share of the target's usual
-/// one: two scenes, each with a quarter of it. With half of it digits before clouds count as come, with twice as much a target
-/// that comes to where a cloud was counts as there before.
+/// Standard deviation by which the scenes behind what lies on the lens change its contrast, as a
+/// share of the target's usual one: two scenes, each with a quarter of it. With half of it digits
+/// before clouds count as come, with twice as much a target that comes to where a cloud was counts
+/// as there before.
 const BEHIND: f64 = 0.35;
 /// How well the pictures are registered, px an axis.
 const REGISTERED_PX: f64 = 0.25;
@@ -24,10 +27,12 @@ const REGISTERED_PX: f64 = 0.25;
 const PIXELS_A_LOOK: f64 = 4.0;
 /// ... and a target is no more looks than these, however large: its parts change together.
 const MOST_LOOKS: f64 = 12.0;
-/// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model must be able to be.
+/// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model
+/// must be able to be.
 const MOST: f64 = 8.0;
-/// By how many times the contrast of a scene may change with the light or the exposure. With no range at all whatever is there
-/// counts as come with every step of the light, where there is no noise to hide the difference.
+/// By how many times the contrast of a scene may change with the light or the exposure. With no
+/// range at all whatever is there counts as come with every step of the light, where there is no
+/// noise to hide the difference.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
 /// So much of the reference's energy must lie where the target was not before.
 const LEAST_FREE: f64 = 0.25;
@@ -42,7 +47,8 @@ pub(crate) struct Arrival {
     before: f64,
     /// The variance of each by noise.
     variance: f64,
-    /// Mean squared change of the pixels over what noise and registration make of an unchanged scene.
+    /// Mean squared change of the pixels over what noise and registration make of an unchanged
+    /// scene.
     change: f64,
     /// Looks that this is the mean of.
     looks: f64,
@@ -66,18 +72,19 @@ pub(crate) struct Placed<'a> {
 }
 
 impl Arrival {
-    /// Log-likelihood ratio of the target's having come there against what is there having been there before; `usual`
-    /// is the contrast that the target has otherwise.
+    /// Log-likelihood ratio of the target's having come there against what is there having been
+    /// there before; `usual` is the contrast that the target has otherwise.
     ///
-    /// Before, the scene had any contrast c there, `c ~ N(0, (usual / 2)^2)`, or the one that is there now; and where the
-    /// scene has not changed, no pixel has.
+    /// Before, the scene had any contrast c there, `c ~ N(0, (usual / 2)^2)`, or the one that is
+    /// there now; and where the scene has not changed, no pixel has.
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
         let Self { change, looks, .. } = self;
         let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
         (self.contrast_log_ratio(usual, UNCHANGED) + changed.min(MOST)).clamp(-MOST, MOST)
     }
 
-    /// The same against what lies on the lens, or is written into the video: the scene behind it has changed.
+    /// The same against what lies on the lens, or is written into the video: the scene behind it
+    /// has changed.
     pub(crate) fn on_lens_log_ratio(self, usual: f64) -> f64 {
         self.contrast_log_ratio(usual, BEHIND * usual).clamp(-MOST, MOST)
     }
@@ -100,8 +107,9 @@ impl Comparison {
         mend(&mut self.now);
     }
 
-    /// Compares what was looked at with what a picture has in a place. Where the target was `seen` in that picture it does not
-    /// count; `None` if that is nearly everywhere, or the place was outside.
+    /// Compares what was looked at with what a picture has in a place. Where the target was `seen`
+    /// in that picture it does not count; `None` if that is nearly everywhere, or the place was
+    /// outside.
     pub(crate) fn with(
         &mut self,
         picture: &Picture,
@@ -129,7 +137,8 @@ impl Comparison {
         for y in 0..height {
             let row_covered = seen.is_some_and(|seen| covered(y, height, then.y, seen.y));
             let above = self.before.row(y.saturating_sub(1));
-            let rows = reference.row(y).iter().zip(self.now.row(y)).zip(self.before.row(y)).zip(above);
+            let rows =
+                reference.row(y).iter().zip(self.now.row(y)).zip(self.before.row(y)).zip(above);
             let mut left = self.before.row(y)[0];
             for (x, (((reference, now), before), above)) in rows.enumerate() {
                 let slope = (before - left).powi(2) + (before - above).powi(2);
@@ -198,7 +207,8 @@ impl Sums {
         let contrast = |product: f64, sum: f64| (product - self.reference * sum / n) / energy;
         // Two differences of noisy pixels are in each slope.
         let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
-        let unchanged = (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
+        let unchanged =
+            (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));
         Some(Arrival {
             now: contrast(self.reference_now, self.now),
             before: contrast(self.reference_before, self.before),

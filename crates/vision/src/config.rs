@@ -4,7 +4,8 @@ use thiserror::Error;
 
 use crate::ReferenceStrategy;
 
-/// How targets are followed. Lengths in pixels, brightness in the image's own unit, times in seconds.
+/// How targets are followed. Lengths in pixels, brightness in the image's own unit, times in
+/// seconds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackerConfig {
@@ -12,39 +13,43 @@ pub struct TrackerConfig {
     pub algorithm: Algorithm,
     /// How the reference follows the target's appearance. Default: the mean of its images.
     pub reference: ReferenceStrategy,
-    /// The region that is searched. Default: four standard deviations of the prediction, and at least
-    /// the papers' three sides.
+    /// The region that is searched. Default: four standard deviations of the prediction, and at
+    /// least the papers' three sides.
     pub gate: GateRule,
     /// Whether the reference follows the target's size and direction. Default true.
     pub follow_shape: bool,
     /// Pixels added to each side of the target's box to make the reference. Default 2: the target's
     /// edge is most of what is known of its place.
     pub margin_px: f64,
-    /// Least standard deviation of the image's noise: a level. Default 1, a level of 8 bits; the noise
-    /// above it is measured in every image. The per-pixel filters' noises are in this unit.
+    /// Least standard deviation of the image's noise: a level. Default 1, a level of 8 bits; the
+    /// noise above it is measured in every image. The per-pixel filters' noises are in this unit.
     pub noise_floor: f64,
-    /// Standard deviation of the white acceleration of the liveliest target, px/s^2 (000, equation 4: the largest
-    /// acceleration by root 3). Default 900, a pixel a frame squared at 30 frames a second. How lively one is, from even flight
-    /// on, is learnt of each; the papers' algorithm takes all for the liveliest.
+    /// Standard deviation of the white acceleration of the liveliest target, px/s^2 (Herasymenko
+    /// 2021, eq. 4: the largest acceleration by root 3). Default 900, a pixel a frame squared at 30
+    /// frames a second. How lively one is, from even flight on, is learnt of each; the papers'
+    /// algorithm takes all for the liveliest.
     pub acceleration_sd_px: f64,
     /// Standard deviation of the velocity of a target that is taken up, px/s. Default 120.
     pub start_velocity_sd_px: f64,
     /// Standard deviation of a place that is given (a box, a cue), px. Default 0.1.
     pub given_sd_px: f64,
-    /// How far beside its target a box may be given, standard deviation, px: one that is too large or lies beside what
-    /// stands out there is moved onto it. 0 takes every box as it is. Default 4.
+    /// How far beside its target a box may be given, standard deviation, px: one that is too large
+    /// or lies beside what stands out there is moved onto it. 0 takes every box as it is. Default
+    /// 4.
     pub box_sd_px: f64,
-    /// Standard deviation of the box's centre about the target's own, px: the same in all images of a
-    /// track, and part of every covariance that is answered until somebody says where the target is. Default 0.1.
+    /// Standard deviation of the box's centre about the target's own, px: the same in all images of
+    /// a track, and part of every covariance that is answered until somebody says where the target
+    /// is. Default 0.1.
     pub centre_sd_px: f64,
     /// Floor of the prediction's standard deviation, px. Default 0.3.
     pub prediction_floor_px: f64,
-    /// How much of the reference's energy a mismatch with the target may take: its inverse. Default 30;
-    /// at 60 textured background is taken for targets.
+    /// How much of the reference's energy a mismatch with the target may take: its inverse. Default
+    /// 30; at 60 textured background is taken for targets.
     pub mismatch: f64,
     /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.5.
     pub contrast_sd: f64,
-    /// Share of the images in which a target can be seen, a blur and a bird before it apart. Default 0.95.
+    /// Share of the images in which a target can be seen, a blur and a bird before it apart.
+    /// Default 0.95.
     pub visible_probability: f64,
     /// Share of the prior that lies anywhere in the gate. Default 0.01; it doubles with every image
     /// without the target, up to a half.
@@ -58,7 +63,8 @@ pub struct TrackerConfig {
     pub give_up_after_s: f64,
     /// What [`Algorithm::Paper`] uses.
     pub paper: PaperConfig,
-    /// Finds targets by itself. Absent (default): only given boxes are followed, and found again where they are lost.
+    /// Finds targets by itself. Absent (default): only given boxes are followed, and found again
+    /// where they are lost.
     pub detector: Option<DetectorConfig>,
 }
 
@@ -66,16 +72,17 @@ pub struct TrackerConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Algorithm {
-    /// By the posterior over all placements, with the likelihood of the zero-mean correlation in the
-    /// measured noise, the filters' prediction as prior, and a fit between the pixels.
+    /// By the posterior over all placements, with the likelihood of the zero-mean correlation in
+    /// the measured noise, the filters' prediction as prior, and a fit between the pixels.
     #[default]
     Posterior,
-    /// To the letter of 000 and 001: one peak of one measure in a gate of three sides, and filters of
-    /// fixed noise. `gate`, `margin_px` and `follow_shape` do not matter to it.
+    /// To the letter of Herasymenko 2021 and Lytvynets 2020: one peak of one measure in a gate of
+    /// three sides, and filters of fixed noise. `gate`, `margin_px` and `follow_shape` do not
+    /// matter to it.
     Paper,
 }
 
-/// The gate (000, section 1; 001, 4.8 and 5.12).
+/// The gate (Herasymenko 2021, section 1; Lytvynets 2020, eqs. 4.8 and 5.12).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum GateRule {
@@ -86,8 +93,8 @@ pub enum GateRule {
         /// Standard deviations. Default 4.
         sigmas: f64,
     },
-    /// As wide as the ellipse `r' D^-1 r <= l^2` that holds the target with a probability (001, 4.8 to
-    /// 4.11); a measurement outside it is none.
+    /// As wide as the ellipse `r' D^-1 r <= l^2` that holds the target with a probability
+    /// (Lytvynets 2020, eqs. 4.8 to 4.11); a measurement outside it is none.
     Ellipsoid {
         /// Probability, 0 to 1.
         probability: f64,
@@ -104,7 +111,7 @@ impl Default for GateRule {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PaperConfig {
-    /// The measure (001, chapter 3). Default: cross-correlation.
+    /// The measure (Lytvynets 2020, chapter 3). Default: cross-correlation.
     pub similarity: Similarity,
     /// Whether it wraps round the gate. Default circular, as a product of spectra does.
     pub extent: Extent,
@@ -157,7 +164,8 @@ impl Default for TrackerConfig {
 }
 
 impl TrackerConfig {
-    /// The algorithm of 000 and 001 as their tables were made: fixed reference, gate of three sides.
+    /// The algorithm of Herasymenko 2021 and Lytvynets 2020 as their tables were made: fixed
+    /// reference, gate of three sides.
     pub fn paper() -> Self {
         Self {
             algorithm: Algorithm::Paper,
@@ -175,8 +183,8 @@ impl TrackerConfig {
 pub struct DetectorConfig {
     /// How often something may be found that is none, 1/min, from 0.000001 to 1000000. Default 1.
     pub false_tracks_a_minute: f64,
-    /// Over how long the background is a mean, s, from 0.1 to 10000. Default 5: clouds are others by then, and what hovers for as long is
-    /// background unless it was found before.
+    /// Over how long the background is a mean, s, from 0.1 to 10000. Default 5: clouds are others
+    /// by then, and what hovers for as long is background unless it was found before.
     pub background_s: f64,
     /// Most targets followed at once, from 1 to 1000. Default 50.
     pub max_targets: usize,
@@ -232,18 +240,33 @@ impl TrackerConfig {
         let within = |value: f64| value > 0.0 && value < 1.0;
         let visible = self.visible_probability;
         check("visible_probability", visible, within(visible), "between 0 and 1")?;
-        check("anywhere_share", self.anywhere_share, within(self.anywhere_share), "between 0 and 1")?;
+        check(
+            "anywhere_share",
+            self.anywhere_share,
+            within(self.anywhere_share),
+            "between 0 and 1",
+        )?;
         let margin = self.margin_px;
         check("margin_px", margin, (0.0..=100.0).contains(&margin), "from 0 to 100 px")?;
-        if let Similarity::CrossSpectrum(SpectralWeight { whitening, band }) = self.paper.similarity {
+        if let Similarity::CrossSpectrum(SpectralWeight { whitening, band }) = self.paper.similarity
+        {
             let good = (0.0..=1.0).contains(&whitening);
-            check("paper.similarity.cross-spectrum.whitening", f64::from(whitening), good, "from 0 to 1")?;
+            check(
+                "paper.similarity.cross-spectrum.whitening",
+                f64::from(whitening),
+                good,
+                "from 0 to 1",
+            )?;
             let good = (1e-3..=1e3).contains(&band);
-            check("paper.similarity.cross-spectrum.band", f64::from(band), good, "from 0.001 to 1000")?;
+            check(
+                "paper.similarity.cross-spectrum.band",
+                f64::from(band),
+                good,
+                "from 0.001 to 1000",
+            )?;
         }
         if self.paper.whole_gate && self.paper.extent == Extent::Linear {
-            let must =
-                "false where the extent is linear: a reference as large as the gate has one place in it";
+            let must = "false where the extent is linear: a reference as large as the gate has one place in it";
             check("paper.whole_gate", 1.0, false, must)?;
         }
         self.validate_gate_and_reference()?;
@@ -256,9 +279,19 @@ impl TrackerConfig {
                 "from 0.000001 to 1000000",
             )?;
             let most = detector.max_targets;
-            check("detector.max_targets", most as f64, (1..=1000).contains(&most), "from 1 to 1000")?;
+            check(
+                "detector.max_targets",
+                most as f64,
+                (1..=1000).contains(&most),
+                "from 1 to 1000",
+            )?;
             let memory = detector.background_s;
-            check("detector.background_s", memory, (0.1..=1e4).contains(&memory), "from 0.1 to 10000 s")?;
+            check(
+                "detector.background_s",
+                memory,
+                (0.1..=1e4).contains(&memory),
+                "from 0.1 to 10000 s",
+            )?;
         }
         Ok(())
     }

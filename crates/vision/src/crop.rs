@@ -1,4 +1,5 @@
-//! Parts of an image that can be correlated: without broken samples, and with something beyond its border.
+//! Parts of an image that can be correlated: without broken samples, and with something beyond its
+//! border.
 
 use std::ops::Range;
 
@@ -7,8 +8,8 @@ use crossfix_correlation::Plane;
 /// No camera is brighter; sums of the squares of more would lose the rest.
 pub(crate) const BRIGHTEST: f32 = 1e6;
 
-/// Makes broken samples (not finite, or beyond every brightness) black: one of them must not spoil a
-/// whole gate.
+/// Makes broken samples (not finite, or beyond every brightness) black: one of them must not spoil
+/// a whole gate.
 pub(crate) fn mend(plane: &mut Plane) {
     let broken = |sample: &f32| u32::from(!matches!(sample.abs(), level if level <= BRIGHTEST));
     // Counting is quicker than stopping at the first.
@@ -20,9 +21,9 @@ pub(crate) fn mend(plane: &mut Plane) {
     }
 }
 
-/// Beyond its border an image goes on as the mean of so many pixels inwards, and of so many on either side along the border.
-/// Single pixels drawn out are stripes of noise, and a reference with stripes of its own finds itself there; with twice as
-/// many the border of a cloud becomes an edge.
+/// Beyond its border an image goes on as the mean of so many pixels inwards, and of so many on
+/// either side along the border. Single pixels drawn out are stripes of noise, and a reference with
+/// stripes of its own finds itself there; with twice as many the border of a cloud becomes an edge.
 const INWARDS: usize = 4;
 
 /// The part of an image with its upper left corner at a place, which may lie beyond the border.
@@ -35,11 +36,16 @@ pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &
     };
     let columns = inside(corner[0], sides[0], image.width());
     let rows = inside(corner[1], sides[1], image.height());
-    if columns.is_empty() || rows.is_empty() || (columns.len() == sides[0] && rows.len() == sides[1]) {
+    if columns.is_empty()
+        || rows.is_empty()
+        || (columns.len() == sides[0] && rows.len() == sides[1])
+    {
         return;
     }
     let (left, right) = borders(&columns);
-    for border in [left, right].into_iter().filter(|border| !border.beyond(sides[0], &columns).is_empty()) {
+    for border in
+        [left, right].into_iter().filter(|border| !border.beyond(sides[0], &columns).is_empty())
+    {
         let means = rows.clone().map(|y| mean(part.row(y)[border.inwards.clone()].iter().copied()));
         let means = smoothed(&means.collect::<Vec<f32>>());
         for (y, mean) in rows.clone().zip(means) {
@@ -47,7 +53,9 @@ pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &
         }
     }
     let (upper, lower) = borders(&rows);
-    for border in [upper, lower].into_iter().filter(|border| !border.beyond(sides[1], &rows).is_empty()) {
+    for border in
+        [upper, lower].into_iter().filter(|border| !border.beyond(sides[1], &rows).is_empty())
+    {
         let means = (0..sides[0]).map(|x| mean(border.inwards.clone().map(|y| part.row(y)[x])));
         let means = smoothed(&means.collect::<Vec<f32>>());
         for y in border.beyond(sides[1], &rows) {
@@ -95,7 +103,8 @@ mod tests {
 
     #[test]
     fn beyond_the_border_the_image_goes_on_without_its_noise() {
-        let image = Plane::from_fn(40, 30, |x, y| 100.0 + if (x + y) % 2 == 0 { 9.0 } else { -9.0 });
+        let image =
+            Plane::from_fn(40, 30, |x, y| 100.0 + if (x + y) % 2 == 0 { 9.0 } else { -9.0 });
         let mut part = Plane::default();
         crop(&image, [-10, 20], [30, 30], &mut part);
         for y in 0..30 {
@@ -112,7 +121,8 @@ mod tests {
 
     #[test]
     fn broken_samples_become_black_and_others_stay() {
-        let mut plane = Plane::from_fn(3, 2, |x, y| [[1.0, f32::NAN, 2.0], [1e30, 3.0, -1e30]][y][x]);
+        let mut plane =
+            Plane::from_fn(3, 2, |x, y| [[1.0, f32::NAN, 2.0], [1e30, 3.0, -1e30]][y][x]);
         mend(&mut plane);
         assert_eq!(plane.samples(), [1.0, 0.0, 2.0, 0.0, 3.0, 0.0]);
     }

@@ -1,4 +1,5 @@
-//! Figure and ground: the part of an image that stands out from what is about it, brighter or darker.
+//! Figure and ground: the part of an image that stands out from what is about it, brighter or
+//! darker.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -12,26 +13,30 @@ use crate::{ImagePoint, PixelBox};
 
 /// The figure reaches to where it stands out by less than this share of its top ...
 const SHARE_OF_TOP: f32 = 0.3;
-/// ... or by less than so many standard deviations of the ground, but not further up than half of the top.
+/// ... or by less than so many standard deviations of the ground, but not further up than half of
+/// the top.
 const ABOVE_GROUND: f32 = 4.0;
 const MOST_OF_TOP: f32 = 0.5;
-/// Parts that are apart by less than this share of the longer side are one thing: rotors, legs and the body.
+/// Parts that are apart by less than this share of the longer side are one thing: rotors, legs and
+/// the body.
 const GAP: f64 = 0.35;
-/// How far a given box may lie beside its target, standard deviations: further off it is another thing's.
+/// How far a given box may lie beside its target, standard deviations: further off it is another
+/// thing's.
 const FURTHEST: f64 = 2.5;
-/// Windows that its figure is sought in, from as wide as that down to the box itself: what stands out beside the box
-/// (a house below a drone) is in none of the last.
+/// Windows that its figure is sought in, from as wide as that down to the box itself: what stands
+/// out beside the box (a house below a drone) is in none of the last.
 const WINDOWS: u32 = 4;
-/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a box twice as large;
-/// twice as wide a one takes a second.
+/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a
+/// box twice as large; twice as wide a one takes a second.
 const SIDES: RangeInclusive<usize> = 5..=129;
 /// Pixels about a figure that the widest window has beside.
 const GROUND_PX: f64 = 2.0;
-/// A figure is taken for the target if its top is so many standard deviations of the noise: in noise alone the highest of
-/// a thousand pixels is 4. With half of it boxes in noise are moved by noise, with twice as much only boxes on what the eye
-/// sees at once are mended.
+/// A figure is taken for the target if its top is so many standard deviations of the noise: in
+/// noise alone the highest of a thousand pixels is 4. With half of it boxes in noise are moved by
+/// noise, with twice as much only boxes on what the eye sees at once are mended.
 const LEAST_TOP: f32 = 9.0;
-/// ... and if this share of all that stands out is its own: else nobody knows which of two was meant.
+/// ... and if this share of all that stands out is its own: else nobody knows which of two was
+/// meant.
 const LEAST_SHARE: f32 = 0.8;
 /// A box is right as it is if its figure is longer than this share of it, both ways, ...
 const LEAST_FILLED: f64 = 0.6;
@@ -50,7 +55,8 @@ pub(crate) struct Region {
 impl Region {
     /// Its box, of at least some sides, in the image whose pixel `corner` is the window's first.
     ///
-    /// It lies about the middle of what stands out, which is the same for cameras on all sides; the corners' is not.
+    /// It lies about the middle of what stands out, which is the same for cameras on all sides; the
+    /// corners' is not.
     pub(crate) fn place(&self, corner: [isize; 2], least: [f64; 2]) -> PixelBox {
         let Self { low, high, middle, .. } = *self;
         let side = |i: usize| {
@@ -67,10 +73,11 @@ fn threshold(top: f32, spread: f32) -> f32 {
     (SHARE_OF_TOP * top).max(ABOVE_GROUND * spread).min(MOST_OF_TOP * top)
 }
 
-/// The figure about a place: all that stands out, and is connected with it over gaps; `None` if it goes on beyond the
-/// window.
+/// The figure about a place: all that stands out, and is connected with it over gaps; `None` if it
+/// goes on beyond the window.
 ///
-/// `off` is by how much each pixel differs from a ground of standard deviation `spread`; `gap` is the least gap, px.
+/// `off` is by how much each pixel differs from a ground of standard deviation `spread`; `gap` is
+/// the least gap, px.
 pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize) -> Option<Region> {
     let threshold = threshold(off.row(seed[1])[seed[0]], spread);
     loop {
@@ -84,7 +91,8 @@ pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize)
     }
 }
 
-/// What is above a threshold and connected with a place, over gaps of so many pixels; `None` if it reaches the border.
+/// What is above a threshold and connected with a place, over gaps of so many pixels; `None` if it
+/// reaches the border.
 fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Option<Region> {
     let (width, height) = (off.width(), off.height());
     let weight = |level: &f32| if *level >= threshold { *level } else { 0.0 };
@@ -109,10 +117,16 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
             }
         }
     }
-    (sum > 0.0).then(|| Region { low, high, middle: moments.map(|moment| moment / sum), weight: sum })
+    (sum > 0.0).then(|| Region {
+        low,
+        high,
+        middle: moments.map(|moment| moment / sum),
+        weight: sum,
+    })
 }
 
-/// Means of three by three pixels about those of a part of an image; beyond the border the border goes on.
+/// Means of three by three pixels about those of a part of an image; beyond the border the border
+/// goes on.
 pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usize; 2]) -> Plane {
     let mut part = image.crop(corner[0] - 1, corner[1] - 1, width + 2, height + 2);
     mend(&mut part);
@@ -121,8 +135,9 @@ pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usiz
     })
 }
 
-/// By how much each pixel stands out of a window: how far one has to climb, or to descend, at least on every way from it
-/// to the border. What goes on beyond the border (a horizon, a mast) does not stand out, whatever it is like.
+/// By how much each pixel stands out of a window: how far one has to climb, or to descend, at least
+/// on every way from it to the border. What goes on beyond the border (a horizon, a mast) does not
+/// stand out, whatever it is like.
 fn standing_out(window: &Plane) -> Plane {
     let upside_down = Plane::from_fn(window.width(), window.height(), |x, y| -window.row(y)[x]);
     let [dark, bright] = [window, &upside_down].map(depths);
@@ -151,7 +166,8 @@ impl PartialOrd for Shore {
     }
 }
 
-/// How deep the water is on each pixel if it is poured over a landscape and runs off at its border (priority flood).
+/// How deep the water is on each pixel if it is poured over a landscape and runs off at its border
+/// (priority flood).
 fn depths(landscape: &Plane) -> Plane {
     let (width, height) = (landscape.width(), landscape.height());
     let mut surface = Plane::from_fn(width, height, |_, _| f32::INFINITY);
@@ -177,10 +193,11 @@ fn depths(landscape: &Plane) -> Plane {
     Plane::from_fn(width, height, |x, y| surface.row(y)[x] - landscape.row(y)[x])
 }
 
-/// The box of the target that a given box was meant for: the given one where it fits, and else that of the one thing that
-/// stands out there, if there is one.
+/// The box of the target that a given box was meant for: the given one where it fits, and else that
+/// of the one thing that stands out there, if there is one.
 ///
-/// `given_sd` is how well a given box lies on its target, px, and `noise_sd` the standard deviation of the image's noise.
+/// `given_sd` is how well a given box lies on its target, px, and `noise_sd` the standard deviation
+/// of the image's noise.
 pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32) -> PixelBox {
     let windows = (0..WINDOWS).rev().map(|window| f64::from(window) / f64::from(WINDOWS - 1));
     let mut figures = windows.filter_map(|share| {
@@ -192,14 +209,16 @@ pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32
 /// Whether a box lies on its figure.
 fn fits(given: PixelBox, figure: PixelBox) -> bool {
     let (at, is) = (given.centre(), figure.centre());
-    let sides = [(given.width, figure.width, is.x - at.x), (given.height, figure.height, is.y - at.y)];
+    let sides =
+        [(given.width, figure.width, is.x - at.x), (given.height, figure.height, is.y - at.y)];
     sides.iter().all(|(side, filled, off)| {
         let is_filled = *filled >= LEAST_FILLED * side && *side >= LEAST_FILLED * filled;
         is_filled && off.abs() <= MOST_OFF * side + 1.0
     })
 }
 
-/// The box of the one thing that stands out in a window that is wider than a given box by so many pixels on each side.
+/// The box of the one thing that stands out in a window that is wider than a given box by so many
+/// pixels on each side.
 fn figure_within(
     image: &Plane,
     given: PixelBox,
@@ -225,10 +244,12 @@ fn figure_within(
     let spread = (OF_MEDIAN * median(&mut off.samples().to_vec())).max(noise_sd / 3.0);
 
     // Inside of the box everything is as likely to have been meant.
-    let beside_box =
-        |i: usize, index: usize| (((ranges[i].start + index) as f64 - at[i]).abs() - sides[i] / 2.0).max(0.0);
+    let beside_box = |i: usize, index: usize| {
+        (((ranges[i].start + index) as f64 - at[i]).abs() - sides[i] / 2.0).max(0.0)
+    };
     let likely = |[x, y]: [usize; 2]| {
-        (-0.5 * (beside_box(0, x).powi(2) + beside_box(1, y).powi(2)) / given_sd.powi(2)).exp() as f32
+        (-0.5 * (beside_box(0, x).powi(2) + beside_box(1, y).powi(2)) / given_sd.powi(2)).exp()
+            as f32
     };
     let level = |[x, y]: [usize; 2]| off.row(y)[x];
     let places = (0..off.height()).flat_map(|y| (0..off.width()).map(move |x| [x, y]));

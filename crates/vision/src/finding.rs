@@ -1,4 +1,5 @@
-//! What is new in an image: boxes that somebody gave, and what the detector finds, which may be a target that was lost.
+//! What is new in an image: boxes that somebody gave, and what the detector finds, which may be a
+//! target that was lost.
 
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
@@ -8,21 +9,28 @@ use crate::detector::{Detector, Found, Known};
 use crate::figure::meant;
 use crate::frame::{Frame, Step};
 use crate::tracker::{Followed, Follower, Origin, box_of, describe};
-use crate::{DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig};
+use crate::{
+    DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
+};
 
-/// Most things that are followed because they may be a target that is lost: each costs as much as one. With 20 an image of a
-/// panning camera takes up to 42 ms in place of 14, and no more is found.
+/// Most things that are followed because they may be a target that is lost: each costs as much as
+/// one. With 20 an image of a panning camera takes up to 42 ms in place of 14, and no more is
+/// found.
 const MOST_CANDIDATES: usize = 6;
-/// A candidate is shown in a lost target's place after so long, s: as long as what a search has found is on probation. With
-/// half of it half a percent more of a still camera's frames are right, and as many less of a panning one's.
+/// A candidate is shown in a lost target's place after so long, s: as long as what a search has
+/// found is on probation. With half of it half a percent more of a still camera's frames are right,
+/// and as many less of a panning one's.
 const CANDIDATE_S: f64 = 0.5;
-/// Its mean side may be so many times longer or shorter: of a drone before trees the brightest part is found.
+/// Its mean side may be so many times longer or shorter: of a drone before trees the brightest part
+/// is found.
 const STAND_IN_SIZES: f64 = 4.0;
-/// The probability that it is the target, at most: nothing is known for it but that it moves, and nothing else has been found.
+/// The probability that it is the target, at most: nothing is known for it but that it moves, and
+/// nothing else has been found.
 const STAND_IN_CERTAINTY: f64 = 0.5;
 
 impl ImageTracker {
-    /// Takes up what somebody gave, and what the detector finds: a target that was lost, or a new one.
+    /// Takes up what somebody gave, and what the detector finds: a target that was lost, or a new
+    /// one.
     pub(crate) fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting);
         let found = self.detect(image, interval, &given);
@@ -33,7 +41,8 @@ impl ImageTracker {
         // What stands in for a target may look like it by now.
         for index in 0..self.followed.len() {
             let stand_in = self.followed[index].stand_in;
-            let place = self.followed.iter().find(|f| Some(f.id) == stand_in).map(|f| box_of(&f.target));
+            let place =
+                self.followed.iter().find(|f| Some(f.id) == stand_in).map(|f| box_of(&f.target));
             if let Some(place) = place {
                 self.is_lost_one(image, place, time, interval);
             }
@@ -95,7 +104,9 @@ impl ImageTracker {
             let stand_in = if is_lost { self.stand_in_of(followed, time) } else { None };
             self.followed[lost].stand_in = stand_in;
             let track = |id| self.tracks.iter().position(|track| track.id == id);
-            if let (Some(shown), Some(instead)) = (track(self.followed[lost].id), stand_in.and_then(track)) {
+            if let (Some(shown), Some(instead)) =
+                (track(self.followed[lost].id), stand_in.and_then(track))
+            {
                 let certainty = self.tracks[instead].certainty.min(STAND_IN_CERTAINTY);
                 self.tracks[shown] =
                     ImageTrack { id: self.tracks[shown].id, certainty, ..self.tracks[instead] };
@@ -104,7 +115,8 @@ impl ImageTracker {
         self.tracks.retain(|track| track.id.0 <= self.next_candidate);
     }
 
-    /// The candidate that stands in for a lost target: the one that did before, or one that does for no other.
+    /// The candidate that stands in for a lost target: the one that did before, or one that does
+    /// for no other.
     fn stand_in_of(&self, lost: &Followed, time: Timestamp) -> Option<ImageTrackId> {
         let [width, height] = lost.target.size();
         let fits = |followed: &Followed| {
@@ -118,8 +130,11 @@ impl ImageTracker {
                 && self.followed.iter().all(|other| other.stand_in != Some(followed.id))
         };
         let is_before = |followed: &&Followed| Some(followed.id) == lost.stand_in;
-        let before = self.followed.iter().find(is_before).filter(|before| !before.target.is_searching());
-        before.or_else(|| self.followed.iter().find(|followed| fits(followed))).map(|followed| followed.id)
+        let before =
+            self.followed.iter().find(is_before).filter(|before| !before.target.is_searching());
+        before
+            .or_else(|| self.followed.iter().find(|followed| fits(followed)))
+            .map(|followed| followed.id)
     }
 
     /// The box of the target that a given box was meant for.
@@ -141,7 +156,8 @@ impl ImageTracker {
         if self.config.detector.is_some() || self.config.algorithm == Algorithm::Paper {
             return;
         }
-        if self.followed.iter().all(|followed| followed.is_candidate() || followed.target.is_seen()) {
+        if self.followed.iter().all(|followed| followed.is_candidate() || followed.target.is_seen())
+        {
             self.detector = None;
             self.followed.retain(|followed| !followed.is_candidate());
         } else if self.detector.is_none()
@@ -151,7 +167,8 @@ impl ImageTracker {
         }
     }
 
-    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for the scene is given up.
+    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for
+    /// the scene is given up.
     fn detect(&mut self, image: &Plane, interval: f64, given: &[PixelBox]) -> Vec<Found> {
         self.call_detector();
         let Some(detector) = &mut self.detector else { return Vec::new() };
@@ -168,7 +185,8 @@ impl ImageTracker {
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
             }
         }
-        // One that is lost is no longer where it is guessed to be: it may be found there, and something else too.
+        // One that is lost is no longer where it is guessed to be: it may be found there, and
+        // something else too.
         let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
         let known = seen.map(|followed| Known {
             id: followed.id,
@@ -176,8 +194,11 @@ impl ImageTracker {
             is_watched: followed.has_moved(),
         });
         // The number of a track to be is nobody's.
-        let given =
-            given.iter().map(|place| Known { id: ImageTrackId(u64::MAX), place: *place, is_watched: false });
+        let given = given.iter().map(|place| Known {
+            id: ImageTrackId(u64::MAX),
+            place: *place,
+            is_watched: false,
+        });
         let known: Vec<Known> = known.chain(given).collect();
         let findings = detector.step(image, interval, turned, &known);
         self.followed.retain(|followed| !findings.scene.contains(&followed.id));
@@ -185,8 +206,15 @@ impl ImageTracker {
         findings.found
     }
 
-    /// Whether what the detector has found is a target that was lost: then that one goes on there, the likeliest of them.
-    fn is_lost_one(&mut self, image: &Plane, place: PixelBox, time: Timestamp, interval: f64) -> bool {
+    /// Whether what the detector has found is a target that was lost: then that one goes on there,
+    /// the likeliest of them.
+    fn is_lost_one(
+        &mut self,
+        image: &Plane,
+        place: PixelBox,
+        time: Timestamp,
+        interval: f64,
+    ) -> bool {
         let frame = Frame {
             image,
             interval,
@@ -197,12 +225,14 @@ impl ImageTracker {
             config: &self.config,
         };
         let bench = &mut self.bench;
-        let sightings = self.followed.iter_mut().filter(|f| !f.is_candidate()).filter_map(|followed| {
-            let Follower::Posterior(target) = &mut followed.target else { return None };
-            let seen = target.sighting(frame, place, bench)?;
-            Some((followed, seen))
-        });
-        let best = sightings.max_by(|(_, one), (_, other)| one.log_ratio.total_cmp(&other.log_ratio));
+        let sightings =
+            self.followed.iter_mut().filter(|f| !f.is_candidate()).filter_map(|followed| {
+                let Follower::Posterior(target) = &mut followed.target else { return None };
+                let seen = target.sighting(frame, place, bench)?;
+                Some((followed, seen))
+            });
+        let best =
+            sightings.max_by(|(_, one), (_, other)| one.log_ratio.total_cmp(&other.log_ratio));
         let Some((followed, seen)) = best else { return false };
         let Follower::Posterior(target) = &mut followed.target else { return false };
         let step = target.go_on_at(frame, seen, &mut self.bench);

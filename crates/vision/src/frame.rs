@@ -19,10 +19,11 @@ pub(crate) struct Frame<'a> {
     pub(crate) keepsake: Option<&'a Plane>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a Scene,
-    /// By how much everything in the image has moved since the scene was looked at last, as the camera turned, px.
+    /// By how much everything in the image has moved since the scene was looked at last, as the
+    /// camera turned, px.
     pub(crate) scene_moved: [f64; 2],
-    /// Whether it is the target's turn to be searched for, if it is lost: one a frame, as a search costs as much as many
-    /// targets that are followed.
+    /// Whether it is the target's turn to be searched for, if it is lost: one a frame, as a search
+    /// costs as much as many targets that are followed.
     pub(crate) may_search: bool,
     pub(crate) config: &'a TrackerConfig,
 }

@@ -1,4 +1,5 @@
-//! The gate: the part of an image in which a target is looked for, and the posterior over the placements of its reference there.
+//! The gate: the part of an image in which a target is looked for, and the posterior over the
+//! placements of its reference there.
 
 use crossfix_correlation::Plane;
 use crossfix_filter::Gate;
@@ -12,9 +13,10 @@ use crate::motion::Motion;
 use crate::posterior::{Posterior, Prior};
 use crate::target::{Target, Workbench};
 
-/// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target cannot be seen when it cannot. A
-/// blur is shorter, a cloud longer. When it was chosen, of ten seeds' sequences 3.8 % of the frames were lost with half
-/// of it in place of 1.7, and with twice as much, a version earlier, 2.7 in place of 2.2.
+/// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target
+/// cannot be seen when it cannot. A blur is shorter, a cloud longer. When it was chosen, of ten
+/// seeds' sequences 3.8 % of the frames were lost with half of it in place of 1.7, and with twice
+/// as much, a version earlier, 2.7 in place of 2.2.
 const HIDDEN_S: f64 = 0.05;
 /// Log ratio of a placement outside the image.
 const IMPOSSIBLE: f32 = -50.0;
@@ -43,8 +45,8 @@ impl Region {
 }
 
 impl Target {
-    /// Half sides of the gate (000, section 1; 001, 5.12): how far from the prediction the reference is
-    /// placed.
+    /// Half sides of the gate (Herasymenko 2021, section 1; Lytvynets 2020, eq. 5.12): how far from
+    /// the prediction the reference is placed.
     pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
         let reference = self.appearance.working.image();
         let expected = self.motion.found();
@@ -54,7 +56,9 @@ impl Target {
             let sigmas = match config.gate {
                 GateRule::ThreeSided => 0.0,
                 GateRule::Innovation { sigmas } => sigmas,
-                GateRule::Ellipsoid { probability } => Gate::with_probability(probability).threshold().sqrt(),
+                GateRule::Ellipsoid { probability } => {
+                    Gate::with_probability(probability).threshold().sqrt()
+                }
             };
             let spread = (sigmas * expected[i].variance.sqrt()).ceil();
             (side as f64).max(spread).min(most as f64) as usize
@@ -72,9 +76,13 @@ impl Target {
         [reference.width(), reference.height()].map(|side| (side / 8).max(2))
     }
 
-    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as much of what is none;
-    /// `None` where that is not much less, or the papers' gate is asked for.
-    pub(crate) fn middle_of_gate(&self, whole: [usize; 2], config: &TrackerConfig) -> Option<[usize; 2]> {
+    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as
+    /// much of what is none; `None` where that is not much less, or the papers' gate is asked for.
+    pub(crate) fn middle_of_gate(
+        &self,
+        whole: [usize; 2],
+        config: &TrackerConfig,
+    ) -> Option<[usize; 2]> {
         let GateRule::Innovation { sigmas } = config.gate else { return None };
         if !self.hypotheses.is_empty() {
             return None;
@@ -87,9 +95,15 @@ impl Target {
         (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
     }
 
-    /// What is expected of the place by some filters, on the placements of a region; `hidden` is how likely the target could
-    /// not be seen in the image before.
-    pub(crate) fn prior(&self, motion: &Motion, hidden: f64, region: Region, frame: Frame<'_>) -> Prior {
+    /// What is expected of the place by some filters, on the placements of a region; `hidden` is
+    /// how likely the target could not be seen in the image before.
+    pub(crate) fn prior(
+        &self,
+        motion: &Motion,
+        hidden: f64,
+        region: Region,
+        frame: Frame<'_>,
+    ) -> Prior {
         let config = frame.config;
         let expected = motion.found();
         let stays_hidden = (-frame.interval / HIDDEN_S).exp();
@@ -105,14 +119,24 @@ impl Target {
         }
     }
 
-    /// The posterior over the placements in a region, of which the image is left in the bench's gate.
-    pub(crate) fn posterior(&self, frame: Frame<'_>, region: Region, bench: &mut Workbench) -> Posterior {
+    /// The posterior over the placements in a region, of which the image is left in the bench's
+    /// gate.
+    pub(crate) fn posterior(
+        &self,
+        frame: Frame<'_>,
+        region: Region,
+        bench: &mut Workbench,
+    ) -> Posterior {
         let Frame { image, config, .. } = frame;
         let Region { origin, corner, sides, .. } = region;
         crop(image, corner, sides, &mut bench.gate);
         bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
-        let expected =
-            self.expectation(self.noise, self.appearance.energy(), self.appearance.pixels(), config);
+        let expected = self.expectation(
+            self.noise,
+            self.appearance.energy(),
+            self.appearance.pixels(),
+            config,
+        );
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
         mask_outside(&mut bench.ratios, origin, image);
         let prior = self.prior(&self.motion, self.hidden, region, frame);

@@ -1,6 +1,8 @@
-//! Several places where a target may be, each with filters of its own, as long as none of them is sure.
+//! Several places where a target may be, each with filters of its own, as long as none of them is
+//! sure.
 //!
-//! One Gaussian cannot hold two places: their mean is neither, and in the next image both lie outside of what it expects.
+//! One Gaussian cannot hold two places: their mean is neither, and in the next image both lie
+//! outside of what it expects.
 
 use crossfix_filter::AxisMeasurement;
 
@@ -19,16 +21,20 @@ const MOST: usize = 12;
 const MOST_PEAKS: usize = 4;
 /// A place with less of a hypothesis, and a hypothesis with less of the target, is dropped.
 const LEAST: f64 = 0.01;
-/// Hypotheses are one if their places and velocities differ by less than so many standard deviations.
+/// Hypotheses are one if their places and velocities differ by less than so many standard
+/// deviations.
 const SAME: f64 = 2.0;
-/// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the target has been elsewhere.
+/// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the
+/// target has been elsewhere.
 const UNEXPECTED: f64 = 16.0;
-/// A turn of the camera by less than this is within what is not known of a target's motion anyway, px.
+/// A turn of the camera by less than this is within what is not known of a target's motion anyway,
+/// px.
 const LEAST_MOVE_PX: f64 = 2.0;
 /// A target of which this long no place is sure counts as lost, s, ...
 const LOST_S: f64 = 0.4;
-/// ... and is searched for after so long, s: it is fainter than noise for a second as a cloud passes. With a fifth of it
-/// 2.9 % of the frames of nine seeds' sequences are lost in place of 2.3, with twice as much 2.4.
+/// ... and is searched for after so long, s: it is fainter than noise for a second as a cloud
+/// passes. With a fifth of it 2.9 % of the frames of nine seeds' sequences are lost in place of
+/// 2.3, with twice as much 2.4.
 const LONGEST_S: f64 = 2.0;
 
 /// A place where the target may be, and how it moves then.
@@ -48,7 +54,8 @@ impl Hypothesis {
         [x, y]
     }
 
-    /// Whether two say the same; where it has been seen and where it has been waited for are not the same.
+    /// Whether two say the same; where it has been seen and where it has been waited for are not
+    /// the same.
     fn is_like(&self, other: &Self) -> bool {
         let (here, there) = (self.motion.found(), other.motion.found());
         let (one, two) = (self.motion.velocity(), other.motion.velocity());
@@ -100,7 +107,8 @@ impl Hypotheses {
         self.all.extend(moved);
     }
 
-    /// How far they are from a place, mean squares of either axis, px^2: what its variance does not hold.
+    /// How far they are from a place, mean squares of either axis, px^2: what its variance does not
+    /// hold.
     pub(crate) fn spread(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
@@ -120,8 +128,8 @@ impl Hypotheses {
 }
 
 impl Target {
-    /// The camera may have turned: then everything in its image has moved, the target too. Light that changes may be taken
-    /// for a turn, so it may have stayed as well.
+    /// The camera may have turned: then everything in its image has moved, the target too. Light
+    /// that changes may be taken for a turn, so it may have stayed as well.
     pub(crate) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
         let by = frame.scene_moved;
         let is_followed = !self.is_searching() && !self.identity.is_on_probation();
@@ -145,10 +153,13 @@ impl Target {
     /// Whether a posterior leaves more than one place to be kept.
     pub(crate) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
         let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
-        in_doubt && matches!(config.gate, GateRule::Innovation { .. }) && !self.identity.is_on_probation()
+        in_doubt
+            && matches!(config.gate, GateRule::Innovation { .. })
+            && !self.identity.is_on_probation()
     }
 
-    /// Follows all places where the target may be into the image whose log ratios are in the bench's map.
+    /// Follows all places where the target may be into the image whose log ratios are in the
+    /// bench's map.
     pub(crate) fn follow_hypotheses(
         &mut self,
         frame: Frame<'_>,
@@ -175,7 +186,8 @@ impl Target {
             self.missed += 1;
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
         };
-        let seen: f64 = self.hypotheses.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum();
+        let seen: f64 =
+            self.hypotheses.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum();
         (self.motion, self.hidden) = (best.motion.clone(), best.hidden);
         let Some([column, row]) = best.peak else {
             self.hypotheses.doubted_s += frame.interval;
@@ -213,7 +225,8 @@ impl Target {
         }
     }
 
-    /// The likeliest of the hypotheses, with the posterior that it leads to, if all of them lead to one place.
+    /// The likeliest of the hypotheses, with the posterior that it leads to, if all of them lead to
+    /// one place.
     fn one_place(
         &self,
         before: &[Hypothesis],
@@ -225,15 +238,22 @@ impl Target {
         let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(before.len());
         let mut all = 0.0;
         for (index, hypothesis) in before.iter().enumerate() {
-            let posterior = bench
-                .map
-                .of(&bench.ratios, &self.prior(&hypothesis.motion, hypothesis.hidden, region, frame));
+            let posterior = bench.map.of(
+                &bench.ratios,
+                &self.prior(&hypothesis.motion, hypothesis.hidden, region, frame),
+            );
             all += hypothesis.weight * posterior.evidence;
-            ways.push((hypothesis.weight * posterior.evidence * posterior.near.mass, index, posterior));
+            ways.push((
+                hypothesis.weight * posterior.evidence * posterior.near.mass,
+                index,
+                posterior,
+            ));
         }
         let (_, best, posterior) = *ways.iter().max_by(|one, other| one.0.total_cmp(&other.0))?;
-        let here = |peak: [usize; 2]| (0..2).all(|i| peak[i].abs_diff(posterior.peak[i]) <= near[i]);
-        let there: f64 = ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
+        let here =
+            |peak: [usize; 2]| (0..2).all(|i| peak[i].abs_diff(posterior.peak[i]) <= near[i]);
+        let there: f64 =
+            ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
         (there > DOUBT * all).then(|| (before[best].motion.clone(), posterior))
     }
 
@@ -292,7 +312,12 @@ impl Target {
                 } else {
                     motion.restart(at, config.search_velocity_sd_px);
                 }
-                branches.push(Hypothesis { weight: weight * share, motion, hidden: 0.0, peak: Some(peak) });
+                branches.push(Hypothesis {
+                    weight: weight * share,
+                    motion,
+                    hidden: 0.0,
+                    peak: Some(peak),
+                });
             }
         }
         branches

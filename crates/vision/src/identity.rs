@@ -1,4 +1,5 @@
-//! Whether what is followed is the target: it has come to where it is, and the scene was there before.
+//! Whether what is followed is the target: it has come to where it is, and the scene was there
+//! before.
 
 use crate::ImagePoint;
 use crate::arrival::Placed;
@@ -8,19 +9,22 @@ use crate::motion::Motion;
 use crate::scene::{Picture, Scene};
 use crate::target::{Target, Workbench};
 
-/// A target that was found again is believed after so long, s: until then a mistake costs what is known of where it went,
-/// and nothing is learnt of it.
+/// A target that was found again is believed after so long, s: until then a mistake costs what is
+/// known of where it went, and nothing is learnt of it.
 const PROBATION_S: f64 = 0.5;
-/// How often the scene takes the place of a target that is followed, 1/s, and how often that is over. With ten times the
-/// first, certainty falls where nothing is known against the target; with a tenth, a cloud is followed for seconds.
+/// How often the scene takes the place of a target that is followed, 1/s, and how often that is
+/// over. With ten times the first, certainty falls where nothing is known against the target; with
+/// a tenth, a cloud is followed for seconds.
 const GOES_PER_S: f64 = 0.1;
 const COMES_PER_S: f64 = 2.0;
-/// The probability that what a search has found is the target: the search has asked more of it than of what is followed.
+/// The probability that what a search has found is the target: the search has asked more of it than
+/// of what is followed.
 const FOUND: f64 = 0.9;
-/// Standard deviation of a target's contrast about its usual one, as a share of that: in the third of a second that a cloud's
-/// edge takes.
+/// Standard deviation of a target's contrast about its usual one, as a share of that: in the third
+/// of a second that a cloud's edge takes.
 const CONTRAST_SD: f64 = 0.3;
-/// Standard deviation of the best of many placements in noise, over that of one: a third to a half of it.
+/// Standard deviation of the best of many placements in noise, over that of one: a third to a half
+/// of it.
 const BEST_SD: f64 = 0.5;
 /// With a reference of which less than this share is the target's nobody knows the usual contrast.
 const CLEAR: f64 = 0.9;
@@ -38,7 +42,8 @@ pub(crate) struct Identity {
     in_pictures: Vec<(u64, ImagePoint)>,
     /// How fast it went when it was last seen for sure, px/s, ...
     speed_px_s: f64,
-    /// ... and where that was in the scene: its place in the image and how far the camera had turned, px.
+    /// ... and where that was in the scene: its place in the image and how far the camera had
+    /// turned, px.
     last_in_scene: Option<[f64; 2]>,
     /// What was known before it was found again, as long as that is not sure.
     probation: Option<Probation>,
@@ -109,11 +114,13 @@ impl Target {
         in_pictures.push((number, self.last_seen));
     }
 
-    /// Log-likelihood ratio of the target's having come to a place against what is there having been there before, by the
-    /// first picture of the scene that tells, and by the first that shows whether it turns with the camera; 0 if none does.
+    /// Log-likelihood ratio of the target's having come to a place against what is there having
+    /// been there before, by the first picture of the scene that tells, and by the first that shows
+    /// whether it turns with the camera; 0 if none does.
     ///
-    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as fast as when it was last seen,
-    /// or as it must have to be here by now; one that hovered, and is where it was, may be in all of them.
+    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as
+    /// fast as when it was last seen, or as it must have to be here by now; one that hovered, and
+    /// is where it was, may be in all of them.
     pub(crate) fn arrival_log_ratio(
         &self,
         frame: Frame<'_>,
@@ -133,9 +140,11 @@ impl Target {
         let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
         let speed = self.identity.speed_px_s.max(self.least_speed(frame, place));
         let mut against = |picture: &Picture, then: ImagePoint| {
-            let seen = self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
+            let seen =
+                self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
-            let was_lost = self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
+            let was_lost =
+                self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
             let has_moved_on = speed * picture.age_s() > longest;
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
@@ -156,14 +165,16 @@ impl Target {
     fn least_speed(&self, frame: Frame<'_>, place: ImagePoint) -> f64 {
         let Some([x, y]) = self.identity.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
-        let lost_s = self.identity.probation.as_ref().map_or(self.unseen_s, |probation| probation.unseen_s);
+        let lost_s =
+            self.identity.probation.as_ref().map_or(self.unseen_s, |probation| probation.unseen_s);
         (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
     }
 
-    /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against its being that of the best
-    /// of so many placements in noise.
+    /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against
+    /// its being that of the best of so many placements in noise.
     fn above_noise_log_ratio(&self, contrast: f64, placements: f64) -> f64 {
-        let deviation = f64::from(self.noise / self.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
+        let deviation =
+            f64::from(self.noise / self.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
         let clear = f64::from(self.appearance.clear_share());
         if clear < CLEAR {
             return 0.0;
@@ -175,8 +186,9 @@ impl Target {
         (target - normal(contrast - best_of_noise, BEST_SD * deviation)).clamp(-MOST, 0.0)
     }
 
-    /// The probability that what is followed is the target and neither the scene nor noise: a chain of two states that sees
-    /// whether what is at a place has come there, and stands out as the target does.
+    /// The probability that what is followed is the target and neither the scene nor noise: a chain
+    /// of two states that sees whether what is at a place has come there, and stands out as the
+    /// target does.
     pub(crate) fn doubt(&mut self, frame: Frame<'_>, look: Look, bench: &mut Workbench) -> f64 {
         // Images that follow each other sooner tell no more together than one.
         let share = (frame.interval / FRAME_INTERVAL).min(1.0);
@@ -203,8 +215,8 @@ impl Target {
         self.identity.is_there = FOUND;
     }
 
-    /// Follows what a search has found. If it is lost again soon it was something else, and the search goes on from what
-    /// was known before.
+    /// Follows what a search has found. If it is lost again soon it was something else, and the
+    /// search goes on from what was known before.
     pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
         if let Some(probation) = &mut self.identity.probation {
             probation.motion.predict(frame.interval, frame.sides());
@@ -214,7 +226,8 @@ impl Target {
         if self.is_searching()
             && let Some(before) = self.identity.probation.take()
         {
-            (self.motion, self.unseen_s, self.last_seen) = (before.motion, before.unseen_s, before.last_seen);
+            (self.motion, self.unseen_s, self.last_seen) =
+                (before.motion, before.unseen_s, before.last_seen);
             self.missed = self.missed.max(before.missed);
             self.take_last_look();
             self.identity.in_pictures.retain(|(number, _)| *number <= before.picture);

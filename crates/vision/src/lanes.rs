@@ -1,5 +1,5 @@
-//! Exponential and logarithm in single precision that the compiler can run in lanes: no branches, no
-//! calls. Good to 1e-5 of the result, and to 1e-6 of the logarithm.
+//! Exponential and logarithm in single precision that the compiler can run in lanes: no branches,
+//! no calls. Good to 1e-5 of the result, and to 1e-6 of the logarithm.
 
 use std::ops::{Add, Div, Mul, Sub};
 
@@ -11,8 +11,9 @@ pub(crate) fn exp(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     let whole = (x + ROUND) - ROUND;
     let t = (x - whole) * std::f32::consts::LN_2;
-    let series =
-        1.0 + t * (1.0 + t * (0.5 + t * (1.0 / 6.0 + t * (1.0 / 24.0 + t * (1.0 / 120.0 + t / 720.0)))));
+    let series = 1.0
+        + t * (1.0
+            + t * (0.5 + t * (1.0 / 6.0 + t * (1.0 / 24.0 + t * (1.0 / 120.0 + t / 720.0)))));
     f32::from_bits(((whole as i32 + 127) << 23) as u32) * series
 }
 

@@ -1,5 +1,5 @@
 //! The agent's eye: finds small targets in one image stream and follows them
-//! by correlation, with a Kalman filter on each image axis (000, 001).
+//! by correlation, with a Kalman filter on each image axis (Herasymenko 2021, Lytvynets 2020).
 //!
 //! [`ImageTracker`] is a pure state machine: images with their times go in,
 //! the tracks of each image come out.
@@ -95,7 +95,8 @@ pub struct PixelBox {
 const FARTHEST: f64 = 1e6;
 
 impl ImagePoint {
-    /// Whether the numbers describe a place that an image can have, or that lies not too far off it.
+    /// Whether the numbers describe a place that an image can have, or that lies not too far off
+    /// it.
     pub fn is_possible(&self) -> bool {
         // A NaN is not.
         self.x.abs() <= FARTHEST && self.y.abs() <= FARTHEST
@@ -110,12 +111,19 @@ impl PixelBox {
 
     /// The box of given sides about a place.
     pub fn about(centre: ImagePoint, width: f64, height: f64) -> Self {
-        Self { x: centre.x - (width - 1.0) / 2.0, y: centre.y - (height - 1.0) / 2.0, width, height }
+        Self {
+            x: centre.x - (width - 1.0) / 2.0,
+            y: centre.y - (height - 1.0) / 2.0,
+            width,
+            height,
+        }
     }
 
     /// Whether the numbers describe a box that a target can have.
     pub fn is_possible(&self) -> bool {
         let corner = ImagePoint { x: self.x, y: self.y };
-        corner.is_possible() && (1.0..=1000.0).contains(&self.width) && (1.0..=1000.0).contains(&self.height)
+        corner.is_possible()
+            && (1.0..=1000.0).contains(&self.width)
+            && (1.0..=1000.0).contains(&self.height)
     }
 }

@@ -16,7 +16,8 @@ pub(crate) struct Expectation {
     pub(crate) contrast: f32,
     /// The contrast's variance.
     pub(crate) contrast_variance: f32,
-    /// How many times the target's energy a mismatch of reference and target may be taken for noise.
+    /// How many times the target's energy a mismatch of reference and target may be taken for
+    /// noise.
     pub(crate) mismatch: f32,
 }
 
@@ -25,10 +26,11 @@ pub(crate) struct Expectation {
 ///
 /// With `a = <reference, image>`, the zero-mean correlation, and `v` the noise's variance,
 ///
-/// `ln L = z^2 / (2 u) - (z - contrast)^2 / (2 (s + u)) - ln(1 + s / u) / 2`, `z = a / E`, `u = v / E`,
+/// `ln L = z^2 / (2 u) - (z - contrast)^2 / (2 (s + u)) - ln(1 + s / u) / 2`, `z = a / E`, `u = v /
+/// E`,
 ///
-/// the first term for `z > 0` only. `v^2 = noise^2 + (excess / mismatch)^2`, where the excess is the
-/// part's energy over the noise's, or the target's own: structured surroundings count for less.
+/// the first term for `z > 0` only. `v^2 = noise^2 + (excess / mismatch)^2`, where the excess is
+/// the part's energy over the noise's, or the target's own: structured surroundings count for less.
 pub(crate) fn log_ratios(statistics: &Statistics, expected: Expectation, ratios: &mut Plane) {
     ratios.reshape(statistics.covariance.width(), statistics.covariance.height());
     Arch::new().dispatch(LogRatios { statistics, expected, ratios });
@@ -45,19 +47,23 @@ impl WithSimd for LogRatios<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        let Expectation { energy, pixels, noise, contrast, contrast_variance, mismatch } = self.expected;
+        let Expectation { energy, pixels, noise, contrast, contrast_variance, mismatch } =
+            self.expected;
         let own = contrast * contrast * energy;
         let (per_energy, per_mismatch, flat) = (1.0 / energy, 1.0 / mismatch, pixels * noise);
-        let statistics = self.statistics.covariance.samples().iter().zip(self.statistics.variance.samples());
-        for (ratio, (covariance, variance)) in self.ratios.samples_mut().iter_mut().zip(statistics) {
+        let statistics =
+            self.statistics.covariance.samples().iter().zip(self.statistics.variance.samples());
+        for (ratio, (covariance, variance)) in self.ratios.samples_mut().iter_mut().zip(statistics)
+        {
             let z = covariance * pixels * per_energy;
             let excess = own.max(variance * pixels - flat) * per_mismatch;
             let u = (noise * noise + excess * excess).sqrt() * per_energy;
             let positive = z.max(0.0);
             let miss = z - contrast;
             let spread = contrast_variance + u;
-            *ratio =
-                positive * positive / (2.0 * u) - miss * miss / (2.0 * spread) - 0.5 * lanes::ln(spread / u);
+            *ratio = positive * positive / (2.0 * u)
+                - miss * miss / (2.0 * spread)
+                - 0.5 * lanes::ln(spread / u);
         }
     }
 }

@@ -8,8 +8,9 @@ use crate::appearance::Drift;
 use crate::target::{LEAST_MEASUREMENT_SD, Target, Workbench};
 use crate::{ImagePoint, TrackerConfig};
 
-/// What noise and the reference do not explain is something else before the target: parts of it, of so many pixels, change
-/// together, and displace the fit as noise of so many times its variance would.
+/// What noise and the reference do not explain is something else before the target: parts of it, of
+/// so many pixels, change together, and displace the fit as noise of so many times its variance
+/// would.
 const PIXELS_A_PART: f64 = 10.0;
 
 /// A place that is measured no better than this is not known at all, standard deviation, px.
@@ -50,11 +51,13 @@ impl Target {
         let working = &self.appearance.working;
         let freedom = if config.follow_shape { Freedom::ShiftScaleTurn } else { Freedom::Shift };
         let options = FitOptions { steps: 2, freedom, ..FitOptions::default() };
-        let fit = bench.workshop.fitter.fit(&bench.gate, working, column as f64, row as f64, options);
+        let fit =
+            bench.workshop.fitter.fit(&bench.gate, working, column as f64, row as f64, options);
         let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
         let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
         let contrast = fit.gain.max(least_contrast);
-        let expected = f64::from(self.appearance.noise() + self.appearance.taken()) * contrast * contrast;
+        let expected =
+            f64::from(self.appearance.noise() + self.appearance.taken()) * contrast * contrast;
         let explained = image_noise * (1.0 + 2.0 * (2.0 / pixels).sqrt());
         let unexplained = (fit.residual_variance - explained - expected).max(0.0);
         let noise = image_noise + PIXELS_A_PART * unexplained;
@@ -63,16 +66,17 @@ impl Target {
         let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
         let scaled = noise * (fit.gain / contrast).powi(2);
         let Drift { log_scale, turn_rad, .. } = self.appearance.drift;
-        let shape = fit
-            .shape_variances(scaled)
-            .map(|[scale, turn]| [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]);
+        let shape = fit.shape_variances(scaled).map(|[scale, turn]| {
+            [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]
+        });
         let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
         let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
         let score = (energy / (energy + rest + 1e-12)).sqrt();
         Look { place, covariance, contrast, shape, score }
     }
 
-    /// The covariance of a fit by a reference that is not the target itself: see [`crate::appearance`]'s `steepness`.
+    /// The covariance of a fit by a reference that is not the target itself: see
+    /// [`crate::appearance`]'s `steepness`.
     fn covariance(&self, fit: &Fit, noise: f64, contrast: f64) -> Matrix2<f64> {
         let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
             return Matrix2::identity();

@@ -1,20 +1,21 @@
-//! The two looks that a lost target is searched for in: its last one, and the one it had at first (the mean of its first images,
-//! as many as it takes to be clear of noise).
+//! The two looks that a lost target is searched for in: its last one, and the one it had at first
+//! (the mean of its first images, as many as it takes to be clear of noise).
 //!
-//! A reference follows what a target looks like, into the clouds and trees that it is lost before, too.
+//! A reference follows what a target looks like, into the clouds and trees that it is lost before,
+//! too.
 
 use crate::TrackerConfig;
 use crate::appearance::{Appearance, Workshop};
 use crate::search::Background;
 use crate::target::Target;
 
-/// Looks that correlate less than this are different ones: on the real and drawn cases those of targets that have not changed
-/// correlate by 0.94 or more, and 0.65 to 0.78 where the last look finds nothing. With half of it the first look is not
-/// searched for.
+/// Looks that correlate less than this are different ones: on the real and drawn cases those of
+/// targets that have not changed correlate by 0.94 or more, and 0.65 to 0.78 where the last look
+/// finds nothing. With half of it the first look is not searched for.
 const ALIKE: f32 = 0.8;
-/// Until so long after it was seen only its last look is searched for, s: before that it has been hidden, and has turned since it was
-/// first seen. With half of it one that turns is found where it is not, with twice as much one that has fooled its reference is
-/// found a second later.
+/// Until so long after it was seen only its last look is searched for, s: before that it has been
+/// hidden, and has turned since it was first seen. With half of it one that turns is found where it
+/// is not, with twice as much one that has fooled its reference is found a second later.
 const LAST_LOOK_S: f64 = 1.0;
 /// With its first look it is seen as it was then; how much that may vary the search knows.
 const FIRST_CONTRAST: f64 = 1.0;
@@ -32,8 +33,13 @@ pub(crate) struct OtherLook {
 }
 
 impl Target {
-    /// Takes its first look, unless the last is like it or it was seen a moment ago. False if it has not.
-    pub(crate) fn take_first_look(&mut self, config: &TrackerConfig, workshop: &mut Workshop) -> bool {
+    /// Takes its first look, unless the last is like it or it was seen a moment ago. False if it
+    /// has not.
+    pub(crate) fn take_first_look(
+        &mut self,
+        config: &TrackerConfig,
+        workshop: &mut Workshop,
+    ) -> bool {
         if self.unseen_s < LAST_LOOK_S {
             return false;
         }

@@ -1,13 +1,14 @@
 //! How a target moves in the image, and how far beside it its reference is found.
 //!
-//! An axis has three states: position, velocity, and the reference's offset: the reference is found at the target's place and
-//! that offset. The noise of the images that the reference was made of is in all measurements alike, and an image that is
-//! learned at an estimated place takes that estimate's error along: no mean over images takes these out, and a filter
-//! without the offset believes that it does.
+//! An axis has three states: position, velocity, and the reference's offset: the reference is found
+//! at the target's place and that offset. The noise of the images that the reference was made of is
+//! in all measurements alike, and an image that is learned at an estimated place takes that
+//! estimate's error along: no mean over images takes these out, and a filter without the offset
+//! believes that it does.
 //!
-//! How lively a target is nobody knows beforehand. So there is a filter for each of some ways of moving, from evenly to as
-//! lively as anything flies, weighted by how well each has predicted (interacting multiple models, 003 (10)-(17); there of a
-//! pixel's brightness).
+//! How lively a target is nobody knows beforehand. So there is a filter for each of some ways of
+//! moving, from evenly to as lively as anything flies, weighted by how well each has predicted
+//! (interacting multiple models, Solonar 2023, eqs. 10-17; there of a pixel's brightness).
 
 use crossfix_filter::{AxisMeasurement, normal_score};
 use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
@@ -15,30 +16,36 @@ use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
 use crate::ImagePoint;
 
 const WAYS: usize = 4;
-/// The ways of moving: white acceleration's standard deviation as a share of the liveliest. With a factor of five between
-/// neighbours none predicts much worse than the right one would; the last flies evenly.
+/// The ways of moving: white acceleration's standard deviation as a share of the liveliest. With a
+/// factor of five between neighbours none predicts much worse than the right one would; the last
+/// flies evenly.
 const LIVELINESS: [f64; WAYS] = [1.0, 0.2, 0.04, 0.0];
-/// How often a target goes over to another way, drawn from all alike, 1/s. With a tenth of it the first images of a turn come as
-/// surprises, and when it was chosen 2.3 % of the frames of ten seeds' sequences were lost with it in place of 1.7; with ten times as much 2.1.
+/// How often a target goes over to another way, drawn from all alike, 1/s. With a tenth of it the
+/// first images of a turn come as surprises, and when it was chosen 2.3 % of the frames of ten
+/// seeds' sequences were lost with it in place of 1.7; with ten times as much 2.1.
 const CHANGES_PER_S: f64 = 0.5;
-/// Of a target that is taken up or found again nobody knows whether it flies evenly: it is lively until it has shown that it
-/// is not.
+/// Of a target that is taken up or found again nobody knows whether it flies evenly: it is lively
+/// until it has shown that it is not.
 const AT_FIRST: [f64; WAYS] = [1.0, 0.0, 0.0, 0.0];
 
-/// Over how long the measurements' noise is matched to the innovations, s: some hundred of them, so that chance changes it by a
-/// few hundredths. Reasoned: with half of it by half as much again, with twice as much a target that comes before another sky is
-/// believed for seconds as it was before this one.
+/// Over how long the measurements' noise is matched to the innovations, s: some hundred of them, so
+/// that chance changes it by a few hundredths. Reasoned: with half of it by half as much again,
+/// with twice as much a target that comes before another sky is believed for seconds as it was
+/// before this one.
 const MATCHED_S: f64 = 3.0;
-/// What was expected counts like innovations of so long, s: the first dozen of them, which tell a third.
+/// What was expected counts like innovations of so long, s: the first dozen of them, which tell a
+/// third.
 const AT_LEAST_S: f64 = 0.5;
-/// How strongly it is drawn to what was expected, of e times which it is off: where innovations tell little of the noise, as the
-/// target's own motion is most of them, nothing else keeps it. With three times as much the noise that is
-/// found of even and of lively targets changes by less than 4 %.
+/// How strongly it is drawn to what was expected, of e times which it is off: where innovations
+/// tell little of the noise, as the target's own motion is most of them, nothing else keeps it.
+/// With three times as much the noise that is found of even and of lively targets changes by less
+/// than 4 %.
 const AS_EXPECTED: f64 = 0.01;
-/// The squared normalised innovation of both axes that one in a hundred exceeds: one image counts for no more.
+/// The squared normalised innovation of both axes that one in a hundred exceeds: one image counts
+/// for no more.
 const OUTLIER: f64 = 9.21;
-/// The noise as it is matched is at most so many times more or less than was expected, variances: a hundred times in its
-/// deviation, from a pixel's hundredth to a pixel.
+/// The noise as it is matched is at most so many times more or less than was expected, variances: a
+/// hundred times in its deviation, from a pixel's hundredth to a pixel.
 const MOST_MATCHED: f64 = 1e4;
 
 /// The states of an axis, by their places.
@@ -61,7 +68,8 @@ pub(crate) struct Motion {
     /// The axes of each way of moving.
     ways: [[Axis; 2]; WAYS],
     weights: [f64; WAYS],
-    /// Variance of the measurements' noise over what it was expected to be, as the innovations have it.
+    /// Variance of the measurements' noise over what it was expected to be, as the innovations have
+    /// it.
     noise_factor: f64,
     /// Over how long it has been matched, s.
     matched_s: f64,
@@ -69,16 +77,16 @@ pub(crate) struct Motion {
     interval: f64,
     /// Mean and covariance over the ways.
     all: [Axis; 2],
-    /// What a pixel of difference between measured and predicted has changed since the last prediction, a way and an axis, and
-    /// that measurement's variances.
+    /// What a pixel of difference between measured and predicted has changed since the last
+    /// prediction, a way and an axis, and that measurement's variances.
     gains: [[Vector3<f64>; 2]; WAYS],
     measured: [f64; 2],
     /// The noise's share in that measurement's innovations, by the ways that are likely now.
     told: f64,
     /// Acceleration variances of the ways, px^2/s^4.
     accelerations: [f64; WAYS],
-    /// Variance that the noise of the learned images has in the offset and that is not in the covariances yet, in units of
-    /// one measurement's, which is not known before the first one.
+    /// Variance that the noise of the learned images has in the offset and that is not in the
+    /// covariances yet, in units of one measurement's, which is not known before the first one.
     untold: f64,
 }
 
@@ -103,19 +111,24 @@ impl Evidence {
 impl Axis {
     fn found(&self) -> AxisMeasurement {
         let position = self.mean[POSITION] + self.mean[OFFSET];
-        AxisMeasurement { position, variance: (FOUND_AT * self.covariance * FOUND_AT.transpose()).x }
+        AxisMeasurement {
+            position,
+            variance: (FOUND_AT * self.covariance * FOUND_AT.transpose()).x,
+        }
     }
 
     /// Moments of a mixture of two.
     fn mixed(&self, share: f64, other: &Self) -> Self {
         let rest = 1.0 - share;
         let apart = self.mean - other.mean;
-        let covariance =
-            self.covariance * share + other.covariance * rest + apart * apart.transpose() * (share * rest);
+        let covariance = self.covariance * share
+            + other.covariance * rest
+            + apart * apart.transpose() * (share * rest);
         Self { mean: self.mean * share + other.mean * rest, covariance }
     }
 
-    /// Constant velocity with white acceleration that is constant over the interval (000 (8), (10); erratum: its variance).
+    /// Constant velocity with white acceleration that is constant over the interval (Herasymenko
+    /// 2021, eqs. 8 and 10; erratum: its variance).
     fn predict(&mut self, interval: f64, acceleration: f64) {
         self.mean[POSITION] += interval * self.mean[VELOCITY];
         let p = &mut self.covariance;
@@ -143,9 +156,14 @@ impl Axis {
 }
 
 impl Motion {
-    /// Of a target whose place, given for both axes, has become its reference's middle: how far it is off, the reference is
-    /// off the other way, so that the reference is found where the target is.
-    pub(crate) fn at_rest(given: [AxisMeasurement; 2], velocity_sd: f64, acceleration_sd: f64) -> Self {
+    /// Of a target whose place, given for both axes, has become its reference's middle: how far it
+    /// is off, the reference is off the other way, so that the reference is found where the target
+    /// is.
+    pub(crate) fn at_rest(
+        given: [AxisMeasurement; 2],
+        velocity_sd: f64,
+        acceleration_sd: f64,
+    ) -> Self {
         let all = given.map(|AxisMeasurement { position, variance }| {
             let off = Vector3::new(1.0, 0.0, -1.0);
             let mut covariance = off * off.transpose() * variance;
@@ -174,14 +192,16 @@ impl Motion {
             axis.mean = Vector3::new(position - offset, 0.0, offset);
             axis.covariance =
                 Matrix3::from_diagonal(&Vector3::new(known + variance, velocity_sd.powi(2), known));
-            (axis.covariance[(POSITION, OFFSET)], axis.covariance[(OFFSET, POSITION)]) = (-known, -known);
+            (axis.covariance[(POSITION, OFFSET)], axis.covariance[(OFFSET, POSITION)]) =
+                (-known, -known);
         }
         self.ways = [self.all; WAYS];
         self.weights = AT_FIRST;
         (self.gains, self.measured) = ([[Vector3::x(); 2]; WAYS], found.map(|at| at.variance));
     }
 
-    /// Starts from a second place that somebody knows, `interval` seconds after the first one (000 (13)-(14)).
+    /// Starts from a second place that somebody knows, `interval` seconds after the first one
+    /// (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn start(&mut self, second: [AxisMeasurement; 2], interval: f64) {
         for i in 0..2 {
             let first = self.all[i];
@@ -207,7 +227,8 @@ impl Motion {
         for (axis, AxisMeasurement { position, variance }) in self.all.iter_mut().zip(given) {
             axis.mean = Vector3::new(position, 0.0, axis.mean[OFFSET]);
             let offset = axis.covariance[(OFFSET, OFFSET)];
-            axis.covariance = Matrix3::from_diagonal(&Vector3::new(variance, velocity_sd.powi(2), offset));
+            axis.covariance =
+                Matrix3::from_diagonal(&Vector3::new(variance, velocity_sd.powi(2), offset));
         }
         self.ways = [self.all; WAYS];
         self.weights = AT_FIRST;
@@ -301,7 +322,8 @@ impl Motion {
         })
     }
 
-    /// Squared normalised innovation of a measurement, of both axes: chi-square with two degrees of freedom if all is well.
+    /// Squared normalised innovation of a measurement, of both axes: chi-square with two degrees of
+    /// freedom if all is well.
     pub(crate) fn surprise(&self, at: [AxisMeasurement; 2]) -> f64 {
         let axis = |i: usize| {
             let mut parts = [(0.0, at[i]); WAYS];
@@ -319,16 +341,19 @@ impl Motion {
         self.noise_factor
     }
 
-    /// Matches the noise to the innovation of the last update, whose square of both axes is given: as far as it tells the noise.
+    /// Matches the noise to the innovation of the last update, whose square of both axes is given:
+    /// as far as it tells the noise.
     pub(crate) fn match_noise(&mut self, surprise: f64) {
         self.matched_s = (self.matched_s + self.interval).min(MATCHED_S);
         let share = (self.interval / (self.matched_s + AT_LEAST_S)).min(1.0);
-        let more = self.told * (surprise.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
+        let more =
+            self.told * (surprise.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
         let factor = self.noise_factor * (1.0 + share * more);
         self.noise_factor = factor.clamp(1.0 / MOST_MATCHED, MOST_MATCHED);
     }
 
-    /// Takes the first measurement's variance for what the noise of each learned image has in the offset.
+    /// Takes the first measurement's variance for what the noise of each learned image has in the
+    /// offset.
     pub(crate) fn tell_noise(&mut self, variances: [f64; 2]) {
         if self.untold <= 0.0 {
             return;
@@ -341,8 +366,8 @@ impl Motion {
         }
     }
 
-    /// Takes in what an image says of where the reference is found: each axis becomes the mixture of near, elsewhere and
-    /// not seen, by its mean and variance.
+    /// Takes in what an image says of where the reference is found: each axis becomes the mixture
+    /// of near, elsewhere and not seen, by its mean and variance.
     pub(crate) fn update(&mut self, evidence: &Evidence) {
         let Evidence { near, at, elsewhere, elsewhere_at } = *evidence;
         self.measured = at.map(|at| at.variance);
@@ -371,7 +396,8 @@ impl Motion {
                     position: prior.position + gain * (at[i].position - prior.position),
                     variance: (1.0 - gain) * prior.variance,
                 };
-                let parts = [(near, here), (elsewhere, elsewhere_at[i]), (1.0 - near - elsewhere, prior)];
+                let parts =
+                    [(near, here), (elsewhere, elsewhere_at[i]), (1.0 - near - elsewhere, prior)];
                 let position: f64 = parts.iter().map(|(mass, part)| mass * part.position).sum();
                 let spread = |(mass, part): &(f64, AxisMeasurement)| {
                     mass * (part.variance + (part.position - position).powi(2))
@@ -400,10 +426,12 @@ impl Motion {
         self.combine();
     }
 
-    /// An image has been learned at a place with a share of the reference; it was measured there with some variances.
+    /// An image has been learned at a place with a share of the reference; it was measured there
+    /// with some variances.
     ///
-    /// It shows the target where its noise v puts it, `x + v - place` beside its middle, so that the offset becomes
-    /// `(1 - share) b + share (place - x - v)`. The estimate of x has taken in the same v by its gain.
+    /// It shows the target where its noise v puts it, `x + v - place` beside its middle, so that
+    /// the offset becomes `(1 - share) b + share (place - x - v)`. The estimate of x has taken in
+    /// the same v by its gain.
     pub(crate) fn learn(&mut self, place: ImagePoint, share: f64, variances: Option<[f64; 2]>) {
         let shifted = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -share, 0.0, 1.0 - share);
         // What is learned with a variance is told with it.
@@ -419,7 +447,8 @@ impl Motion {
                 let known = shifted * gains[i] * new.transpose();
                 axis.covariance = shifted * axis.covariance * shifted.transpose();
                 if let Some(variances) = variances {
-                    axis.covariance += (known + known.transpose()) * variances[i].min(self.measured[i])
+                    axis.covariance += (known + known.transpose())
+                        * variances[i].min(self.measured[i])
                         + new * new.transpose() * variances[i];
                 }
             }

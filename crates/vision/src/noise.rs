@@ -2,7 +2,8 @@ use crossfix_correlation::Plane;
 
 use crate::crop::BRIGHTEST;
 
-/// Samples that the median is taken of: it is right to a tenth then, and its mean over images to a twentieth.
+/// Samples that the median is taken of: it is right to a tenth then, and its mean over images to a
+/// twentieth.
 const SAMPLES: usize = 100;
 /// The response of the mask to white noise: the root of the sum of its squared weights.
 const MASK_GAIN: f32 = 6.0;
@@ -28,7 +29,8 @@ impl NoiseMeter {
         self.variance_within(image, [0, 0], [image.width(), image.height()], floor)
     }
 
-    /// The noise's variance in what of a part is in the image, at least `floor^2`. `corner` is its first column and row.
+    /// The noise's variance in what of a part is in the image, at least `floor^2`. `corner` is its
+    /// first column and row.
     pub(crate) fn variance_within(
         &mut self,
         image: &Plane,

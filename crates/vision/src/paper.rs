@@ -1,5 +1,6 @@
-//! One target followed to the letter of 000 and 001: a gate of three sides about the prediction, one
-//! peak of one similarity measure, two Kalman filters of fixed measurement noise.
+//! One target followed to the letter of Herasymenko 2021 and Lytvynets 2020: a gate of three sides
+//! about the prediction, one peak of one similarity measure, two Kalman filters of fixed
+//! measurement noise.
 
 use crossfix_correlation::{Extent, Plane, Reference, Window};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
@@ -17,7 +18,7 @@ pub(crate) struct PaperTarget {
     pub(crate) size: [f64; 2],
     reference: Reference,
     adaptation: Adaptation,
-    /// Absent until the second measurement (000 (13)-(14)).
+    /// Absent until the second measurement (Herasymenko 2021, eqs. 13-14).
     axes: Option<[AxisFilter; 2]>,
     first: ImagePoint,
     /// Where the box's middle lies from the middle of the reference, which is cut at whole pixels.
@@ -47,7 +48,9 @@ impl PaperTarget {
     }
 
     pub(crate) fn position(&self) -> ImagePoint {
-        self.axes.as_ref().map_or(self.first, |[x, y]| ImagePoint { x: x.position(), y: y.position() })
+        self.axes
+            .as_ref()
+            .map_or(self.first, |[x, y]| ImagePoint { x: x.position(), y: y.position() })
     }
 
     pub(crate) fn velocity(&self) -> ImagePoint {
@@ -63,8 +66,8 @@ impl PaperTarget {
         AxisMeasurement { position, variance: config.paper.measurement_sd_px.powi(2) }
     }
 
-    /// Takes a place from somebody who knows it; after the box alone, the start from two measurements
-    /// (000 (13)-(14)).
+    /// Takes a place from somebody who knows it; after the box alone, the start from two
+    /// measurements (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn take_place(
         &mut self,
         image: &Plane,
@@ -78,14 +81,21 @@ impl PaperTarget {
             axes[0].measurement_update(at(place.x));
             axes[1].measurement_update(at(place.y));
         } else {
-            let start =
-                |first, second| AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px);
+            let start = |first, second| {
+                AxisFilter::start(at(first), at(second), interval, config.acceleration_sd_px)
+            };
             self.axes = Some([start(self.first.x, place.x), start(self.first.y, place.y)]);
         }
         self.answer(place, 1.0, None, config)
     }
 
-    fn answer(&self, place: ImagePoint, score: f64, nis: Option<f64>, config: &TrackerConfig) -> Step {
+    fn answer(
+        &self,
+        place: ImagePoint,
+        score: f64,
+        nis: Option<f64>,
+        config: &TrackerConfig,
+    ) -> Step {
         let covariance = Matrix2::identity() * config.paper.measurement_sd_px.powi(2);
         Step { measured: Some(Measurement { place, covariance }), score, certainty: 1.0, nis }
     }
@@ -115,7 +125,8 @@ impl PaperTarget {
             &mut bench.ratios,
         );
         let peak = bench.ratios.peak();
-        let refined = if config.paper.sub_pixel { peak.refined(&bench.ratios) } else { peak.whole() };
+        let refined =
+            if config.paper.sub_pixel { peak.refined(&bench.ratios) } else { peak.whole() };
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
         let whole = |at: f64, gate: usize, reference: usize| {
@@ -161,8 +172,8 @@ fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
 
 /// The part of an image about a place, cut at whole pixels, and where its first pixel is.
 fn crop(image: &Plane, middle: ImagePoint, width: usize, height: usize) -> (Plane, [f64; 2]) {
-    let start =
-        [(middle.x, width), (middle.y, height)].map(|(at, side)| (at - (side as f64 - 1.0) / 2.0).round());
+    let start = [(middle.x, width), (middle.y, height)]
+        .map(|(at, side)| (at - (side as f64 - 1.0) / 2.0).round());
     let mut part = image.crop(start[0] as isize, start[1] as isize, width, height);
     mend(&mut part);
     (part, start)

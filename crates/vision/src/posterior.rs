@@ -27,8 +27,8 @@ pub(crate) struct Part {
     pub(crate) variance: [f64; 2],
 }
 
-/// Where the target is, given the image: near the peak, elsewhere, or not to be seen. The masses sum
-/// to 1.
+/// Where the target is, given the image: near the peak, elsewhere, or not to be seen. The masses
+/// sum to 1.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Posterior {
     /// Column and row of the peak.
@@ -36,7 +36,8 @@ pub(crate) struct Posterior {
     pub(crate) near: Part,
     pub(crate) elsewhere: Part,
     pub(crate) unseen: f64,
-    /// How likely the image is with this prior, in a unit that is the same for all priors of one map.
+    /// How likely the image is with this prior, in a unit that is the same for all priors of one
+    /// map.
     pub(crate) evidence: f64,
 }
 
@@ -48,8 +49,8 @@ impl Posterior {
     }
 }
 
-/// Turns a map of log likelihood ratios into a posterior (the soft weighting of all peaks). Keeps its
-/// memory.
+/// Turns a map of log likelihood ratios into a posterior (the soft weighting of all peaks). Keeps
+/// its memory.
 #[derive(Debug, Default)]
 pub(crate) struct PosteriorMap {
     weights: Plane,
@@ -115,19 +116,26 @@ impl PosteriorMap {
         let rest = Part { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
         let sum = total.mass + unseen;
         let share = |part: Part| Part { mass: part.mass / sum, ..part };
-        Posterior { peak, near: share(near), elsewhere: share(rest), unseen: unseen / sum, evidence: sum }
+        Posterior {
+            peak,
+            near: share(near),
+            elsewhere: share(rest),
+            unseen: unseen / sum,
+            evidence: sum,
+        }
     }
 
     /// The placement of most weight.
     fn peak(&self) -> [usize; 2] {
         let (width, height) = (self.weights.width(), self.weights.height());
-        let row =
-            (0..height).fold(0, |best, y| if self.sums[y].best > self.sums[best].best { y } else { best });
+        let row = (0..height)
+            .fold(0, |best, y| if self.sums[y].best > self.sums[best].best { y } else { best });
         let line = self.weights.row(row);
         [(0..width).fold(0, |best, x| if line[x] > line[best] { x } else { best }), row]
     }
 
-    /// Takes the best peak off the map of the last posterior, and returns it with its part in units of the evidence.
+    /// Takes the best peak off the map of the last posterior, and returns it with its part in units
+    /// of the evidence.
     pub(crate) fn take_peak(&mut self, near: [usize; 2]) -> ([usize; 2], Part) {
         let peak = self.peak();
         let [columns, rows] = around(peak, near, [self.weights.width(), self.weights.height()]);
@@ -174,7 +182,8 @@ fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> Part {
     let mass_or_one = if mass > 0.0 { mass } else { 1.0 };
     let mean = first.map(|f| f / mass_or_one);
     // A placement stands for a whole pixel.
-    let variance = [0, 1].map(|i| (second[i] / mass_or_one - mean[i] * mean[i]).max(0.0) + 1.0 / 12.0);
+    let variance =
+        [0, 1].map(|i| (second[i] / mass_or_one - mean[i] * mean[i]).max(0.0) + 1.0 / 12.0);
     Part { mass, mean, variance }
 }
 
@@ -215,7 +224,8 @@ impl WithSimd for Weigh<'_> {
             let across = share * map.rows[y];
             let ratios = map.ratios.row_mut(y);
             let weights = map.weights.row_mut(y);
-            let line = ratios.iter_mut().zip(weights.iter_mut()).zip(log_ratios.row(y)).zip(&map.columns);
+            let line =
+                ratios.iter_mut().zip(weights.iter_mut()).zip(log_ratios.row(y)).zip(&map.columns);
             for (((ratio, weight), log_ratio), along) in line {
                 *ratio = lanes::exp(log_ratio - largest);
                 *weight = (across * along + anywhere) * *ratio;
@@ -272,13 +282,17 @@ mod tests {
         let map = Plane::from_fn(21, 17, |_, _| 0.0);
         let posterior = PosteriorMap::default().of(&map, &prior(0.0));
         let seen = posterior.near.mass + posterior.elsewhere.mass;
-        assert!((seen - 0.95).abs() < 0.01 && (posterior.unseen - 0.05).abs() < 0.01, "{posterior:?}");
+        assert!(
+            (seen - 0.95).abs() < 0.01 && (posterior.unseen - 0.05).abs() < 0.01,
+            "{posterior:?}"
+        );
         assert!((posterior.near.mean[0] - 10.0).abs() < 1e-3, "{posterior:?}");
     }
 
     #[test]
     fn two_equal_peaks_share_the_mass_by_the_prior() {
-        let map = Plane::from_fn(21, 17, |x, y| if y == 8 && (x == 10 || x == 14) { 20.0 } else { -5.0 });
+        let map =
+            Plane::from_fn(21, 17, |x, y| if y == 8 && (x == 10 || x == 14) { 20.0 } else { -5.0 });
         let posterior = PosteriorMap::default().of(&map, &prior(0.0));
         // exp(-(4^2) / 8) = 0.135 of the nearer one's.
         let share = posterior.elsewhere.mass / posterior.near.mass;

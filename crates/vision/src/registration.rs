@@ -1,19 +1,23 @@
-//! By how much a picture is shifted against another: the camera's turn, told from targets that move.
+//! By how much a picture is shifted against another: the camera's turn, told from targets that
+//! move.
 
 use crossfix_correlation::Plane;
 
-/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between tell the same.
+/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between
+/// tell the same.
 pub(crate) const STRIDE: usize = 2;
 /// Steps of the registration, at most, and the step that ends it, pixels.
 const STEPS: usize = 6;
 const SETTLED: f32 = 0.003;
 /// A longer step is a mistake, pixels: it is taken so far.
 const LONGEST_STEP: f32 = 2.0;
-/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves is no turn.
+/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves
+/// is no turn.
 const OUTLYING: f32 = 5.0;
-/// A turn must lessen the misfit by so many times what a pixel has of it. Two smoothed pictures of noise alone fit by up to 60
-/// times better somewhere near, as only one pixel in eighteen is independent; with half of it a clear sky turns by chance,
-/// with twice as much a turn is told a frame later.
+/// A turn must lessen the misfit by so many times what a pixel has of it. Two smoothed pictures of
+/// noise alone fit by up to 60 times better somewhere near, as only one pixel in eighteen is
+/// independent; with half of it a clear sky turns by chance, with twice as much a turn is told a
+/// frame later.
 const SIGNIFICANT: f32 = 120.0;
 /// Fewer pixels in common tell no turn.
 pub(crate) const LEAST_COMMON: f32 = 50.0;
@@ -65,9 +69,14 @@ impl Normal {
     }
 }
 
-/// The differences of a picture of now from one of then, shifted by so many pixels, with their places and the slopes
-/// of then.
-fn each_off(now: &Plane, then: &Plane, shift: [f32; 2], mut take: impl FnMut([usize; 2], [f32; 2], f32)) {
+/// The differences of a picture of now from one of then, shifted by so many pixels, with their
+/// places and the slopes of then.
+fn each_off(
+    now: &Plane,
+    then: &Plane,
+    shift: [f32; 2],
+    mut take: impl FnMut([usize; 2], [f32; 2], f32),
+) {
     let (width, height) = (now.width(), now.height());
     let whole = shift.map(f32::floor);
     let [right, down] = [shift[0] - whole[0], shift[1] - whole[1]];
@@ -94,12 +103,12 @@ fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> Normal {
 
 /// Columns and rows of the tiles of a picture by which a turn is told from a target that moves.
 const TILES: [usize; 2] = [12, 9];
-/// A target may be in so many tiles about the one where a turn would lessen the misfit most: 50 px of a picture of 320x240, and
-/// what smoothing makes of them.
+/// A target may be in so many tiles about the one where a turn would lessen the misfit most: 50 px
+/// of a picture of 320x240, and what smoothing makes of them.
 const AROUND: usize = 2;
 
-/// A turn lessens the misfit by at least this share of all away from where it does most: the ends of a large target's
-/// smoothed picture reach a twentieth that far.
+/// A turn lessens the misfit by at least this share of all away from where it does most: the ends
+/// of a large target's smoothed picture reach a twentieth that far.
 const ELSEWHERE: f32 = 0.1;
 
 /// The squares that are left in each tile, and their weights.
@@ -107,7 +116,8 @@ const ELSEWHERE: f32 = 0.1;
 struct Misfits([[(f32, f32); TILES[0]]; TILES[1]]);
 
 impl Misfits {
-    /// Those of a picture of now against one of then, shifted by so many pixels and brighter by so much.
+    /// Those of a picture of now against one of then, shifted by so many pixels and brighter by so
+    /// much.
     fn at(now: &Plane, then: &Plane, shift: [f32; 2], brighter: f32) -> Self {
         let sides = [now.width(), now.height()];
         let mut tiles = [[(0.0, 0.0); TILES[0]]; TILES[1]];
@@ -121,8 +131,8 @@ impl Misfits {
         Self(tiles)
     }
 
-    /// Whether they are less than others by more than noise makes them, and elsewhere too than about the two tiles that have
-    /// gained most: there a target may be, and have been.
+    /// Whether they are less than others by more than noise makes them, and elsewhere too than
+    /// about the two tiles that have gained most: there a target may be, and have been.
     fn are_better_than(&self, before: &Self) -> bool {
         let whole = self.gain(before, &[]);
         let (squares, weights) = self.sums(&[]);
@@ -171,8 +181,9 @@ fn gain_of(before: (f32, f32), now: (f32, f32)) -> f32 {
     (mean(before) - mean(now)) * now.1
 }
 
-/// By how much a picture of now is shifted against one of then, px, from a first guess on (Lucas and Kanade 1981). `None`
-/// where another shift explains no more than noise would, or a target that moves: a clear sky tells no turn.
+/// By how much a picture of now is shifted against one of then, px, from a first guess on (Lucas
+/// and Kanade 1981). `None` where another shift explains no more than noise would, or a target that
+/// moves: a clear sky tells no turn.
 pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[f32; 2]> {
     if (then.width(), then.height()) != (now.width(), now.height()) {
         return None;

@@ -1,8 +1,8 @@
-//! What the scene looks like without the targets: a few pictures of the last seconds, and by how much the camera has
-//! turned since each.
+//! What the scene looks like without the targets: a few pictures of the last seconds, and by how
+//! much the camera has turned since each.
 //!
-//! What a target hides shows in a picture in which it was elsewhere. A place where the image is what it was then shows
-//! the scene and no target, whatever a reference makes of it.
+//! What a target hides shows in a picture in which it was elsewhere. A place where the image is
+//! what it was then shows the scene and no target, whatever a reference makes of it.
 
 use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
@@ -12,24 +12,29 @@ use crate::crop::mend;
 use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
-/// Pictures that are kept, the latest, and the time between them, s: they reach back for 3 to 3.6 s. With half of either a
-/// slow target covers what it hides in all of them; with more, light and clouds are others by then.
+/// Pictures that are kept, the latest, and the time between them, s: they reach back for 3 to 3.6
+/// s. With half of either a slow target covers what it hides in all of them; with more, light and
+/// clouds are others by then.
 const PICTURES: usize = 6;
 const SPACING_S: f64 = 0.6;
-/// About how old the picture is against which a change is asked for, s: a target has moved by its own size by then.
+/// About how old the picture is against which a change is asked for, s: a target has moved by its
+/// own size by then.
 const CHANGED_S: f64 = 1.0;
-/// Blocks of so many pixels a side are one pixel of the coarse picture by which the camera's turn is found: in single
-/// pixels the noise has more slope than clouds have, and the turn is taken for nothing.
+/// Blocks of so many pixels a side are one pixel of the coarse picture by which the camera's turn
+/// is found: in single pixels the noise has more slope than clouds have, and the turn is taken for
+/// nothing.
 const COARSENESS: usize = 8;
 /// How often the coarse picture is smoothed, by a quarter, a half and a quarter of neighbours.
 const SMOOTHED: usize = 3;
-/// A camera that has turned by less than this since it was looked at stands still, px: twice what noise makes of it ...
+/// A camera that has turned by less than this since it was looked at stands still, px: twice what
+/// noise makes of it ...
 const STILL_PX: f64 = 0.1;
-/// ... and is looked at again after so long, s, if it is not jerked: with half of it an image costs 10 us more, of 640x480
-/// 30 us.
+/// ... and is looked at again after so long, s, if it is not jerked: with half of it an image costs
+/// 10 us more, of 640x480 30 us.
 const STILL_S: f64 = 0.1;
 
-/// A camera is jerked if what changes from one image to the next is this much more than usual, and so many levels, ...
+/// A camera is jerked if what changes from one image to the next is this much more than usual, and
+/// so many levels, ...
 const JERK: f32 = 1.5;
 const JERK_LEVELS: f32 = 0.25;
 /// ... where this share of what is usual is the last image's.
@@ -73,7 +78,8 @@ impl Picture {
     }
 }
 
-/// Blocks along a row of which one is looked at: there are hundreds, and half of them has to change.
+/// Blocks along a row of which one is looked at: there are hundreds, and half of them has to
+/// change.
 const GLANCED: usize = 4;
 
 /// A row in some blocks, by which a jerk of the camera is noticed at a tenth of what a look costs.
@@ -91,7 +97,8 @@ impl Glance {
     fn is_another(&mut self, image: &Plane) -> bool {
         let Self { means, changes, usual } = self;
         let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
-        let blocks = rows.flat_map(|y| image.row(y).as_chunks::<COARSENESS>().0.iter().step_by(GLANCED));
+        let blocks =
+            rows.flat_map(|y| image.row(y).as_chunks::<COARSENESS>().0.iter().step_by(GLANCED));
         let now = blocks.map(|block| block.iter().sum::<f32>() / COARSENESS as f32);
         changes.clear();
         if means.is_empty() {
@@ -141,7 +148,8 @@ impl Scene {
         self.taken
     }
 
-    /// By how much the scene has moved since the beginning: what is at (x, y) was at (x, y) plus this, px.
+    /// By how much the scene has moved since the beginning: what is at (x, y) was at (x, y) plus
+    /// this, px.
     pub(crate) fn turned(&self) -> [f64; 2] {
         let since = self.pictures.first().map_or([0.0; 2], |newest| newest.shift);
         [0, 1].map(|i| self.turned[i] + since[i])
@@ -154,8 +162,9 @@ impl Scene {
         (self.glance, self.is_still) = (Glance::default(), false);
     }
 
-    /// Finds out how the camera has turned, by the newest picture: the others turned as much against that one as when
-    /// it was taken. A camera that stood still lately is looked at now and then.
+    /// Finds out how the camera has turned, by the newest picture: the others turned as much
+    /// against that one as when it was taken. A camera that stood still lately is looked at now and
+    /// then.
     pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
         self.unlooked_s += interval;
         for picture in &mut self.pictures {
@@ -174,9 +183,12 @@ impl Scene {
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
         newest.shift = turned(&self.coarse, &newest.coarse, before);
-        self.is_still = newest.shift.iter().zip(before).all(|(now, before)| (now - before).abs() < STILL_PX);
+        self.is_still =
+            newest.shift.iter().zip(before).all(|(now, before)| (now - before).abs() < STILL_PX);
         for picture in others {
-            for (shift, (now, before)) in picture.shift.iter_mut().zip(newest.shift.iter().zip(before)) {
+            for (shift, (now, before)) in
+                picture.shift.iter_mut().zip(newest.shift.iter().zip(before))
+            {
                 *shift += now - before;
             }
         }
@@ -208,13 +220,17 @@ impl Scene {
         Some(self.taken)
     }
 
-    /// What has changed since about a second ago: the image less what was there then, 0 where nothing is known. False
-    /// without such a picture.
+    /// What has changed since about a second ago: the image less what was there then, 0 where
+    /// nothing is known. False without such a picture.
     pub(crate) fn change(&self, image: &Plane, change: &mut Plane) -> bool {
-        let of_age = |picture: &&Picture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
+        let of_age =
+            |picture: &&Picture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
         let off = |picture: &Picture| (picture.age_s - CHANGED_S).abs();
-        let nearest =
-            self.pictures.iter().filter(of_age).min_by(|one, other| off(one).total_cmp(&off(other)));
+        let nearest = self
+            .pictures
+            .iter()
+            .filter(of_age)
+            .min_by(|one, other| off(one).total_cmp(&off(other)));
         let Some(Picture { image: before, shift, .. }) = nearest else { return false };
         let (width, height) = (image.width(), image.height());
         let whole = shift.map(f64::floor);
@@ -239,7 +255,8 @@ impl Scene {
     }
 }
 
-/// By how much the camera has turned between two coarse pictures, px of the image; `before` where they do not tell.
+/// By how much the camera has turned between two coarse pictures, px of the image; `before` where
+/// they do not tell.
 fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
     let coarseness = COARSENESS as f64;
     let told = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
@@ -251,7 +268,8 @@ fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
     to.reshape(from.width() / COARSENESS, from.height() / COARSENESS);
     let share = 1.0 / (COARSENESS * COARSENESS) as f32;
     for y in 0..to.height() {
-        // Down the columns first: that is many at a time. Of a picture of less than a block the last row counts again.
+        // Down the columns first: that is many at a time. Of a picture of less than a block the
+        // last row counts again.
         let rows: [&[f32]; COARSENESS] =
             std::array::from_fn(|k| from.row((y * COARSENESS + k).min(from.height() - 1)));
         sums.clear();
@@ -344,7 +362,10 @@ mod tests {
             let frames = (oldest.age_s * 30.0).round();
             assert!(frames > 20.0, "{frames}");
             let off = [oldest.shift[0] - 0.8 * frames, oldest.shift[1] + 0.5 * frames];
-            assert!(off.iter().all(|off| off.abs() < most), "{off:?} of {frames} frames, noise {noise}");
+            assert!(
+                off.iter().all(|off| off.abs() < most),
+                "{off:?} of {frames} frames, noise {noise}"
+            );
         }
     }
 
@@ -356,7 +377,9 @@ mod tests {
         for _ in 0..90 {
             let image = Plane::from_fn(640, 480, |_, _| 128.0 + normal.sample(&mut rng));
             scene.register(&image, 1.0 / 30.0);
-            assert!(scene.pictures().flat_map(|picture| picture.shift).all(|shift| shift.abs() < 2.0));
+            assert!(
+                scene.pictures().flat_map(|picture| picture.shift).all(|shift| shift.abs() < 2.0)
+            );
             scene.keep(&image);
         }
     }
@@ -373,7 +396,11 @@ mod tests {
                 120.0 + normal.sample(&mut rng) + 100.0 * (-0.5 * (u * u + v * v)).exp()
             });
             scene.register(&image, 1.0 / 30.0);
-            assert!(scene.turned().iter().all(|turned| turned.abs() < 1.0), "{frame}: {:?}", scene.turned());
+            assert!(
+                scene.turned().iter().all(|turned| turned.abs() < 1.0),
+                "{frame}: {:?}",
+                scene.turned()
+            );
             scene.keep(&image);
         }
     }
@@ -390,7 +417,8 @@ mod tests {
         let mut change = Plane::default();
         assert!(!scene.change(&clouds([0.0; 2], 0.5, 1), &mut change));
         for frame in 0..40_usize {
-            let image = with_blob(clouds([0.4 * frame as f64, 0.0], 0.5, frame as u64), 60 + 3 * frame);
+            let image =
+                with_blob(clouds([0.4 * frame as f64, 0.0], 0.5, frame as u64), 60 + 3 * frame);
             scene.register(&image, 1.0 / 30.0);
             let is_known = scene.change(&image, &mut change);
             assert!(is_known || frame < 20, "frame {frame}");
@@ -399,8 +427,9 @@ mod tests {
         let column = 60 + 3 * 39 + 4;
         assert!(change.row(103)[column] > 60.0);
         let elsewhere = (20..220).filter(|y| !(95..112).contains(y));
-        let worst =
-            elsewhere.flat_map(|y| &change.row(y)[20..290]).fold(0.0, |most: f32, c| most.max(c.abs()));
+        let worst = elsewhere
+            .flat_map(|y| &change.row(y)[20..290])
+            .fold(0.0, |most: f32, c| most.max(c.abs()));
         assert!(worst < 8.0, "{worst}");
     }
 

@@ -12,25 +12,27 @@ use crate::look::Look;
 use crate::noise::{OF_MEDIAN, median};
 use crate::target::{Target, Workbench};
 
-/// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few milliseconds then; with 8 it
-/// takes three times as long and finds no more, with 3 it finds what looks like the target from afar. And the most pixels that
-/// are made one, a side.
+/// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
+/// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
+/// looks like the target from afar. And the most pixels that are made one, a side.
 const COARSE_SIDE: usize = 5;
 const MOST_COARSE: usize = 4;
 /// A found place is believed if its log ratio is at least this, at least `MARGIN` above the next
-/// best place's, and its contrast is by so many nats likelier the target's than that of the best of so many places of what
-/// is searched through. Of the places that a search takes for the target on the shared and drawn cases half are others'
-/// without the last, and with 4 a third; with twice as much an eighth of the right ones is refused.
+/// best place's, and its contrast is by so many nats likelier the target's than that of the best of
+/// so many places of what is searched through. Of the places that a search takes for the target on
+/// the shared and drawn cases half are others' without the last, and with 4 a third; with twice as
+/// much an eighth of the right ones is refused.
 pub(crate) const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
 /// No scene looks less like a target than this, in contrasts: the samples' own steps.
 const LEAST_LIKENESS: f64 = 1e-3;
-/// Variance of the noise of what has changed over the image's: its own, and what interpolation leaves of the picture's.
+/// Variance of the noise of what has changed over the image's: its own, and what interpolation
+/// leaves of the picture's.
 const NOISE_OF_CHANGE: f32 = 1.6;
 
-/// What the scene itself looks like to a target's reference: the log ratios in a picture in which the
-/// target was elsewhere.
+/// What the scene itself looks like to a target's reference: the log ratios in a picture in which
+/// the target was elsewhere.
 #[derive(Clone, Debug)]
 pub(crate) struct Background {
     coarseness: usize,
@@ -80,7 +82,8 @@ fn coarse_reference(target: &Target, coarseness: usize, resampler: &mut Resample
     let (width, height) = (side(working.width()), side(working.height()));
     let mut whole = Plane::from_fn(width * coarseness, height * coarseness, |_, _| 0.0);
     let middle = |length: usize| (length as f64 - 1.0) / 2.0;
-    let view = View { x: middle(working.width()), y: middle(working.height()), scale: 1.0, turn_rad: 0.0 };
+    let view =
+        View { x: middle(working.width()), y: middle(working.height()), scale: 1.0, turn_rad: 0.0 };
     resampler.look(working, view, &mut whole);
     let mut image = Plane::default();
     coarsened(&whole, coarseness, &mut image);
@@ -115,7 +118,8 @@ impl Coarse {
         let pixels = (width * height) as f32;
         let noise = noise / (self.coarseness * self.coarseness) as f32;
         let noise = noise.max((config.noise_floor * config.noise_floor) as f32);
-        let expected = target.expectation(noise, self.reference.variance() * pixels, pixels, config);
+        let expected =
+            target.expectation(noise, self.reference.variance() * pixels, pixels, config);
         log_ratios(&bench.statistics, expected, &mut bench.ratios);
     }
 
@@ -125,7 +129,8 @@ impl Coarse {
         let Search { contrasts, .. } = &mut bench.search;
         contrasts.clear();
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
-        let deviation = OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
+        let deviation =
+            OF_MEDIAN * median(contrasts) / self.reference.variance().max(f32::MIN_POSITIVE);
         Likeness {
             deviation: f64::from(deviation).max(LEAST_LIKENESS),
             places: contrasts.len().max(1) as f64,
@@ -133,7 +138,8 @@ impl Coarse {
     }
 }
 
-/// How much what is searched through looks like a target: the contrast with which its reference is found, place by place.
+/// How much what is searched through looks like a target: the contrast with which its reference is
+/// found, place by place.
 #[derive(Clone, Copy, Debug)]
 struct Likeness {
     /// Its standard deviation about none.
@@ -142,8 +148,8 @@ struct Likeness {
 }
 
 impl Likeness {
-    /// Log-likelihood ratio of a contrast's being a target's, whose usual one is known, against the best place's of the
-    /// scene.
+    /// Log-likelihood ratio of a contrast's being a target's, whose usual one is known, against the
+    /// best place's of the scene.
     fn log_ratio(self, contrast: f64, usual: f64, contrast_sd: f64) -> f64 {
         let Self { deviation, places } = self;
         let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
@@ -161,11 +167,13 @@ struct Searched<'a> {
     is_change: bool,
 }
 
-/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image, where it may hover; and by turns
-/// in its last look and its first, which stays if it is found by that.
+/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image,
+/// where it may hover; and by turns in its last look and its first, which stays if it is found by
+/// that.
 pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench) -> Found {
     let mut change = std::mem::take(&mut bench.search.change);
-    let is_change = target.searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
+    let is_change =
+        target.searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
     if target.searches / 2 % 2 == 1 {
         target.take_first_look(frame.config, &mut bench.workshop);
     }
@@ -183,7 +191,12 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     found
 }
 
-fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench: &mut Workbench) -> Found {
+fn find_in(
+    target: &mut Target,
+    frame: Frame<'_>,
+    searched: Searched<'_>,
+    bench: &mut Workbench,
+) -> Found {
     let config = frame.config;
     let Searched { picture: image, noise, is_change } = searched;
     let working = target.appearance.working.image();
@@ -202,8 +215,10 @@ fn find_in(target: &mut Target, frame: Frame<'_>, searched: Searched<'_>, bench:
         let first = (((at[i] - half[i]) / side).max(0.0) as usize).min(last);
         first..(((at[i] + half[i]) / side).max(0.0) as usize + 1).min(last).max(first) + 1
     });
-    let coarse =
-        Coarse { reference: coarse_reference(target, coarseness, &mut bench.workshop.resampler), coarseness };
+    let coarse = Coarse {
+        reference: coarse_reference(target, coarseness, &mut bench.workshop.resampler),
+        coarseness,
+    };
     if !is_change {
         remember_background(target, frame, &coarse, bench);
     }
@@ -245,8 +260,8 @@ pub(crate) struct Peak {
     pub(crate) sides: [usize; 2],
 }
 
-/// The best of the placements within a reach of a place, px, at full resolution; the part that they cover is left in the
-/// bench's gate.
+/// The best of the placements within a reach of a place, px, at full resolution; the part that they
+/// cover is left in the bench's gate.
 pub(crate) fn best_near(
     target: &Target,
     image: &Plane,
@@ -270,7 +285,15 @@ pub(crate) fn best_near(
     bench.search.fine = fine;
     let covariance = bench.statistics.covariance.row(peak.row)[peak.column];
     let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
-    Peak { column: peak.column, row: peak.row, log_ratio: peak.score, contrast, origin, corner, sides }
+    Peak {
+        column: peak.column,
+        row: peak.row,
+        log_ratio: peak.score,
+        contrast,
+        origin,
+        corner,
+        sides,
+    }
 }
 
 /// Half sides of the search, px: they grow from frame to frame.
@@ -287,10 +310,18 @@ pub(crate) fn half_sides(
 }
 
 /// The scene's own log ratios, once a loss.
-fn remember_background(target: &mut Target, frame: Frame<'_>, coarse: &Coarse, bench: &mut Workbench) {
+fn remember_background(
+    target: &mut Target,
+    frame: Frame<'_>,
+    coarse: &Coarse,
+    bench: &mut Workbench,
+) {
     let coarseness = coarse.coarseness;
-    let known = target.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
-    let Some(keepsake) = frame.keepsake.filter(|_| !known && target.in_keepsake.is_some()) else { return };
+    let known =
+        target.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
+    let Some(keepsake) = frame.keepsake.filter(|_| !known && target.in_keepsake.is_some()) else {
+        return;
+    };
     let mut picture = std::mem::take(&mut bench.search.coarse);
     coarsened(keepsake, coarseness, &mut picture);
     mend(&mut picture);
@@ -338,10 +369,16 @@ impl Area {
             if *is_change {
                 return 0.0;
             }
-            let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else { return 0.0 };
+            let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else {
+                return 0.0;
+            };
             let near = (middle(column) - seen.x).abs() <= sides[0] as f64
                 && (middle(row) - seen.y).abs() <= sides[1] as f64;
-            if near { 0.0 } else { background.ratios.clamped(column as isize, row as isize).max(0.0) }
+            if near {
+                0.0
+            } else {
+                background.ratios.clamped(column as isize, row as isize).max(0.0)
+            }
         };
         let (mut best, mut most) = ([0, 0], f64::NEG_INFINITY);
         for (y, row) in ranges[1].clone().enumerate() {

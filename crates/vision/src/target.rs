@@ -1,6 +1,6 @@
 //! One target followed by the posterior over its placements: the likelihood of every placement in
-//! the gate and the filters' prediction give where it is, how well that is known, and whether it can
-//! be seen at all.
+//! the gate and the filters' prediction give where it is, how well that is known, and whether it
+//! can be seen at all.
 
 use crossfix_correlation::{Correlator, Plane, Statistics};
 use crossfix_filter::{AxisMeasurement, Gate};
@@ -29,22 +29,26 @@ pub(crate) const SEARCH_AFTER_FRAMES: u32 = 3;
 const NOISE_SHARE: f32 = 0.3;
 /// Variance below which a fit is narrower than the pixels of the map, px^2.
 const NARROW: f64 = 0.5;
-/// What a map tells of a place is at least this share of what is known then: with less, chance would be taken for a measurement
-/// from afar.
+/// What a map tells of a place is at least this share of what is known then: with less, chance
+/// would be taken for a measurement from afar.
 const LEAST_TOLD: f64 = 0.1;
 /// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
 const MANOEUVRE: f64 = 25.0;
-/// A manoeuvre makes the filters' variances at most so many times larger: from a tenth of a pixel to ten.
+/// A manoeuvre makes the filters' variances at most so many times larger: from a tenth of a pixel
+/// to ten.
 const MOST_INFLATED: f64 = 1e4;
-/// Certainty above which the rest of the gate is not looked at: what is there could take no more from it than this leaves.
+/// Certainty above which the rest of the gate is not looked at: what is there could take no more
+/// from it than this leaves.
 const SURE: f64 = 0.99;
 /// Certainty above which a target counts as seen.
 pub(crate) const SEEN: f64 = 0.5;
 /// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
 const USUAL_S: f64 = 3.0;
-/// Time constant with which a lost target's contrast is taken for what it usually is again, s: about a cloud's edge.
+/// Time constant with which a lost target's contrast is taken for what it usually is again, s:
+/// about a cloud's edge.
 const FADES_S: f64 = 0.5;
-/// Floor of a measurement's standard deviation, px: the fit's bias over the phases of a pixel, which no noise shows.
+/// Floor of a measurement's standard deviation, px: the fit's bias over the phases of a pixel,
+/// which no noise shows.
 pub(crate) const LEAST_MEASUREMENT_SD: f64 = 0.005;
 /// Correlations at which an image is not learned at all, and fully.
 const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
@@ -118,11 +122,17 @@ fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeas
 }
 
 impl Target {
-    /// Takes a target up: the box and a margin become the reference (001, object model).
+    /// Takes a target up: the box and a margin become the reference (Lytvynets 2020, object model).
     ///
-    /// The velocity is unknown but for its prior: with the next measurement the state becomes that of
-    /// 000 (13)-(14), shrunk towards rest by the share of the measurement's variance in the prior's.
-    pub(crate) fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
+    /// The velocity is unknown but for its prior: with the next measurement the state becomes that
+    /// of Herasymenko 2021, eqs. 13-14, shrunk towards rest by the share of the measurement's
+    /// variance in the prior's.
+    pub(crate) fn new(
+        image: &Plane,
+        place: PixelBox,
+        bench: &mut Workbench,
+        config: &TrackerConfig,
+    ) -> Self {
         let centre = place.centre();
         let around = [place.width, place.height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
         let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
@@ -162,7 +172,8 @@ impl Target {
         self.motion.velocity()
     }
 
-    /// Covariance of position and velocity on either axis, the other places where the target may be included.
+    /// Covariance of position and velocity on either axis, the other places where the target may be
+    /// included.
     pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
         let spread = self.hypotheses.spread(self.position());
         let covariances = self.motion.covariances();
@@ -173,11 +184,15 @@ impl Target {
         })
     }
 
-    /// What a look measured, the reference's offset taken out, with all that its covariance must hold.
+    /// What a look measured, the reference's offset taken out, with all that its covariance must
+    /// hold.
     pub(crate) fn measurement(&self, look: &Look) -> Measurement {
         let [x, y] = self.motion.offset();
         let place = ImagePoint { x: look.place.x - x.position, y: look.place.y - y.position };
-        Measurement { place, covariance: look.covariance + Matrix2::new(x.variance, 0.0, 0.0, y.variance) }
+        Measurement {
+            place,
+            covariance: look.covariance + Matrix2::new(x.variance, 0.0, 0.0, y.variance),
+        }
     }
 
     /// Whether it is searched for, or for long has not been sure in any place.
@@ -231,9 +246,14 @@ impl Target {
         }
     }
 
-    /// Takes a place in the next image from somebody who knows it, instead of measuring it: with the
-    /// box it is the start from two measurements (000 (13)-(14)).
-    pub(crate) fn take_place(&mut self, frame: Frame<'_>, place: ImagePoint, bench: &mut Workbench) -> Step {
+    /// Takes a place in the next image from somebody who knows it, instead of measuring it: with
+    /// the box it is the start from two measurements (Herasymenko 2021, eqs. 13-14).
+    pub(crate) fn take_place(
+        &mut self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        bench: &mut Workbench,
+    ) -> Step {
         let Frame { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
         let searching = self.is_searching();
@@ -247,7 +267,8 @@ impl Target {
             self.motion.take_place(given);
         }
         self.identity.is_given();
-        let share = self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
+        let share =
+            self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
         self.motion.learn(place, f64::from(share), None);
         self.seen(place);
         self.hypotheses.clear();
@@ -261,11 +282,17 @@ impl Target {
         let reach = self.hypotheses.reach(self.position());
         let half = self.half_gate(image, config);
         let image_sides = [image.width(), image.height()];
-        let half =
-            [0, 1].map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
+        let half = [0, 1]
+            .map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
         let whole = Region::about(self, half);
-        let noise = bench.meter.variance_within(image, whole.corner, whole.sides, config.noise_floor as f32);
-        self.noise = if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
+        let noise = bench.meter.variance_within(
+            image,
+            whole.corner,
+            whole.sides,
+            config.noise_floor as f32,
+        );
+        self.noise =
+            if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
 
         // The whole gate is looked at only where the middle of it leaves a doubt.
         let middle = self.middle_of_gate(whole.half, config).map(|half| Region::about(self, half));
@@ -310,14 +337,17 @@ impl Target {
         }
         if certainty > SEEN && distance > MANOEUVRE {
             // Certain, and not where it was expected: the filters are too sure of themselves.
-            let off = |i: usize| (found[i].position - expected[i].position).powi(2) / expected[i].variance;
+            let off = |i: usize| {
+                (found[i].position - expected[i].position).powi(2) / expected[i].variance
+            };
             self.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
             self.motion.update(&Evidence::of(found));
             self.seen(look.place);
             self.learn(frame, look.place, look, certainty, bench);
             return step(Some(measured));
         }
-        // Whether it is the target that is followed is said by the certainty, and the covariance is that of where it is then.
+        // Whether it is the target that is followed is said by the certainty, and the covariance is
+        // that of where it is then.
         let posterior = if certainty > SEEN { posterior } else { &doubted };
         self.motion.update(&self.evidence(posterior, found, origin, frame.config));
         let (estimate, hidden) = (self.position(), posterior.unseen);
@@ -332,8 +362,9 @@ impl Target {
         step((certainty > SEEN).then_some(measured))
     }
 
-    /// What a posterior over the placements says of where the reference is found. Where the fit is narrower than the pixels of
-    /// the map, it says where in the peak; elsewhere the peak's own moments do, the prediction's part taken out.
+    /// What a posterior over the placements says of where the reference is found. Where the fit is
+    /// narrower than the pixels of the map, it says where in the peak; elsewhere the peak's own
+    /// moments do, the prediction's part taken out.
     fn evidence(
         &self,
         posterior: &Posterior,
@@ -343,7 +374,8 @@ impl Target {
     ) -> Evidence {
         let narrow = fitted.iter().all(|at| at.variance < NARROW);
         let floor = config.prediction_floor_px.powi(2);
-        let expected = self.motion.found().map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
+        let expected =
+            self.motion.found().map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
         let in_image = |part: &Part, i: usize| AxisMeasurement {
             position: origin[i] + part.mean[i],
             variance: part.variance[i],
@@ -389,9 +421,11 @@ impl Target {
         if seen && !self.identity.is_on_probation() {
             let clear = f64::from(self.appearance.clear_share());
             let measured = look.contrast / clear;
-            let variance = f64::from(self.noise / self.appearance.energy().max(1e-12)) / clear.powi(2)
+            let variance = f64::from(self.noise / self.appearance.energy().max(1e-12))
+                / clear.powi(2)
                 + CONTRAST_FLOOR.powi(2);
-            self.contrast_variance += (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
+            self.contrast_variance +=
+                (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
             let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
             self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
             self.contrast_variance *= 1.0 - gain;
@@ -405,7 +439,8 @@ impl Target {
                 self.follow_shape(look);
             }
             let (certainty, workshop) = (certainty as f32, &mut bench.workshop);
-            let share = self.appearance.learn(image, place, self.noise, certainty, interval, workshop);
+            let share =
+                self.appearance.learn(image, place, self.noise, certainty, interval, workshop);
             let variances = [look.covariance.m11, look.covariance.m22];
             self.motion.learn(place, f64::from(share), Some(variances));
         }
@@ -431,7 +466,8 @@ impl Target {
         // Nothing is known of its contrast any more but what it usually is.
         let share = (frame.interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);
-        self.contrast_variance += share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
+        self.contrast_variance +=
+            share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
         if !frame.may_search {
             self.missed += 1;
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
@@ -450,8 +486,9 @@ impl Target {
         };
         self.begin_probation(frame.scene);
         let (found, expected) = (look.found(), self.motion.found());
-        let is_near =
-            |i: usize| (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance;
+        let is_near = |i: usize| {
+            (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance
+        };
         if self.missed < 20 && is_near(0) && is_near(1) {
             self.motion.condition([0, 1].map(|i| AxisMeasurement {
                 variance: found[i].variance.min(expected[i].variance),

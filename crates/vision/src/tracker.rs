@@ -10,8 +10,8 @@ use crate::scene::Scene;
 use crate::target::{Target, Workbench};
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
-/// Steps longer or shorter than these are taken as these: after a pause nothing is known of a target
-/// anyway, and no camera is that fast.
+/// Steps longer or shorter than these are taken as these: after a pause nothing is known of a
+/// target anyway, and no camera is that fast.
 const LONGEST_INTERVAL: f64 = 1.0;
 const SHORTEST_INTERVAL: f64 = 1e-4;
 
@@ -24,14 +24,16 @@ pub enum TrackPhase {
     Tracking,
     /// Not measured in this image: a prediction.
     Coasting,
-    /// Not measured for several images, or for long not sure in any place: the prediction is a guess, and it is searched for.
+    /// Not measured for several images, or for long not sure in any place: the prediction is a
+    /// guess, and it is searched for.
     Searching,
 }
 
 /// One target in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageTrack {
-    /// The track. While a target that was given is lost, what else moves may be shown as it, with a `certainty` of at most 0.5.
+    /// The track. While a target that was given is lost, what else moves may be shown as it, with a
+    /// `certainty` of at most 0.5.
     pub id: ImageTrackId,
     /// Its life.
     pub phase: TrackPhase,
@@ -66,10 +68,12 @@ pub(crate) enum Origin {
         /// Where it was found, and how far the scene had moved then, px.
         first: ImagePoint,
         turned: [f64; 2],
-        /// Whether it has been elsewhere since or before, in the image and in the scene, so that the background of its place
-        /// is known without it: what keeps to its place in the image is on the lens, or written into the video.
+        /// Whether it has been elsewhere since or before, in the image and in the scene, so that
+        /// the background of its place is known without it: what keeps to its place in the image is
+        /// on the lens, or written into the video.
         has_moved: bool,
-        /// Whether it is followed only because a target is lost that it may be: it has no track of its own.
+        /// Whether it is followed only because a target is lost that it may be: it has no track of
+        /// its own.
         is_candidate: bool,
     },
 }
@@ -82,9 +86,16 @@ pub(crate) enum Follower {
 }
 
 impl Follower {
-    pub(crate) fn new(image: &Plane, place: PixelBox, bench: &mut Workbench, config: &TrackerConfig) -> Self {
+    pub(crate) fn new(
+        image: &Plane,
+        place: PixelBox,
+        bench: &mut Workbench,
+        config: &TrackerConfig,
+    ) -> Self {
         match config.algorithm {
-            Algorithm::Posterior => Self::Posterior(Box::new(Target::new(image, place, bench, config))),
+            Algorithm::Posterior => {
+                Self::Posterior(Box::new(Target::new(image, place, bench, config)))
+            }
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }
     }
@@ -93,7 +104,9 @@ impl Follower {
         match (self, cue) {
             (Self::Posterior(target), None) => target.step(frame, bench),
             (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
-            (Self::Paper(target), None) => target.step(frame.image, frame.interval, bench, frame.config),
+            (Self::Paper(target), None) => {
+                target.step(frame.image, frame.interval, bench, frame.config)
+            }
             (Self::Paper(target), Some(place)) => {
                 target.take_place(frame.image, place, frame.interval, frame.config)
             }
@@ -169,8 +182,9 @@ impl Followed {
     }
 }
 
-/// A candidate that keeps to its place for so long is none, s: a target that can be told from its scene has gone further than
-/// its size by then if it moves at all. Half of it is little more than a candidate needs to be shown.
+/// A candidate that keeps to its place for so long is none, s: a target that can be told from its
+/// scene has gone further than its size by then if it moves at all. Half of it is little more than
+/// a candidate needs to be shown.
 const STAYS_S: f64 = 1.5;
 
 /// A picture of a moment ago in which every target was seen: what a lost target is not.
@@ -256,9 +270,9 @@ impl ImageTracker {
         }
     }
 
-    /// Tells where a target is in the next image (an operator, a cue): the place is taken instead of
-    /// measured. With the box it is the start from two measurements (000 (13)-(14)). A track that is
-    /// not there, or a place that no image has, is left out.
+    /// Tells where a target is in the next image (an operator, a cue): the place is taken instead
+    /// of measured. With the box it is the start from two measurements (Herasymenko 2021, eqs.
+    /// 13-14). A track that is not there, or a place that no image has, is left out.
     pub fn cue(&mut self, id: ImageTrackId, place: ImagePoint) {
         let known = self.followed.iter_mut().find(|followed| followed.id == id);
         if let Some(followed) = known.filter(|_| place.is_possible()) {
@@ -271,15 +285,17 @@ impl ImageTracker {
         self.refused
     }
 
-    /// Follows all targets into the next image and returns its tracks, ordered by id. An image without
-    /// new, lost, doubtful or given-up targets, and none at its border, allocates no memory, but for the detector.
+    /// Follows all targets into the next image and returns its tracks, ordered by id. An image
+    /// without new, lost, doubtful or given-up targets, and none at its border, allocates no
+    /// memory, but for the detector.
     pub fn step(&mut self, image: &Plane, time: Timestamp) -> &[ImageTrack] {
         let shot = Shot { time, size: (image.width(), image.height()) };
         if image.samples().is_empty() || !self.admits(shot) {
             self.refused += 1;
             return &[];
         }
-        let since = |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
+        let since =
+            |last: Shot| time.seconds_since(last.time).clamp(SHORTEST_INTERVAL, LONGEST_INTERVAL);
         let interval = self.last.map_or(LONGEST_INTERVAL, since);
         if self.last.is_some_and(|last| time.seconds_since(last.time) > LONGEST_INTERVAL) {
             // Nobody knows what the camera did meanwhile.
@@ -306,7 +322,8 @@ impl ImageTracker {
             may_search: false,
             config: &self.config,
         };
-        // For one that is stood in for something moves already: what a search finds beside that is more often the scene.
+        // For one that is stood in for something moves already: what a search finds beside that is
+        // more often the scene.
         let turn = self
             .followed
             .iter()
@@ -343,8 +360,9 @@ impl ImageTracker {
         &self.tracks
     }
 
-    /// Whether an image follows the last one. After some that agree with each other and not with that
-    /// one, they are right: a camera has changed its mode, or one clock reading was from the future.
+    /// Whether an image follows the last one. After some that agree with each other and not with
+    /// that one, they are right: a camera has changed its mode, or one clock reading was from the
+    /// future.
     fn admits(&mut self, shot: Shot) -> bool {
         if self.last.is_none_or(|last| shot.follows(last)) {
             self.refused_last = None;
@@ -365,7 +383,8 @@ impl ImageTracker {
         }
         // What was noted in the wrong one's time means nothing either.
         for followed in &mut self.followed {
-            (followed.measured_at, followed.since, followed.searched) = (shot.time, shot.time, None);
+            (followed.measured_at, followed.since, followed.searched) =
+                (shot.time, shot.time, None);
         }
         self.keepsake = None;
         self.scene.clear();
@@ -374,22 +393,26 @@ impl ImageTracker {
         true
     }
 
-    /// Keeps a picture for later losses: from time to time, while every target is seen, and when one
-    /// is new.
+    /// Keeps a picture for later losses: from time to time, while every target is seen, and when
+    /// one is new.
     fn keep(&mut self, image: &Plane, time: Timestamp) {
-        let all_seen =
-            self.followed.iter().all(|followed| followed.is_candidate() || followed.target.is_seen());
+        let all_seen = self
+            .followed
+            .iter()
+            .all(|followed| followed.is_candidate() || followed.target.is_seen());
         let new = self
             .followed
             .iter()
             .any(|f| matches!(&f.target, Follower::Posterior(t) if t.in_keepsake.is_none()));
-        let old = self.keepsake.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= KEEPSAKE_AGE);
+        let old =
+            self.keepsake.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= KEEPSAKE_AGE);
         let posterior = self.config.algorithm == Algorithm::Posterior;
         if !posterior || self.followed.is_empty() || !all_seen || !(new || old) {
             return;
         }
-        let keepsake =
-            self.keepsake.get_or_insert_with(|| Keepsake { picture: Plane::default(), taken: time });
+        let keepsake = self
+            .keepsake
+            .get_or_insert_with(|| Keepsake { picture: Plane::default(), taken: time });
         keepsake.picture.copy_from(image);
         keepsake.taken = time;
         for followed in &mut self.followed {
@@ -403,16 +426,20 @@ impl ImageTracker {
     /// tracks of one target.
     fn give_up(&mut self, now: Timestamp) {
         let patience = self.config.give_up_after_s;
-        self.followed.retain(|f| f.origin == Origin::Given || now.seconds_since(f.measured_at) <= patience);
+        self.followed
+            .retain(|f| f.origin == Origin::Given || now.seconds_since(f.measured_at) <= patience);
         // They would take the places of others, and cover a target that hovers there.
-        let stays = |f: &Followed| f.is_candidate() && !f.has_moved() && now.seconds_since(f.since) > STAYS_S;
+        let stays = |f: &Followed| {
+            f.is_candidate() && !f.has_moved() && now.seconds_since(f.since) > STAYS_S
+        };
         self.followed.retain(|followed| !stays(followed));
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
             // One that is lost is not where it is guessed to be.
-            let is_of =
-                |other: &Followed| !other.target.is_searching() && same(&other.target, &rest[0].target);
+            let is_of = |other: &Followed| {
+                !other.target.is_searching() && same(&other.target, &rest[0].target)
+            };
             let is_double = rest[0].origin != Origin::Given && older.iter().any(is_of);
             let is_known = rest[0].is_candidate()
                 && rest[1..].iter().any(|younger| !younger.is_candidate() && is_of(younger));
@@ -438,7 +465,12 @@ fn same(one: &Follower, other: &Follower) -> bool {
     (a.x - b.x).abs() < aw.max(bw) / 2.0 && (a.y - b.y).abs() < ah.max(bh) / 2.0
 }
 
-pub(crate) fn describe(id: ImageTrackId, target: &Follower, phase: TrackPhase, step: Step) -> ImageTrack {
+pub(crate) fn describe(
+    id: ImageTrackId,
+    target: &Follower,
+    phase: TrackPhase,
+    step: Step,
+) -> ImageTrack {
     let [width, height] = target.size();
     ImageTrack {
         id,

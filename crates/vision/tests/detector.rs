@@ -68,7 +68,8 @@ fn sky(_: f64, _: f64, _: f64) -> f64 {
 /// Sky above, still and sharp texture below the row 90, a mast.
 fn landscape(x: f64, y: f64, _: f64) -> f64 {
     let mast = if (x - 200.0).abs() < 1.5 && y > 40.0 { 60.0 } else { 0.0 };
-    let ground = 40.0 * (x * 0.9).sin() * (y * 1.1 + x * 0.2).cos() + 25.0 * (x * 0.23 + y * 0.31).sin();
+    let ground =
+        40.0 * (x * 0.9).sin() * (y * 1.1 + x * 0.2).cos() + 25.0 * (x * 0.23 + y * 0.31).sin();
     mast + if y < 90.0 { 150.0 + 0.1 * y } else { 90.0 + ground }
 }
 
@@ -117,12 +118,17 @@ fn is_at(track: &ImageTrack, spot: &Spot, within: f64) -> bool {
 
 #[test]
 fn what_comes_is_found_once_within_half_a_second() {
-    // In the sky: a plain one, one over still ground, one over leaves in the wind, one with clouds; bright and dark.
+    // In the sky: a plain one, one over still ground, one over leaves in the wind, one with clouds;
+    // bright and dark.
     for (scene, seed) in [(sky as Scene, 1), (landscape, 2), (leaves, 3), (clouds, 4)] {
         for brighter in [90.0, -90.0] {
             let mut world = World::new(320, 240, 3.0, scene, seed);
-            let spot =
-                |time_s: f64| Spot { x: 30.0 + 70.0 * (time_s - 2.0), y: 60.0, spread: [4.0, 2.5], brighter };
+            let spot = |time_s: f64| Spot {
+                x: 30.0 + 70.0 * (time_s - 2.0),
+                y: 60.0,
+                spread: [4.0, 2.5],
+                brighter,
+            };
             let (mut found_s, mut numbers) = (None, Vec::new());
             watch(&mut world, 4.0, from(2.0, spot), |time_s, tracks| {
                 for track in tracks {
@@ -135,7 +141,10 @@ fn what_comes_is_found_once_within_half_a_second() {
                 }
             });
             numbers.dedup();
-            assert!(found_s.is_some_and(|found_s| found_s <= 2.5), "{seed}, {brighter}: {found_s:?}");
+            assert!(
+                found_s.is_some_and(|found_s| found_s <= 2.5),
+                "{seed}, {brighter}: {found_s:?}"
+            );
             assert_eq!(numbers.len(), 1, "{seed}, {brighter}");
         }
     }
@@ -222,8 +231,12 @@ fn a_shaken_camera_finds_what_comes_and_nothing_else() {
         landscape(x + by, y + down, time_s)
     }
     let mut world = World::new(240, 200, 3.0, shaken, 20);
-    let spot =
-        |time_s: f64| Spot { x: 30.0 + 60.0 * (time_s - 3.0), y: 50.0, spread: [4.0, 2.5], brighter: 100.0 };
+    let spot = |time_s: f64| Spot {
+        x: 30.0 + 60.0 * (time_s - 3.0),
+        y: 50.0,
+        spread: [4.0, 2.5],
+        brighter: 100.0,
+    };
     let mut seen = 0;
     watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
         assert!(time_s >= 3.0 || tracks.is_empty(), "at {time_s}: {tracks:?}");
@@ -241,8 +254,12 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
         clouds(x + turned, y, 0.0) + 20.0 * ((x + turned) * 0.4).sin() * (y * 0.5).cos()
     }
     let mut world = World::new(320, 240, 2.0, turning, 21);
-    let spot =
-        |time_s: f64| Spot { x: 20.0 + 50.0 * (time_s - 3.0), y: 120.0, spread: [4.0, 3.0], brighter: 100.0 };
+    let spot = |time_s: f64| Spot {
+        x: 20.0 + 50.0 * (time_s - 3.0),
+        y: 120.0,
+        spread: [4.0, 3.0],
+        brighter: 100.0,
+    };
     let mut seen = 0;
     watch(&mut world, 5.0, from(3.0, spot), |time_s, tracks| {
         let on_it = tracks.iter().filter(|track| is_at(track, &spot(time_s), 8.0)).count();
@@ -284,7 +301,10 @@ fn fifty_at_once_are_found_and_keep_their_numbers() {
         let seen = numbers.iter().flatten().count();
         assert!(time_s < 1.3 || seen == 50, "at {time_s}: {seen}");
     });
-    assert!(last == 50 && numbers.iter().flatten().all(|(_, is_kept)| *is_kept), "{last}, {numbers:?}");
+    assert!(
+        last == 50 && numbers.iter().flatten().all(|(_, is_kept)| *is_kept),
+        "{last}, {numbers:?}"
+    );
 }
 
 #[test]

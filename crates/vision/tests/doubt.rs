@@ -1,4 +1,5 @@
-//! Where the image does not say what is the target: noise, clouds that look like it, a camera that is jerked.
+//! Where the image does not say what is the target: noise, clouds that look like it, a camera that
+//! is jerked.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
@@ -60,7 +61,8 @@ fn what_is_gone_for_good_is_not_seen_in_the_clouds() {
                 &scene.image((frame < 60).then(|| at(frame)), [0.1 * frame as f32, 0.0]),
                 frame,
             );
-            running = if frame >= 60 && track.phase != TrackPhase::Searching { running + 1 } else { 0 };
+            running =
+                if frame >= 60 && track.phase != TrackPhase::Searching { running + 1 } else { 0 };
             longest = longest.max(running);
         }
         assert!(longest <= 25, "seed {seed}: {longest} images on something else");

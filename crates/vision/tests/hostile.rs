@@ -1,5 +1,5 @@
-//! Whatever a camera, a clock or an operator gives a tracker, it answers with what can be, or not at
-//! all. `fuzz/` runs the same driver with a fuzzer; its corpus is replayed here.
+//! Whatever a camera, a clock or an operator gives a tracker, it answers with what can be, or not
+//! at all. `fuzz/` runs the same driver with a fuzzer; its corpus is replayed here.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 

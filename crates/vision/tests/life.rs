@@ -26,12 +26,17 @@ fn at(frame: u32) -> Timestamp {
 
 #[test]
 fn two_targets_are_found_followed_and_kept_apart() {
-    let config = TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
+    let config =
+        TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
     let mut tracker = ImageTracker::new(config).unwrap();
     let mut last = Vec::new();
     for frame in 0..60 {
         let t = frame as f32;
-        let image = if frame < 12 { spots(&[]) } else { spots(&[(20.0 + t, 30.0), (140.0 - 1.5 * t, 90.0)]) };
+        let image = if frame < 12 {
+            spots(&[])
+        } else {
+            spots(&[(20.0 + t, 30.0), (140.0 - 1.5 * t, 90.0)])
+        };
         last = tracker.step(&image, at(frame)).to_vec();
     }
     assert_eq!(last.len(), 2, "{last:?}");
@@ -48,7 +53,8 @@ fn an_occluded_target_coasts_and_is_taken_back() {
     for frame in 0..60 {
         let x = 20.0 + 2.0 * frame as f32;
         let hidden = (25..33).contains(&frame);
-        let tracks = tracker.step(&if hidden { spots(&[]) } else { spots(&[(x, 60.0)]) }, at(frame));
+        let tracks =
+            tracker.step(&if hidden { spots(&[]) } else { spots(&[(x, 60.0)]) }, at(frame));
         phases.push(tracks[0].phase);
         if frame == 59 {
             assert!((tracks[0].position.x - f64::from(x)).abs() < 1.0, "{tracks:?}");
@@ -89,7 +95,10 @@ fn a_target_that_leaves_the_image_is_taken_back_where_it_enters_again() {
     }
     let (track, x) = last.unwrap();
     assert_eq!(track.phase, TrackPhase::Tracking);
-    assert!((track.position.x - x).abs() < 0.5 && (track.position.y - 60.0).abs() < 0.5, "{track:?}");
+    assert!(
+        (track.position.x - x).abs() < 0.5 && (track.position.y - 60.0).abs() < 0.5,
+        "{track:?}"
+    );
 }
 
 #[test]
@@ -105,11 +114,13 @@ fn a_target_half_hidden_is_still_followed() {
     }
 }
 
-/// A sky that the camera drifts over, with a cloud that looks like the target and is two thirds as bright.
+/// A sky that the camera drifts over, with a cloud that looks like the target and is two thirds as
+/// bright.
 fn drifting(frame: u32, target: Option<(f32, f32)>, noise: &mut impl FnMut() -> f32) -> Plane {
     let drift = 0.3 * frame as f32;
-    let spot =
-        |x: f32, y: f32, column: f32, row: f32| (-((column - x).powi(2) + (row - y).powi(2)) / 8.0).exp();
+    let spot = |x: f32, y: f32, column: f32, row: f32| {
+        (-((column - x).powi(2) + (row - y).powi(2)) / 8.0).exp()
+    };
     Plane::from_fn(320, 240, |column, row| {
         let (column, row) = (column as f32, row as f32);
         let sky = 12.0 * (((column + drift) / 31.0).sin() + (row / 23.0).cos());
@@ -136,8 +147,10 @@ fn a_cloud_that_looks_like_the_target_is_not_followed_in_its_place() {
             let hidden = (66..81).contains(&frame);
             let image = drifting(frame, (!hidden).then_some(place), &mut noise);
             let track = tracker.step(&image, at(frame))[0];
-            let off = (track.position.x - f64::from(place.0)).hypot(track.position.y - f64::from(place.1));
-            running = if track.phase != TrackPhase::Searching && off > 10.0 { running + 1 } else { 0 };
+            let off = (track.position.x - f64::from(place.0))
+                .hypot(track.position.y - f64::from(place.1));
+            running =
+                if track.phase != TrackPhase::Searching && off > 10.0 { running + 1 } else { 0 };
             longest = longest.max(running);
             if frame > 120 {
                 assert!(off < 1.0, "seed {seed}, frame {frame}: {off} px off");
@@ -158,7 +171,8 @@ fn a_target_that_hovers_is_found_again_where_it_was() {
         let mut tracker = ImageTracker::new(TrackerConfig::default()).unwrap();
         tracker.take_up(PixelBox { x: 216.0, y: 76.0, width: 9.0, height: 9.0 });
         for frame in 0..240 {
-            // Hidden for half a second now and then, and for longer than any picture of the scene is kept.
+            // Hidden for half a second now and then, and for longer than any picture of the scene
+            // is kept.
             let hidden = (60..75).contains(&frame) || (100..220).contains(&frame);
             let image = drifting(frame, (!hidden).then_some((220.0, 80.0)), &mut noise);
             let track = tracker.step(&image, at(frame))[0];
@@ -195,7 +209,8 @@ fn a_camera_that_changes_its_size_or_has_had_one_wrong_time_is_followed_again() 
 
 #[test]
 fn a_found_target_that_one_wrong_time_has_cut_off_is_given_up_in_time() {
-    let config = TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
+    let config =
+        TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() };
     let mut tracker = ImageTracker::new(config).unwrap();
     for frame in 0..40 {
         let t = frame as f32;

@@ -9,7 +9,9 @@ use crossfix_vision::TrackPhase;
 
 /// Something of other looks than the target: a dark bar, upright.
 fn bar([x, y]: [f32; 2], contrast: f32) -> impl Fn(f32, f32) -> f32 {
-    move |column, row| if (column - x).abs() <= 1.5 && (row - y).abs() <= 5.0 { contrast } else { 0.0 }
+    move |column, row| {
+        if (column - x).abs() <= 1.5 && (row - y).abs() <= 5.0 { contrast } else { 0.0 }
+    }
 }
 
 #[test]
@@ -19,9 +21,11 @@ fn what_looks_as_it_did_at_first_is_found_again() {
         let mut tracker = tracker_on([60.0, 60.0]);
         let mut found = None;
         for frame in 0..200 {
-            // For four seconds it turns from a bright blob to a dark bar; then it is hidden, and hovers elsewhere as it was.
+            // For four seconds it turns from a bright blob to a dark bar; then it is hidden, and
+            // hovers elsewhere as it was.
             let share = |from: f32| ((frame as f32 - from) / 40.0).clamp(0.0, 1.0);
-            let (at, is_hidden) = ([60.0 + 0.3 * frame.min(120) as f32, 60.0], (120..140).contains(&frame));
+            let (at, is_hidden) =
+                ([60.0 + 0.3 * frame.min(120) as f32, 60.0], (120..140).contains(&frame));
             let image = if is_hidden {
                 scene.image(None, [0.0; 2])
             } else if frame < 120 {
@@ -35,8 +39,9 @@ fn what_looks_as_it_did_at_first_is_found_again() {
             if frame == 119 {
                 assert!(off(&track, at) < 3.0, "seed {seed}: it is lost before it is hidden");
             }
-            let is_there =
-                frame >= 140 && track.phase == TrackPhase::Tracking && off(&track, [170.0, 110.0]) < 3.0;
+            let is_there = frame >= 140
+                && track.phase == TrackPhase::Tracking
+                && off(&track, [170.0, 110.0]) < 3.0;
             found = found.or(is_there.then_some(frame));
         }
         assert!(found.is_some_and(|found| found < 165), "seed {seed}: found in image {found:?}");
@@ -59,7 +64,10 @@ fn the_one_thing_that_moves_is_shown_for_a_lost_target_until_that_is_found() {
                 _ => scene.image(Some(at), [0.0; 2]),
             };
             let track = step(&mut tracker, &image, frame);
-            if (125..150).contains(&frame) && track.phase == TrackPhase::Tracking && off(&track, at) < 4.0 {
+            if (125..150).contains(&frame)
+                && track.phase == TrackPhase::Tracking
+                && off(&track, at) < 4.0
+            {
                 assert!(track.certainty <= 0.5, "seed {seed}, image {frame}: {}", track.certainty);
                 shown += 1;
             }
@@ -79,7 +87,8 @@ fn what_is_written_into_the_video_is_not_taken_for_a_lost_target() {
         let mut tracker = tracker_on(at(0));
         let (written, mut taken) = ([200.0, 150.0], 0);
         for frame in 0..160 {
-            // The camera turns; the mark keeps to its place in the image, and looks like the target.
+            // The camera turns; the mark keeps to its place in the image, and looks like the
+            // target.
             let turned = [0.8 * frame as f32, 0.4 * frame as f32];
             let mark = |x: f32, y: f32| {
                 let (u, v) = ((x - written[0]) / 4.0, (y - written[1]) / 2.4);

@@ -43,7 +43,8 @@ fn taken_up(image: &Plane, place: PixelBox, config: TrackerConfig) -> ImageTrack
 
 /// A box of the target's size, changed by a factor and moved.
 fn drawn(spot: Spot, [dx, dy]: [f64; 2], factor: f64) -> PixelBox {
-    let centre = crossfix_vision::ImagePoint { x: f64::from(spot.x) + dx, y: f64::from(spot.y) + dy };
+    let centre =
+        crossfix_vision::ImagePoint { x: f64::from(spot.x) + dx, y: f64::from(spot.y) + dy };
     PixelBox::about(centre, 11.0 * factor, 6.0 * factor)
 }
 
@@ -70,7 +71,10 @@ fn a_loose_box_is_moved_onto_what_stands_out() {
         for (beside, factor) in LOOSE {
             let track = taken_up(&image, drawn(spot, beside, factor), TrackerConfig::default());
             assert!(off(&track, spot) < 0.5, "{beside:?} {factor}: {track:?}");
-            assert!((7.0..=16.0).contains(&track.width) && (4.0..=10.0).contains(&track.height), "{track:?}");
+            assert!(
+                (7.0..=16.0).contains(&track.width) && (4.0..=10.0).contains(&track.height),
+                "{track:?}"
+            );
         }
     }
 }
@@ -84,7 +88,8 @@ fn a_box_that_fits_stays_and_so_does_every_box_if_the_configuration_says_so() {
     assert_eq!((track.position, track.width), (fitting.centre(), fitting.width));
     for (beside, factor) in LOOSE {
         let place = drawn(spot, beside, factor);
-        let track = taken_up(&image, place, TrackerConfig { box_sd_px: 0.0, ..TrackerConfig::default() });
+        let track =
+            taken_up(&image, place, TrackerConfig { box_sd_px: 0.0, ..TrackerConfig::default() });
         assert_eq!((track.position, track.width), (place.centre(), place.width));
     }
 }

@@ -8,7 +8,9 @@ use std::cell::Cell;
 
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
-use crossfix_vision::{ImageTracker, ImmConfig, PixelBox, ReferenceStrategy, TrackPhase, TrackerConfig};
+use crossfix_vision::{
+    ImageTracker, ImmConfig, PixelBox, ReferenceStrategy, TrackPhase, TrackerConfig,
+};
 
 /// The system's allocator, counting what each thread asks of it.
 struct Counting;
@@ -60,9 +62,12 @@ fn pictures() -> Vec<Plane> {
 
 #[test]
 fn a_track_allocates_nothing() {
-    for reference in [ReferenceStrategy::default(), ReferenceStrategy::PixelImm(ImmConfig::default())] {
+    for reference in
+        [ReferenceStrategy::default(), ReferenceStrategy::PixelImm(ImmConfig::default())]
+    {
         let pictures = pictures();
-        let mut tracker = ImageTracker::new(TrackerConfig { reference, ..TrackerConfig::default() }).unwrap();
+        let mut tracker =
+            ImageTracker::new(TrackerConfig { reference, ..TrackerConfig::default() }).unwrap();
         tracker.take_up(PixelBox { x: 95.0, y: 57.0, width: 11.0, height: 7.0 });
         let mut step = |frame: usize| {
             let time = Timestamp::from_seconds(frame as f64 / 30.0);

@@ -37,8 +37,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             ));
         }
         for path in &site.fusion {
-            let verdict =
-                if cfg!(feature = "centre") { "is good" } else { "is for the fusion centre to check" };
+            let verdict = if cfg!(feature = "centre") {
+                "is good"
+            } else {
+                "is for the fusion centre to check"
+            };
             output::line(format!("fusion centre: {} {verdict}", path.display()));
         }
         return Ok(());
@@ -49,7 +52,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Some(Kind::Network) => toml::to_string(&load_network(&args.config)?)?,
         Some(Kind::Tracker) => {
             let tracker: TrackerConfig = config::load(&args.config, &args.sets, Kind::Tracker)?;
-            tracker.validate().with_context(|| format!("{} has an error", args.config.display()))?;
+            tracker
+                .validate()
+                .with_context(|| format!("{} has an error", args.config.display()))?;
             toml::to_string(&tracker)?
         }
         #[cfg(feature = "centre")]
@@ -58,7 +63,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Some(Kind::Fusion) | None => check_fusion(args)?,
         #[cfg(not(feature = "centre"))]
         kind => {
-            let kind = kind.map_or("a file that is no camera's".to_owned(), |kind| kind.to_string());
+            let kind =
+                kind.map_or("a file that is no camera's".to_owned(), |kind| kind.to_string());
             return Err(parts::is_left_out(&format!("what checks {kind}"), "centre"));
         }
     };

@@ -63,7 +63,8 @@ impl Component {
     fn start(name: &str, folder: &Path, arguments: &[String]) -> anyhow::Result<Self> {
         let program = std::env::current_exe().context("cannot find this program's own file")?;
         let log = folder.join("logs").join(format!("{name}.log"));
-        let log = std::fs::File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+        let log = std::fs::File::create(&log)
+            .with_context(|| format!("cannot write {}", log.display()))?;
         let child = Command::new(program)
             .args(arguments)
             .arg("--stop-with-stdin")
@@ -143,7 +144,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let files = write_files(&args.output, &scene, &world, &network)?;
     if play(args, &files, &network, &shutdown)? == Ending::Interrupted {
         let recording = files.recording.display();
-        output::line(format!("stopped early; the recording is readable: crossfix view {recording}"));
+        output::line(format!(
+            "stopped early; the recording is readable: crossfix view {recording}"
+        ));
         return Ok(());
     }
     tracing::info!("drawing the picture");
@@ -173,22 +176,33 @@ enum Ending {
 }
 
 /// Starts everything, follows it to its end, stops it.
-fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown) -> anyhow::Result<Ending> {
+fn play(
+    args: &Args,
+    files: &Files,
+    network: &NetworkConfig,
+    shutdown: &Shutdown,
+) -> anyhow::Result<Ending> {
     let text = |path: &Path| path.display().to_string();
     let start = |name: &str, arguments: &[&str]| {
         let arguments: Vec<String> = arguments.iter().map(|a| (*a).to_owned()).collect();
         Component::start(name, &files.folder, &arguments)
     };
     let (network_file, recording) = (text(&files.network), text(&files.recording));
-    let mut recorder = start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
+    let mut recorder =
+        start("recorder", &["record", "-c", &network_file, "-o", &recording, "--overwrite"])?;
     let mut fusion = start("fusion", &["fuse", "-c", &text(&files.fusion)])?;
-    let viewer =
-        if args.view { Some(start("viewer", &["view", "-c", &text(&files.network)])?) } else { None };
+    let viewer = if args.view {
+        Some(start("viewer", &["view", "-c", &text(&files.network)])?)
+    } else {
+        None
+    };
 
     let link = Link::open(network, &Role::Observer)?;
-    let subscription = link.subscribe(&[Key::new(network.site.clone(), Channel::Tracks).to_string()])?;
+    let subscription =
+        link.subscribe(&[Key::new(network.site.clone(), Channel::Tracks).to_string()])?;
     let go_on = || !shutdown.requested();
-    link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on).context("the fusion centre did not come up")?;
+    link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on)
+        .context("the fusion centre did not come up")?;
     let start_at = wall_seconds() + RUN_UP_S;
     let mut agents = Vec::new();
     for (name, file) in &files.cameras {
@@ -241,8 +255,8 @@ fn play(args: &Args, files: &Files, network: &NetworkConfig, shutdown: &Shutdown
 
 fn progress_bar(duration: f64) -> ProgressBar {
     let bar = ProgressBar::new((duration * 10.0) as u64);
-    let style =
-        ProgressStyle::with_template("{elapsed:>4} [{bar:30}] {msg}").map(|s| s.progress_chars("=> "));
+    let style = ProgressStyle::with_template("{elapsed:>4} [{bar:30}] {msg}")
+        .map(|s| s.progress_chars("=> "));
     if let Ok(style) = style {
         bar.set_style(style);
     }
@@ -341,7 +355,10 @@ fn write_files(
             network: "network.toml".into(),
             intrinsics: Some(format!("{name}.yaml").into()),
             pose: Some(PoseConfig::of(camera.camera().pose())),
-            source: SourceConfig::Simulation { scene: "scene.toml".into(), publish_truth: index == 0 },
+            source: SourceConfig::Simulation {
+                scene: "scene.toml".into(),
+                publish_truth: index == 0,
+            },
             clock: ClockConfig {
                 source: config::ClockSourceName::Simulated,
                 offset_s: clock.offset_s,
@@ -350,7 +367,10 @@ fn write_files(
             },
             preview: Default::default(),
             boxes: Vec::new(),
-            tracker: TrackerConfig { detector: Some(DetectorConfig::default()), ..TrackerConfig::default() },
+            tracker: TrackerConfig {
+                detector: Some(DetectorConfig::default()),
+                ..TrackerConfig::default()
+            },
         };
         let path = folder.join(format!("{name}.toml"));
         write(&path, &toml::to_string(&file)?)?;

@@ -36,8 +36,8 @@ pub struct Question {
     /// Leave out what lies less than this after the first truth, seconds.
     #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
     pub skip_s: f64,
-    /// Only the instants at which so many cameras saw something: in the frame just before and in that
-    /// just after.
+    /// Only the instants at which so many cameras saw something: in the frame just before and in
+    /// that just after.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub min_cameras: usize,
 }
@@ -100,7 +100,11 @@ impl Run {
 
 fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
     let target = |state: &crossfix_message::TrueState| {
-        Some(TrueTarget { id: state.id, position: state.position?.into(), velocity: state.velocity?.into() })
+        Some(TrueTarget {
+            id: state.id,
+            position: state.position?.into(),
+            velocity: state.velocity?.into(),
+        })
     };
     frame.targets.iter().filter_map(target).collect()
 }
@@ -123,10 +127,13 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
         recording.display()
     );
     run.truth.sort_by_key(|frame| frame.time_ns);
-    let times: Vec<Timestamp> = run.truth.iter().map(|f| Timestamp::from_nanos(f.time_ns)).collect();
+    let times: Vec<Timestamp> =
+        run.truth.iter().map(|f| Timestamp::from_nanos(f.time_ns)).collect();
     let start = times[0].plus_seconds(question.skip_s);
     let mut evaluator = Evaluator::new(question.cutoff_m);
-    for ((frame, &time), cameras) in run.truth.iter().zip(&times).zip(run.sightings.cameras_at(&times)) {
+    for ((frame, &time), cameras) in
+        run.truth.iter().zip(&times).zip(run.sightings.cameras_at(&times))
+    {
         if time >= start && cameras >= question.min_cameras {
             evaluator.add(time, &targets(frame), &run.tracks.at(time));
         }
@@ -204,8 +211,9 @@ fn waits(delays: &Delays) -> String {
         || "a target was never answered for".to_owned(),
         |first| format!("first answer after {first:.1} s"),
     );
-    let seconds =
-        |value: Option<f64>| value.map_or_else(|| "never".to_owned(), |value| format!("{value:.1} s"));
+    let seconds = |value: Option<f64>| {
+        value.map_or_else(|| "never".to_owned(), |value| format!("{value:.1} s"))
+    };
     let next = match delays.returns {
         0 => String::new(),
         returns => format!(

@@ -10,13 +10,15 @@ use crate::recorded::{self, Lacks};
 
 /// Write the confirmed tracks of a recording as a table.
 ///
-/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m: seconds since the Unix epoch, metres, metres a second,
-/// what the track is (confirmed or coasting; with --all also tentative and one-camera), how many cameras have given
-/// it a bearing within the second before, and the root of the sum of the position's variances, metres. With
-/// --times, the state of each track at those times from its last frame at or before them,
-/// extrapolated with its velocity.
+/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m: seconds since the Unix epoch, metres,
+/// metres a second, what the track is (confirmed or coasting; with --all also tentative and
+/// one-camera), how many cameras have given it a bearing within the second before, and the root of
+/// the sum of the position's variances, metres. With --times, the state of each track at those
+/// times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv")]
+#[command(
+    after_help = "Example:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv"
+)]
 pub struct Args {
     /// The recording (MCAP) with tracks.
     recording: PathBuf,
@@ -26,7 +28,8 @@ pub struct Args {
     /// A table (CSV) with a column `t`: the times to answer, seconds since the Unix epoch.
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
-    /// Also the tracks that are not sure yet, and those that one camera alone follows: their range is a guess.
+    /// Also the tracks that are not sure yet, and those that one camera alone follows: their range
+    /// is a guess.
     #[arg(long)]
     all: bool,
 }
@@ -67,7 +70,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let draft = Draft::new(&args.csv, &inputs)?;
     let mut writer = csv::Writer::from_path(draft.path())
         .with_context(|| format!("cannot write {}", args.csv.display()))?;
-    writer.write_record(["t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m"])?;
+    writer.write_record([
+        "t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m",
+    ])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
         for estimate in estimates {
@@ -84,10 +89,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
     match &args.times {
         Some(path) => {
-            let mut reader =
-                csv::Reader::from_path(path).with_context(|| format!("cannot read {}", path.display()))?;
+            let mut reader = csv::Reader::from_path(path)
+                .with_context(|| format!("cannot read {}", path.display()))?;
             for row in reader.deserialize() {
-                let TimeRow { t } = row.with_context(|| format!("{} needs a column `t`", path.display()))?;
+                let TimeRow { t } =
+                    row.with_context(|| format!("{} needs a column `t`", path.display()))?;
                 write(t, &at(Timestamp::from_seconds(t)))?;
             }
         }

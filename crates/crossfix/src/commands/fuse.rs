@@ -69,7 +69,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let kinds = ["bearings", "calibration", "health"];
     let site = station.link.site().clone();
-    let mut subscription = station.link.subscribe(&kinds.map(|kind| Key::of_all_cameras(&site, kind)))?;
+    let mut subscription =
+        station.link.subscribe(&kinds.map(|kind| Key::of_all_cameras(&site, kind)))?;
     let alive = station.link.declare_alive(Channel::FusionAlive)?;
     tracing::info!("the fusion centre of `{site}` is up, run {}", station.link.run());
 
@@ -101,7 +102,11 @@ impl Station {
     }
 
     /// Handles what is on its way, for a moment, and what waits.
-    fn finish(&mut self, subscription: &mut Subscription, shutdown: &Shutdown) -> anyhow::Result<()> {
+    fn finish(
+        &mut self,
+        subscription: &mut Subscription,
+        shutdown: &Shutdown,
+    ) -> anyhow::Result<()> {
         while !shutdown.overdue(LAST_WORDS)
             && let Some(received) = subscription.next(POLL)
         {
@@ -127,12 +132,17 @@ impl Station {
             let missing = self.reception.see(key, origin, *at);
             if missing > 0 {
                 self.centre.warn(&format!("missing {key}"), || {
-                    format!("{missing} messages on `{key}` were lost on the way from run {}", origin.run)
+                    format!(
+                        "{missing} messages on `{key}` were lost on the way from run {}",
+                        origin.run
+                    )
                 });
             }
         }
-        let sender =
-            origin.map_or_else(|| " from an unknown program".to_owned(), |o| format!(" from run {}", o.run));
+        let sender = origin.map_or_else(
+            || " from an unknown program".to_owned(),
+            |o| format!(" from run {}", o.run),
+        );
         let outputs = self.centre.take(&key.channel, data, &sender);
         self.publish(outputs)
     }

@@ -28,7 +28,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn print(info: &RecordingInfo) {
-    let head = ["channel", "messages", "bytes", "first [s]", "last [s]", "schema"].map(str::to_owned);
+    let head =
+        ["channel", "messages", "bytes", "first [s]", "last [s]", "schema"].map(str::to_owned);
     let mut rows = vec![head.to_vec()];
     rows.extend(info.channels.iter().map(|channel| {
         vec![

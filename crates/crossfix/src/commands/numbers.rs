@@ -20,11 +20,13 @@ fn within(text: &str, least: f64, most: f64, unit: &str) -> Result<f64, String> 
 }
 
 pub fn positive(text: &str) -> Result<f64, String> {
-    number(text).and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
+    number(text)
+        .and_then(|n| if n > 0.0 { Ok(n) } else { Err("it must be more than 0".to_owned()) })
 }
 
 pub fn not_negative(text: &str) -> Result<f64, String> {
-    number(text).and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
+    number(text)
+        .and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
 }
 
 /// How many times as fast as in life; 0 is as fast as it goes.

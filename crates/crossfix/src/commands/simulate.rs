@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use crossfix_geometry::{Pixel, PixelCovariance};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key, Payload,
-    SiteName, Timestamp,
+    BearingFrame, BearingTrack, CameraCalibration, Channel, ClockSource, ImageTrackState, Key,
+    Payload, SiteName, Timestamp,
 };
 use crossfix_recording::{Entry, RecordingWriter, Source};
 use crossfix_simulation::{Scene, SimulatedCamera, World};
@@ -51,7 +51,8 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     if let Some(folder) = &args.scenario {
-        let site = args.site.site().build().context("the site that the options describe is impossible")?;
+        let site =
+            args.site.site().build().context("the site that the options describe is impossible")?;
         let exposures = scenario::write(&site, folder)?;
         output::line(format!("{exposures} exposures written to {}", folder.display()));
     }
@@ -60,19 +61,25 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
     let scene: Scene = config::load(path, &args.sets, config::Kind::Scene)?;
-    let world = scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
+    let world =
+        scene.build().with_context(|| format!("the scene {} has an error", path.display()))?;
     let noise = args.noise_px;
-    ensure!((0.01..100.0).contains(&noise), "--noise-px is {noise}: it must be from 0.01 to 100 px");
+    ensure!(
+        (0.01..100.0).contains(&noise),
+        "--noise-px is {noise}: it must be from 0.01 to 100 px"
+    );
     if let Some(path) = &args.output {
         let messages = record(&world, path, noise, scene.seed)?;
         output::line(format!("{messages} messages written to {}", path.display()));
     }
     if let Some(folder) = &args.video {
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+        std::fs::create_dir_all(folder)
+            .with_context(|| format!("cannot make {}", folder.display()))?;
         for camera in world.cameras() {
             let path = folder.join(format!("{}.y4m", camera.name()));
             let draft = Draft::new(&path, &[])?;
-            film(camera, draft.path()).with_context(|| format!("cannot write {}", path.display()))?;
+            film(camera, draft.path())
+                .with_context(|| format!("cannot write {}", path.display()))?;
             draft.keep()?;
             output::line(format!("{} frames written to {}", camera.frames(), path.display()));
         }
@@ -84,8 +91,8 @@ fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Resul
     let site: SiteName = "simulation".parse()?;
     let mut entries = Vec::new();
     for (index, camera) in world.cameras().iter().enumerate() {
-        let calibration =
-            CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH).with_pose_sd(0.0, 0.0);
+        let calibration = CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH)
+            .with_pose_sd(0.0, 0.0);
         let key = Key::new(site.clone(), Channel::Calibration(camera.name().clone()));
         entries.push(imported(key, Timestamp::EPOCH, calibration.encode()));
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -97,7 +104,11 @@ fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Resul
     for step in 0..(world.duration_s() * 10.0) as u32 {
         let t = f64::from(step) / 10.0;
         let key = Key::new(site.clone(), Channel::Truth);
-        entries.push(imported(key, Timestamp::from_seconds(t), truth_frame(world, t, 0.0).encode()));
+        entries.push(imported(
+            key,
+            Timestamp::from_seconds(t),
+            truth_frame(world, t, 0.0).encode(),
+        ));
     }
     entries.sort_by_key(|entry| entry.data_time);
     let draft = Draft::new(path, &[])?;
@@ -129,7 +140,8 @@ fn exposure(
         }
         let mut normal = || -> f64 { StandardNormal.sample(rng) };
         let pixel = Pixel::new(exact.x() + noise_px * normal(), exact.y() + noise_px * normal());
-        let bearing = camera.camera().model().bearing(pixel, PixelCovariance::isotropic(noise_px))?;
+        let bearing =
+            camera.camera().model().bearing(pixel, PixelCovariance::isotropic(noise_px))?;
         tracks.push(BearingTrack {
             track_id: target.id,
             bearing: Some(bearing.direction().into_inner().into()),

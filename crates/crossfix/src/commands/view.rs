@@ -28,8 +28,8 @@ pub struct Args {
     /// The network's file (TOML): show the site live.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Write the picture to a file (.rrd) instead of a viewer. A live one that is there already stays, and
-    /// the new one is written beside it.
+    /// Write the picture to a file (.rrd) instead of a viewer. A live one that is there already
+    /// stays, and the new one is written beside it.
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     /// A viewer that runs already, e.g. 127.0.0.1:9876; one is started without.
@@ -65,7 +65,9 @@ fn viewer(args: &Args) -> anyhow::Result<RecordingStream> {
 
 fn say_saved(rrd: &Path) {
     let rrd = rrd.display();
-    output::line(format!("picture written to {rrd}; look at it with: rerun --bind 127.0.0.1 {rrd}"));
+    output::line(format!(
+        "picture written to {rrd}; look at it with: rerun --bind 127.0.0.1 {rrd}"
+    ));
 }
 
 /// Draws a recording into an .rrd file.
@@ -104,7 +106,8 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
         return Ok(());
     };
     // A live picture is like a live recording: what was drawn stays, whatever becomes of the rest.
-    let rrd = args.save.as_deref().and_then(|asked| output::names(asked).find(|path| !path.exists()));
+    let rrd =
+        args.save.as_deref().and_then(|asked| output::names(asked).find(|path| !path.exists()));
     let stream = match (&rrd, &args.save) {
         (Some(rrd), Some(asked)) => {
             output::say_other_name(asked, rrd);
@@ -154,8 +157,9 @@ impl Watch {
     fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
         if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
-            self.repeats
-                .warn("foreign", *at, || format!("`{key}` is of no camera of the network's file: not shown"));
+            self.repeats.warn("foreign", *at, || {
+                format!("`{key}` is of no camera of the network's file: not shown")
+            });
             return Ok(());
         }
         if let Some(origin) = *origin {
@@ -175,7 +179,10 @@ impl Watch {
         }
         if begun.elapsed() > STALL {
             self.repeats.warn("stall", *at, || {
-                format!("the viewer did not take the picture for {:.0} s", begun.elapsed().as_secs_f64())
+                format!(
+                    "the viewer did not take the picture for {:.0} s",
+                    begun.elapsed().as_secs_f64()
+                )
             });
         }
         Ok(())

@@ -26,8 +26,8 @@ pub struct CameraFile {
     pub name: CameraName,
     /// The network's file (TOML).
     pub network: PathBuf,
-    /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if both
-    /// this and `pose` are there, they replace the recorded calibration.
+    /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if
+    /// both this and `pose` are there, they replace the recorded calibration.
     pub intrinsics: Option<PathBuf>,
     /// Where it stands and looks.
     pub pose: Option<PoseConfig>,
@@ -58,8 +58,9 @@ pub struct PoseConfig {
     /// The rotation world_from_camera, row by row: its columns are the camera's axes (x right,
     /// y down, z forward) in the world.
     pub rotation: Option<[[f64; 3]; 3]>,
-    /// Standard deviation of the rotation about each axis, mrad. 0 to 1000. With `position_sd_m`; absent: a
-    /// careful survey's (1 mrad, 5 cm) is assumed, and how good the pose is is learnt from the sight lines.
+    /// Standard deviation of the rotation about each axis, mrad. 0 to 1000. With `position_sd_m`;
+    /// absent: a careful survey's (1 mrad, 5 cm) is assumed, and how good the pose is is learnt
+    /// from the sight lines.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rotation_sd_mrad: Option<f64>,
     /// Standard deviation of the centre along each axis, m. 0 to 1000.
@@ -202,10 +203,13 @@ impl CameraFile {
         match (&self.intrinsics, &self.pose, &self.source) {
             (Some(intrinsics), Some(pose), _) => {
                 let text = std::fs::read_to_string(intrinsics)
-                    .with_context(|| format!("key `intrinsics`: cannot read {}", intrinsics.display()))
+                    .with_context(|| {
+                        format!("key `intrinsics`: cannot read {}", intrinsics.display())
+                    })
                     .with_context(wrong)?;
-                let intrinsics = intrinsics_from_yaml(&text)
-                    .with_context(|| format!("the intrinsics file {} has an error", intrinsics.display()))?;
+                let intrinsics = intrinsics_from_yaml(&text).with_context(|| {
+                    format!("the intrinsics file {} has an error", intrinsics.display())
+                })?;
                 let pose = pose.pose().context("section [pose]").with_context(wrong)?;
                 let camera = Camera::new(intrinsics, pose)?;
                 self.check_lens(&camera).with_context(wrong)?;
@@ -276,8 +280,8 @@ impl CameraFile {
         Ok(())
     }
 
-    /// Checks what needs the lens: that it shows a direction for every pixel, and that boxes are in its
-    /// image.
+    /// Checks what needs the lens: that it shows a direction for every pixel, and that boxes are in
+    /// its image.
     fn check_lens(&self, camera: &Camera) -> anyhow::Result<()> {
         let ImageSize { width, height } = camera.model().intrinsics().size;
         let (right, bottom) = (f64::from(width) - 1.0, f64::from(height) - 1.0);
@@ -302,8 +306,8 @@ impl CameraFile {
         Ok(())
     }
 
-    /// Opens the pictures and holds them against the lens: what else an agent would find out only when it
-    /// starts.
+    /// Opens the pictures and holds them against the lens: what else an agent would find out only
+    /// when it starts.
     pub fn check_pictures(&self, camera: &Camera) -> anyhow::Result<()> {
         let SourceConfig::Video { path, .. } = &self.source else {
             return Ok(());
@@ -311,7 +315,8 @@ impl CameraFile {
         let wrong = || format!("key `source.path`: {}", path.display());
         let mut source = crossfix_video::open(path, FrameClock::default()).with_context(wrong)?;
         let frame = source.next_frame().with_context(wrong)?;
-        let frame = frame.with_context(|| format!("key `source.path`: {} holds no frame", path.display()))?;
+        let frame = frame
+            .with_context(|| format!("key `source.path`: {} holds no frame", path.display()))?;
         let ImageSize { width, height } = camera.model().intrinsics().size;
         ensure!(
             (frame.width, frame.height) == (width as usize, height as usize),
@@ -325,7 +330,9 @@ impl CameraFile {
 
     fn check_source(&self) -> anyhow::Result<()> {
         let (key, file) = match &self.source {
-            SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => ("source.path", path),
+            SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
+                ("source.path", path)
+            }
             SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
         };
         ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
@@ -334,7 +341,11 @@ impl CameraFile {
 
     /// The message that describes the camera: the recorded one as it is, where it is replayed with
     /// its own, so that the same bytes give the same tracks.
-    pub fn calibration(&self, camera: &Camera, valid_from: Timestamp) -> anyhow::Result<CameraCalibration> {
+    pub fn calibration(
+        &self,
+        camera: &Camera,
+        valid_from: Timestamp,
+    ) -> anyhow::Result<CameraCalibration> {
         match &self.source {
             SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
                 recorded_calibration(path, &self.name)
@@ -343,7 +354,9 @@ impl CameraFile {
                 let message = CameraCalibration::new(&self.name, camera, valid_from);
                 let declared = self.pose.as_ref().and_then(PoseConfig::deviations);
                 Ok(match declared {
-                    Some((rotation_rad, position_m)) => message.with_pose_sd(rotation_rad, position_m),
+                    Some((rotation_rad, position_m)) => {
+                        message.with_pose_sd(rotation_rad, position_m)
+                    }
                     None => message,
                 })
             }
@@ -367,7 +380,9 @@ impl CameraFile {
     /// Whether its source is played as fast as it goes.
     pub fn is_unpaced(&self) -> bool {
         match self.source {
-            SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => speed == 0.0,
+            SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => {
+                speed == 0.0
+            }
             SourceConfig::Simulation { .. } => false,
         }
     }
@@ -384,8 +399,9 @@ fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<C
     let found = recorded::find(recording, |entry| {
         (entry.key.channel == channel).then(|| decode::<CameraCalibration>(&entry.data))
     })?;
-    let found =
-        found.with_context(|| format!("{} has no calibration of camera `{name}`", recording.display()))?;
+    let found = found.with_context(|| {
+        format!("{} has no calibration of camera `{name}`", recording.display())
+    })?;
     found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
 }
 

@@ -17,10 +17,11 @@ pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> 
     parse(&text, sets).or_else(|error| {
         let kind = toml::from_str(&text).ok().and_then(|keys| Kind::of(&keys));
         match kind.filter(|kind| *kind != wanted) {
-            Some(kind) => bail!("{} is {kind}, and what is wanted here is {wanted}", path.display()),
-            None => {
-                Err(error).with_context(|| format!("the configuration file {} has an error", path.display()))
+            Some(kind) => {
+                bail!("{} is {kind}, and what is wanted here is {wanted}", path.display())
             }
+            None => Err(error)
+                .with_context(|| format!("the configuration file {} has an error", path.display())),
         }
     })
 }
@@ -43,7 +44,9 @@ impl Kind {
             Some(Self::Camera)
         } else if has(&["targets"]) {
             Some(Self::Scene)
-        } else if has(&["site", "routers"]) || keys.get("cameras").is_some_and(toml::Value::is_table) {
+        } else if has(&["site", "routers"])
+            || keys.get("cameras").is_some_and(toml::Value::is_table)
+        {
             Some(Self::Network)
         } else if has(&["event_time", "bearings", "initiation", "tracking", "clocks", "network"]) {
             Some(Self::Fusion)
@@ -104,7 +107,9 @@ fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
 fn explain(error: &toml::de::Error) -> anyhow::Error {
     let message = error.to_string();
     let quoted: Vec<&str> = error.message().split('`').skip(1).step_by(2).collect();
-    if !error.message().starts_with("unknown field") && !error.message().starts_with("unknown variant") {
+    if !error.message().starts_with("unknown field")
+        && !error.message().starts_with("unknown variant")
+    {
         return anyhow!("{}", message.trim_end());
     }
     let nearest = quoted.split_first().and_then(|(unknown, known)| {
@@ -123,7 +128,8 @@ mod tests {
 
     #[test]
     fn an_unknown_key_names_the_line_and_the_nearest_known_one() {
-        let error = parse::<FusionConfig>("[event_time]\nlatenes_s = 1.0\n", &[]).unwrap_err().to_string();
+        let error =
+            parse::<FusionConfig>("[event_time]\nlatenes_s = 1.0\n", &[]).unwrap_err().to_string();
         assert!(error.contains("latenes_s"), "{error}");
         assert!(error.contains("line 2"), "{error}");
         assert!(error.contains("did you mean `lateness_s`?"), "{error}");
@@ -144,7 +150,8 @@ mod tests {
             let keys = toml::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
             assert_eq!(Kind::of(&keys), Some(kind), "{name}");
             if kind != Kind::Fusion {
-                let error = load::<crate::config::FusionFile>(&path, &[], Kind::Fusion).unwrap_err();
+                let error =
+                    load::<crate::config::FusionFile>(&path, &[], Kind::Fusion).unwrap_err();
                 let says = format!("is {kind}, and what is wanted here is a fusion centre's file");
                 assert!(error.to_string().contains(&says), "{error}");
             }
@@ -153,8 +160,10 @@ mod tests {
 
     #[test]
     fn an_override_replaces_a_value_and_makes_a_section() {
-        let sets = ["tracking.acceleration_density=3.5".to_owned(), "initiation.solver=triple".to_owned()];
-        let config: FusionConfig = parse("[tracking]\nacceleration_density = 1.0\n", &sets).unwrap();
+        let sets =
+            ["tracking.acceleration_density=3.5".to_owned(), "initiation.solver=triple".to_owned()];
+        let config: FusionConfig =
+            parse("[tracking]\nacceleration_density = 1.0\n", &sets).unwrap();
         assert_eq!(config.tracking.acceleration_density, 3.5);
         assert_eq!(config.initiation.solver, crossfix_fusion::SpatialSolver::Triple);
     }

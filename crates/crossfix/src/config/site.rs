@@ -13,7 +13,9 @@ use super::{CameraFile, Kind};
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
     let network: NetworkConfig = super::load(path, &[], Kind::Network)?;
-    network.validate().with_context(|| format!("the network file {} has an error", path.display()))?;
+    network
+        .validate()
+        .with_context(|| format!("the network file {} has an error", path.display()))?;
     Ok(network)
 }
 
@@ -26,9 +28,10 @@ fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
         .collect();
     files.sort();
     let read = |path: PathBuf| {
-        let text =
-            std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
-        let keys = toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        let keys =
+            toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
         Ok((path, keys))
     };
     files.into_iter().map(read).collect()
@@ -94,8 +97,8 @@ impl Site {
         let file = CameraFile::load(path, &[])?;
         let camera = file.camera(path)?;
         file.check_pictures(&camera).with_context(|| path.display().to_string())?;
-        let network =
-            load_network(&file.network).with_context(|| format!("key `network` of {}", path.display()))?;
+        let network = load_network(&file.network)
+            .with_context(|| format!("key `network` of {}", path.display()))?;
         ensure!(
             network.cameras.contains_key(&file.name),
             "{}: camera `{}` has no endpoint: add it to [cameras] of {}",
@@ -143,7 +146,8 @@ fn check_fusion(path: &Path) -> anyhow::Result<()> {
     let Some(network) = &file.network else {
         return Ok(());
     };
-    let network = load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
+    let network =
+        load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
     for camera in file.cameras.iter().flatten() {
         ensure!(
             network.cameras.contains_key(camera),

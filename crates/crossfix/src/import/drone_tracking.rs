@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource, ImageTrackState, Key,
-    Payload, SiteName, Timestamp, TrueState, TruthFrame,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
+    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
 };
 use crossfix_recording::Entry;
 use nalgebra::{Matrix2, Matrix3, Point3, Vector3};
@@ -22,8 +22,8 @@ const SYNC_RATE: f64 = 59.94006;
 /// Rate of the RTK samples, Hz.
 const RTK_RATE: f64 = 5.0;
 
-/// Standard deviation of the fitted places, m an axis: the poses' residual is declared as their rotation's, and
-/// refitted centres of the same cameras agree to 3 to 7 cm (the data's README).
+/// Standard deviation of the fitted places, m an axis: the poses' residual is declared as their
+/// rotation's, and refitted centres of the same cameras agree to 3 to 7 cm (the data's README).
 const FITTED_POSITION_SD_M: f64 = 0.05;
 
 /// What to read.
@@ -113,7 +113,8 @@ fn lens_path(dir: &Path, name: &str, dataset: u32) -> PathBuf {
 }
 
 fn parse_json<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    serde_json::from_str(&read_text(path)?).with_context(|| format!("{} is not as expected", path.display()))
+    serde_json::from_str(&read_text(path)?)
+        .with_context(|| format!("{} is not as expected", path.display()))
 }
 
 /// Reads the test part of a split: calibrations, bearings of every frame, truth.
@@ -125,9 +126,10 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>>
         .remove(&selection.dataset.to_string())
         .with_context(|| format!("{} has no data set {}", poses.display(), selection.dataset))?;
     let masked: Vec<f64> = serde_json::from_value(dataset["rtk_masked_indices"].take())?;
-    let split: Split = serde_json::from_value(dataset[selection.split].take()).with_context(|| {
-        format!("{} has no split `{}` of the expected form", poses.display(), selection.split)
-    })?;
+    let split: Split =
+        serde_json::from_value(dataset[selection.split].take()).with_context(|| {
+            format!("{} has no split `{}` of the expected form", poses.display(), selection.split)
+        })?;
 
     let folder = dir.join(format!("dataset{}", selection.dataset));
     let mut entries = truth(&folder, &site, &split, &masked)?;
@@ -135,7 +137,11 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>>
         let found = split.cameras.iter().find(|(_, camera)| camera.name == *wanted);
         let Some((key, fitted)) = found else {
             let known: Vec<&str> = split.cameras.values().map(|c| c.name.as_str()).collect();
-            bail!("no camera `{wanted}` in data set {}: there are {}", selection.dataset, known.join(", "));
+            bail!(
+                "no camera `{wanted}` in data set {}: there are {}",
+                selection.dataset,
+                known.join(", ")
+            );
         };
         let lens: LensFile = parse_json(&lens_path(dir, wanted, selection.dataset))?;
         let labels = read_labels(&folder.join("detections").join(format!("{key}.txt")))?;
@@ -156,7 +162,8 @@ fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
         .map(str::trim)
         .filter(starts_with_digit)
         .map(|line| {
-            let numbers: Vec<f64> = line.split_whitespace().map_while(|word| word.parse().ok()).collect();
+            let numbers: Vec<f64> =
+                line.split_whitespace().map_while(|word| word.parse().ok()).collect();
             let [frame, x, y, ..] = numbers[..] else {
                 bail!("{}: `{line}` is not `frame x y`", path.display());
             };
@@ -185,7 +192,8 @@ fn camera_entries(
             continue;
         }
         let time = Timestamp::from_seconds(seconds);
-        let track = label.pixel.map(|pixel| bearing_track(&camera, pixel, fitted.residual_sigma_rad));
+        let track =
+            label.pixel.map(|pixel| bearing_track(&camera, pixel, fitted.residual_sigma_rad));
         let frame = BearingFrame {
             camera: name.to_string(),
             sequence: label.frame,
@@ -222,7 +230,12 @@ fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> anyhow::Result<Be
 }
 
 /// The RTK samples of the test part, without the masked ones.
-fn truth(folder: &Path, site: &SiteName, split: &Split, masked: &[f64]) -> anyhow::Result<Vec<Entry>> {
+fn truth(
+    folder: &Path,
+    site: &SiteName,
+    split: &Split,
+    masked: &[f64],
+) -> anyhow::Result<Vec<Entry>> {
     let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"), masked)?;
     let key = Key::new(site.clone(), Channel::Truth);
     let mut entries = Vec::new();
@@ -234,7 +247,8 @@ fn truth(folder: &Path, site: &SiteName, split: &Split, masked: &[f64]) -> anyho
         let velocity = Some(velocity_between(&window[0], &window[1], &window[2]).into());
         let time = Timestamp::from_seconds(seconds);
         let state = TrueState { id: 1, position: Some(place.into()), velocity };
-        let frame = TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
+        let frame =
+            TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
         entries.push(imported(key.clone(), time, frame.encode()));
     }
     Ok(entries)
@@ -248,7 +262,9 @@ fn rtk_samples(path: &Path, masked: &[f64]) -> anyhow::Result<Vec<Sample>> {
     let text = read_text(path)?;
     let rows = text
         .lines()
-        .map(|line| line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>())
+        .map(|line| {
+            line.split_whitespace().map_while(|word| word.parse().ok()).collect::<Vec<f64>>()
+        })
         .filter(|row| row.len() >= 3);
     let sample = |(k, row): (usize, Vec<f64>)| {
         // Four columns: an index first.

@@ -7,8 +7,9 @@ use std::path::Path;
 use anyhow::{Context, ensure};
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource, ImageTrackState, Key,
-    Payload, SiteName, Timestamp, TrueState, TruthFrame, Vector3 as WireVector,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
+    ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
+    Vector3 as WireVector,
 };
 use crossfix_recording::Entry;
 use nalgebra::{Matrix3, Point3, Vector3};
@@ -68,7 +69,8 @@ fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry
     let name = name_of(camera.id)?;
     let rows = Matrix3::from(camera.R_world_from_cam).transpose();
     let axes = rows * Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0));
-    let pose = Pose::new(axes, Point3::from(camera.pos)).with_context(|| format!("camera {}", camera.id))?;
+    let pose = Pose::new(axes, Point3::from(camera.pos))
+        .with_context(|| format!("camera {}", camera.id))?;
     let intrinsics = Intrinsics {
         size: ImageSize { width: 4000, height: 3000 },
         fx: 1000.0,
@@ -80,7 +82,11 @@ fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry
     // The format's poses are the truth.
     let message = CameraCalibration::new(&name, &Camera::new(intrinsics, pose)?, Timestamp::EPOCH)
         .with_pose_sd(0.0, 0.0);
-    Ok(imported(Key::new(site.clone(), Channel::Calibration(name)), Timestamp::EPOCH, message.encode()))
+    Ok(imported(
+        Key::new(site.clone(), Channel::Calibration(name)),
+        Timestamp::EPOCH,
+        message.encode(),
+    ))
 }
 
 fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
@@ -118,7 +124,8 @@ fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
 }
 
 fn truth(dir: &Path, site: &SiteName, scenario: &Scenario) -> anyhow::Result<Vec<Entry>> {
-    let epochs: BTreeSet<Timestamp> = scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
+    let epochs: BTreeSet<Timestamp> =
+        scenario.epochs_s.iter().map(|&t| Timestamp::from_seconds(t)).collect();
     let mut frames: BTreeMap<Timestamp, Vec<TrueState>> = BTreeMap::new();
     for row in read_csv::<TruthRow>(&dir.join("truth.csv"))? {
         let time = Timestamp::from_seconds(row.t);

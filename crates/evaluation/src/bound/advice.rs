@@ -17,11 +17,11 @@ const SAMPLE: usize = 2000;
 /// How good a set of cameras is over a volume.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Score {
-    /// Median of the position's standard deviation, m, over *all* of the volume: where there is no fix, or
-    /// a worse one, the volume's diagonal counts.
+    /// Median of the position's standard deviation, m, over *all* of the volume: where there is no
+    /// fix, or a worse one, the volume's diagonal counts.
     pub median_sd_m: f64,
-    /// The geometric mean of the same, m: what decides between equal medians. The arithmetic one would
-    /// count the bad fixes of two cameras side by side as well nigh as good as a good one.
+    /// The geometric mean of the same, m: what decides between equal medians. The arithmetic one
+    /// would count the bad fixes of two cameras side by side as well nigh as good as a good one.
     pub mean_sd_m: f64,
     /// Share of the volume with a fix.
     pub fixed: f64,
@@ -50,12 +50,14 @@ pub struct Advice {
 }
 
 impl Advice {
-    /// The best candidates that stand at least so far apart, m: neighbours are as good as each other.
+    /// The best candidates that stand at least so far apart, m: neighbours are as good as each
+    /// other.
     pub fn best_apart(&self, count: usize, apart_m: f64) -> Vec<Candidate> {
         let mut best: Vec<Candidate> = Vec::new();
         for candidate in &self.candidates {
             let place = Point3::from(candidate.position_m);
-            let apart = |other: &Candidate| (Point3::from(other.position_m) - place).norm() >= apart_m;
+            let apart =
+                |other: &Candidate| (Point3::from(other.position_m) - place).norm() >= apart_m;
             if best.len() < count && best.iter().all(apart) {
                 best.push(*candidate);
             }
@@ -91,7 +93,8 @@ fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) 
         .collect();
     let stride = volume.centres().count().div_ceil(SAMPLE).max(1);
     let known = |(_, point): (usize, Point3<f64>)| {
-        let theirs: Vec<FisherInformation> = observers.iter().filter_map(|o| o.information(point)).collect();
+        let theirs: Vec<FisherInformation> =
+            observers.iter().filter_map(|o| o.information(point)).collect();
         let mut information = prior(assumptions);
         theirs.iter().for_each(|one| information += one);
         Known { point, cameras: theirs.len(), information }
@@ -122,13 +125,18 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-/// Tries one more camera, like the first, at places on rings round the volume at the cameras' median
-/// height, aimed at the volume's middle. Ground and obstacles are not known.
+/// Tries one more camera, like the first, at places on rings round the volume at the cameras'
+/// median height, aimed at the volume's middle. Ground and obstacles are not known.
 ///
 /// None if there is no camera.
-pub fn advise(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Option<Advice> {
+pub fn advise(
+    cameras: &[PlannedCamera],
+    volume: &Volume,
+    assumptions: &Assumptions,
+) -> Option<Advice> {
     let like = cameras.first()?;
-    let places: Vec<Point3<f64>> = cameras.iter().map(|camera| camera.camera.pose().position()).collect();
+    let places: Vec<Point3<f64>> =
+        cameras.iter().map(|camera| camera.camera.pose().position()).collect();
     let height = median(places.iter().map(|place| place.z).collect())?;
     let middle = volume.middle();
     let away = |place: &Point3<f64>| Vector2::new(place.x - middle.x, place.y - middle.y).norm();
@@ -137,7 +145,8 @@ pub fn advise(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpti
     let known = known(cameras, volume, assumptions);
     let worst_m = volume.diagonal_m();
     let candidate = |ring: f64, direction: u32| {
-        let (sin, cos) = (f64::from(direction) / f64::from(DIRECTIONS) * std::f64::consts::TAU).sin_cos();
+        let (sin, cos) =
+            (f64::from(direction) / f64::from(DIRECTIONS) * std::f64::consts::TAU).sin_cos();
         let offset = Vector3::new(cos, sin, 0.0) * (ring * distance);
         let place = Point3::new(middle.x + offset.x, middle.y + offset.y, height);
         let pose = Pose::looking_at(place, middle).ok()?;
@@ -170,8 +179,14 @@ mod tests {
 
     fn planned(position: [f64; 3]) -> PlannedCamera {
         let size = ImageSize { width: 1200, height: 1000 };
-        let lens =
-            Intrinsics { size, fx: 700.0, fy: 700.0, cx: 600.0, cy: 500.0, distortion: Distortion::None };
+        let lens = Intrinsics {
+            size,
+            fx: 700.0,
+            fy: 700.0,
+            cx: 600.0,
+            cy: 500.0,
+            distortion: Distortion::None,
+        };
         let pose = Pose::looking_at(position.into(), Point3::new(0.0, 0.0, 50.0)).unwrap();
         let camera = Camera::new(lens, pose).unwrap();
         PlannedCamera { name: "first".to_owned(), camera, rate_hz: 30.0, clock_sd_s: 0.0 }
@@ -191,7 +206,8 @@ mod tests {
     }
 
     fn volume() -> Volume {
-        Volume::new(Point3::new(-20.0, -20.0, 30.0), Point3::new(20.0, 20.0, 70.0), Some(10.0)).unwrap()
+        Volume::new(Point3::new(-20.0, -20.0, 30.0), Point3::new(20.0, 20.0, 70.0), Some(10.0))
+            .unwrap()
     }
 
     #[test]
@@ -206,7 +222,11 @@ mod tests {
         let [x, y, z] = best.position_m;
         assert!(y.abs() > 2.0 * x.abs(), "across the line of sight, not at ({x}, {y})");
         assert_eq!(z, 50.0);
-        assert!(best.score.median_sd_m < 0.5 * advice.now.median_sd_m, "{best:?} against {:?}", advice.now);
+        assert!(
+            best.score.median_sd_m < 0.5 * advice.now.median_sd_m,
+            "{best:?} against {:?}",
+            advice.now
+        );
     }
 
     #[test]
@@ -223,16 +243,25 @@ mod tests {
     fn where_little_is_fixed_at_all_a_camera_beside_another_is_not_the_best() {
         // The site to copy and a target that a camera sees 97 m far: no two see it in one place.
         let size = ImageSize { width: 1920, height: 1080 };
-        let lens =
-            Intrinsics { size, fx: 1460.0, fy: 1460.0, cx: 960.0, cy: 540.0, distortion: Distortion::None };
-        let cameras =
-            [[115.0, -45.0, 4.0], [15.0, 120.0, 3.0], [-110.0, -60.0, 2.0]].map(|place: [f64; 3]| {
+        let lens = Intrinsics {
+            size,
+            fx: 1460.0,
+            fy: 1460.0,
+            cx: 960.0,
+            cy: 540.0,
+            distortion: Distortion::None,
+        };
+        let cameras = [[115.0, -45.0, 4.0], [15.0, 120.0, 3.0], [-110.0, -60.0, 2.0]].map(
+            |place: [f64; 3]| {
                 let pose = Pose::looking_at(place.into(), Point3::new(0.0, 0.0, 46.0)).unwrap();
                 PlannedCamera { camera: Camera::new(lens, pose).unwrap(), ..planned(place) }
-            });
+            },
+        );
         let target = Some(TargetSize { size_m: 0.4, least_px: 6.0 });
-        let volume = Volume::new(Point3::new(-65.0, -65.0, 0.0), Point3::new(65.0, 65.0, 110.0), Some(10.0));
-        let advice = advise(&cameras, &volume.unwrap(), &Assumptions { target, ..assumptions() }).unwrap();
+        let volume =
+            Volume::new(Point3::new(-65.0, -65.0, 0.0), Point3::new(65.0, 65.0, 110.0), Some(10.0));
+        let advice =
+            advise(&cameras, &volume.unwrap(), &Assumptions { target, ..assumptions() }).unwrap();
         assert_eq!(advice.now.fixed, 0.0);
         let best = Point3::from(advice.candidates[0].position_m);
         for camera in &cameras {
@@ -242,11 +271,17 @@ mod tests {
 
     #[test]
     fn one_more_camera_never_harms() {
-        let cameras =
-            [planned([-100.0, 0.0, 50.0]), planned([0.0, -100.0, 50.0]), planned([60.0, 70.0, 2.0])];
+        let cameras = [
+            planned([-100.0, 0.0, 50.0]),
+            planned([0.0, -100.0, 50.0]),
+            planned([60.0, 70.0, 2.0]),
+        ];
         let advice = advise(&cameras, &volume(), &assumptions()).unwrap();
         for candidate in &advice.candidates {
-            assert!(candidate.score.mean_sd_m <= advice.now.mean_sd_m * (1.0 + 1e-9), "{candidate:?}");
+            assert!(
+                candidate.score.mean_sd_m <= advice.now.mean_sd_m * (1.0 + 1e-9),
+                "{candidate:?}"
+            );
         }
     }
 }

@@ -5,7 +5,8 @@ use std::ops::AddAssign;
 use crossfix_geometry::{SightLine, tangent_basis};
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3x2, Matrix6, Point3, Unit, Vector3, Vector6};
 
-/// Information whose scaled eigenvalues fall below this share of the mean is singular but for rounding.
+/// Information whose scaled eigenvalues fall below this share of the mean is singular but for
+/// rounding.
 const SINGULAR: f64 = 1e-12;
 
 /// A sight line to a target: its direction, the tangents across it, its length. World, metres.
@@ -26,7 +27,8 @@ impl LineGeometry {
         range_m.is_finite().then_some(Self { direction, tangents, range_m })
     }
 
-    /// A measured line, with the tangents in which its covariance is, to a target at a range in metres.
+    /// A measured line, with the tangents in which its covariance is, to a target at a range in
+    /// metres.
     ///
     /// `None` if the range is not a positive number.
     pub fn of(line: &SightLine, range_m: f64) -> Option<Self> {
@@ -44,7 +46,8 @@ impl LineGeometry {
         self.tangents.transpose() / self.range_m
     }
 
-    /// Bearing by the camera's errors: a turn (rad) of the direction, `E' [u]x`, and a displacement (m).
+    /// Bearing by the camera's errors: a turn (rad) of the direction, `E' [u]x`, and a displacement
+    /// (m).
     fn by_errors(&self) -> Matrix2x6<f64> {
         let turn = self.tangents.transpose() * self.direction.cross_matrix();
         let displacement = self.by_displacement();
@@ -139,9 +142,12 @@ impl FisherInformation {
     pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
         let across = line.by_displacement();
         let position = across.transpose() * noise.0 * across;
-        for (row, column, weight) in
-            [(0, 0, times.count), (0, 3, times.sum_s), (3, 0, times.sum_s), (3, 3, times.squares_s2)]
-        {
+        for (row, column, weight) in [
+            (0, 0, times.count),
+            (0, 3, times.sum_s),
+            (3, 0, times.sum_s),
+            (3, 3, times.squares_s2),
+        ] {
             let mut block = self.0.fixed_view_mut::<3, 3>(row, column);
             block += position * weight;
         }
@@ -152,14 +158,16 @@ impl FisherInformation {
         &self.0
     }
 
-    /// The bound: the covariance of `[p, v]`, m and m/s; `None` if some direction is not known at all.
+    /// The bound: the covariance of `[p, v]`, m and m/s; `None` if some direction is not known at
+    /// all.
     pub fn covariance(&self) -> Option<Matrix6<f64>> {
         // Positions and velocities have scales of their own: a unit diagonal makes them alike.
         let scale = self.0.diagonal().map(|v| v.sqrt().recip());
         if !scale.iter().all(|v| v.is_finite()) {
             return None;
         }
-        let scaled = Matrix6::from_fn(|row, column| self.0[(row, column)] * scale[row] * scale[column]);
+        let scaled =
+            Matrix6::from_fn(|row, column| self.0[(row, column)] * scale[row] * scale[column]);
         let eigen = scaled.symmetric_eigen();
         if eigen.eigenvalues.min() < SINGULAR {
             return None;
@@ -189,8 +197,9 @@ pub struct CommonErrors {
 impl CommonErrors {
     /// Errors of the camera's rotation (rad an axis), position (m an axis) and clock (s).
     ///
-    /// A wrong clock shows a target of `speed_mps` where it was or will be: for a direction of flight
-    /// that nobody knows beforehand, a displacement of `speed * clock / root 3` on each axis.
+    /// A wrong clock shows a target of `speed_mps` where it was or will be: for a direction of
+    /// flight that nobody knows beforehand, a displacement of `speed * clock / root 3` on each
+    /// axis.
     pub fn new(rotation_sd_rad: f64, position_sd_m: f64, clock_sd_s: f64, speed_mps: f64) -> Self {
         let flown = speed_mps * clock_sd_s / 3.0_f64.sqrt();
         Self { rotation_sd_rad, displacement_sd_m: position_sd_m.hypot(flown) }
@@ -256,7 +265,8 @@ mod tests {
         covariance.fixed_view::<3, 3>(0, 0).into_owned()
     }
 
-    /// Two cameras at 100 m from the target whose lines cross at an angle; SD of the range along the first.
+    /// Two cameras at 100 m from the target whose lines cross at an angle; SD of the range along
+    /// the first.
     fn range_sd(angle: f64, first_sd: f64, second_sd: f64) -> f64 {
         let towards = [Vector3::x(), Vector3::new(angle.cos(), angle.sin(), 0.0)];
         let mut information = FisherInformation::velocity_prior(1.0);
@@ -295,7 +305,8 @@ mod tests {
         }
     }
 
-    /// The orthogonal geometry of the fusion notes: mean bound of five periods at camera 1's last time.
+    /// The orthogonal geometry of the fusion notes: mean bound of five periods at camera 1's last
+    /// time.
     fn orthogonal_bound(delays: [f64; 3]) -> (f64, f64) {
         const RUNS: usize = 2000;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -312,7 +323,9 @@ mod tests {
             };
             let speed = Vector3::from_fn(|_, _| velocity.sample(&mut rng));
             let mut information = FisherInformation::default();
-            for (azimuth, delay) in [0.0_f64, 120.0, 240.0].map(f64::to_radians).into_iter().zip(delays) {
+            for (azimuth, delay) in
+                [0.0_f64, 120.0, 240.0].map(f64::to_radians).into_iter().zip(delays)
+            {
                 let (sin, cos) = azimuth.sin_cos();
                 let u = Vector3::new(elevation.cos() * cos, elevation.cos() * sin, elevation.sin());
                 for period in 0..5 {
@@ -331,14 +344,17 @@ mod tests {
 
     #[test]
     fn the_limit_of_five_periods_is_the_reference_implementations() {
-        for (delays, expected) in [([0.0, 0.1, 0.2], (0.093, 0.040)), ([0.0, 0.3, 0.4], (0.090, 0.040))] {
+        for (delays, expected) in
+            [([0.0, 0.1, 0.2], (0.093, 0.040)), ([0.0, 0.3, 0.4], (0.090, 0.040))]
+        {
             let (position, velocity) = orthogonal_bound(delays);
             assert!((position / expected.0 - 1.0).abs() < 0.03, "{delays:?}: {position} m");
             assert!((velocity / expected.1 - 1.0).abs() < 0.03, "{delays:?}: {velocity} m/s");
         }
     }
 
-    /// Three orthogonal cameras at 100 m, each with `count` bearings of 1 mrad, and errors in common.
+    /// Three orthogonal cameras at 100 m, each with `count` bearings of 1 mrad, and errors in
+    /// common.
     fn position_sd(count: usize, errors: &CommonErrors) -> f64 {
         let mut information = FisherInformation::velocity_prior(15.0);
         for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
@@ -356,7 +372,9 @@ mod tests {
         let none = CommonErrors::default();
         assert!((position_sd(400, &none) / position_sd(40_000, &none) - 10.0).abs() < 0.1);
         // Each axis is seen by two cameras: the floor is root(3/2) of one camera's error at 100 m.
-        for errors in [CommonErrors::new(5e-4, 0.0, 0.0, 0.0), CommonErrors::new(0.0, 0.05, 0.0, 0.0)] {
+        for errors in
+            [CommonErrors::new(5e-4, 0.0, 0.0, 0.0), CommonErrors::new(0.0, 0.05, 0.0, 0.0)]
+        {
             let sd = position_sd(1_000_000, &errors);
             assert!((sd / (0.05 * 1.5_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
         }

@@ -12,7 +12,8 @@ pub use information::{
     BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
 };
 pub use plan::{
-    Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict, smallest_target,
+    Accuracy, Assumptions, Cell, DEGENERATE_RATIO, PlannedCamera, TargetSize, predict,
+    smallest_target,
 };
 pub use summary::{Contribution, Summary, contributions, layers};
 pub use volume::{Volume, VolumeError};

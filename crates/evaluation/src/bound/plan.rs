@@ -5,7 +5,8 @@ use nalgebra::{Matrix6, Point3};
 use serde::Serialize;
 
 use super::{
-    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets, Volume,
+    BearingNoise, CameraInformation, CommonErrors, FisherInformation, LineGeometry, TimeOffsets,
+    Volume,
 };
 
 /// A fix whose worst axis is more than so many times its best one is degenerate.
@@ -46,7 +47,8 @@ pub struct Assumptions {
     pub position_sd_m: f64,
     /// How fast a target flies, m/s: what an error of the clock is worth.
     pub speed_mps: f64,
-    /// What is known of a target's velocity beforehand: standard deviation, m/s an axis; none is nothing.
+    /// What is known of a target's velocity beforehand: standard deviation, m/s an axis; none is
+    /// nothing.
     pub velocity_prior_sd_mps: Option<f64>,
     /// How small a target must be seen; none is however small.
     pub target: Option<TargetSize>,
@@ -111,7 +113,8 @@ pub struct Cell {
     pub centre_m: [f64; 3],
     /// The cameras that see it, by their places in the list.
     pub cameras: Vec<usize>,
-    /// How well a target there is known; none if fewer than two cameras see it, or two along one line.
+    /// How well a target there is known; none if fewer than two cameras see it, or two along one
+    /// line.
     pub accuracy: Option<Accuracy>,
 }
 
@@ -125,8 +128,13 @@ pub(super) struct Observer<'a> {
 }
 
 impl<'a> Observer<'a> {
-    /// A camera whose newest bearing is `phase` of its interval old; at least one lies in the window.
-    pub(super) fn new(planned: &'a PlannedCamera, phase: f64, assumptions: &'a Assumptions) -> Self {
+    /// A camera whose newest bearing is `phase` of its interval old; at least one lies in the
+    /// window.
+    pub(super) fn new(
+        planned: &'a PlannedCamera,
+        phase: f64,
+        assumptions: &'a Assumptions,
+    ) -> Self {
         let count = (assumptions.window_s * planned.rate_hz).floor().max(1.0) as usize;
         let times = (0..count).map(|n| -(n as f64 + phase) / planned.rate_hz).collect();
         let Assumptions { rotation_sd_rad, position_sd_m, speed_mps, .. } = *assumptions;
@@ -134,7 +142,12 @@ impl<'a> Observer<'a> {
             camera: &planned.camera,
             times,
             reach_m: assumptions.reach_m(&planned.camera).unwrap_or(f64::INFINITY),
-            errors: CommonErrors::new(rotation_sd_rad, position_sd_m, planned.clock_sd_s, speed_mps),
+            errors: CommonErrors::new(
+                rotation_sd_rad,
+                position_sd_m,
+                planned.clock_sd_s,
+                speed_mps,
+            ),
             assumptions,
         }
     }
@@ -168,7 +181,8 @@ pub(super) fn accuracy(cameras: usize, information: &FisherInformation) -> Optio
     covariance.as_ref().map(Accuracy::of)
 }
 
-/// The bound in each cube of a volume, of the state at the end of the window: what a tracker can say now.
+/// The bound in each cube of a volume, of the state at the end of the window: what a tracker can
+/// say now.
 ///
 /// A target flies straight, its direction from the cameras taken as constant over the window. The
 /// cameras are not synchronised: their phases are spread evenly.
@@ -194,9 +208,13 @@ pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpt
     volume.centres().map(cell).collect()
 }
 
-/// The smallest target, m, that two cameras see at a point when it must span so many pixels; none if
-/// fewer than two have the point in their images.
-pub fn smallest_target(cameras: &[PlannedCamera], point: Point3<f64>, least_px: f64) -> Option<f64> {
+/// The smallest target, m, that two cameras see at a point when it must span so many pixels; none
+/// if fewer than two have the point in their images.
+pub fn smallest_target(
+    cameras: &[PlannedCamera],
+    point: Point3<f64>,
+    least_px: f64,
+) -> Option<f64> {
     let size = |planned: &PlannedCamera| {
         let lens = planned.camera.model().intrinsics();
         let range = (point - planned.camera.pose().position()).norm();
@@ -228,8 +246,14 @@ mod tests {
 
     fn planned(position: [f64; 3], target: [f64; 3]) -> PlannedCamera {
         let size = ImageSize { width: 1001, height: 801 };
-        let lens =
-            Intrinsics { size, fx: 1000.0, fy: 1000.0, cx: 500.0, cy: 400.0, distortion: Distortion::None };
+        let lens = Intrinsics {
+            size,
+            fx: 1000.0,
+            fy: 1000.0,
+            cx: 500.0,
+            cy: 400.0,
+            distortion: Distortion::None,
+        };
         let pose = Pose::looking_at(position.into(), target.into()).unwrap();
         let camera = Camera::new(lens, pose).unwrap();
         PlannedCamera { name: String::new(), camera, rate_hz: 30.0, clock_sd_s: 0.0 }
@@ -249,13 +273,17 @@ mod tests {
         let cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
         let without = Assumptions { velocity_prior_sd_mps: None, ..assumptions() };
         let accuracy = cell(&cameras, target, &without).accuracy.unwrap();
-        // North and east are seen by one camera each, up by both: sigma = 0.5 px / 1000 px * 100 m. A
-        // straight line through n points, read at the last: sigma^2 (4n - 2) / (n (n + 1)).
+        // North and east are seen by one camera each, up by both: sigma = 0.5 px / 1000 px * 100 m.
+        // A straight line through n points, read at the last: sigma^2 (4n - 2) / (n (n + 1)).
         let n = 30.0;
         let single = 0.05_f64.powi(2) * (4.0 * n - 2.0) / (n * (n + 1.0));
         let sd = (2.5 * single).sqrt();
         // The second camera's newest bearing is half an interval old.
-        assert!((accuracy.position_sd_m / sd - 1.0).abs() < 0.04, "{} against {sd}", accuracy.position_sd_m);
+        assert!(
+            (accuracy.position_sd_m / sd - 1.0).abs() < 0.04,
+            "{} against {sd}",
+            accuracy.position_sd_m
+        );
         let slope = 0.05 * 30.0 * (12.0 / (n * (n * n - 1.0))).sqrt();
         assert!((accuracy.velocity_sd_mps / (slope * 2.5_f64.sqrt()) - 1.0).abs() < 1e-3);
     }
@@ -301,7 +329,8 @@ mod tests {
     #[test]
     fn what_a_camera_does_wrong_all_the_time_stays() {
         let target = [0.0, 0.0, 50.0];
-        let mut cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
+        let mut cameras =
+            [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
         let sd = |cameras: &[PlannedCamera], assumptions: &Assumptions| {
             cell(cameras, target, assumptions).accuracy.unwrap().position_sd_m
         };

@@ -35,7 +35,8 @@ impl Summary {
     /// The figures of some cubes.
     pub fn of<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> Self {
         let cells: Vec<&Cell> = cells.into_iter().collect();
-        let fixes: Vec<&Accuracy> = cells.iter().filter_map(|cell| cell.accuracy.as_ref()).collect();
+        let fixes: Vec<&Accuracy> =
+            cells.iter().filter_map(|cell| cell.accuracy.as_ref()).collect();
         let sorted = |value: fn(&Accuracy) -> f64| {
             let mut values: Vec<f64> = fixes.iter().map(|fix| value(fix)).collect();
             values.sort_by(f64::total_cmp);
@@ -94,8 +95,12 @@ pub fn contributions(
     cells: &[Cell],
 ) -> Vec<Contribution> {
     let of = |(index, camera): (usize, &PlannedCamera)| {
-        let others: Vec<PlannedCamera> =
-            cameras.iter().enumerate().filter(|(other, _)| *other != index).map(|(_, c)| c.clone()).collect();
+        let others: Vec<PlannedCamera> = cameras
+            .iter()
+            .enumerate()
+            .filter(|(other, _)| *other != index)
+            .map(|(_, c)| c.clone())
+            .collect();
         let lens = camera.camera.model().intrinsics();
         let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
         Contribution {

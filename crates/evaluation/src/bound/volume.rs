@@ -8,16 +8,20 @@ use thiserror::Error;
 const MOST_CELLS: f64 = 100_000.0;
 /// Cubes along the longest side where nobody says how large they are.
 const DEFAULT_CELLS_ALONG: f64 = 12.0;
-/// Axes nearer to parallel than this cross nowhere: the least eigenvalue of `sum (I - uu')`, a camera.
+/// Axes nearer to parallel than this cross nowhere: the least eigenvalue of `sum (I - uu')`, a
+/// camera.
 const PARALLEL: f64 = 1e-3;
-/// Half the default volume's width over the median distance of the cameras from where their axes cross.
+/// Half the default volume's width over the median distance of the cameras from where their axes
+/// cross.
 const DEFAULT_REACH: f64 = 0.5;
 
 /// What is wrong with a volume.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum VolumeError {
     /// A corner is nowhere, or not beyond the other one.
-    #[error("the volume from {min:?} to {max:?} m is empty: each number of the second must be larger")]
+    #[error(
+        "the volume from {min:?} to {max:?} m is empty: each number of the second must be larger"
+    )]
     Empty {
         /// The low corner.
         min: [f64; 3],
@@ -52,12 +56,16 @@ pub struct Volume {
 }
 
 impl Volume {
-    /// The cubes of side `step_m` that cover the box between two corners, m; without a side, one that
-    /// is a round number and cuts the longest edge into about twelve.
+    /// The cubes of side `step_m` that cover the box between two corners, m; without a side, one
+    /// that is a round number and cuts the longest edge into about twelve.
     ///
     /// # Errors
     /// [`VolumeError`] if the box is empty, the step no length, or the cubes too many.
-    pub fn new(min: Point3<f64>, max: Point3<f64>, step_m: Option<f64>) -> Result<Self, VolumeError> {
+    pub fn new(
+        min: Point3<f64>,
+        max: Point3<f64>,
+        step_m: Option<f64>,
+    ) -> Result<Self, VolumeError> {
         let sides = max - min;
         if !sides.iter().all(|side| *side > 0.0 && side.is_finite()) {
             return Err(VolumeError::Empty { min: min.into(), max: max.into() });
@@ -75,8 +83,8 @@ impl Volume {
         Ok(Self { min, step_m, cells: [counts.x, counts.y, counts.z].map(|count| count as usize) })
     }
 
-    /// A box round the point where the cameras' optical axes cross, half as wide as the cameras stand
-    /// apart, from the lowest camera's height upwards.
+    /// A box round the point where the cameras' optical axes cross, half as wide as the cameras
+    /// stand apart, from the lowest camera's height upwards.
     ///
     /// # Errors
     /// [`VolumeError::NoCrossing`] where they cross nowhere in front of them.
@@ -91,7 +99,8 @@ impl Volume {
         let half = Vector3::repeat((DEFAULT_REACH * median / round).round() * round);
         let middle = (middle / round).map(f64::round) * round;
         let mut min = middle - half;
-        let lowest = cameras.iter().map(|camera| camera.pose().position().z).fold(f64::INFINITY, f64::min);
+        let lowest =
+            cameras.iter().map(|camera| camera.pose().position().z).fold(f64::INFINITY, f64::min);
         min.z = min.z.max((lowest / round).floor() * round).min(middle.z - round);
         Self::new(min, middle + half, step_m)
     }
@@ -162,14 +171,21 @@ mod tests {
 
     fn camera(position: [f64; 3], target: [f64; 3]) -> Camera {
         let size = ImageSize { width: 1000, height: 800 };
-        let lens =
-            Intrinsics { size, fx: 900.0, fy: 900.0, cx: 500.0, cy: 400.0, distortion: Distortion::None };
+        let lens = Intrinsics {
+            size,
+            fx: 900.0,
+            fy: 900.0,
+            cx: 500.0,
+            cy: 400.0,
+            distortion: Distortion::None,
+        };
         Camera::new(lens, Pose::looking_at(position.into(), target.into()).unwrap()).unwrap()
     }
 
     #[test]
     fn cubes_cover_the_box_layer_by_layer() {
-        let volume = Volume::new(Point3::origin(), Point3::new(30.0, 20.0, 15.0), Some(10.0)).unwrap();
+        let volume =
+            Volume::new(Point3::origin(), Point3::new(30.0, 20.0, 15.0), Some(10.0)).unwrap();
         let centres: Vec<_> = volume.centres().collect();
         assert_eq!(centres.len(), 3 * 2 * 2);
         assert_eq!(centres.first(), Some(&(0, Point3::new(5.0, 5.0, 5.0))));
@@ -196,7 +212,8 @@ mod tests {
         assert!(volume.min().z < 50.0 && volume.max().z > 90.0, "{volume:?}");
         assert!(volume.min().z >= 0.0);
         // Side by side, and back to back.
-        for (first, second) in [([0.0, 99.0, 3.0], [10.0, 99.0, 3.0]), ([0.0, -99.0, 3.0], [10.0, 9.0, 3.0])]
+        for (first, second) in
+            [([0.0, 99.0, 3.0], [10.0, 99.0, 3.0]), ([0.0, -99.0, 3.0], [10.0, 9.0, 3.0])]
         {
             let apart = [camera([0.0, 0.0, 3.0], first), camera([10.0, 0.0, 3.0], second)];
             assert_eq!(Volume::where_axes_cross(&apart, None), Err(VolumeError::NoCrossing));

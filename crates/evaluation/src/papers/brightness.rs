@@ -1,5 +1,5 @@
-//! The brightness of one pixel by the interacting multiple models and by exponential smoothing (003,
-//! Fig. 4 to 6).
+//! The brightness of one pixel by the interacting multiple models and by exponential smoothing
+//! (Solonar 2023, Fig. 4 to 6).
 
 use crossfix_vision::{ImmConfig, PixelImm};
 
@@ -23,7 +23,7 @@ struct Cell {
     noise: f64,
 }
 
-/// Mean absolute errors (003, (17)-(19)) of the filter and of the smoothing, in one run.
+/// Mean absolute errors (Solonar 2023, eqs. 17-19) of the filter and of the smoothing, in one run.
 fn errors(seed: u64, run: usize, cell: Cell) -> [f64; 2] {
     let mut random = Noise::new(seed, run);
     let mut truth = 128.0;
@@ -58,14 +58,17 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let of = |i: usize| mean(&samples.iter().map(|s| s[i]).collect::<Vec<_>>());
             let (filter, smoothing) = (of(0), of(1));
             let name = format!("sigma_w {noise}, jumps {jump}");
-            // The errata's figures.
+            // The figures of docs/papers.md.
             let asked = match (noise as u32, jump as u32, (rate * 10.0).round() as u32) {
                 (5, 60, 1) => Some(0.70),
                 (5, 60, 9) => Some(1.47),
                 _ => None,
             };
             let row = Row::new(format!("IMM, {name}"), rate, filter);
-            rows.push(Row { limit: asked.map(|value| Limit::Near { value, tolerance: 0.1 * value }), ..row });
+            rows.push(Row {
+                limit: asked.map(|value| Limit::Near { value, tolerance: 0.1 * value }),
+                ..row
+            });
             rows.push(Row::new(format!("smoothing, {name}"), rate, smoothing));
             let ratio = smoothing.0 / filter.0;
             let relative = (filter.1 / filter.0).hypot(smoothing.1 / smoothing.0);
@@ -75,10 +78,20 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             ratios.push(Row { paper, limit, ..row });
         }
     }
-    let table =
-        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "lambda, 1/s", y, rows };
+    let table = |name, title: &str, y, rows| Table {
+        name,
+        title: title.to_owned(),
+        x: "lambda, 1/s",
+        y,
+        rows,
+    };
     vec![
-        table("brightness", "Error of a pixel's brightness (003, Fig. 4 to 6)", "levels", rows),
+        table(
+            "brightness",
+            "Error of a pixel's brightness (Solonar 2023, Fig. 4 to 6)",
+            "levels",
+            rows,
+        ),
         table("brightness-ratio", "Smoothing's error over the IMM's", "ratio", ratios),
     ]
 }

@@ -1,4 +1,4 @@
-//! Energies and signal-to-noise ratios of the silhouettes (001, tables 1 and 2).
+//! Energies and signal-to-noise ratios of the silhouettes (Lytvynets 2020, tables 1 and 2).
 
 use crossfix_simulation::Silhouette;
 
@@ -21,18 +21,34 @@ pub(super) fn tables(_: ValidationOptions) -> Vec<Table> {
         let energy: f64 = canvas.iter().map(|b| f64::from(b - mean).powi(2)).sum();
         let name = format!("{}x{}", sides[0], sides[1]);
         let near = |value: f64, share: f64| Limit::Near { value, tolerance: share * value };
-        energies
-            .push(Row::new(&name, sides[0] as f64, (energy, 0.0)).paper(printed).limit(near(printed, 0.01)));
+        energies.push(
+            Row::new(&name, sides[0] as f64, (energy, 0.0))
+                .paper(printed)
+                .limit(near(printed, 0.01)),
+        );
         for (i, paper) in decibels.into_iter().enumerate() {
             let sigma_n = 0.1 * (i + 1) as f64;
             // h^2 = E / (2 sigma_n^2), equation (3) of chapter 6.
             let ratio = 10.0 * (energy / (2.0 * sigma_n * sigma_n)).log10();
-            ratios.push(Row::new(&name, sigma_n, (ratio, 0.0)).paper(paper).limit(near(paper, 0.02)));
+            ratios
+                .push(Row::new(&name, sigma_n, (ratio, 0.0)).paper(paper).limit(near(paper, 0.02)));
         }
     }
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
     vec![
-        table("energy", "Energy of the silhouettes (001, table 1)", "columns", "energy", energies),
-        table("ratio", "Output signal-to-noise ratio (001, table 2)", "sigma_n", "dB", ratios),
+        table(
+            "energy",
+            "Energy of the silhouettes (Lytvynets 2020, table 1)",
+            "columns",
+            "energy",
+            energies,
+        ),
+        table(
+            "ratio",
+            "Output signal-to-noise ratio (Lytvynets 2020, table 2)",
+            "sigma_n",
+            "dB",
+            ratios,
+        ),
     ]
 }

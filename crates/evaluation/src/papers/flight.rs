@@ -8,17 +8,17 @@ use nalgebra::{Matrix2, Vector2};
 
 use super::runs::Noise;
 
-/// One tact of the texts, s.
+/// Time between images in the papers ("tact"), s.
 pub(crate) const TACT: f64 = 1.0 / 30.0;
 /// Standard deviation of the places that a tracker is given about the true ones, px.
 const GIVEN_SD: f64 = 0.02;
 /// Sides of the pictures, px.
 const SIDE: usize = 640;
-/// Frames of a flight (000, section 3).
+/// Frames of a flight (Herasymenko 2021, section 3).
 pub(crate) const FRAMES: usize = 20;
 
-/// Positions of the texts' target: from (100, 100) at 10 px a tact on each axis, white acceleration of
-/// SD `sigma_a` px/tact^2.
+/// Positions of the papers' target: from (100, 100) at 10 px per tact on each axis, white
+/// acceleration of SD `sigma_a` px/tact^2.
 pub(crate) fn texts_path(noise: &mut Noise, frames: usize, sigma_a: f64) -> Vec<[f64; 2]> {
     let (mut position, mut velocity) = ([100.0; 2], [10.0; 2]);
     let mut path = vec![position];
@@ -66,8 +66,8 @@ impl Canvas {
         Self { image, reach: sides.map(|side| 3 * side + 40), painted: None }
     }
 
-    /// Paints a picture: noise of SD `sigma_n` about a place, and there the stamp `strength` times, then
-    /// everything brighter by `light`.
+    /// Paints a picture: noise of SD `sigma_n` about a place, and there the stamp `strength` times,
+    /// then everything brighter by `light`.
     pub(crate) fn paint(
         &mut self,
         stamp: Option<&Stamp>,
@@ -87,7 +87,9 @@ impl Canvas {
         };
         let area = [range(at[0], self.reach[0]), range(at[1], self.reach[1])];
         match stamp {
-            Some(Stamp::Drawn(silhouette)) => silhouette.draw(self.image.samples_mut(), SIDE, at, strength),
+            Some(Stamp::Drawn(silhouette)) => {
+                silhouette.draw(self.image.samples_mut(), SIDE, at, strength);
+            }
             Some(Stamp::Pasted { crop, width }) => self.paste(crop, *width, at),
             None => {}
         }
@@ -157,7 +159,8 @@ impl Follower {
         Some(Self { tracker, frame: 0, size: sides.map(|s| s as f64), last: None, sigma_a })
     }
 
-    /// Takes the next picture with the true place and velocity (px/s); in the first two the tracker is given the place, and there is no outcome.
+    /// Takes the next picture with the true place and velocity (px/s); in the first two the tracker
+    /// is given the place, and there is no outcome.
     pub(crate) fn step(
         &mut self,
         image: &Plane,
@@ -165,7 +168,8 @@ impl Follower {
         velocity: [f64; 2],
         noise: &mut Noise,
     ) -> Option<Outcome> {
-        let [x, y] = if self.frame < 2 { truth.map(|at| at + GIVEN_SD * noise.normal()) } else { truth };
+        let [x, y] =
+            if self.frame < 2 { truth.map(|at| at + GIVEN_SD * noise.normal()) } else { truth };
         let place = ImagePoint { x, y };
         match (self.frame, &self.last) {
             (0, _) => self.tracker.take_up(PixelBox::about(place, self.size[0], self.size[1])),

@@ -12,7 +12,7 @@ use super::table::{Limit, Row, Table, mean, root_mean_square, share};
 const SIDES: [usize; 2] = [25, 15];
 const SIGMA_N: f64 = 0.25;
 const FRAMES: usize = 100;
-/// A flight of this experiment is five times as long as the texts'.
+/// A flight of this experiment is five times as long as the papers'.
 const RUNS_SHARE: usize = 4;
 
 /// What happens to the target.
@@ -86,7 +86,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         ("smoothing 0.9", ReferenceStrategy::Smoothing { memory: 0.9 }),
         ("IMM", ReferenceStrategy::PixelImm(ImmConfig::default())),
     ];
-    // The errata's figures, with zero-mean correlation: fixed, replacement, smoothing, IMM.
+    // The figures of docs/papers.md, with zero-mean correlation: fixed, replacement, smoothing,
+    // IMM.
     let errata = [
         [0.24, 0.28, 0.27, 4.01, 3.94],
         [1.22, 2.47, 1.38, 1.42, 3.60],
@@ -108,7 +109,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             .into_iter()
             .flatten()
             .collect();
-            let kept: Vec<f64> = runs.iter().filter(|(_, lost)| !lost).map(|(rmse, _)| *rmse).collect();
+            let kept: Vec<f64> =
+                runs.iter().filter(|(_, lost)| !lost).map(|(rmse, _)| *rmse).collect();
             let series = format!("{name}: {}", scene.name);
             let x = number as f64;
             let paper = index.checked_sub(1).map(|i| errata[i][number]);
@@ -119,9 +121,15 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             losses.push(Row { limit: asked(Limit::AtMost(0.0)), ..row });
         }
     }
-    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "scene", y, rows };
+    let table =
+        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "scene", y, rows };
     vec![
-        table("loop", "RMSE in the loop, 25x15, sigma_n 0.25 (beside it the errata's)", "px", accuracy),
+        table(
+            "loop",
+            "RMSE in the loop, 25x15, sigma_n 0.25 (beside it the errata's)",
+            "px",
+            accuracy,
+        ),
         table("loop-loss", "Lost at the end of the loop", "P", losses),
     ]
 }

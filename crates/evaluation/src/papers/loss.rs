@@ -1,4 +1,5 @@
-//! Probability of losing the target, and how long it is kept (000, Fig. 7 and 8; 001, tables 3 and 4).
+//! Probability of losing the target, and how long it is kept (Herasymenko 2021, Fig. 7 and 8;
+//! Lytvynets 2020, tables 3 and 4).
 
 use crossfix_simulation::Silhouette;
 use crossfix_vision::TrackerConfig;
@@ -10,7 +11,8 @@ use super::table::{Limit, Row, Table, mean, share};
 
 const SIGMAS: [f64; 6] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6];
 
-/// A template of the texts: sides, the pedestal of the errata, and the figures of 001, tables 3 and 4.
+/// A template of the papers: sides, the pedestal of the errata, and the figures of Lytvynets 2020,
+/// tables 3 and 4.
 struct Template {
     sides: [usize; 2],
     pedestal: f32,
@@ -39,8 +41,8 @@ const TEMPLATES: [Template; 3] = [
     },
 ];
 
-/// Frames that a target was kept in each run: the first whose prediction is off by more than the box
-/// on either axis ends it.
+/// Frames that a target was kept in each run: the first whose prediction is off by more than the
+/// box on either axis ends it.
 fn kept(
     options: ValidationOptions,
     stamp: &Stamp,
@@ -97,14 +99,21 @@ pub(super) fn paper_tables(options: ValidationOptions) -> Vec<Table> {
             let row = Row::new(&name, sigma_n, lost(&runs)).paper(paper_lost[i]);
             lost_rows.push(Row { limit: expected_lost(*sides, sigma_n), ..row });
             let row = Row::new(&name, sigma_n, frames(&runs)).paper(paper_frames[i]);
-            let asked = (sides[0] == 10 && i == 3).then_some(Limit::Near { value: 7.4, tolerance: 0.7 });
+            let asked =
+                (sides[0] == 10 && i == 3).then_some(Limit::Near { value: 7.4, tolerance: 0.7 });
             kept_rows.push(Row { limit: asked, ..row });
         }
     }
-    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "sigma_n", y, rows };
+    let table =
+        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "sigma_n", y, rows };
     vec![
         table("loss-paper", "Loss probability, the papers' algorithm", "P", lost_rows),
-        table("frames-paper", "Mean frames tracked of 20, the papers' algorithm", "frames", kept_rows),
+        table(
+            "frames-paper",
+            "Mean frames tracked of 20, the papers' algorithm",
+            "frames",
+            kept_rows,
+        ),
     ]
 }
 
@@ -121,8 +130,9 @@ pub(super) fn default_tables(options: ValidationOptions) -> Vec<Table> {
         let more = (sides[0] == 25).then_some(0.8);
         for (i, sigma_n) in SIGMAS.into_iter().chain(more).enumerate() {
             let runs = kept(options, &stamp, *sides, sigma_n, &TrackerConfig::default());
-            let asked =
-                ASKED.iter().find(|(w, s, _)| *w == sides[0] && *s == (sigma_n * 10.0).round() as u32);
+            let asked = ASKED
+                .iter()
+                .find(|(w, s, _)| *w == sides[0] && *s == (sigma_n * 10.0).round() as u32);
             let row = Row::new(&name, sigma_n, lost(&runs));
             rows.push(Row {
                 paper: paper.get(i).copied(),

@@ -1,5 +1,6 @@
 //! The papers' tables and figures made again, each figure beside the paper's: the image tracker of
-//! 000 and 001, the adaptive reference of 003, the fusion of 002 and the manoeuvres of 004.
+//! Herasymenko 2021 and Lytvynets 2020, the adaptive reference of Solonar 2023, the fusion of
+//! Klochko 2020 and the manoeuvres of Kalinov 2019.
 
 mod brightness;
 mod energy;
@@ -17,7 +18,7 @@ pub use table::{Limit, Row, Table, Verdict};
 /// How much is simulated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ValidationOptions {
-    /// Monte Carlo runs of each experiment; the texts have 1000.
+    /// Monte Carlo runs of each experiment; the papers have 1000.
     pub runs: usize,
     /// Seed of all of them.
     pub seed: u64,
@@ -36,20 +37,32 @@ struct Experiment {
 }
 
 const TRACKER: [Experiment; 7] = [
-    Experiment { name: "energies and signal-to-noise ratios (001, tables 1 and 2)", make: energy::tables },
-    Experiment { name: "positioning (000, Fig. 5) against the Cramer-Rao bound", make: positioning::tables },
-    Experiment { name: "Kalman filter and prediction (000, Fig. 6)", make: motion::tables },
     Experiment {
-        name: "loss of track (000, Fig. 7 and 8; 001, tables 3 and 4), paper mode",
+        name: "energies and signal-to-noise ratios (Lytvynets 2020, tables 1 and 2)",
+        make: energy::tables,
+    },
+    Experiment {
+        name: "positioning (Herasymenko 2021, Fig. 5) against the Cramer-Rao bound",
+        make: positioning::tables,
+    },
+    Experiment {
+        name: "Kalman filter and prediction (Herasymenko 2021, Fig. 6)",
+        make: motion::tables,
+    },
+    Experiment {
+        name: "loss of track (Herasymenko 2021, Fig. 7 and 8; Lytvynets 2020, tables 3 and 4), paper mode",
         make: loss::paper_tables,
     },
     Experiment { name: "loss of track, default", make: loss::default_tables },
-    Experiment { name: "brightness of a pixel (003, Fig. 4 to 6)", make: brightness::tables },
+    Experiment {
+        name: "brightness of a pixel (Solonar 2023, Fig. 4 to 6)",
+        make: brightness::tables,
+    },
     Experiment { name: "reference strategies in the loop", make: looped::tables },
 ];
 
-/// Makes the tables of the image tracker of those experiments whose name holds `only`. `progress` is
-/// told the number of experiments done, how many there are, and the name of the next.
+/// Makes the tables of the image tracker of those experiments whose name holds `only`. `progress`
+/// is told the number of experiments done, how many there are, and the name of the next.
 pub fn validate_tracker(
     options: ValidationOptions,
     only: &str,

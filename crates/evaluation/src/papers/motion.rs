@@ -1,4 +1,4 @@
-//! The Kalman filters: honesty of the covariance, and the curves of 000, Fig. 6.
+//! The Kalman filters: honesty of the covariance, and the curves of Herasymenko 2021, Fig. 6.
 
 use crossfix_filter::{AxisFilter, AxisMeasurement};
 use crossfix_simulation::Silhouette;
@@ -41,7 +41,8 @@ fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
     mean(&samples)
 }
 
-/// How a target flies: with white acceleration of an SD, px/tact^2, for so many frames, of which the first few do not count.
+/// How a target flies: with white acceleration of an SD, px/tact^2, for so many frames, of which
+/// the first few do not count.
 #[derive(Clone, Copy)]
 struct Flight {
     name: &'static str,
@@ -79,8 +80,9 @@ fn outcomes(
         Some(outcomes)
     });
     let kept = |run: &Vec<Outcome>| {
-        run.iter()
-            .all(|o| o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64)
+        run.iter().all(|o| {
+            o.prediction[0].abs() <= sides[0] as f64 && o.prediction[1].abs() <= sides[1] as f64
+        })
     };
     runs.into_iter().flatten().filter(kept).collect()
 }
@@ -106,8 +108,9 @@ fn over_runs(runs: &[Vec<Outcome>], of: impl Fn(&Outcome) -> Option<f64>) -> (f6
 /// Fig. 6, and the consistency of filter and tracker.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let near_two = |tolerance| Limit::Near { value: 2.0, tolerance };
-    let nees = [0.3, 1.0, 3.0]
-        .map(|sigma_a| Row::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1)));
+    let nees = [0.3, 1.0, 3.0].map(|sigma_a| {
+        Row::new("filter alone", sigma_a, filter_nees(options, sigma_a)).limit(near_two(0.1))
+    });
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
     vec![
         table("nees", "NEES of the Kalman filter", "sigma_a", "NEES", nees.to_vec()),
@@ -116,7 +119,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-/// Consistency of the default tracker: squared innovations and errors over their variances, in cells with noise of their own.
+/// Consistency of the default tracker: squared innovations and errors over their variances, in
+/// cells with noise of their own.
 fn honesty(options: ValidationOptions) -> Table {
     let mut rows = Vec::new();
     for flight in [TEXTS, STRAIGHT] {
@@ -125,9 +129,10 @@ fn honesty(options: ValidationOptions) -> Table {
                 let seed = options.seed.wrapping_add(1000 * rows.len() as u64);
                 let options = ValidationOptions { seed, ..options };
                 let runs = outcomes(options, flight, sides, sigma_n, &TrackerConfig::default());
-                for (what, figure) in
-                    [("NIS", over_runs(&runs, |o| o.nis)), ("NEES", over_runs(&runs, |o| Some(o.nees)))]
-                {
+                for (what, figure) in [
+                    ("NIS", over_runs(&runs, |o| o.nis)),
+                    ("NEES", over_runs(&runs, |o| Some(o.nees))),
+                ] {
                     let name = format!("{what} {}x{}, {}", sides[0], sides[1], flight.name);
                     let limit = Limit::Near { value: 2.0, tolerance: 0.1 };
                     rows.push(Row::new(name, sigma_n, figure).limit(limit));
@@ -148,7 +153,11 @@ fn figure_6(options: ValidationOptions) -> Table {
             runs.iter().filter_map(|run| run.get(frame)).map(of).collect()
         };
         let x = (frame + 2) as f64;
-        rows.push(Row::new("prediction, Monte Carlo", x, root_mean_square(&at(&|o| o.prediction[0]))));
+        rows.push(Row::new(
+            "prediction, Monte Carlo",
+            x,
+            root_mean_square(&at(&|o| o.prediction[0])),
+        ));
         let filters = mean(&at(&|o| o.prediction_variance[0].sqrt()));
         rows.push(Row::new("prediction, filter", x, filters));
         // "The actual SD does not exceed the theoretical SD": holds at sigma_n 0.1 (errata).
@@ -157,6 +166,8 @@ fn figure_6(options: ValidationOptions) -> Table {
         rows.push(Row::new("estimate, Monte Carlo", x, actual).limit(Limit::AtMost(theoretical.0)));
         rows.push(Row::new("estimate, filter", x, theoretical));
     }
-    let title = "Errors of prediction and estimate on x, 10x6, sigma_n 0.1 (000, Fig. 6)".to_owned();
+    let title =
+        "Errors of prediction and estimate on x, 10x6, sigma_n 0.1 (Herasymenko 2021, Fig. 6)"
+            .to_owned();
     Table { name: "figure-6", title, x: "tact", y: "SD, px", rows }
 }

@@ -1,4 +1,4 @@
-//! Accuracy of one measurement (000, Fig. 5), beside the Cramer-Rao bound.
+//! Accuracy of one measurement (Herasymenko 2021, Fig. 5), beside the Cramer-Rao bound.
 
 use crossfix_correlation::{FitOptions, Fitter, LowPass, LowPassMemory, Plane, Reference, Window};
 use crossfix_simulation::{Silhouette, TEMPLATE_SIZES};
@@ -9,13 +9,14 @@ use super::table::{Limit, Row, Table, root_mean_square};
 
 /// Margin of the reference, px.
 const MARGIN: usize = 3;
-/// Low-pass of a clean reference, px: without one the silhouettes' edges, which are finer than a pixel,
-/// pull the fit towards whole pixels.
+/// Low-pass of a clean reference, px: without one the silhouettes' edges, which are finer than a
+/// pixel, pull the fit towards whole pixels.
 const CLEAN_LOW_PASS: f32 = 0.45;
 /// Runs of a fit for each one of the tracker.
 const CHEAP: usize = 20;
 /// The bound for noise of SD 1 (errata), x and y, of the sizes in their order.
-const ERRATA_BOUNDS: [[f64; 2]; 4] = [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
+const ERRATA_BOUNDS: [[f64; 2]; 4] =
+    [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
 
 /// The bound for noise of SD 1: `sqrt(diag J^-1)`, J the sum of the gradient's outer products, here
 /// with contrast and brightness known.
@@ -86,11 +87,17 @@ fn worst_bias(silhouette: &Silhouette, axis: usize) -> f64 {
 }
 
 /// The errors of fits to pictures at any phase, less the bias there, which has a row of its own.
-fn fits(options: ValidationOptions, silhouette: &Silhouette, sigma_n: f64, noisy: bool) -> Vec<[f64; 2]> {
+fn fits(
+    options: ValidationOptions,
+    silhouette: &Silhouette,
+    sigma_n: f64,
+    noisy: bool,
+) -> Vec<[f64; 2]> {
     runs::all(CHEAP * options.runs, |run| {
         let mut noise = Noise::new(options.seed, run);
         let offset = [noise.uniform() - 0.5, noise.uniform() - 0.5];
-        let clean = [picture(silhouette, MARGIN + 2, offset), picture(silhouette, MARGIN, [0.0; 2])];
+        let clean =
+            [picture(silhouette, MARGIN + 2, offset), picture(silhouette, MARGIN, [0.0; 2])];
         let [mut image, mut reference] = clean.clone();
         noise.add_to(image.samples_mut(), sigma_n as f32);
         if noisy {
@@ -128,10 +135,12 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                         (deviation * normalised, standard_error * normalised),
                     ));
                     // Two noisy pictures tell their offset root 2 less well than one.
-                    let best = bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
+                    let best =
+                        bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
                     let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });
                     ratios.push(
-                        Row::new(series, sigma_n, (deviation / best, standard_error / best)).limit(asked),
+                        Row::new(series, sigma_n, (deviation / best, standard_error / best))
+                            .limit(asked),
                     );
                 }
             }
@@ -139,16 +148,20 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         for axis in 0..2 {
             let label = ["x", "y"][axis];
             let near = Limit::Near { value: errata[axis], tolerance: 0.02 * errata[axis] };
-            ratios.push(Row::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near));
+            ratios.push(
+                Row::new(format!("bound {name} {label}"), 1.0, (bound[axis], 0.0)).limit(near),
+            );
             let worst = worst_bias(&silhouette, axis);
-            bias.push(Row::new(format!("{name} {label}"), 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)));
+            bias.push(
+                Row::new(format!("{name} {label}"), 0.0, (worst, 0.0)).limit(Limit::AtMost(0.01)),
+            );
         }
     }
     let table = |name, title: &str, x, y, rows| Table { name, title: title.to_owned(), x, y, rows };
     vec![
         table(
             "figure-5",
-            "Normalised positioning error 2 sigma / side (000, Fig. 5)",
+            "Normalised positioning error 2 sigma / side (Herasymenko 2021, Fig. 5)",
             "sigma_n",
             "",
             accuracy,

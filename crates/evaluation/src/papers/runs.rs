@@ -1,4 +1,5 @@
-//! Monte Carlo runs on all cores. A run is a function of its seed, so that the cores change nothing.
+//! Monte Carlo runs on all cores. A run is a function of its seed, so that the cores change
+//! nothing.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -53,7 +54,9 @@ pub(crate) fn all<T: Send>(count: usize, run: impl Fn(usize) -> T + Sync) -> Vec
         // A run that panics has failed: so has the whole.
         threads
             .into_iter()
-            .flat_map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            .flat_map(|thread| {
+                thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+            })
             .collect()
     });
     results.sort_by_key(|(index, _)| *index);

@@ -53,7 +53,15 @@ pub struct Row {
 impl Row {
     /// A row with ours alone.
     pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
-        Self { series: series.into(), x, paper: None, reference: None, limit: None, ours, standard_error }
+        Self {
+            series: series.into(),
+            x,
+            paper: None,
+            reference: None,
+            limit: None,
+            ours,
+            standard_error,
+        }
     }
 
     /// With the paper's figure.
@@ -134,7 +142,8 @@ pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
 pub(crate) fn root_ratio(squares: &[f64], other_squares: &[f64]) -> (f64, f64) {
     let (above, below) = (mean(squares).0, mean(other_squares).0);
     let root = (above / below).sqrt();
-    let off: Vec<f64> = squares.iter().zip(other_squares).map(|(a, b)| a / above - b / below).collect();
+    let off: Vec<f64> =
+        squares.iter().zip(other_squares).map(|(a, b)| a / above - b / below).collect();
     (root, root / 2.0 * mean(&off).1)
 }
 

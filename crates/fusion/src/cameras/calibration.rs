@@ -6,8 +6,8 @@ use crossfix_geometry::Camera;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix6, Point3};
 
-/// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of a
-/// clock that runs wild, those that lie farthest in the future are forgotten.
+/// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of
+/// a clock that runs wild, those that lie farthest in the future are forgotten.
 const MAX_UPCOMING: usize = 8;
 
 /// A camera as its calibration describes it.
@@ -37,9 +37,9 @@ impl KnownCamera {
 
 /// A camera as it stands at the exposure that is handled, and as it will stand later.
 ///
-/// A frame waits for others that were captured before it. If its camera is calibrated anew meanwhile, it
-/// must still be read with the calibration that held when it was captured, or a recording would give
-/// other tracks than the flight did.
+/// A frame waits for others that were captured before it. If its camera is calibrated anew
+/// meanwhile, it must still be read with the calibration that held when it was captured, or a
+/// recording would give other tracks than the flight did.
 #[derive(Clone, Debug)]
 pub(super) struct Calibrations {
     now: KnownCamera,
@@ -96,7 +96,8 @@ mod tests {
             cy: 239.5,
             distortion: Distortion::None,
         };
-        let pose = Pose::looking_at(Point3::new(x, 0.0, 0.0), Point3::new(0.0, 100.0, 10.0)).unwrap();
+        let pose =
+            Pose::looking_at(Point3::new(x, 0.0, 0.0), Point3::new(0.0, 100.0, 10.0)).unwrap();
         KnownCamera {
             camera: Camera::new(intrinsics, pose).unwrap(),
             pose_covariance: Matrix6::identity(),

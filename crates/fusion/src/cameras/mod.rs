@@ -9,8 +9,8 @@
 //! | what stands in its view for good | what it reports in one place | `rooted.rs` |
 //! | whether it is left out | lines beside what others see, frames out of time | `standing.rs` |
 //!
-//! Its clock is not here: clocks are known against each other, and what is learnt of one is tied to all
-//! (`crate::clocks`).
+//! Its clock is not here: clocks are known against each other, and what is learnt of one is tied to
+//! all (`crate::clocks`).
 
 mod calibration;
 mod noise;
@@ -42,10 +42,11 @@ pub(crate) use strangers::view_sr;
 
 /// A camera whose noise is so many times (variance) what it reports is doubted.
 const DOUBTED_NOISE: f64 = 2.0;
-/// A clock whose variance (logarithm) and offset (in its deviations) change by less than this changes no track.
+/// A clock whose variance (logarithm) and offset (in its deviations) change by less than this
+/// changes no track.
 const NOTICED_CLOCK: f64 = 0.1;
-/// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and what is known of a
-/// clock must not be divided by next to nothing.
+/// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and
+/// what is known of a clock must not be divided by next to nothing.
 const RIGHT_CLOCK_S: f64 = 1e-9;
 
 /// The deviation and the offset of a clock that the tracks know of, s.
@@ -122,8 +123,8 @@ impl CameraState {
         self.standing.is_excluded() || self.punctuality.is_excluded()
     }
 
-    /// Puts into an exposure what is known of the camera, and takes what it shows in. Where too little has been seen
-    /// to tell how many of its bearings are false, there are `clutter_per_sr`.
+    /// Puts into an exposure what is known of the camera, and takes what it shows in. Where too
+    /// little has been seen to tell how many of its bearings are false, there are `clutter_per_sr`.
     pub(crate) fn tell(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
         exposure.uncertainty.pose_scale = self.pose_scale.factor();
         exposure.uncertainty.factor = self.noise.factor();
@@ -137,7 +138,8 @@ impl CameraState {
 
     /// How its clock has changed since the tracks were told, by an exposure; `None` if little.
     pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
-        let now = ToldClock { sd_s: exposure.uncertainty.time_sd_s, offset_s: exposure.correction_s };
+        let now =
+            ToldClock { sd_s: exposure.uncertainty.time_sd_s, offset_s: exposure.correction_s };
         let told = *self.told_clock.get_or_insert(now);
         let ratio = (now.sd_s / told.sd_s).powi(2);
         let ahead = (now.offset_s - told.offset_s) / told.sd_s;
@@ -149,8 +151,8 @@ impl CameraState {
         known.then_some(ClockChange { ahead, ratio })
     }
 
-    /// Takes in squared third differences of its bearings of tracks, and how many of an exposure are nobody's; a
-    /// bearing holds a track for `holding_s`.
+    /// Takes in squared third differences of its bearings of tracks, and how many of an exposure
+    /// are nobody's; a bearing holds a track for `holding_s`.
     pub(crate) fn learn_noise(
         &mut self,
         time: Timestamp,
@@ -161,8 +163,8 @@ impl CameraState {
         self.strangers.see(time, strangers, holding_s);
     }
 
-    /// Takes in whether a frame came in time, one that was refused says nothing else; returns the new standing if
-    /// that has changed.
+    /// Takes in whether a frame came in time, one that was refused says nothing else; returns the
+    /// new standing if that has changed.
     pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraStanding> {
         let fitting = if in_time { Fitting::Fits } else { Fitting::Refused };
         self.punctuality.learn(time, &[fitting]);
@@ -202,9 +204,14 @@ impl Cameras {
         Self { by_name: BTreeMap::new(), rooted_s }
     }
 
-    /// Makes a camera known, or how it will stand from a capture time on. The first calibration holds for all that
-    /// was captured before it, too.
-    pub(crate) fn calibrate(&mut self, name: CameraName, valid_from: Timestamp, known: KnownCamera) {
+    /// Makes a camera known, or how it will stand from a capture time on. The first calibration
+    /// holds for all that was captured before it, too.
+    pub(crate) fn calibrate(
+        &mut self,
+        name: CameraName,
+        valid_from: Timestamp,
+        known: KnownCamera,
+    ) {
         match self.by_name.entry(name) {
             Entry::Vacant(place) => {
                 place.insert(CameraState::new(known, self.rooted_s));
@@ -241,8 +248,8 @@ impl Cameras {
         self.by_name.len()
     }
 
-    /// Goes on to a time; returns the cameras that stand elsewhere from now on. What was learnt of how they stood is
-    /// forgotten.
+    /// Goes on to a time; returns the cameras that stand elsewhere from now on. What was learnt of
+    /// how they stood is forgotten.
     pub(crate) fn advance(&mut self, time: Timestamp) -> Vec<CameraName> {
         let mut moved = Vec::new();
         for (name, camera) in &mut self.by_name {
@@ -255,7 +262,12 @@ impl Cameras {
     }
 
     /// Learns from an exposure how far its camera can be believed.
-    pub(crate) fn judge(&mut self, name: &CameraName, time: Timestamp, fittings: &Fittings) -> Judgement {
+    pub(crate) fn judge(
+        &mut self,
+        name: &CameraName,
+        time: Timestamp,
+        fittings: &Fittings,
+    ) -> Judgement {
         let Some(camera) = self.by_name.get_mut(name) else {
             return Judgement::default();
         };

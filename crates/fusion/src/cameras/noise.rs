@@ -1,8 +1,9 @@
 //! How noisy a camera's bearings are from one exposure to the next, against what it reports.
 //!
-//! The third difference of four bearings of one target cancels where the target is, how fast it goes, how it
-//! turns, and whatever pose, clock and slow errors shift all four by: what is left is four draws of white noise.
-//! So it tells the white part of a camera's noise apart from all else, whatever the track believes.
+//! The third difference of four bearings of one target cancels where the target is, how fast it
+//! goes, how it turns, and whatever pose, clock and slow errors shift all four by: what is left is
+//! four draws of white noise. So it tells the white part of a camera's noise apart from all else,
+//! whatever the track believes.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
@@ -12,14 +13,14 @@ use nalgebra::{Unit, Vector2, Vector3};
 const MEDIAN: f64 = 1.386_294;
 /// How much more of the draws lies below the median by each unit of the logarithm of the scale.
 const SLOPE: f64 = 0.346_574;
-/// Draws that the estimate remembers: it is then known to 10 %. With half as many a camera must report a third of
-/// its variance before it is noticed, and not half of it.
+/// Draws that the estimate remembers: it is then known to 10 %. With half as many a camera must
+/// report a third of its variance before it is noticed, and not half of it.
 const MEMORY: f64 = 200.0;
-/// Standard error of the logarithm of the scale after one draw (simulated: neighbouring ones share three of their
-/// four bearings).
+/// Standard error of the logarithm of the scale after one draw (simulated: neighbouring ones share
+/// three of their four bearings).
 const ERROR_OF_ONE: f64 = 1.9;
-/// So many standard errors from what it reports a camera is no more taken at its word. With half as many one in
-/// four is doubted by chance before its first two hundred draws are over.
+/// So many standard errors from what it reports a camera is no more taken at its word. With half as
+/// many one in four is doubted by chance before its first two hundred draws are over.
 const DOUBT: f64 = 3.0;
 
 /// The last bearings that a camera gave of a track.
@@ -27,9 +28,10 @@ const DOUBT: f64 = 3.0;
 pub(crate) struct LastThree([Option<(Timestamp, Unit<Vector3<f64>>)>; 3]);
 
 impl LastThree {
-    /// Takes a bearing in; returns the squared third difference of it and the three before by the reported
-    /// noise (two degrees of freedom where that is honest), where none lies further from the next than
-    /// `longest_s`. `expected` is the direction in which the track has the target at a time.
+    /// Takes a bearing in; returns the squared third difference of it and the three before by the
+    /// reported noise (two degrees of freedom where that is honest), where none lies further from
+    /// the next than `longest_s`. `expected` is the direction in which the track has the target at
+    /// a time.
     pub(crate) fn see(
         &mut self,
         time: Timestamp,
@@ -41,7 +43,9 @@ impl LastThree {
         self.0 = [second, third, Some((time, line.direction))];
         let seen = [first?, second?, third?, (time, line.direction)];
         let ages = seen.map(|(then, _)| time.seconds_since(then));
-        if !ages.windows(2).all(|pair| (0.0..=longest_s).contains(&(pair[0] - pair[1])) && pair[0] > pair[1])
+        if !ages
+            .windows(2)
+            .all(|pair| (0.0..=longest_s).contains(&(pair[0] - pair[1])) && pair[0] > pair[1])
         {
             return None;
         }
@@ -57,8 +61,8 @@ impl LastThree {
     }
 }
 
-/// How often a camera's reported covariances count, by a running median of its third differences: one
-/// bearing in ten may be no target's.
+/// How often a camera's reported covariances count, by a running median of its third differences:
+/// one bearing in ten may be no target's.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct WhiteNoise {
     log_factor: f64,
@@ -73,8 +77,9 @@ impl WhiteNoise {
         self.log_factor += above / (SLOPE * self.draws.max(10.0));
     }
 
-    /// How many times the reported covariance the noise is; 1 as long as that is not clear, and where it is
-    /// less: what a camera reports holds errors that last longer than four pictures, too.
+    /// How many times the reported covariance the noise is; 1 as long as that is not clear, and
+    /// where it is less: what a camera reports holds errors that last longer than four pictures,
+    /// too.
     pub(crate) fn factor(&self) -> f64 {
         let is_clear = self.log_factor * self.draws.sqrt() > DOUBT * ERROR_OF_ONE;
         if is_clear { self.log_factor.exp() } else { 1.0 }

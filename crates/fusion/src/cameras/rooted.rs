@@ -1,5 +1,6 @@
-//! What stands in a camera's view for good: trees, horizons, lights, cloud edges. Detectors report them again
-//! and again in the same place, and the lines of two cameras to two of them cross as a target's do.
+//! What stands in a camera's view for good: trees, horizons, lights, cloud edges. Detectors report
+//! them again and again in the same place, and the lines of two cameras to two of them cross as a
+//! target's do.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
@@ -7,18 +8,19 @@ use nalgebra::{Unit, Vector3};
 
 /// How far something rooted sways about its middle, rad: a tree of 2 m in the wind at 150 m.
 const REACH_RAD: f64 = 0.015;
-/// The middle follows what it sways about with a time constant of so many times that after which something is
-/// rooted: a few periods of a tree.
+/// The middle follows what it sways about with a time constant of so many times that after which
+/// something is rooted: a few periods of a tree.
 const MIDDLE: f64 = 2.0;
 /// Something rooted is reported in at least this share of the exposures.
 const LEAST_SHARE: f64 = 0.3;
 /// What has not been reported for so many times that time is forgotten.
 const FORGOTTEN: f64 = 7.0;
-/// What has been reported in a smaller share of the exposures since is clutter and not remembered: of clutter there
-/// is no end. With half of it twice as many places are searched for each bearing; ten times as much would forget what is seldom
-/// detected.
+/// What has been reported in a smaller share of the exposures since is clutter and not remembered:
+/// of clutter there is no end. With half of it twice as many places are searched for each bearing;
+/// ten times as much would forget what is seldom detected.
 const CLUTTER_SHARE: f64 = 0.03;
-/// What is reported within this share of that time of a camera's first exposure may have been there before.
+/// What is reported within this share of that time of a camera's first exposure may have been there
+/// before.
 const BEGINNING: f64 = 0.2;
 /// Places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
 const MAX_PLACES: usize = 1_000;
@@ -50,8 +52,8 @@ struct Place {
 /// The places in a camera's view from which it has reported something lately.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
-    /// What has stayed within reach of one direction for this long is rooted, s: a target that flies leaves it
-    /// sooner, and one that hovers has been seen to come.
+    /// What has stayed within reach of one direction for this long is rooted, s: a target that
+    /// flies leaves it sooner, and one that hovers has been seen to come.
     rooted_s: f64,
     places: Vec<Place>,
     began: Option<Timestamp>,
@@ -85,20 +87,35 @@ impl View {
         lines.map(|line| self.report(time, began, before, line)).collect()
     }
 
-    fn report(&mut self, time: Timestamp, began: Timestamp, before: f64, line: &SightLine) -> Rooted {
+    fn report(
+        &mut self,
+        time: Timestamp,
+        began: Timestamp,
+        before: f64,
+        line: &SightLine,
+    ) -> Rooted {
         let rooted_s = self.rooted_s;
         // What is there when a camera begins to look may have been there for long.
         let may_be_old = |first: Timestamp| first.seconds_since(began) < BEGINNING * rooted_s;
-        let distance =
-            |place: &Place| (place.middle.into_inner() - line.direction.into_inner()).norm_squared();
+        let distance = |place: &Place| {
+            (place.middle.into_inner() - line.direction.into_inner()).norm_squared()
+        };
         let near = self.places.iter_mut().map(|place| (distance(place), place));
-        let nearest = near.filter(|(away, _)| *away <= REACH_RAD.powi(2)).min_by(|a, b| a.0.total_cmp(&b.0));
+        let nearest =
+            near.filter(|(away, _)| *away <= REACH_RAD.powi(2)).min_by(|a, b| a.0.total_cmp(&b.0));
         let Some((_, place)) = nearest else {
             if self.places.len() >= MAX_PLACES {
                 self.places.remove(0);
             }
             let (middle, start) = (line.direction, line.direction);
-            self.places.push(Place { middle, start, first: time, last: time, reports: 1.0, before });
+            self.places.push(Place {
+                middle,
+                start,
+                first: time,
+                last: time,
+                reports: 1.0,
+                before,
+            });
             return if may_be_old(time) { Rooted::Unknown } else { Rooted::No };
         };
         let share = (time.seconds_since(place.last).max(0.0) / (MIDDLE * rooted_s)).min(1.0);

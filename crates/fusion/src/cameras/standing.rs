@@ -1,18 +1,20 @@
 //! How far each camera can be believed.
 //!
-//! How large a camera's errors are is found from all lines together ([`super::pose_scale`]), and such a camera
-//! counts less; here is what that cannot find: a camera whose lines miss the targets by so much that no track
-//! takes them, and one whose frames come at impossible times. A target that a camera does not report accuses
-//! nobody: something may stand in between. Only a line beside a target that three other cameras see does.
+//! How large a camera's errors are is found from all lines together ([`super::pose_scale`]), and
+//! such a camera counts less; here is what that cannot find: a camera whose lines miss the targets
+//! by so much that no track takes them, and one whose frames come at impossible times. A target
+//! that a camera does not report accuses nobody: something may stand in between. Only a line beside
+//! a target that three other cameras see does.
 
 use crossfix_message::Timestamp;
 
-/// What is remembered of a camera, s: long enough for a bird beside a target to pass, short enough for a
-/// camera that has been put right to come back.
+/// What is remembered of a camera, s: long enough for a bird beside a target to pass, short enough
+/// for a camera that has been put right to come back.
 const MEMORY_S: f64 = 5.0;
 /// Evidence that a verdict needs, s.
 const LEAST_EVIDENCE_S: f64 = 3.0;
-/// A camera that misses the targets, or whose frames are refused, in this share of the time is left out.
+/// A camera that misses the targets, or whose frames are refused, in this share of the time is left
+/// out.
 const EXCLUSION: f64 = 0.7;
 /// It comes back when it does so in less than this.
 const RETURN: f64 = 0.3;
@@ -26,8 +28,8 @@ pub enum CameraStanding {
     Good,
     /// Its bearings miss the targets by more than is declared of its pose: they count less.
     Doubted,
-    /// Its bearings pass beside the targets that the others see, or its frames are refused: pose or clock must
-    /// be wrong. They are compared and not used, until they fit again.
+    /// Its bearings pass beside the targets that the others see, or its frames are refused: pose or
+    /// clock must be wrong. They are compared and not used, until they fit again.
     Excluded,
 }
 
@@ -80,13 +82,14 @@ impl Evidence {
     }
 }
 
-/// The standing of a camera, by one kind of evidence; none as long as there was nothing to compare it with.
+/// The standing of a camera, by one kind of evidence; none as long as there was nothing to compare
+/// it with.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Standing(Option<Evidence>);
 
 impl Standing {
-    /// Takes in how an exposure fits, by its camera's own clock. All targets of one exposure are one piece of
-    /// evidence: they share its pose and time.
+    /// Takes in how an exposure fits, by its camera's own clock. All targets of one exposure are
+    /// one piece of evidence: they share its pose and time.
     pub(super) fn learn(&mut self, time: Timestamp, fittings: &[Fitting]) {
         if fittings.is_empty() {
             return;
@@ -97,18 +100,20 @@ impl Standing {
         evidence.compared_s = (evidence.compared_s + step_s).min(MEMORY_S);
         let wrong = fittings.iter().filter(|fitting| **fitting != Fitting::Fits).count();
         let share = wrong as f64 / fittings.len() as f64;
-        evidence.wrong += (share - evidence.wrong) * (step_s / evidence.compared_s.max(step_s)).min(1.0);
+        evidence.wrong +=
+            (share - evidence.wrong) * (step_s / evidence.compared_s.max(step_s)).min(1.0);
     }
 
-    /// Another camera has been left out: what was held against this one was found beside what that one said.
+    /// Another camera has been left out: what was held against this one was found beside what that
+    /// one said.
     pub(super) fn acquit(&mut self) {
         if let Some(evidence) = self.0.as_mut().filter(|evidence| !evidence.excluded) {
             (evidence.wrong, evidence.compared_s) = (0.0, 0.0);
         }
     }
 
-    /// An exposure at a time says nothing for or against the camera. Where that goes on for long, as there is no
-    /// target left to compare it with, a verdict lapses: returns whether one has.
+    /// An exposure at a time says nothing for or against the camera. Where that goes on for long,
+    /// as there is no target left to compare it with, a verdict lapses: returns whether one has.
     pub(super) fn lapse(&mut self, time: Timestamp) -> bool {
         let is_old = |evidence: &&mut Evidence| time.seconds_since(evidence.last).abs() > MEMORY_S;
         let lapsed = self.0.as_mut().filter(|evidence| evidence.excluded).filter(is_old);
@@ -125,7 +130,8 @@ impl Standing {
 
     /// Leaves the camera out or lets it back in; returns the new standing if that has changed.
     pub(super) fn review(&mut self) -> Option<CameraStanding> {
-        let evidence = self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
+        let evidence =
+            self.0.as_mut().filter(|evidence| evidence.compared_s >= LEAST_EVIDENCE_S)?;
         let limit = if evidence.excluded { RETURN } else { EXCLUSION };
         let excluded = evidence.wrong > limit;
         let changed = excluded != evidence.excluded;

@@ -6,15 +6,17 @@ use crossfix_message::Timestamp;
 
 use super::KnownCamera;
 
-/// How long the strangers of a camera are averaged over, in times for which a bearing holds a track.
+/// How long the strangers of a camera are averaged over, in times for which a bearing holds a
+/// track.
 const MEMORY: f64 = 2.0;
 /// Strangers in an exposure that may always be, however few there were.
 const LEAST_STRANGERS: f64 = 0.02;
-/// No image covers less than this, sr: a microradian squared, which keeps densities finite for any lens.
+/// No image covers less than this, sr: a microradian squared, which keeps densities finite for any
+/// lens.
 const LEAST_VIEW_SR: f64 = 1e-12;
 
-/// Bearings of a camera in an exposure that belong to no track that is held in its place: their running mean, as of
-/// the last exposure; nothing before the first.
+/// Bearings of a camera in an exposure that belong to no track that is held in its place: their
+/// running mean, as of the last exposure; nothing before the first.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Strangers(Option<(Timestamp, f64)>);
 

@@ -1,5 +1,5 @@
-//! The adjustment of a window: the target's way, the clocks and the poses that fit its bearings best
-//! together.
+//! The adjustment of a window: the target's way, the clocks and the poses that fit its bearings
+//! best together.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
@@ -131,7 +131,8 @@ impl<'a> Adjustment<'a> {
         if self.rescale(&state, Loss::Trimmed) {
             (state, density, evidence) = self.best_density(state, density)?;
         }
-        let strangers = self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
+        let strangers =
+            self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
         Some(Adjusted {
             cameras: state.cameras,
@@ -144,8 +145,8 @@ impl<'a> Adjustment<'a> {
     }
 
     /// Sets how often each camera's covariances count, by its residuals: after the first descent,
-    /// when not all may fit, by their median; in the end by the mean of what fits. Says whether that
-    /// has changed much.
+    /// when not all may fit, by their median; in the end by the mean of what fits. Says whether
+    /// that has changed much.
     fn rescale(&mut self, state: &State, loss: Loss) -> bool {
         let squares = self.squares(state);
         let mut changed = false;
@@ -194,9 +195,9 @@ impl<'a> Adjustment<'a> {
         (sight.time_s - offset, since)
     }
 
-    /// The target of a bearing. A clock ahead by o shows it where it was o ago: its offset moves the
-    /// place by minus the velocity, its drift by that times the time since the epoch. A camera turned
-    /// by d and moved by c sees it at p + d x (p - origin) + c.
+    /// The target of a bearing. A clock ahead by o shows it where it was o ago: its offset moves
+    /// the place by minus the velocity, its drift by that times the time since the epoch. A camera
+    /// turned by d and moved by c sees it at p + d x (p - origin) + c.
     fn target(&self, sight: &Sight, state: &State) -> Target {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);
@@ -219,7 +220,8 @@ impl<'a> Adjustment<'a> {
                 let turned = unit.cross(&away);
                 add(first + axis, turned);
                 add(first + 3 + axis, unit);
-                place += turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
+                place +=
+                    turned * state.cameras[first + axis] + unit * state.cameras[first + 3 + axis];
             }
         }
         Target { basis, place, shifts, count }
@@ -232,7 +234,8 @@ impl<'a> Adjustment<'a> {
         for step in [-1, 1] {
             let mut moved = false;
             while DENSITIES.contains(&(best.1 + step)) {
-                let Some((state, evidence)) = self.with_evidence(best.0.clone(), best.1 + step) else {
+                let Some((state, evidence)) = self.with_evidence(best.0.clone(), best.1 + step)
+                else {
                     break;
                 };
                 if evidence <= best.2 {
@@ -250,12 +253,14 @@ impl<'a> Adjustment<'a> {
 
     /// Descends, and twice the logarithm of the evidence (Laplace's), but for a constant.
     fn with_evidence(&self, state: State, density: i32) -> Option<(State, f64)> {
-        let (state, Quadratic { cost, information, .. }) = self.descend(state, density, Loss::Trimmed)?;
+        let (state, Quadratic { cost, information, .. }) =
+            self.descend(state, density, Loss::Trimmed)?;
         let factor = information.cholesky()?;
         let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
         let before = self.prior.precision.clone().cholesky()?;
         let log_before: f64 = 2.0 * before.l_dirty().diagonal().map(f64::ln).sum();
-        let scales = self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
+        let scales =
+            self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
         let width = self.curve.log_width(jerk(density));
         let evidence = log_before - cost - log_determinant - width - scales;
         evidence.is_finite().then_some((state, evidence))
@@ -270,7 +275,8 @@ impl<'a> Adjustment<'a> {
             for i in 0..damped.nrows() {
                 damped[(i, i)] *= 1.0 + damping;
             }
-            let next = damped.cholesky().map(|factor| self.moved(&state, &factor.solve(&here.gradient)));
+            let next =
+                damped.cholesky().map(|factor| self.moved(&state, &factor.solve(&here.gradient)));
             let there = next.as_ref().map(|next| self.quadratic(next, density, loss));
             match (next, there) {
                 (Some(next), Some(there)) if there.cost < here.cost => {
@@ -343,7 +349,8 @@ impl<'a> Adjustment<'a> {
 }
 
 fn share_of_strangers(squares: &[f64]) -> f64 {
-    squares.iter().filter(|squared| **squared > STRANGER).count() as f64 / squares.len().max(1) as f64
+    squares.iter().filter(|squared| **squared > STRANGER).count() as f64
+        / squares.len().max(1) as f64
 }
 
 /// Density of the jerk, m^2/s^5.
@@ -368,8 +375,9 @@ impl Seen {
         let away = target - sight.line.origin.coords;
         let range = away.norm();
         let direction = away / range;
-        let across: Matrix2x3<f64> =
-            sight.line.basis.transpose() * (Matrix3::identity() - direction * direction.transpose()) / range;
+        let across: Matrix2x3<f64> = sight.line.basis.transpose()
+            * (Matrix3::identity() - direction * direction.transpose())
+            / range;
         let inverse: Matrix2<f64> = (sight.line.covariance * scale).try_inverse()?;
         let weighed = across.transpose() * inverse;
         let squared = residual.dot(&(inverse * residual));

@@ -1,5 +1,5 @@
-//! What is believed of the clocks, offset and drift of each against one of them, the reference; and,
-//! as a camera that is turned sees a moving target early or late, of the cameras' poses.
+//! What is believed of the clocks, offset and drift of each against one of them, the reference;
+//! and, as a camera that is turned sees a moving target early or late, of the cameras' poses.
 
 use std::collections::BTreeMap;
 
@@ -20,7 +20,8 @@ const POSE_FLOOR: f64 = 1e-6;
 /// Offsets beyond this are no offsets any more, s.
 const MAX_OFFSET_S: f64 = 2.0;
 
-/// A camera's pose that is uncertain: the place of its error in the state, and its covariance as it was reported.
+/// A camera's pose that is uncertain: the place of its error in the state, and its covariance as it
+/// was reported.
 #[derive(Clone, Copy, Debug)]
 struct UnsurePose {
     place: usize,
@@ -53,11 +54,12 @@ pub(super) struct Belief {
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     epoch: Option<Timestamp>,
-    /// By how much the common time of all clocks, offset and drift, is not what the clocks' reported
-    /// deviations make of them now: it does not step when a clock becomes worse known than it was.
+    /// By how much the common time of all clocks, offset and drift, is not what the clocks'
+    /// reported deviations make of them now: it does not step when a clock becomes worse known than
+    /// it was.
     site: [f64; 2],
-    /// What all clocks say together: made anew whenever one of them is known otherwise, and not as time goes on,
-    /// which steps nobody's time.
+    /// What all clocks say together: made anew whenever one of them is known otherwise, and not as
+    /// time goes on, which steps nobody's time.
     common: Common,
 }
 
@@ -94,7 +96,8 @@ impl Belief {
         self.calibrate(camera, pose);
     }
 
-    /// A camera has another pose, of this covariance: what was learnt of the one before is forgotten.
+    /// A camera has another pose, of this covariance: what was learnt of the one before is
+    /// forgotten.
     pub(super) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
         let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
             return;
@@ -168,7 +171,8 @@ impl Belief {
         }
         self.epoch = Some(time);
         self.site[0] += self.site[1] * dt;
-        // Each offset grows by its drift: of mean and covariance only the rows and columns of offsets change.
+        // Each offset grows by its drift: of mean and covariance only the rows and columns of
+        // offsets change.
         let clocks: Vec<usize> = self.clock_places().collect();
         for &k in &clocks {
             self.mean[k] += dt * self.mean[k + 1];
@@ -193,13 +197,19 @@ impl Belief {
     }
 
     /// Replaces what is believed of some components; what hangs together with them moves along.
-    pub(super) fn learn(&mut self, components: &[usize], mean: &DVector<f64>, covariance: &DMatrix<f64>) {
+    pub(super) fn learn(
+        &mut self,
+        components: &[usize],
+        mean: &DVector<f64>,
+        covariance: &DMatrix<f64>,
+    ) {
         let (before_mean, before) = self.marginal(components);
         let Some(factor) = before.clone().cholesky() else {
             return;
         };
         let n = self.mean.len();
-        let ties = DMatrix::from_fn(n, components.len(), |i, k| self.covariance[(i, components[k])]);
+        let ties =
+            DMatrix::from_fn(n, components.len(), |i, k| self.covariance[(i, components[k])]);
         let gain = factor.solve(&ties.transpose()).transpose();
         let next_mean = &self.mean + &gain * (mean - before_mean);
         let next = &self.covariance + &gain * (covariance - before) * gain.transpose();
@@ -211,8 +221,8 @@ impl Belief {
         }
     }
 
-    /// A camera says that its clock is worse than it was: standard deviations of offset (s) and drift
-    /// (s/s). It may be off by so much from where it stood.
+    /// A camera says that its clock is worse than it was: standard deviations of offset (s) and
+    /// drift (s/s). It may be off by so much from where it stood.
     pub(super) fn reopen(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) {
         let site = self.reference_offset_and_drift();
         let Some(clock) = self.cameras.get_mut(camera) else {
@@ -234,7 +244,8 @@ impl Belief {
 
     /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.
     pub(super) fn doubt(&mut self, camera: &CameraName) {
-        let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference()) else {
+        let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference())
+        else {
             return;
         };
         let Some(place) = clock.place else {
@@ -278,7 +289,8 @@ impl Belief {
     /// Finds out how much each clock says of true time, by where they stand now.
     fn settle(&mut self) {
         let clocks = self.cameras.values();
-        let stands = |clock: &Clock| Reading { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
+        let stands =
+            |clock: &Clock| Reading { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
         self.common = common_time(&clocks.map(stands).collect::<Vec<_>>());
     }
 
@@ -335,7 +347,9 @@ impl Belief {
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
             // No clock is worse known than what was reported of it, as far as that is believed.
-            sd_s: (own + common).min(Reading { offset, variance: clock.prior }.believed(offset)).sqrt(),
+            sd_s: (own + common)
+                .min(Reading { offset, variance: clock.prior }.believed(offset))
+                .sqrt(),
             relative_sd_s: own.sqrt(),
             drift,
             drift_sd: (own_drift + common_drift).min(clock.drift_prior).sqrt(),
@@ -349,7 +363,11 @@ impl Belief {
         let offset = |clock: &Clock| self.relative(clock, 0, ahead);
         let common = self.shares().map(|(clock, share)| share * offset(clock)).sum::<f64>()
             - (self.site[0] + self.site[1] * ahead);
-        self.cameras.values().map(|clock| offset(clock) - common).fold(0.0, f64::max).min(MAX_OFFSET_S)
+        self.cameras
+            .values()
+            .map(|clock| offset(clock) - common)
+            .fold(0.0, f64::max)
+            .min(MAX_OFFSET_S)
     }
 
     /// Offset and drift of the reference against true time as of the epoch.
@@ -369,15 +387,19 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// Three clocks of 0.1 s, of which the second and the third are learnt against the first, the reference.
+    /// Three clocks of 0.1 s, of which the second and the third are learnt against the first, the
+    /// reference.
     fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
         let mut belief = Belief::default();
         for (camera, pose) in ["a", "b", "c"].into_iter().zip(poses) {
             belief.add(&name(camera), [0.1, 3e-5], pose);
         }
         belief.advance(Timestamp::EPOCH);
-        let components: Vec<usize> =
-            ["b", "c"].into_iter().filter_map(|c| belief.place(&name(c))).flat_map(|k| [k, k + 1]).collect();
+        let components: Vec<usize> = ["b", "c"]
+            .into_iter()
+            .filter_map(|c| belief.place(&name(c)))
+            .flat_map(|k| [k, k + 1])
+            .collect();
         let mean = DVector::from_vec(vec![0.06, 1e-5, -0.03, 0.0]);
         belief.learn(&components, &mean, &DMatrix::from_diagonal_element(4, 4, 1e-12));
         (belief, components)
@@ -387,15 +409,16 @@ mod tests {
         belief.estimate(&name(camera), Timestamp::EPOCH).unwrap()
     }
 
-    /// The common offset that is likeliest where each clock is off from it by its deviation, or one in a hundred by
-    /// a second: where the likelihood's slope is 0.
+    /// The common offset that is likeliest where each clock is off from it by its deviation, or one
+    /// in a hundred by a second: where the likelihood's slope is 0.
     fn most_likely(offsets: &[f64], sd: f64) -> f64 {
         let slope = |common: f64| -> f64 {
             let of_clock = |offset: &f64| {
                 let off = offset - common;
-                let [(honest, a), (liar, b)] = [(0.99, sd), (0.01, 1.0)].map(|(share, sd): (f64, f64)| {
-                    (share / sd * (-(off / sd).powi(2) / 2.0).exp(), sd.powi(-2))
-                });
+                let [(honest, a), (liar, b)] =
+                    [(0.99, sd), (0.01, 1.0)].map(|(share, sd): (f64, f64)| {
+                        (share / sd * (-(off / sd).powi(2) / 2.0).exp(), sd.powi(-2))
+                    });
                 off * (honest * a + liar * b) / (honest + liar)
             };
             offsets.iter().map(of_clock).sum()
@@ -463,13 +486,20 @@ mod tests {
             for (camera, before) in ["a", "b", "c"].into_iter().zip(before) {
                 let after = of(&belief, camera);
                 // Nobody's time steps, and only this clock's is unsure.
-                assert!((after.offset_s - before.offset_s).abs() < 1e-9, "{camera}: {after:?} {before:?}");
-                assert!((after.drift - before.drift).abs() < 1e-12, "{camera}: {after:?} {before:?}");
+                assert!(
+                    (after.offset_s - before.offset_s).abs() < 1e-9,
+                    "{camera}: {after:?} {before:?}"
+                );
+                assert!(
+                    (after.drift - before.drift).abs() < 1e-12,
+                    "{camera}: {after:?} {before:?}"
+                );
                 let unsure = if camera == reopened { 0.4..0.5 } else { 0.0..0.05 };
                 assert!(unsure.contains(&after.relative_sd_s), "{camera}: {after:?}");
             }
             assert!(belief.covariance.clone().cholesky().is_some());
-            let (b, later) = (of(&belief, "b"), belief.estimate(&name("b"), Timestamp::from_seconds(60.0)));
+            let (b, later) =
+                (of(&belief, "b"), belief.estimate(&name("b"), Timestamp::from_seconds(60.0)));
             assert!((later.unwrap().offset_s - b.offset_s - 60.0 * b.drift).abs() < 1e-9);
             belief.advance(Timestamp::from_seconds(60.0));
             let moved = belief.estimate(&name("b"), Timestamp::from_seconds(60.0)).unwrap();

@@ -1,14 +1,16 @@
 //! What all clocks of a site say together, of which some are worse than is said of them.
 //!
-//! Each clock is as good as its deviation says, or one of a few that are off by a second. What is common to all then
-//! has a likelihood of several maxima, each with clocks that are believed and others that are not. They are found by
-//! expectation and maximisation from every clock on, and count by how likely they are: where two clocks contradict
-//! each other either may be right, and the variance is as large as they are apart.
+//! Each clock is as good as its deviation says, or one of a few that are off by a second. What is
+//! common to all then has a likelihood of several maxima, each with clocks that are believed and
+//! others that are not. They are found by expectation and maximisation from every clock on, and
+//! count by how likely they are: where two clocks contradict each other either may be right, and
+//! the variance is as large as they are apart.
 
 use std::f64::consts::PI;
 
-/// The share of clocks that are not as good as is said of them: a source of time lost, a latency unknown. It hardly
-/// matters: with half of it one of three counts until it is off by 5.6 of its deviations, and not by 5.5.
+/// The share of clocks that are not as good as is said of them: a source of time lost, a latency
+/// unknown. It hardly matters: with half of it one of three counts until it is off by 5.6 of its
+/// deviations, and not by 5.5.
 const LIARS: f64 = 0.01;
 /// How far off those are, s. With half of it the same.
 const LIARS_SD_S: f64 = 1.0;
@@ -31,7 +33,8 @@ impl Reading {
 
     /// Logarithm of the density of its being off by so much from what all say.
     fn log_likelihood(self, off: f64) -> f64 {
-        let normal = |variance: f64| (-off.powi(2) / variance / 2.0).exp() / (2.0 * PI * variance).sqrt();
+        let normal =
+            |variance: f64| (-off.powi(2) / variance / 2.0).exp() / (2.0 * PI * variance).sqrt();
         ((1.0 - LIARS) * normal(self.variance) + LIARS * normal(self.liars_variance())).ln()
     }
 
@@ -42,7 +45,8 @@ impl Reading {
         }
         let liars = self.liars_variance();
         let odds = LIARS / (1.0 - LIARS) * (self.variance / liars).sqrt();
-        let honest = (1.0 + odds * (off.powi(2) * (1.0 / self.variance - 1.0 / liars) / 2.0).exp()).recip();
+        let honest =
+            (1.0 + odds * (off.powi(2) * (1.0 / self.variance - 1.0 / liars) / 2.0).exp()).recip();
         (honest / self.variance + (1.0 - honest) / liars).recip()
     }
 }
@@ -56,7 +60,8 @@ pub(super) struct Common {
     pub(super) variance: f64,
 }
 
-/// A maximum of the likelihood: the common offset, its variance, the clocks' shares in it, and how likely it is.
+/// A maximum of the likelihood: the common offset, its variance, the clocks' shares in it, and how
+/// likely it is.
 struct Maximum {
     offset: f64,
     variance: f64,
@@ -97,7 +102,8 @@ fn climb(clocks: &[Reading], order: &[usize], start: f64) -> Maximum {
         shares.iter_mut().for_each(|share| *share *= variance);
         offset = order.iter().map(|&i| shares[i] * clocks[i].offset).sum();
     }
-    let log_likelihood = order.iter().map(|&i| clocks[i].log_likelihood(clocks[i].offset - offset)).sum();
+    let log_likelihood =
+        order.iter().map(|&i| clocks[i].log_likelihood(clocks[i].offset - offset)).sum();
     Maximum { offset, variance, shares, log_likelihood }
 }
 
@@ -105,7 +111,8 @@ fn climb(clocks: &[Reading], order: &[usize], start: f64) -> Maximum {
 fn mixed(clocks: usize, maxima: &[Maximum]) -> Common {
     let volume = |maximum: &Maximum| maximum.log_likelihood + maximum.variance.ln() / 2.0;
     let largest = maxima.iter().map(volume).fold(f64::NEG_INFINITY, f64::max);
-    let weights: Vec<f64> = maxima.iter().map(|maximum| (volume(maximum) - largest).exp()).collect();
+    let weights: Vec<f64> =
+        maxima.iter().map(|maximum| (volume(maximum) - largest).exp()).collect();
     let total: f64 = weights.iter().sum();
     let weighed = || maxima.iter().zip(weights.iter().map(|weight| weight / total));
     let mean: f64 = weighed().map(|(maximum, weight)| maximum.offset * weight).sum();
@@ -128,10 +135,15 @@ mod tests {
 
     /// What clocks of so many deviations say together that stand so, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
-        let clocks: Vec<Reading> =
-            clocks.iter().map(|(offset, sd)| Reading { offset: *offset, variance: sd.powi(2) }).collect();
+        let clocks: Vec<Reading> = clocks
+            .iter()
+            .map(|(offset, sd)| Reading { offset: *offset, variance: sd.powi(2) })
+            .collect();
         let Common { shares, variance } = common_time(&clocks);
-        (shares.iter().zip(&clocks).map(|(share, clock)| share * clock.offset).sum(), variance.sqrt())
+        (
+            shares.iter().zip(&clocks).map(|(share, clock)| share * clock.offset).sum(),
+            variance.sqrt(),
+        )
     }
 
     #[test]
@@ -146,7 +158,9 @@ mod tests {
     #[test]
     fn honest_clocks_of_all_deviations_are_believed() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        for sds in [&[0.002, 0.02][..], &[0.002, 0.05, 0.05], &[0.002, 0.002, 0.05, 0.05], &[0.1; 4]] {
+        for sds in
+            [&[0.002, 0.02][..], &[0.002, 0.05, 0.05], &[0.002, 0.002, 0.05, 0.05], &[0.1; 4]]
+        {
             let best = sds.iter().map(|sd: &f64| sd.powi(-2)).sum::<f64>().recip();
             let (mut squares, mut scaled) = (0.0, 0.0);
             for _ in 0..2000 {
@@ -156,7 +170,8 @@ mod tests {
                 scaled += (offset / sd).powi(2) / 2000.0;
             }
             assert!(squares < 1.2 * best, "{sds:?}: {} {}", squares.sqrt(), best.sqrt());
-            // The standard error of a mean square of 2000 draws is 0.03; that any may be a liar makes them less sure.
+            // The standard error of a mean square of 2000 draws is 0.03; that any may be a liar
+            // makes them less sure.
             assert!((0.7..1.1).contains(&scaled), "{sds:?}: {scaled}");
         }
     }
@@ -166,7 +181,8 @@ mod tests {
         for off in [0.02, 0.05, 1.0, -30.0] {
             let (offset, sd) = common(&[(off, 2e-3), (0.0, 2e-3), (0.3e-3, 2e-3)]);
             assert!((offset - 0.15e-3).abs() < 0.1e-3, "{off}: {offset}");
-            // One in a hundred thousand that the other two are wrong, and alike, is a millisecond or two of it.
+            // One in a hundred thousand that the other two are wrong, and alike, is a millisecond
+            // or two of it.
             assert!((1.4e-3..5e-3).contains(&sd), "{off}: {sd}");
         }
     }

@@ -23,7 +23,8 @@ pub(super) struct Curve {
     pieces: usize,
 }
 
-/// How much each of four coefficients counts for the place (1) and for the velocity (1/s) at a time.
+/// How much each of four coefficients counts for the place (1) and for the velocity (1/s) at a
+/// time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Basis {
     /// The first of the four coefficients.
@@ -49,24 +50,35 @@ impl Curve {
         let u = along - first as f64;
         let (v, u2) = (1.0 - u, u * u);
         let u3 = u2 * u;
-        let place = [v * v * v, 3.0 * u3 - 6.0 * u2 + 4.0, 3.0 * (u + u2 - u3) + 1.0, u3].map(|b| b / 6.0);
+        let place =
+            [v * v * v, 3.0 * u3 - 6.0 * u2 + 4.0, 3.0 * (u + u2 - u3) + 1.0, u3].map(|b| b / 6.0);
         let velocity =
             [-v * v, 3.0 * u2 - 4.0 * u, 1.0 + 2.0 * u - 3.0 * u2, u2].map(|b| b / (2.0 * PIECE_S));
         Basis { first, place, velocity }
     }
 
-    /// Adds to a matrix of information what is known of the coefficients beforehand: a white jerk of
-    /// this power spectral density (m^2/s^5), and that nothing flies beyond all bounds.
+    /// Adds to a matrix of information what is known of the coefficients beforehand: a white jerk
+    /// of this power spectral density (m^2/s^5), and that nothing flies beyond all bounds.
     pub(super) fn add_prior(&self, information: &mut DMatrix<f64>, jerk_density: f64) {
         let share = (self.points() as f64).recip();
-        add_differences(information, self.points(), &THIRD, (jerk_density * PIECE_S.powi(5)).recip());
+        add_differences(
+            information,
+            self.points(),
+            &THIRD,
+            (jerk_density * PIECE_S.powi(5)).recip(),
+        );
         let bend = share / (VAGUE_ACCELERATION * PIECE_S * PIECE_S).powi(2);
         add_differences(information, self.points(), &SECOND, bend);
-        add_differences(information, self.points(), &FIRST, share / (VAGUE_SPEED * PIECE_S).powi(2));
+        add_differences(
+            information,
+            self.points(),
+            &FIRST,
+            share / (VAGUE_SPEED * PIECE_S).powi(2),
+        );
     }
 
-    /// How the information of a jerk's density enters the evidence: minus twice the logarithm of the
-    /// prior's density, but for what is the same for all.
+    /// How the information of a jerk's density enters the evidence: minus twice the logarithm of
+    /// the prior's density, but for what is the same for all.
     pub(super) fn log_width(&self, jerk_density: f64) -> f64 {
         3.0 * (self.points() - THIRD.len() + 1) as f64 * jerk_density.ln()
     }
@@ -139,7 +151,10 @@ mod tests {
         for t in [-1.2, -0.3, 0.77, 3.1] {
             let (place, velocity) = curve.basis(t).at(&coefficients);
             assert!((place - at(t)).norm() < 1e-2, "{t}: {place}");
-            assert!((velocity - Vector3::new(10.0, -2.0 * t, 0.0)).norm() < 1e-2, "{t}: {velocity}");
+            assert!(
+                (velocity - Vector3::new(10.0, -2.0 * t, 0.0)).norm() < 1e-2,
+                "{t}: {velocity}"
+            );
         }
     }
 }

@@ -10,7 +10,8 @@ use super::window::Window;
 
 /// Bearings of less than this say nothing that can be checked, s.
 const LEAST_WINDOW_S: f64 = 1.0;
-/// Residuals larger than this (squared, over what was reported) are not the noise's but a mistake's.
+/// Residuals larger than this (squared, over what was reported) are not the noise's but a
+/// mistake's.
 const MAX_SCALE: f64 = 16.0;
 /// When more than this share of a camera's bearings do not fit, the camera does not.
 const MAX_STRANGERS: f64 = 0.3;
@@ -22,7 +23,8 @@ const SUSPICIOUS_PULL: f64 = 6.0;
 const JUMP: f64 = 18.0;
 /// Cameras that are tried for a jump, the least fitting first.
 const MAX_SUSPECTS: usize = 4;
-/// A part of a camera's bearings that fits so much better (squared) than all of them is after a jump.
+/// A part of a camera's bearings that fits so much better (squared) than all of them is after a
+/// jump.
 const BETTER: f64 = 1.5;
 /// A curve reaches beyond its bearings as far as the clocks may move, and no farther than this, s.
 const MAX_MARGIN_S: f64 = 1.0;
@@ -51,10 +53,12 @@ struct Pupil<'a> {
     window: &'a Window,
 }
 
-/// A belief after a window. If the window does not fit it well, the clock of a camera may have jumped.
+/// A belief after a window. If the window does not fit it well, the clock of a camera may have
+/// jumped.
 pub(super) fn lesson(belief: &Belief, window: &Window) -> Lesson {
     let window = window.checked();
-    let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S) else {
+    let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S)
+    else {
         return Lesson::Nothing;
     };
     let mut belief = belief.clone();
@@ -75,14 +79,17 @@ impl Pupil<'_> {
             return Lesson::Learnt(Box::new(self.learnt(self.belief.clone(), adjusted)));
         }
         let suspects = self.suspects(plain.as_ref());
-        if let Some(belief) = suspects.first().and_then(|camera| self.jumped_within(camera, plain.as_ref())) {
+        if let Some(belief) =
+            suspects.first().and_then(|camera| self.jumped_within(camera, plain.as_ref()))
+        {
             return Lesson::Learnt(Box::new(belief));
         }
         let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
         for camera in suspects {
             let mut doubting = self.belief.clone();
             doubting.doubt(camera);
-            let Some(adjusted) = adjust(&doubting, self.window, &self.components).filter(fits) else {
+            let Some(adjusted) = adjust(&doubting, self.window, &self.components).filter(fits)
+            else {
                 continue;
             };
             let evidence = adjusted.evidence - JUMP;
@@ -106,8 +113,8 @@ impl Pupil<'_> {
         belief
     }
 
-    /// What is believed if a camera's clock has jumped in the first half of the window: its bearings
-    /// of the second half fit much better than all, and not by the clock as it was.
+    /// What is believed if a camera's clock has jumped in the first half of the window: its
+    /// bearings of the second half fit much better than all, and not by the clock as it was.
     fn jumped_within(&self, camera: &CameraName, plain: Option<&Adjusted>) -> Option<Belief> {
         let index = self.window.cameras.iter().position(|known| known == camera)?;
         let strange = |adjusted: &Adjusted| adjusted.scales[index];
@@ -129,7 +136,9 @@ impl Pupil<'_> {
     /// The cameras of the window whose clocks may have jumped, the least fitting first.
     fn suspects(&self, adjusted: Option<&Adjusted>) -> Vec<&CameraName> {
         let strange = |index: usize| {
-            adjusted.map_or(0.0, |adjusted| adjusted.scales[index] + MAX_SCALE * adjusted.strangers[index])
+            adjusted.map_or(0.0, |adjusted| {
+                adjusted.scales[index] + MAX_SCALE * adjusted.strangers[index]
+            })
         };
         let cameras = self.window.cameras.iter().enumerate();
         let mut suspects: Vec<(f64, &CameraName)> = cameras

@@ -45,7 +45,8 @@ const CHECK_EVERY_S: f64 = 4.0;
 const PAUSE_S: f64 = 0.02;
 /// A clock is worse than it was when its camera reports it this many times worse.
 const WORSE: f64 = 3.0;
-/// So many windows one after the other that fit only if all that was learnt was wrong say that it was.
+/// So many windows one after the other that fit only if all that was learnt was wrong say that it
+/// was.
 const MAX_REFUSED: u32 = 2;
 
 /// What is known of a camera's clock.
@@ -139,14 +140,15 @@ impl ClockEstimator {
         self.needed
     }
 
-    /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only one
-    /// counts that makes the clock much worse than it was: its source of time is lost.
+    /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only
+    /// one counts that makes the clock much worse than it was: its source of time is lost.
     pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
         let reported_sd_s = reported.time_sd_s;
         if !self.config.estimate {
             return;
         }
-        let uncertain = reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
+        let uncertain =
+            reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
         let Some(before) = self.reported.get_mut(camera) else {
             self.needed |= uncertain;
@@ -164,10 +166,20 @@ impl ClockEstimator {
         }
     }
 
-    /// The standard deviation of an exposure's time against the other cameras', s, by what is known of
-    /// its clock and by what its camera says of it: a clock that is not estimated is as good as it says.
-    pub(crate) fn time_sd_s(&self, camera: &CameraName, known: &ClockEstimate, reported_sd_s: f64) -> f64 {
-        if self.is_at_its_word(camera) { known.relative_sd_s.max(reported_sd_s) } else { known.relative_sd_s }
+    /// The standard deviation of an exposure's time against the other cameras', s, by what is known
+    /// of its clock and by what its camera says of it: a clock that is not estimated is as good as
+    /// it says.
+    pub(crate) fn time_sd_s(
+        &self,
+        camera: &CameraName,
+        known: &ClockEstimate,
+        reported_sd_s: f64,
+    ) -> f64 {
+        if self.is_at_its_word(camera) {
+            known.relative_sd_s.max(reported_sd_s)
+        } else {
+            known.relative_sd_s
+        }
     }
 
     /// Whether a clock is not estimated, for its camera says that it is good.
@@ -198,7 +210,8 @@ impl ClockEstimator {
     pub(crate) fn estimate(&self, camera: &CameraName) -> Option<ClockEstimate> {
         let estimate = self.newest().estimate(camera, self.now)?;
         let at_its_word = self.is_at_its_word(camera);
-        let widens = |reported: &&Reported| at_its_word || (reported.suspected && !reported.cleared);
+        let widens =
+            |reported: &&Reported| at_its_word || (reported.suspected && !reported.cleared);
         let reported = self.reported.get(camera).filter(widens);
         let widened = |sd: f64| reported.map_or(sd, |reported| reported.sd_s.max(sd));
         let (sd_s, relative_sd_s) = (widened(estimate.sd_s), widened(estimate.relative_sd_s));
@@ -211,14 +224,15 @@ impl ClockEstimator {
         self.newest().largest_offset(self.now)
     }
 
-    /// Moves on to a time: closes a window that is full or whose target too few cameras see, or looks
-    /// at one that is open, now and then. One window at a time, for an exposure waits for it.
+    /// Moves on to a time: closes a window that is full or whose target too few cameras see, or
+    /// looks at one that is open, now and then. One window at a time, for an exposure waits for it.
     pub(crate) fn advance(&mut self, time: Timestamp, tracker: &Tracker) {
         self.now = self.now.max(time);
         if self.now < self.next_adjustment {
             return;
         }
-        let followed = |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
+        let followed =
+            |id: TrackId| tracker.track(id).is_some_and(|t| t.is_confirmed() && t.is_held());
         let now = self.now;
         let full = |window: &Window| now.seconds_since(window.start) >= WINDOW_S;
         if let Some(index) = self.windows.iter().position(|w| full(w) || !followed(w.track)) {
@@ -238,7 +252,8 @@ impl ClockEstimator {
         }
     }
 
-    /// All clocks have stepped by so much, s: what was learnt stays, what was being looked at is of another time.
+    /// All clocks have stepped by so much, s: what was learnt stays, what was being looked at is of
+    /// another time.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.belief.step_time(step_s);
         (self.provisional, self.round) = (None, None);
@@ -270,11 +285,14 @@ impl ClockEstimator {
 
     /// The worst standard deviation of a clock among all cameras, s.
     fn worst_sd(&self) -> f64 {
-        let sd = |camera| self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
+        let sd = |camera| {
+            self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s)
+        };
         self.reported.keys().map(sd).fold(0.0, f64::max)
     }
 
-    /// Whether a window is for a camera's clock, which is among the worst known and no other window's.
+    /// Whether a window is for a camera's clock, which is among the worst known and no other
+    /// window's.
     fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
         let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
@@ -282,8 +300,8 @@ impl ClockEstimator {
         is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
-    /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly known
-    /// as it was in the beginning, until a window tells.
+    /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly
+    /// known as it was in the beginning, until a window tells.
     pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
             if let Some(reported) = self.reported.get_mut(camera) {
@@ -291,7 +309,9 @@ impl ClockEstimator {
             }
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
             // Up to now its bearings may be by the clock as it was.
-            self.windows.iter_mut().for_each(|window| *window = window.without_early(f64::INFINITY, camera));
+            self.windows
+                .iter_mut()
+                .for_each(|window| *window = window.without_early(f64::INFINITY, camera));
             self.round = None;
         }
     }
@@ -325,7 +345,10 @@ impl ClockEstimator {
 
     /// Whether the clock of a camera that sees one of the targets is not well known.
     fn is_unsure(&self) -> bool {
-        self.windows.iter().flat_map(|window| &window.cameras).any(|camera| self.is_unsure_of(camera))
+        self.windows
+            .iter()
+            .flat_map(|window| &window.cameras)
+            .any(|camera| self.is_unsure_of(camera))
     }
 
     fn is_unsure_of(&self, camera: &CameraName) -> bool {
@@ -336,7 +359,9 @@ impl ClockEstimator {
     /// Looks at what the next open window tells so far; after the last it counts.
     fn look(&mut self, mut round: Round) {
         if let Some(window) = self.windows.get(round.next) {
-            if let Lesson::Learnt(next) = lesson(round.belief.as_ref().unwrap_or(&self.belief), window) {
+            if let Lesson::Learnt(next) =
+                lesson(round.belief.as_ref().unwrap_or(&self.belief), window)
+            {
                 round.belief = Some(*next);
                 round.cleared.extend(window.checked_cameras());
             }
@@ -361,7 +386,8 @@ mod tests {
 
     #[test]
     fn a_clock_at_its_word_is_as_good_as_each_frame_says_and_a_trusted_one_is_right() {
-        let [word, trusted, unsure] = ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
+        let [word, trusted, unsure] =
+            ["a", "t", "u"].map(|name| name.parse::<CameraName>().unwrap());
         let config = Clocks { trusted: vec![trusted.clone()], ..Clocks::default() };
         let mut clocks = ClockEstimator::new(config);
         for (camera, sd_s) in [(&word, 0.9e-3), (&trusted, 0.3), (&unsure, 0.1)] {

@@ -6,8 +6,8 @@ use nalgebra::Vector3;
 
 use crate::track::TrackId;
 
-/// A window holds no more bearings than this: when it is full, every other one of each camera is let
-/// go, and from then on as many are not taken.
+/// A window holds no more bearings than this: when it is full, every other one of each camera is
+/// let go, and from then on as many are not taken.
 const MAX_SIGHTS: usize = 1500;
 /// A window is of so many cameras: eight unknowns each, in time that is bounded. The others have
 /// their turn with another window.
@@ -86,7 +86,8 @@ impl Window {
         }
         let known = self.cameras.iter().position(|known| known == camera);
         let no_link = self.links >= MAX_LINKS && time_s < ROLL_CALL_S;
-        if known.is_none() && (self.cameras.len() >= MAX_CAMERAS || (role == Role::Link && no_link)) {
+        if known.is_none() && (self.cameras.len() >= MAX_CAMERAS || (role == Role::Link && no_link))
+        {
             return;
         }
         let index = known.unwrap_or_else(|| {
@@ -118,8 +119,9 @@ impl Window {
     /// Earliest and latest time of its bearings, s.
     pub(super) fn span(&self) -> Option<(f64, f64)> {
         let times = || self.sights.iter().map(|sight| sight.time_s);
-        (!self.sights.is_empty())
-            .then(|| (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max)))
+        (!self.sights.is_empty()).then(|| {
+            (times().fold(f64::INFINITY, f64::min), times().fold(f64::NEG_INFINITY, f64::max))
+        })
     }
 
     /// Which cameras have given enough bearings for what they say to be checked.
@@ -173,7 +175,11 @@ mod tests {
             let time = Timestamp::from_seconds(f64::from(k) * 1e-3);
             window.add(&camera, Role::Wanted, time, line, Vector3::zeros());
         }
-        assert!((MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()), "{}", window.sights.len());
+        assert!(
+            (MAX_SIGHTS / 2..=MAX_SIGHTS).contains(&window.sights.len()),
+            "{}",
+            window.sights.len()
+        );
         let (first, last) = window.span().unwrap();
         assert!(first < 0.01 && last > 8.9, "{first} {last}");
         let of_b = window.sights.iter().filter(|sight| sight.camera == 1).count();
@@ -188,7 +194,13 @@ mod tests {
         for k in 0..60_u32 {
             let camera = format!("{:02}", k % 16).parse().unwrap();
             let role = if k % 16 < 14 { Role::Link } else { Role::Wanted };
-            window.add(&camera, role, Timestamp::from_seconds(f64::from(k) / 60.0), line, Vector3::zeros());
+            window.add(
+                &camera,
+                role,
+                Timestamp::from_seconds(f64::from(k) / 60.0),
+                line,
+                Vector3::zeros(),
+            );
         }
         let names: Vec<&str> = window.cameras.iter().map(CameraName::as_str).collect();
         assert_eq!(names[..6], ["00", "01", "02", "03", "14", "15"]);

@@ -5,14 +5,14 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// Exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default lateness, three of
-/// 30 Hz 5400 within the longest.
+/// Exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default lateness,
+/// three of 30 Hz 5400 within the longest.
 const MOST_EXPOSURES: usize = 6_000;
 /// Sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in all.
 const MOST_SIGHTINGS: usize = 100_000;
 
-/// By what exposures are put into order: two of a camera may be corrected to the same time, and the reported times
-/// tell them apart.
+/// By what exposures are put into order: two of a camera may be corrected to the same time, and the
+/// reported times tell them apart.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Place {
     time: Timestamp,
@@ -20,8 +20,8 @@ struct Place {
     reported: Timestamp,
 }
 
-/// Exposures that wait until nothing can come before them, in the order of their times, each with a note; never
-/// more than may.
+/// Exposures that wait until nothing can come before them, in the order of their times, each with a
+/// note; never more than may.
 ///
 /// ```text
 ///                        out, in order
@@ -34,8 +34,9 @@ struct Place {
 ///  refused
 /// ```
 ///
-/// The fusion has two: by the times that the cameras report ([`super::EventBuffer`] says what can still come), and
-/// by those times less what the clocks are found to be ahead (until no clock can be so far ahead).
+/// The fusion has two: by the times that the cameras report ([`super::EventBuffer`] says what can
+/// still come), and by those times less what the clocks are found to be ahead (until no clock can
+/// be so far ahead).
 #[derive(Debug)]
 pub(crate) struct ReorderQueue<Note> {
     waiting: BTreeMap<Place, (Exposure, Note)>,
@@ -55,7 +56,8 @@ impl<Note> ReorderQueue<Note> {
         self.waiting.contains_key(&place)
     }
 
-    /// Takes an exposure in by its time, with the time that its camera reported, unless the same waits already.
+    /// Takes an exposure in by its time, with the time that its camera reported, unless the same
+    /// waits already.
     pub(crate) fn insert(&mut self, exposure: Exposure, reported: Timestamp, note: Note) {
         let place = Place { time: exposure.time, camera: exposure.camera.clone(), reported };
         if let Entry::Vacant(waiting) = self.waiting.entry(place) {
@@ -64,8 +66,8 @@ impl<Note> ReorderQueue<Note> {
         }
     }
 
-    /// The first exposure, if it is no later than the time before which nothing can come any more, or if more wait
-    /// than may.
+    /// The first exposure, if it is no later than the time before which nothing can come any more,
+    /// or if more wait than may.
     pub(crate) fn pop_settled(&mut self, settled: Option<Timestamp>) -> Option<(Exposure, Note)> {
         let (first, _) = self.waiting.first_key_value()?;
         let is_crowded = self.waiting.len() > MOST_EXPOSURES || self.sightings > MOST_SIGHTINGS;

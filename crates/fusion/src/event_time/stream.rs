@@ -5,8 +5,8 @@ use super::PATIENCES;
 /// For so many times the lateness a camera is waited for as one whose frames overtake each other.
 const DISORDER_LASTS: f64 = 20.0;
 
-/// So many frames of a camera one after the other far behind its newest say that its clock was ahead,
-/// even where they come too late.
+/// So many frames of a camera one after the other far behind its newest say that its clock was
+/// ahead, even where they come too late.
 const MOST_FAR_BEHIND: u32 = 3;
 
 /// How one camera's frames come.
@@ -28,7 +28,14 @@ pub(super) struct Stream {
 
 impl Stream {
     pub(super) fn beginning(newest: Timestamp) -> Self {
-        Self { newest, trusted: Timestamp::MIN, step_s: 0.0, heard_s: 0.0, far_behind: 0, disorder: None }
+        Self {
+            newest,
+            trusted: Timestamp::MIN,
+            step_s: 0.0,
+            heard_s: 0.0,
+            far_behind: 0,
+            disorder: None,
+        }
     }
 
     /// Takes note of a frame that came `late_s` too late.
@@ -44,13 +51,15 @@ impl Stream {
             if late_s.is_some() || known_s > 0.0 {
                 self.disorder = Some((behind_s.max(known_s), self.newest));
             }
-        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s) {
+        } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s)
+        {
             // No network reorders so far: the clock was ahead, and now it is not.
             *self = Self { trusted: self.trusted, ..Self::beginning(time) };
         }
     }
 
-    /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the order.
+    /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the
+    /// order.
     pub(super) fn disorder_s(&self, lateness_s: f64) -> f64 {
         let lasts_s = DISORDER_LASTS * lateness_s;
         let lately = |(_, then): &(f64, Timestamp)| self.newest.seconds_since(*then) <= lasts_s;

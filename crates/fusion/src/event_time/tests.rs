@@ -60,7 +60,10 @@ fn what_is_overtaken_is_taken_until_something_later_is_worked_on() {
     assert_eq!(buffer.release().unwrap().unwrap().time, Timestamp::from_seconds(1.1));
     buffer.pass(Timestamp::from_seconds(1.2));
     let late = buffer.insert(exposure("a", 1.15)).unwrap_err();
-    assert!(matches!(late, RejectionReason::Late { by_s } if (by_s - 0.05).abs() < 1e-9), "{late:?}");
+    assert!(
+        matches!(late, RejectionReason::Late { by_s } if (by_s - 0.05).abs() < 1e-9),
+        "{late:?}"
+    );
 }
 
 #[test]
@@ -173,7 +176,10 @@ fn one_camera_from_the_future_is_refused_and_drags_nobody() {
     }
     // Ten of `a` and nine of `b`: the tenth of `b` waits for `a`.
     assert_eq!(drain(&mut buffer).len(), 19);
-    assert!(matches!(buffer.insert(exposure("liar", 1e6 + 1.0)), Err(RejectionReason::Future { .. })));
+    assert!(matches!(
+        buffer.insert(exposure("liar", 1e6 + 1.0)),
+        Err(RejectionReason::Future { .. })
+    ));
 }
 
 #[test]
@@ -242,7 +248,11 @@ fn sixteen_cameras_are_not_dragged_by_seven() {
     let mut buffer = EventBuffer::new(EventTime::default());
     let lie = |camera, t| Some(if camera < 7 { between(5.0..6.0, t, 9.003) } else { t });
     assert_eq!(run(&mut buffer, 16, 0..20, lie), 0, "within what may be ahead they wait");
-    assert!(drain(&mut buffer).is_empty() && buffer.waiting.load().0 <= 16, "{}", buffer.waiting.load().0);
+    assert!(
+        drain(&mut buffer).is_empty() && buffer.waiting.load().0 <= 16,
+        "{}",
+        buffer.waiting.load().0
+    );
 }
 
 #[test]
@@ -302,7 +312,8 @@ fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
         basis: nalgebra::Matrix3x2::identity(),
         covariance: nalgebra::Matrix2::identity(),
     };
-    let sighting = crate::Sighting { image_track: 1, line, rooted: crate::cameras::Rooted::Unknown };
+    let sighting =
+        crate::Sighting { image_track: 1, line, rooted: crate::cameras::Rooted::Unknown };
     Exposure { sightings: vec![sighting; sightings], ..exposure(camera, time_s) }
 }
 

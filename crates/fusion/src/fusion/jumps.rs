@@ -10,10 +10,11 @@ use crate::initiation::Initiator;
 use crate::site_time::moved;
 use crate::unmet::Unmet;
 
-/// All clocks have stepped forward, and the cameras have not stood still, where that is so much likelier by the
-/// targets' bearings (logarithm): a host that sleeps is the commoner.
+/// All clocks have stepped forward, and the cameras have not stood still, where that is so much
+/// likelier by the targets' bearings (logarithm): a host that sleeps is the commoner.
 const STEP_MARGIN: f64 = 8.0;
-/// A longer step forward is not told from a host that slept, s: where a target is after that nobody knows.
+/// A longer step forward is not told from a host that slept, s: where a target is after that nobody
+/// knows.
 const LONGEST_FORWARD_S: f64 = 2.0;
 
 impl Fusion {
@@ -27,8 +28,8 @@ impl Fusion {
         }
     }
 
-    /// Takes the order of time up anew from a time long passed: what was made of a time that never was
-    /// is forgotten.
+    /// Takes the order of time up anew from a time long passed: what was made of a time that never
+    /// was is forgotten.
     pub(super) fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
         while let Some((exposure, ())) = self.corrected.pop() {
@@ -56,17 +57,23 @@ impl Fusion {
         frames.iter().for_each(|frame| self.take(frame, outputs));
     }
 
-    /// Whether all clocks have stepped by so much, s. Time that has gone back has. Where it has gone forward all
-    /// cameras may have stood still, as those of a host that slept; they have not, if their bearings show the
-    /// targets where they would be without it, and not where they would be with it.
+    /// Whether all clocks have stepped by so much, s. Time that has gone back has. Where it has
+    /// gone forward all cameras may have stood still, as those of a host that slept; they have not,
+    /// if their bearings show the targets where they would be without it, and not where they would
+    /// be with it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         let fit = |ahead_s: f64| -> f64 {
             let of_frame = |frame: &BearingFrame| {
                 let frame = moved(frame, -ahead_s);
                 let name = frame.camera.parse().ok()?;
                 let known = self.cameras.at(&name, Timestamp::from_nanos(frame.capture_time_ns))?;
-                let read =
-                    ingress::read(&frame, &name, known, &self.config.bearings, &mut Counters::default());
+                let read = ingress::read(
+                    &frame,
+                    &name,
+                    known,
+                    &self.config.bearings,
+                    &mut Counters::default(),
+                );
                 Some(self.tracker.fit(&read.ok()?.0, known))
             };
             frames.iter().filter_map(of_frame).sum()

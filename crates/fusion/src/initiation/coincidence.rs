@@ -10,7 +10,8 @@ use crate::visibility::independent_share;
 
 /// Logarithm of the probability that a camera is blind for a target that it should see.
 const BLIND: f64 = -4.6;
-/// A camera whose clock shifts its bearings by so many times their own variance agrees with nothing.
+/// A camera whose clock shifts its bearings by so many times their own variance agrees with
+/// nothing.
 const VAGUE: f64 = 10.0;
 
 /// How much likelier it is that lines are one target's than that every camera sees a target of its
@@ -46,7 +47,12 @@ impl Coincidence {
 
     /// Of what one camera has followed so far.
     pub(super) fn of_one(camera: &CameraName, sight: Sight) -> Self {
-        Self { sights: vec![(camera.clone(), sight)], silent: Vec::new(), log_ratio: 0.0, vague: false }
+        Self {
+            sights: vec![(camera.clone(), sight)],
+            silent: Vec::new(),
+            log_ratio: 0.0,
+            vague: false,
+        }
     }
 
     /// Learns what a camera shifts its first line by, of which the target's place has been made.
@@ -66,7 +72,8 @@ impl Coincidence {
         self.sights.iter().any(|(name, _)| name == camera)
     }
 
-    /// A camera's first line, with its log-likelihood ratio; the target may move across it at `rate_sd` (rad/s).
+    /// A camera's first line, with its log-likelihood ratio; the target may move across it at
+    /// `rate_sd` (rad/s).
     pub(super) fn see_first(
         &mut self,
         camera: &CameraName,

@@ -1,9 +1,9 @@
 //! Targets that cameras see one after another, and never two at a time.
 //!
-//! What one camera alone follows is a direction that turns. When it loses sight of it, another may have begun to see
-//! it: the new camera's line crosses the direction that the old one would have by now in one place, and place and
-//! turning give a velocity across the old line. How the new line turns, and where the next camera sees it, tells
-//! whether that was so.
+//! What one camera alone follows is a direction that turns. When it loses sight of it, another may
+//! have begun to see it: the new camera's line crosses the direction that the old one would have by
+//! now in one place, and place and turning give a velocity across the old line. How the new line
+//! turns, and where the next camera sees it, tells whether that was so.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,28 +26,28 @@ use crate::tracker::{log_likelihood_ratio, same_target};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
-/// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what flies past a camera
-/// is lost again and again; twice as much takes strangers for it.
+/// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what
+/// flies past a camera is lost again and again; twice as much takes strangers for it.
 const TURNING_SD: f64 = 0.3;
-/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of it what turns hard is
-/// lost, with twice as much two directions are too soon alike.
+/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of
+/// it what turns hard is lost, with twice as much two directions are too soon alike.
 const TURNING_DENSITY: f64 = 3e-4;
-/// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if all ranges over a
-/// factor of 150 were equally likely.
+/// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if
+/// all ranges over a factor of 150 were equally likely.
 const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
-/// A camera has lost sight of what it followed if it would so seldom (logarithm) have missed it so often by chance:
-/// once in 100 times, which are two exposures where it reports nine of ten.
+/// A camera has lost sight of what it followed if it would so seldom (logarithm) have missed it so
+/// often by chance: once in 100 times, which are two exposures where it reports nine of ten.
 const LOST: f64 = -4.6;
-/// Two cameras that have seen something together for longer than this, s, and have not made a target of it, see
-/// different things.
+/// Two cameras that have seen something together for longer than this, s, and have not made a
+/// target of it, see different things.
 const TOGETHER_S: f64 = 1.0;
-/// That it is one target must be so many times (logarithm) likelier than that each camera sees another, and than
-/// any other reading of the same lines: a chance of 1 in 3000.
+/// That it is one target must be so many times (logarithm) likelier than that each camera sees
+/// another, and than any other reading of the same lines: a chance of 1 in 3000.
 const MARGIN: f64 = 8.0;
 /// A reading less likely than this (logarithm) is given up.
 const GIVEN_UP: f64 = -5.0;
-/// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others tried with one: time
-/// is bounded.
+/// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others
+/// tried with one: time is bounded.
 const MAX_SEEN: usize = 20;
 const MAX_LOST: usize = 20;
 const MAX_READINGS: usize = 4;
@@ -60,7 +60,8 @@ struct Seen {
     number: u64,
     sight: Sight,
     first: Timestamp,
-    /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2), ...
+    /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2),
+    /// ...
     line: TimedLine,
     pose_variance: f64,
     /// ... and of the camera.
@@ -100,7 +101,8 @@ struct Look<'a> {
 }
 
 impl Look<'_> {
-    /// What is uncertain of the exposure's camera: what a clock shifts is not known before the velocity is.
+    /// What is uncertain of the exposure's camera: what a clock shifts is not known before the
+    /// velocity is.
     fn uncertainty(&self) -> CameraUncertainty {
         CameraUncertainty { clock_is_noise: true, ..self.exposure.uncertainty }
     }
@@ -153,7 +155,8 @@ impl Seen {
         }
     }
 
-    /// Whether the camera no longer sees it, and has not only missed it a few times; or is silent itself.
+    /// Whether the camera no longer sees it, and has not only missed it a few times; or is silent
+    /// itself.
     fn is_lost(&self, now: Timestamp, tracking: &Tracking) -> bool {
         let share = (self.lines / (self.lines + self.gaps)).min(tracking.detection_probability);
         let is_silent = now.seconds_since(self.sight.time) > tracking.coasting_after_s;
@@ -172,8 +175,8 @@ impl Seen {
         sight
     }
 
-    /// A track of it, in the place where its direction at a time crosses another line; the target may be as
-    /// fast as `speed` (m/s, standard deviation) along the direction.
+    /// A track of it, in the place where its direction at a time crosses another line; the target
+    /// may be as fast as `speed` (m/s, standard deviation) along the direction.
     fn placed(
         &self,
         camera: &CameraName,
@@ -183,15 +186,18 @@ impl Seen {
     ) -> Option<Track> {
         let Self { sight, line: last, uncertainty, .. } = self;
         let by_now = self.at(time).direction;
-        let [range, there] = passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
+        let [range, there] =
+            passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
         if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
             return None;
         }
         let along = sight.direction.into_inner();
         let velocity = (sight.rate - along * along.dot(&sight.rate)) * range;
         let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
-        let [across, along_squared] = [model.basis * model.basis.transpose(), along * along.transpose()];
-        // A range that is off by a share has the place off along the direction, and the velocity by the same share.
+        let [across, along_squared] =
+            [model.basis * model.basis.transpose(), along * along.transpose()];
+        // A range that is off by a share has the place off along the direction, and the velocity by
+        // the same share.
         let scale = stacked(along * range, velocity) * UNKNOWN_LOG_RANGE_SD;
         let direction_variance = sight.variance + self.pose_variance;
         let (tie, turning) = (sight.tie, sight.rate_variance);
@@ -227,18 +233,26 @@ fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
 }
 
 impl Reading {
-    /// Takes the exposure's best line in; returns whether it is still open what this is: not if a track has the line.
+    /// Takes the exposure's best line in; returns whether it is still open what this is: not if a
+    /// track has the line.
     fn advance(&mut self, look: &Look<'_>, rules: &Handover) -> bool {
         let Look { exposure, known, is_owned, .. } = *look;
         let Some(expected) = look.expectation(&self.track) else {
             return true;
         };
         let lines = exposure.sightings.iter().enumerate().take(MAX_LINES);
-        let fits = lines
-            .filter_map(|(i, sighting)| Some((expected.fit(&sighting.line, rules.gate)?.log_density, i)));
+        let fits = lines.filter_map(|(i, sighting)| {
+            Some((expected.fit(&sighting.line, rules.gate)?.log_density, i))
+        });
         let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
         if let Some((log_density, index)) = best.filter(|(_, index)| !is_owned[*index]) {
-            self.take(look, index, &expected, log_density - rules.strangers_per_sr(known).ln(), rules);
+            self.take(
+                look,
+                index,
+                &expected,
+                log_density - rules.strangers_per_sr(known).ln(),
+                rules,
+            );
         }
         best.is_none_or(|(_, index)| !is_owned[index])
     }
@@ -259,14 +273,21 @@ impl Reading {
         self.track.measurement_update(camera, line, (*time, &look.uncertainty()), motion)?;
         self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
         let timed = (line, *time, uncertainty.time_sd_s);
-        // That two cameras which see something at once agree says nothing of what the first one has seen before.
+        // That two cameras which see something at once agree says nothing of what the first one has
+        // seen before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
             *name != self.of.0 && name != camera && time.seconds_since(residual.time) < TOGETHER_S
         });
         let first_ratio = if is_joint { 0.0 } else { first_ratio };
         match expected {
             Expectation::Near(prediction) => {
-                self.coincidence.see(camera, timed, prediction, (density, rules.speed), first_ratio);
+                self.coincidence.see(
+                    camera,
+                    timed,
+                    prediction,
+                    (density, rules.speed),
+                    first_ratio,
+                );
             }
             Expectation::Along { .. } if self.coincidence.knows(camera) => {}
             Expectation::Along { .. } => {
@@ -301,7 +322,8 @@ impl Handover {
         self.seen.remove(camera);
     }
 
-    /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks that are sure now.
+    /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks
+    /// that are sure now.
     pub(super) fn see(
         &mut self,
         exposure: &Exposure,
@@ -319,14 +341,16 @@ impl Handover {
         self.settle(&look)
     }
 
-    /// Forgets what no camera has seen for as long as a track would be kept, and what was never sure at once.
+    /// Forgets what no camera has seen for as long as a track would be kept, and what was never
+    /// sure at once.
     fn forget(&mut self, now: Timestamp) {
         let (tracking, pair_s) = (&self.tracking, self.pair_s);
         let lost_after_s = tracking.lost_after_s;
         for seen in self.seen.values_mut() {
             for one in seen.iter_mut() {
                 one.readings.retain(|reading| {
-                    now.seconds_since(reading.track.updated) <= lost_after_s && reading.ratio() > GIVEN_UP
+                    now.seconds_since(reading.track.updated) <= lost_after_s
+                        && reading.ratio() > GIVEN_UP
                 });
             }
             seen.retain(|one| {
@@ -350,7 +374,8 @@ impl Handover {
         let mut taken = vec![false; with_pose.len()];
         let (gate, mut begun, mut explained) = (self.gate, Vec::new(), BTreeSet::new());
         let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
-        // Those that are best known choose first; one that is lost takes nothing that may be a stranger.
+        // Those that are best known choose first; one that is lost takes nothing that may be a
+        // stranger.
         let mut order: Vec<usize> = (0..seen.len()).collect();
         order.sort_by(|&a, &b| {
             seen[a].at(exposure.time).variance.total_cmp(&seen[b].at(exposure.time).variance)
@@ -359,10 +384,13 @@ impl Handover {
             let one = &mut seen[place];
             let sight = one.at(exposure.time);
             let is_lost = one.is_lost(exposure.time, &self.tracking);
-            let near = exposure.sightings.iter().enumerate().take(taken.len()).filter(|(i, _)| !taken[*i]);
+            let near =
+                exposure.sightings.iter().enumerate().take(taken.len()).filter(|(i, _)| !taken[*i]);
+            let fits = near.filter_map(|(i, sighting)| {
+                Some((sight.density(&sighting.line, factor, gate)?, i))
+            });
             let fits =
-                near.filter_map(|(i, sighting)| Some((sight.density(&sighting.line, factor, gate)?, i)));
-            let fits = fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > strangers + MARGIN));
+                fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > strangers + MARGIN));
             let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
             let Some((log_density, index)) = best else {
                 one.missed += 1.0;
@@ -420,7 +448,8 @@ impl Handover {
             .collect();
         lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
         for (camera, one) in lost.into_iter().take(MAX_LOST) {
-            let since = begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
+            let since =
+                begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
             for &Begun { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
                 let name = (exposure.camera.clone(), exposure.sequence, index);
                 let is_read = one.readings.iter().any(|reading| reading.newest == name);
@@ -432,10 +461,12 @@ impl Handover {
                 let reading = one
                     .placed(camera, (line, now), (self.speed, self.max_range_m), motion)
                     .and_then(|track| {
-                        let unlikely = track.state().velocity().norm_squared() / (2.0 * self.speed.powi(2));
+                        let unlikely =
+                            track.state().velocity().norm_squared() / (2.0 * self.speed.powi(2));
                         let expected = look.expectation(&track)?;
                         let fit = expected.fit(line, self.gate)?;
-                        let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known)) - unlikely;
+                        let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known))
+                            - unlikely;
                         let coincidence = Coincidence::of_one(camera, one.sight.clone());
                         let mut reading = Reading {
                             of: (camera.clone(), one.number),
@@ -452,8 +483,8 @@ impl Handover {
         self.seen = all;
     }
 
-    /// The readings that an exposure has made sure. Others of the same lines are rivals, unless they are the same
-    /// target.
+    /// The readings that an exposure has made sure. Others of the same lines are rivals, unless
+    /// they are the same target.
     fn settle(&mut self, look: &Look<'_>) -> Vec<Start> {
         let Look { exposure, motion, .. } = *look;
         let is_new = |reading: &Reading| {
@@ -461,14 +492,16 @@ impl Handover {
             *camera == exposure.camera && *sequence == exposure.sequence
         };
         let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
-        let all: Vec<&Reading> = self.seen.values().flatten().flat_map(|one| &one.readings).collect();
+        let all: Vec<&Reading> =
+            self.seen.values().flatten().flat_map(|one| &one.readings).collect();
         let mut sure: Vec<&Reading> = all
             .iter()
             .copied()
             .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
             .filter(|one| {
                 let mut rivals = all.iter().filter(|other| {
-                    other.ratio() > one.ratio() - MARGIN && (other.newest == one.newest || other.of == one.of)
+                    other.ratio() > one.ratio() - MARGIN
+                        && (other.newest == one.newest || other.of == one.of)
                 });
                 rivals.all(|other| same_target(&state(one), &state(other)))
             })
@@ -485,8 +518,9 @@ impl Handover {
                 found.push(track);
             }
         }
-        let is_found =
-            |reading: &Reading| found.iter().any(|track| same_target(track.state(), &state(reading)));
+        let is_found = |reading: &Reading| {
+            found.iter().any(|track| same_target(track.state(), &state(reading)))
+        };
         let settled: BTreeSet<u64> =
             all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.1).collect();
         for seen in self.seen.values_mut() {

@@ -147,8 +147,9 @@ impl Hypotheses {
             }
         }
         // What one camera alone sees may be anywhere: it begins anew when another sees it too.
-        self.hypotheses
-            .retain(|h| h.cameras().len() >= 2 && h.coincidence.log_ratio().is_none_or(|r| r > LEAST_SCORE));
+        self.hypotheses.retain(|h| {
+            h.cameras().len() >= 2 && h.coincidence.log_ratio().is_none_or(|r| r > LEAST_SCORE)
+        });
         let seeds = self.finder.find(exposures, cameras);
         self.begin(seeds, exposures, motion);
         self.prune();
@@ -164,7 +165,8 @@ impl Hypotheses {
         let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
-        let look = Look { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
+        let look =
+            Look { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for hypothesis in std::mem::take(&mut self.hypotheses) {
             self.extend_one(hypothesis, &look, &mut next);
@@ -173,8 +175,8 @@ impl Hypotheses {
         self.prune_families();
     }
 
-    /// Lets one hypothesis go on with each bearing in its gate that is likely enough beside the likeliest way, and
-    /// without any if that is.
+    /// Lets one hypothesis go on with each bearing in its gate that is likely enough beside the
+    /// likeliest way, and without any if that is.
     fn extend_one(&self, mut hypothesis: Hypothesis, look: &Look<'_>, next: &mut Vec<Hypothesis>) {
         let Look { exposure, known, motion, lines, uncertainty, detection, interval_s } = *look;
         let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
@@ -235,14 +237,17 @@ impl Hypotheses {
         self.hypotheses.retain(|h| {
             let (best, count) = families.entry(h.family).or_insert((h.track.score, 0));
             *count += 1;
-            *count <= MAX_FAMILY && h.track.score > *best - FAMILY_MARGIN && h.track.score > LEAST_SCORE
+            *count <= MAX_FAMILY
+                && h.track.score > *best - FAMILY_MARGIN
+                && h.track.score > LEAST_SCORE
         });
         self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
     fn sort(&mut self) {
-        self.hypotheses
-            .sort_by(|a, b| b.track.score.total_cmp(&a.track.score).then_with(|| a.lines.cmp(&b.lines)));
+        self.hypotheses.sort_by(|a, b| {
+            b.track.score.total_cmp(&a.track.score).then_with(|| a.lines.cmp(&b.lines))
+        });
     }
 
     /// Begins a hypothesis with every seed.
@@ -250,7 +255,10 @@ impl Hypotheses {
         let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
             .iter()
             .map(|exposure| {
-                (&exposure.camera, CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty })
+                (
+                    &exposure.camera,
+                    CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
+                )
             })
             .collect();
         for seed in seeds {
@@ -268,15 +276,20 @@ impl Hypotheses {
                 .filter_map(|((camera, ..), line)| Some((camera, line, *uncertainty.get(camera)?)));
             let mut track = Box::new(Track::start(&fix, named, motion));
             track.score = seed.score;
-            let lines = seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
-            let mut coincidence = Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
+            let lines =
+                seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
+            let mut coincidence =
+                Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
             for ((camera, sequence, index), timed) in &seed.lines {
                 let seen_from = (camera, timed.line.origin);
-                let of = |exposure: &&&Exposure| exposure.camera == *camera && exposure.sequence == *sequence;
-                let own = exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index));
-                let expected = uncertainty
-                    .get(camera)
-                    .and_then(|uncertainty| track.expectation(timed.time, seen_from, uncertainty, motion));
+                let of = |exposure: &&&Exposure| {
+                    exposure.camera == *camera && exposure.sequence == *sequence
+                };
+                let own =
+                    exposures.iter().find(of).and_then(|exposure| exposure.sightings.get(*index));
+                let expected = uncertainty.get(camera).and_then(|uncertainty| {
+                    track.expectation(timed.time, seen_from, uncertainty, motion)
+                });
                 if let (Some(own), Some(Expectation::Near(prediction))) = (own, expected) {
                     coincidence.begin_shift(camera, &own.line, &prediction);
                 }
@@ -309,8 +322,9 @@ impl Hypotheses {
         self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
-    /// The best hypotheses without common lines that are likely enough and have no rival. One target must be likelier
-    /// than that each camera sees another by the number of pairs of lines of which it may be so by chance.
+    /// The best hypotheses without common lines that are likely enough and have no rival. One
+    /// target must be likelier than that each camera sees another by the number of pairs of lines
+    /// of which it may be so by chance.
     fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &Motion) -> Vec<Start> {
         // The best come first, and the others are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
@@ -321,21 +335,26 @@ impl Hypotheses {
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
                 // Lines of two targets that two cameras see one each may cross for a while.
-                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born) >= self.pair_s
+                let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born)
+                    >= self.pair_s
                     && hypothesis.track.is_placed();
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
                 let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= pairs);
                 let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);
-                    let alike =
-                        |k: usize| same_target(&state, &self.hypotheses[k].track.predicted(now, motion));
+                    let alike = |k: usize| {
+                        same_target(&state, &self.hypotheses[k].track.predicted(now, motion))
+                    };
                     selection.loss_without(i, alike) >= RIVAL_MARGIN
                 }
             })
             .collect();
-        let lines: BTreeSet<LineId> =
-            sure.iter().flat_map(|&i| &self.hypotheses[i].lines).map(|(_, id)| id.clone()).collect();
+        let lines: BTreeSet<LineId> = sure
+            .iter()
+            .flat_map(|&i| &self.hypotheses[i].lines)
+            .map(|(_, id)| id.clone())
+            .collect();
         let starts = sure.iter().map(|&i| self.start(&self.hypotheses[i])).collect();
         if !lines.is_empty() {
             self.hypotheses.retain(|h| h.lines.iter().all(|(_, id)| !lines.contains(id)));
@@ -352,16 +371,19 @@ impl Hypotheses {
         let mut track = Track::clone(&hypothesis.track);
         track.status = TrackStatus::Confirmed;
         track.observe();
-        let claimed_by = hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
+        let claimed_by =
+            hypothesis.lines.iter().filter_map(|(_, id)| self.claims.get(id)).copied().collect();
         Start { track, cameras: hypothesis.cameras().len(), claimed_by }
     }
 }
 
-/// How many pairs there are of what two cameras see and is not rooted, where they see most; the logarithm.
+/// How many pairs there are of what two cameras see and is not rooted, where they see most; the
+/// logarithm.
 fn logarithm_of_pairs(exposures: &[&Exposure]) -> f64 {
     let mut lines: BTreeMap<&CameraName, usize> = BTreeMap::new();
     for exposure in exposures {
-        let count = exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes).count();
+        let count =
+            exposure.sightings.iter().filter(|sighting| sighting.rooted != Rooted::Yes).count();
         let most = lines.entry(&exposure.camera).or_default();
         *most = count.max(*most);
     }

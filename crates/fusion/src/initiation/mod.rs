@@ -1,7 +1,7 @@
 //! New tracks from the bearings that no track claims: they are gathered into
 //! observation periods ([`Periods`]), and what of several periods belongs
 //! together is found either by following hypotheses ([`Hypotheses`]) or, as in
-//! 002, by solving each period for fixes and grouping these ([`Grouped`]).
+//! Klochko 2020, by solving each period for fixes and grouping these ([`Grouped`]).
 
 mod coincidence;
 mod handover;
@@ -65,8 +65,8 @@ enum Method {
 impl Initiator {
     pub(crate) fn new(config: &FusionConfig) -> Self {
         let initiation = &config.initiation;
-        let pairs =
-            initiation.method == InitiationMethod::Hypotheses || initiation.solver == SpatialSolver::Pair;
+        let pairs = initiation.method == InitiationMethod::Hypotheses
+            || initiation.solver == SpatialSolver::Pair;
         let method = match initiation.method {
             InitiationMethod::Hypotheses => Method::Hypotheses(Hypotheses::new(config)),
             InitiationMethod::Grouping => Method::Grouped(Grouped::new(config)),
@@ -83,8 +83,8 @@ impl Initiator {
         self.handover.forget_camera(camera);
     }
 
-    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns the tracks that
-    /// begin with it of targets that cameras see one after another.
+    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns
+    /// the tracks that begin with it of targets that cameras see one after another.
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,
@@ -131,15 +131,17 @@ pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> +
     })
 }
 
-/// The same with what is uncertain of the camera's pose: where one bearing of each camera must meet,
-/// that is noise like any other.
+/// The same with what is uncertain of the camera's pose: where one bearing of each camera must
+/// meet, that is noise like any other.
 pub(crate) fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     let pose = exposure.uncertainty.pose;
-    let origin_sd_m =
-        pose.map_or(0.0, |pose| (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt());
+    let origin_sd_m = pose.map_or(0.0, |pose| {
+        (pose.covariance().fixed_view::<3, 3>(3, 3).trace() / 3.0).max(0.0).sqrt()
+    });
     lines_of(exposure).map(move |(id, mut timed)| {
         let line = &mut timed.line;
-        let at_infinity = BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
+        let at_infinity =
+            BearingModel { direction: line.direction, basis: line.basis, range: f64::INFINITY };
         line.covariance *= exposure.uncertainty.factor;
         line.covariance += exposure.uncertainty.shared(&at_infinity, Vector3::zeros());
         (id, TimedLine { origin_sd_m, ..timed })

@@ -48,6 +48,10 @@ impl Passings {
         let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);
         let between = second.time.seconds_since(first.time).abs() + unsure;
         let motion = self.speed * between;
-        if by_m <= SIGMAS * (noise + poses + motion) { Passing::Close } else { Passing::Apart { by_m } }
+        if by_m <= SIGMAS * (noise + poses + motion) {
+            Passing::Close
+        } else {
+            Passing::Apart { by_m }
+        }
     }
 }

@@ -4,7 +4,8 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// A camera whose newest exposure is older than so many frame intervals (of most cameras) is silent.
+/// A camera whose newest exposure is older than so many frame intervals (of most cameras) is
+/// silent.
 const SILENT_INTERVALS: f64 = 5.0;
 /// A period is closed where the exposures lie within this factor of as close as they ever do.
 const SPREAD_FACTOR: f64 = 1.2;
@@ -52,20 +53,26 @@ impl Periods {
 
     /// Takes an exposure in, and returns the period if it ends with it; `known` is the number of
     /// cameras that may be heard.
-    pub(crate) fn add(&mut self, exposure: Exposure, known: usize) -> Option<BTreeMap<CameraName, Exposure>> {
+    pub(crate) fn add(
+        &mut self,
+        exposure: Exposure,
+        known: usize,
+    ) -> Option<BTreeMap<CameraName, Exposure>> {
         let now = exposure.time;
         let before = self.heard.len();
         let previous = self.hear(&exposure.camera, now);
         self.unused.insert(exposure.camera.clone(), exposure);
         if let Some(interval_s) = self.usual_interval_s().filter(|_| previous) {
-            self.heard.retain(|_, heard| now.seconds_since(heard.time) <= SILENT_INTERVALS * interval_s);
+            self.heard
+                .retain(|_, heard| now.seconds_since(heard.time) <= SILENT_INTERVALS * interval_s);
         }
         self.repeated |= previous;
         if self.heard.len() != before {
             // Other cameras lie otherwise.
             self.spreads.clear();
         }
-        let spread_of = |oldest: Option<Timestamp>| oldest.map_or(0.0, |time| now.seconds_since(time));
+        let spread_of =
+            |oldest: Option<Timestamp>| oldest.map_or(0.0, |time| now.seconds_since(time));
         if self.heard.len() < self.cameras || !(self.repeated || self.heard.len() >= known) {
             return None;
         }
@@ -78,7 +85,8 @@ impl Periods {
         unused.retain(|camera, _| heard.contains_key(camera));
         let complete = unused.len() == heard.len();
         let spread = spread_of(unused.values().map(|exposure| exposure.time).min());
-        let long_enough = self.closed.is_none_or(|closed| now.seconds_since(closed) >= self.shortest_s);
+        let long_enough =
+            self.closed.is_none_or(|closed| now.seconds_since(closed) >= self.shortest_s);
         if !(complete && long_enough && spread <= closest * SPREAD_FACTOR) {
             return None;
         }
@@ -102,7 +110,8 @@ impl Periods {
 
     /// The median of the cameras' usual intervals, s: one camera with odd times changes little.
     fn usual_interval_s(&self) -> Option<f64> {
-        let mut intervals: Vec<f64> = self.heard.values().filter_map(|heard| heard.interval_s).collect();
+        let mut intervals: Vec<f64> =
+            self.heard.values().filter_map(|heard| heard.interval_s).collect();
         intervals.sort_unstable_by(f64::total_cmp);
         intervals.get(intervals.len() / 2).copied()
     }

@@ -22,7 +22,8 @@ const SETTLED_CAMERAS: usize = 4;
 const MAX_SEEDS: usize = 2_000;
 /// Quantiles are kept for sets of up to so many cameras; larger ones pass.
 const MAX_CAMERAS: usize = 64;
-/// Most pairs of lines that pass each other closely and are looked at in one period: time is bounded.
+/// Most pairs of lines that pass each other closely and are looked at in one period: time is
+/// bounded.
 const MAX_CLOSE_PAIRS: usize = 20_000;
 /// No more pairs are looked at where so many sets have been found: of bearings that are alike every
 /// combination is as good as any other.
@@ -74,7 +75,9 @@ impl SeedFinder {
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
         // n lines have 2 n - 3 degrees of freedom, as the velocity has a prior.
         let set_gates = (0..MAX_CAMERAS)
-            .map(|n: usize| chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1)))
+            .map(|n: usize| {
+                chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1))
+            })
             .collect();
         Self {
             passings: Passings::new(&initiation),
@@ -89,7 +92,8 @@ impl SeedFinder {
 
     /// Every set of lines of one period that may be one target's, the most likely first.
     pub(crate) fn find(&self, exposures: &[&Exposure], cameras: &Cameras) -> Vec<Seed> {
-        let lines: Vec<Vec<NamedLine>> = exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
+        let lines: Vec<Vec<NamedLine>> =
+            exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
         let growing = Growing { exposures, cameras, lines: &lines };
         let mut settled: Vec<Vec<bool>> = lines.iter().map(|l| vec![false; l.len()]).collect();
         let mut seeds = Vec::new();
@@ -99,12 +103,15 @@ impl SeedFinder {
             for i in 0..lines[a].len() {
                 for j in 0..lines[b].len() {
                     tried += 1;
-                    let enough = tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
+                    let enough =
+                        tried > MAX_PAIRS || close > MAX_CLOSE_PAIRS || seeds.len() > MAX_FOUND;
                     if settled[a][i] || settled[b][j] || enough {
                         continue;
                     }
                     let both = |rooted| {
-                        [(a, i), (b, j)].iter().all(|&(k, l)| exposures[k].sightings[l].rooted == rooted)
+                        [(a, i), (b, j)]
+                            .iter()
+                            .all(|&(k, l)| exposures[k].sightings[l].rooted == rooted)
                     };
                     if both(Rooted::Yes) && exposures.len() == 2 {
                         continue;
@@ -137,8 +144,8 @@ impl SeedFinder {
         });
         let mut seen = BTreeSet::new();
         order.retain(|&i| seen.insert(&names[i]));
-        // Where three cameras agree on both lines of a pair, with others or with each other, the pair
-        // can wait for the next period: there are many more of these than targets.
+        // Where three cameras agree on both lines of a pair, with others or with each other, the
+        // pair can wait for the next period: there are many more of these than targets.
         let agreed: BTreeSet<&LineId> =
             order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
         order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
@@ -148,7 +155,7 @@ impl SeedFinder {
     }
 
     /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first
-    /// (002, equation 12).
+    /// (Klochko 2020, eq. 12).
     fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
         let camera = |i: usize| Some(&growing.cameras.known(&growing.exposures[i].camera)?.camera);
         let mut pairs = Vec::new();
@@ -161,8 +168,9 @@ impl SeedFinder {
                 let apart = (one.position() - other.position()).norm();
                 let any = !growing.lines[a].is_empty() && !growing.lines[b].is_empty();
                 if any && apart <= 2.0 * self.initiation.max_range_m {
-                    let axis =
-                        |pose: &crossfix_geometry::Pose| pose.rotation().matrix().column(2).into_owned();
+                    let axis = |pose: &crossfix_geometry::Pose| {
+                        pose.rotation().matrix().column(2).into_owned()
+                    };
                     pairs.push((axis(one).cross(&axis(other)).norm(), (a, b)));
                 }
             }
@@ -194,7 +202,9 @@ impl SeedFinder {
                     longer.push((c, *line));
                     let timed: Vec<TimedLine> =
                         longer.iter().map(|&(k, l)| growing.lines[k][l].1.clone()).collect();
-                    if let Some(solution) = self.solve(&timed).filter(|s| self.agrees(s, longer.len())) {
+                    if let Some(solution) =
+                        self.solve(&timed).filter(|s| self.agrees(s, longer.len()))
+                    {
                         next.push((longer, solution));
                     }
                 }
@@ -236,7 +246,8 @@ impl SeedFinder {
     ) -> Vec<usize> {
         let known = growing.cameras.known(&growing.exposures[c].camera);
         let newest = places.iter().map(|&(k, l)| growing.lines[k][l].1.time).max();
-        let (Some(known), Some(reference), Some((_, first))) = (known, newest, growing.lines[c].first())
+        let (Some(known), Some(reference), Some((_, first))) =
+            (known, newest, growing.lines[c].first())
         else {
             return Vec::new();
         };
@@ -253,20 +264,28 @@ impl SeedFinder {
         let distance = |(l, (_, timed)): (usize, &NamedLine)| {
             Some((prediction.fit(&timed.line, self.line_gate)?.gate_distance, l))
         };
-        let mut near: Vec<(f64, usize)> = growing.lines[c].iter().enumerate().filter_map(distance).collect();
+        let mut near: Vec<(f64, usize)> =
+            growing.lines[c].iter().enumerate().filter_map(distance).collect();
         near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
         near.into_iter().map(|(_, l)| l).collect()
     }
 
     /// The seed of a set, if it is possible at all.
-    fn seed(&self, growing: &Growing<'_>, places: &[(usize, usize)], solution: MapSolution) -> Option<Seed> {
+    fn seed(
+        &self,
+        growing: &Growing<'_>,
+        places: &[(usize, usize)],
+        solution: MapSolution,
+    ) -> Option<Seed> {
         if places.len() < self.least_cameras || is_rooted(growing, places) {
             return None;
         }
-        let mut lines: Vec<NamedLine> = places.iter().map(|&(k, l)| growing.lines[k][l].clone()).collect();
+        let mut lines: Vec<NamedLine> =
+            places.iter().map(|&(k, l)| growing.lines[k][l].clone()).collect();
         lines.sort_by(|x, y| x.1.time.cmp(&y.1.time).then_with(|| x.0.cmp(&y.0)));
         let position = solution.state.position();
-        let in_range = |(_, l): &NamedLine| (position - l.line.origin).norm() < self.initiation.max_range_m;
+        let in_range =
+            |(_, l): &NamedLine| (position - l.line.origin).norm() < self.initiation.max_range_m;
         if !(lines.iter().all(in_range) && self.agrees(&solution, lines.len())) {
             return None;
         }
@@ -278,21 +297,23 @@ impl SeedFinder {
                     .known(&exposure.camera)
                     .is_some_and(|known| known.expects(position, self.initiation.max_range_m))
         });
-        let false_alarms: f64 = places.iter().map(|&(k, _)| growing.exposures[k].clutter_per_sr.ln()).sum();
+        let false_alarms: f64 =
+            places.iter().map(|&(k, _)| growing.exposures[k].clutter_per_sr.ln()).sum();
         let score = self.log_evidence(&lines, &solution)? - false_alarms
             + silent.count() as f64 * (1.0 - self.detection_probability).ln();
         (score > self.least_score).then_some(Seed { lines, solution, score })
     }
 
-    /// Logarithm of the density of the lines as a new target's: the density of new targets times the
-    /// integral over all positions and velocities.
+    /// Logarithm of the density of the lines as a new target's: the density of new targets times
+    /// the integral over all positions and velocities.
     fn log_evidence(&self, lines: &[NamedLine], solution: &MapSolution) -> Option<f64> {
         let factor = solution.state.covariance.cholesky()?;
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
         let velocity = 3.0 * self.initiation.velocity_prior_sd_mps.ln();
-        let mut evidence = self.initiation.birth_density_per_m3.ln() + 1.5 * (2.0 * PI).ln() + log_root
-            - velocity
-            - solution.chi_square / 2.0;
+        let mut evidence =
+            self.initiation.birth_density_per_m3.ln() + 1.5 * (2.0 * PI).ln() + log_root
+                - velocity
+                - solution.chi_square / 2.0;
         let (position, speed) = (solution.state.position(), self.initiation.velocity_prior_sd_mps);
         for (_, timed) in lines {
             let noise = timed.noise_at((position - timed.line.origin).norm(), speed);
@@ -303,8 +324,8 @@ impl SeedFinder {
     }
 }
 
-/// Whether lines are of things that stand in their cameras' views for good. Of a camera that has only begun to
-/// look nobody can say: then three must agree.
+/// Whether lines are of things that stand in their cameras' views for good. Of a camera that has
+/// only begun to look nobody can say: then three must agree.
 fn is_rooted(growing: &Growing<'_>, places: &[(usize, usize)]) -> bool {
     let rooted = || places.iter().map(|&(k, l)| growing.exposures[k].sightings[l].rooted);
     rooted().all(|rooted| rooted == Rooted::Yes)

@@ -1,12 +1,13 @@
-//! Which readings of the bearings go together: the set of greatest total score without common lines.
+//! Which readings of the bearings go together: the set of greatest total score without common
+//! lines.
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::spatial::LineId;
 
-/// Comparisons of readings in one period, about a tenth of a second's worth; half of them are kept for the question
-/// how sure each choice is.
+/// Comparisons of readings in one period, about a tenth of a second's worth; half of them are kept
+/// for the question how sure each choice is.
 const MAX_COMPARISONS: usize = 20_000_000;
 /// Passes of the local search; each makes the total greater, and few are ever needed.
 const MAX_PASSES: usize = 20;
@@ -27,7 +28,8 @@ pub(super) struct Selection {
     users: Vec<Vec<usize>>,
     shared_lines: usize,
     chosen: BTreeSet<usize>,
-    /// Comparisons that may still be made: time is bounded where everything clashes with everything.
+    /// Comparisons that may still be made: time is bounded where everything clashes with
+    /// everything.
     budget: Cell<usize>,
 }
 
@@ -35,8 +37,8 @@ impl Selection {
     /// The best set found of readings, given as scores with lines; `shared_lines` is how many lines
     /// two chosen ones may have in common. Readings of score 0 and less are never chosen.
     ///
-    /// Choosing the best first lets a reading of several targets' bearings shut them all out. So the
-    /// choice is improved by exchange: one goes out if those that it kept out are worth more.
+    /// Choosing the best first lets a reading of several targets' bearings shut them all out. So
+    /// the choice is improved by exchange: one goes out if those that it kept out are worth more.
     pub(super) fn new<'a>(
         scored: impl Iterator<Item = (f64, &'a [(u64, LineId)])>,
         shared_lines: usize,
@@ -81,7 +83,8 @@ impl Selection {
         let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
-        let gained: f64 = self.additions(&without, &others).iter().map(|&i| self.readings[i].score).sum();
+        let gained: f64 =
+            self.additions(&without, &others).iter().map(|&i| self.readings[i].score).sum();
         // Where there was no time to look for others, nothing is sure.
         if self.budget.get() == 0 { 0.0 } else { self.readings[chosen].score - gained }
     }
@@ -89,7 +92,8 @@ impl Selection {
     /// Readings that have a line in common with one.
     fn neighbours(&self, of: usize) -> impl Iterator<Item = usize> {
         let lines = &self.readings[of].lines;
-        let all: BTreeSet<usize> = lines.iter().flat_map(|&line| self.users[line].iter().copied()).collect();
+        let all: BTreeSet<usize> =
+            lines.iter().flat_map(|&line| self.users[line].iter().copied()).collect();
         all.into_iter().filter(move |&i| i != of)
     }
 
@@ -113,7 +117,9 @@ impl Selection {
     /// Those of some readings that fit beside a choice and each other, the best first.
     fn additions(&self, choice: &BTreeSet<usize>, among: &[usize]) -> Vec<usize> {
         let mut by_score: Vec<usize> = among.to_vec();
-        by_score.sort_by(|&a, &b| self.readings[b].score.total_cmp(&self.readings[a].score).then(a.cmp(&b)));
+        by_score.sort_by(|&a, &b| {
+            self.readings[b].score.total_cmp(&self.readings[a].score).then(a.cmp(&b))
+        });
         let mut choice = choice.clone();
         let mut added = Vec::new();
         for i in by_score {
@@ -154,8 +160,10 @@ impl Selection {
                 if self.chosen.contains(&i) {
                     continue;
                 }
-                let against: Vec<usize> =
-                    self.neighbours(i).filter(|k| self.chosen.contains(k) && self.clash(i, *k)).collect();
+                let against: Vec<usize> = self
+                    .neighbours(i)
+                    .filter(|k| self.chosen.contains(k) && self.clash(i, *k))
+                    .collect();
                 let lost: f64 = against.iter().map(|&k| self.readings[k].score).sum();
                 if self.readings[i].score > lost + 1e-9 {
                     against.iter().for_each(|k| {
@@ -180,7 +188,8 @@ mod tests {
         let lines = |ids: &[usize]| -> Vec<(u64, LineId)> {
             ids.iter().map(|&i| (0, ("a".parse().unwrap(), 0, i))).collect()
         };
-        let owned: Vec<(f64, Vec<(u64, LineId)>)> = readings.iter().map(|(s, l)| (*s, lines(l))).collect();
+        let owned: Vec<(f64, Vec<(u64, LineId)>)> =
+            readings.iter().map(|(s, l)| (*s, lines(l))).collect();
         Selection::new(owned.iter().map(|(s, l)| (*s, l.as_slice())), shared)
     }
 

@@ -24,11 +24,12 @@ pub(super) struct Sight {
     pub(super) rate_variance: f64,
     pub(super) tie: f64,
     pub(super) time: Timestamp,
-    /// What the pose shifts all bearings of the camera by, as far as is known (rad, world), and its covariance along
-    /// the tangents once the first prediction has told it.
+    /// What the pose shifts all bearings of the camera by, as far as is known (rad, world), and its
+    /// covariance along the tangents once the first prediction has told it.
     shift: Vector3<f64>,
     shift_covariance: Option<Matrix2<f64>>,
-    /// Squared innovations by what the reported noise lets expect, and how many coordinates these are.
+    /// Squared innovations by what the reported noise lets expect, and how many coordinates these
+    /// are.
     squares: f64,
     coordinates: f64,
 }
@@ -50,9 +51,13 @@ impl Sight {
         }
     }
 
-    /// Learns the camera's shift from the first line, of which the target's place has been made: what is left of the
-    /// line is shift and noise, in the proportion of their covariances.
-    pub(super) fn begin_shift(&mut self, line: &SightLine, prediction: &BearingPrediction) -> Option<()> {
+    /// Learns the camera's shift from the first line, of which the target's place has been made:
+    /// what is left of the line is shift and noise, in the proportion of their covariances.
+    pub(super) fn begin_shift(
+        &mut self,
+        line: &SightLine,
+        prediction: &BearingPrediction,
+    ) -> Option<()> {
         let Beginning { left, shift, noise, placed } = prediction.beginning(line)?;
         let total = shift + noise;
         let gain = shift * total.try_inverse()?;
@@ -61,8 +66,8 @@ impl Sight {
         Some(())
     }
 
-    /// Where the line is expected at a time; `density` is that of the white acceleration that drives
-    /// it, rad^2/s^3.
+    /// Where the line is expected at a time; `density` is that of the white acceleration that
+    /// drives it, rad^2/s^3.
     pub(super) fn predict(&mut self, time: Timestamp, density: f64) {
         let dt = time.seconds_since(self.time);
         self.direction = Unit::new_normalize(self.direction.into_inner() + self.rate * dt);
@@ -74,9 +79,14 @@ impl Sight {
         self.time = time;
     }
 
-    /// How much likelier (logarithm) a line is where the target of all cameras is predicted than where
-    /// this camera alone expects it; learns the camera's shift, which is the same in all its lines.
-    pub(super) fn log_ratio(&mut self, line: &SightLine, prediction: &BearingPrediction) -> Option<f64> {
+    /// How much likelier (logarithm) a line is where the target of all cameras is predicted than
+    /// where this camera alone expects it; learns the camera's shift, which is the same in all its
+    /// lines.
+    pub(super) fn log_ratio(
+        &mut self,
+        line: &SightLine,
+        prediction: &BearingPrediction,
+    ) -> Option<f64> {
         let to_tangents = prediction.basis().transpose();
         let turn = to_tangents * line.basis;
         let own = turn * line.covariance * turn.transpose() * self.factor();
@@ -94,11 +104,12 @@ impl Sight {
         Some(together - alone)
     }
 
-    /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times; `None` if it lies
-    /// outside the gate.
+    /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times;
+    /// `None` if it lies outside the gate.
     pub(super) fn density(&self, line: &SightLine, factor: f64, gate: Gate) -> Option<f64> {
         let variance = self.variance + line.covariance.trace() / 2.0 * factor.max(self.factor());
-        let squared = (line.direction.into_inner() - self.direction.into_inner()).norm_squared() / variance;
+        let squared =
+            (line.direction.into_inner() - self.direction.into_inner()).norm_squared() / variance;
         gate.holds(squared).then(|| -squared / 2.0 - (2.0 * PI * variance).ln())
     }
 
@@ -116,8 +127,8 @@ impl Sight {
         self.variance -= gain * self.variance;
     }
 
-    /// How many times the lines' reported covariances count, as far as these have shown: where noise is larger than
-    /// it says, every small difference would pass for evidence.
+    /// How many times the lines' reported covariances count, as far as these have shown: where
+    /// noise is larger than it says, every small difference would pass for evidence.
     fn factor(&self) -> f64 {
         (self.squares / self.coordinates).max(1.0)
     }

@@ -1,8 +1,9 @@
-//! How accurate ranges are, from the angles between the lines alone (002, the section on accuracy).
+//! How accurate ranges are, from the angles between the lines alone (Klochko 2020, the section on
+//! accuracy).
 
 use nalgebra::{Matrix2, Matrix3};
 
-/// Covariance of the ranges of [`super::pair`], m^2 (002, equation 12).
+/// Covariance of the ranges of [`super::pair`], m^2 (Klochko 2020, eq. 12).
 ///
 /// `angle` is the one between the lines, rad; `equation_sd` the standard deviation of each
 /// coordinate of the vector `e_2` of equation 4, m, the coordinates uncorrelated. It is least at a
@@ -10,25 +11,38 @@ use nalgebra::{Matrix2, Matrix3};
 pub fn pair_range_covariance(angle: f64, equation_sd: f64) -> Option<Matrix2<f64>> {
     let (sin, cos) = angle.sin_cos();
     let sine_square = sin * sin;
-    (sine_square > f64::EPSILON).then(|| Matrix2::new(1.0, cos, cos, 1.0) * equation_sd.powi(2) / sine_square)
+    (sine_square > f64::EPSILON)
+        .then(|| Matrix2::new(1.0, cos, cos, 1.0) * equation_sd.powi(2) / sine_square)
 }
 
-/// Covariance of the ranges of three receivers at one time, without velocity, m^2 (002, equation 13).
+/// Covariance of the ranges of three receivers at one time, without velocity, m^2 (Klochko 2020,
+/// eq. 13).
 ///
-/// `alpha` is the angle between the first line and the second, `beta` that between the first and the
-/// third, rad; `equation_sd` as in [`pair_range_covariance`].
+/// `alpha` is the angle between the first line and the second, `beta` that between the first and
+/// the third, rad; `equation_sd` as in [`pair_range_covariance`].
 ///
-/// The formula takes all six coordinates of `e_2` and `e_3` for uncorrelated. Both hold the error of
-/// the first receiver's `r_1 a_1`, so that with equal, isotropic errors of the three points their
-/// coordinates correlate by a half, and the formula is optimistic (erratum): three perpendicular
-/// lines give `r_1` a standard deviation 1.22 times as large. `None` if all lines are parallel.
+/// The formula takes all six coordinates of `e_2` and `e_3` for uncorrelated. Both hold the error
+/// of the first receiver's `r_1 a_1`, so that with equal, isotropic errors of the three points
+/// their coordinates correlate by a half, and the formula is optimistic (erratum): three
+/// perpendicular lines give `r_1` a standard deviation 1.22 times as large. `None` if all lines are
+/// parallel.
 pub fn triple_range_covariance(alpha: f64, beta: f64, equation_sd: f64) -> Option<Matrix3<f64>> {
     let ((sin_a, cos_a), (sin_b, cos_b)) = (alpha.sin_cos(), beta.sin_cos());
     let (square_a, square_b) = (sin_a * sin_a, sin_b * sin_b);
     let sum = square_a + square_b;
     let both = cos_a * cos_b;
     (sum > f64::EPSILON).then(|| {
-        let shape = Matrix3::new(1.0, cos_a, cos_b, cos_a, 1.0 + square_b, both, cos_b, both, 1.0 + square_a);
+        let shape = Matrix3::new(
+            1.0,
+            cos_a,
+            cos_b,
+            cos_a,
+            1.0 + square_b,
+            both,
+            cos_b,
+            both,
+            1.0 + square_a,
+        );
         shape * equation_sd.powi(2) / sum
     })
 }
@@ -92,7 +106,10 @@ mod tests {
         for i in 0..N {
             for j in 0..N {
                 let scale = (formula[(i, i)] * formula[(j, j)]).sqrt();
-                assert!((found[(i, j)] - formula[(i, j)]).abs() < TOLERANCE * scale, "{found} {formula}");
+                assert!(
+                    (found[(i, j)] - formula[(i, j)]).abs() < TOLERANCE * scale,
+                    "{found} {formula}"
+                );
             }
         }
     }
@@ -109,16 +126,18 @@ mod tests {
     #[test]
     fn equation_13_is_the_covariance_of_uncorrelated_equations() {
         let mut normal = normals();
-        let found = covariance(&system_of_three(directions()), || Vector6::from_fn(|_, _| SD * normal()));
+        let found =
+            covariance(&system_of_three(directions()), || Vector6::from_fn(|_, _| SD * normal()));
         assert_near(&found, &triple_range_covariance(angles()[0], angles()[1], SD).unwrap());
     }
 
-    /// `e_k` is the error of the first receiver's point less that of receiver k's: SD of a coordinate
-    /// of a point, and so of `e_k` times root 2.
+    /// `e_k` is the error of the first receiver's point less that of receiver k's: SD of a
+    /// coordinate of a point, and so of `e_k` times root 2.
     fn of_shared_errors(a: [Vector3<f64>; 3]) -> Matrix3<f64> {
         let mut normal = normals();
         covariance(&system_of_three(a), || {
-            let mut point = || Vector3::from_fn(|_, _| SD * std::f64::consts::FRAC_1_SQRT_2 * normal());
+            let mut point =
+                || Vector3::from_fn(|_, _| SD * std::f64::consts::FRAC_1_SQRT_2 * normal());
             let (first, second, third) = (point(), point(), point());
             let (e2, e3) = (first - second, first - third);
             Vector6::new(e2.x, e2.y, e2.z, e3.x, e3.y, e3.z)

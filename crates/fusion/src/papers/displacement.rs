@@ -1,6 +1,6 @@
 use nalgebra::Vector3;
 
-/// How a target moves between the instants of two lines (002, equation 5).
+/// How a target moves between the instants of two lines (Klochko 2020, eq. 5).
 ///
 /// The scales say what is known beforehand, as standard deviations an axis: the rank is decided
 /// against them, and where the data cannot carry an unknown the answer stays near zero of it.
@@ -40,7 +40,7 @@ impl Displacement {
     }
 }
 
-/// `dM` of a motion found (002, equation 5), m.
+/// `dM` of a motion found (Klochko 2020, eq. 5), m.
 pub(crate) fn displacement(
     velocity: Vector3<f64>,
     acceleration: Option<Vector3<f64>>,

@@ -26,7 +26,10 @@ pub(super) struct FixFinder {
 
 impl FixFinder {
     pub(super) fn new(config: &FusionConfig) -> Self {
-        Self { config: config.initiation.clone(), seeds: SeedFinder::new(config, 3, f64::NEG_INFINITY) }
+        Self {
+            config: config.initiation.clone(),
+            seeds: SeedFinder::new(config, 3, f64::NEG_INFINITY),
+        }
     }
 
     /// Every fix that the exposures of one period can make.
@@ -41,7 +44,8 @@ impl FixFinder {
             SpatialSolver::Map => {
                 let sets = self.seeds.find(exposures, cameras).into_iter();
                 sets.filter_map(|seed| {
-                    let (observability, state) = (seed.solution.observability(), seed.solution.state.clone());
+                    let (observability, state) =
+                        (seed.solution.observability(), seed.solution.state.clone());
                     let (time, velocity) = (seed.time()?, VelocityKnowledge::Solved);
                     let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
                     Some(PeriodFix { fix, lines: seed.lines })
@@ -51,7 +55,7 @@ impl FixFinder {
         }
     }
 
-    /// 002, alternative algorithm: all pairs of the first two cameras with `J <= beta`.
+    /// Klochko 2020, alternative algorithm: all pairs of the first two cameras with `J <= beta`.
     fn pair_fixes(&self, exposures: &[&Exposure]) -> Vec<PeriodFix> {
         let [first, second, ..] = exposures else {
             return Vec::new();
@@ -82,7 +86,7 @@ impl FixFinder {
         fixes
     }
 
-    /// 002, proposed algorithm: all triples of the first three cameras.
+    /// Klochko 2020, proposed algorithm: all triples of the first three cameras.
     fn triple_fixes(&self, exposures: &[&Exposure]) -> Vec<PeriodFix> {
         let [first, second, third, ..] = exposures else {
             return Vec::new();
@@ -123,7 +127,8 @@ impl FixFinder {
             return None;
         }
         let solver = if solution.observability.is_full() { solver } else { Solver::PseudoInverse };
-        let mut fix = self.fix_at(&lines, lines.first()?.1.time, solver, VelocityKnowledge::Solved)?;
+        let mut fix =
+            self.fix_at(&lines, lines.first()?.1.time, solver, VelocityKnowledge::Solved)?;
         fix.state.mean.fixed_rows_mut::<3>(0).copy_from(&solution.position.coords);
         fix.state.mean.fixed_rows_mut::<3>(3).copy_from(&solution.velocity);
         fix.observability = solution.observability;

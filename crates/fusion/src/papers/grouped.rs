@@ -1,4 +1,4 @@
-//! 002's temporal processing on the fixes of each period.
+//! Klochko's temporal processing on the fixes of each period.
 
 use std::collections::BTreeSet;
 
@@ -49,7 +49,11 @@ impl Grouped {
         let groups = self.grouping.advance(&self.finder.fixes(exposures, cameras));
         let tracks = groups.iter().filter_map(|group| start(group, motion));
         tracks
-            .map(|track| Start { cameras: track.residuals.len(), track, claimed_by: BTreeSet::new() })
+            .map(|track| Start {
+                cameras: track.residuals.len(),
+                track,
+                claimed_by: BTreeSet::new(),
+            })
             .collect()
     }
 }

@@ -1,6 +1,6 @@
-//! 002's temporal processing: fixes of successive periods are grouped by the
+//! Klochko's temporal processing: fixes of successive periods are grouped by the
 //! residual from the group's extrapolation, with an accumulated indicator, and
-//! the best groups without common sight lines are handed over (002, temporal
+//! the best groups without common sight lines are handed over (Klochko 2020, temporal
 //! processing of both algorithms).
 //!
 //! How many targets there are, the paper's `m^` (step 5 of the alternative
@@ -87,8 +87,8 @@ impl Group {
     }
 
     /// Where the group is at the time of its last fix and how fast: the fix itself where it has a
-    /// velocity (002, proposed algorithm, step 3), or the line through all vectors of the group
-    /// (alternative algorithm, steps 1 and 4). `None` for a single fix without a velocity.
+    /// velocity (Klochko 2020, proposed algorithm, step 3), or the line through all vectors of the
+    /// group (alternative algorithm, steps 1 and 4). `None` for a single fix without a velocity.
     fn trajectory(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
         let state = &self.last().fix.state;
         match self.last().fix.velocity {
@@ -100,7 +100,8 @@ impl Group {
     /// Positions over time by least squares, at the time of the last.
     fn fitted_line(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
         let reference = self.last().fix.time;
-        let times: Vec<f64> = self.fixes.iter().map(|f| f.fix.time.seconds_since(reference)).collect();
+        let times: Vec<f64> =
+            self.fixes.iter().map(|f| f.fix.time.seconds_since(reference)).collect();
         let count = times.len() as f64;
         let mean_time = times.iter().sum::<f64>() / count;
         let positions = || self.fixes.iter().map(|f| f.fix.state.position().coords);
@@ -131,7 +132,8 @@ struct Candidate {
     from: (u8, usize, usize),
 }
 
-/// Keeps the best candidates, those with the most fixes first, then those with the least indicators.
+/// Keeps the best candidates, those with the most fixes first, then those with the least
+/// indicators.
 fn keep_best(candidates: &mut Vec<Candidate>) {
     candidates.sort_by(|a, b| {
         b.fixes.cmp(&a.fixes).then(a.indicator.total_cmp(&b.indicator)).then(a.from.cmp(&b.from))
@@ -162,7 +164,8 @@ impl Grouping {
         self.select()
     }
 
-    /// Every group goes on with each fix that passes the gate, and without any; every fix begins one.
+    /// Every group goes on with each fix that passes the gate, and without any; every fix begins
+    /// one.
     fn grow(&mut self, fixes: &[PeriodFix]) {
         let mut candidates = Vec::new();
         for (index, group) in self.groups.iter().enumerate() {
@@ -196,9 +199,11 @@ impl Grouping {
                 longer.indicator = candidate.indicator;
                 longer
             }
-            (_, _, place) => {
-                Group { fixes: vec![fixes[place].clone()], indicator: 0.0, first_period: self.period }
-            }
+            (_, _, place) => Group {
+                fixes: vec![fixes[place].clone()],
+                indicator: 0.0,
+                first_period: self.period,
+            },
         });
         self.groups = grown.collect();
     }
@@ -211,7 +216,8 @@ impl Grouping {
             return None;
         }
         let Some((position, velocity)) = group.trajectory() else {
-            // 002, alternative algorithm, step 1: any pair of the first two periods starts a group.
+            // Klochko 2020, alternative algorithm, step 1: any pair of the first two periods starts
+            // a group.
             let distance = (fix.fix.state.position() - last.state.position()).norm();
             return (distance <= self.rules.max_speed * dt).then_some(0.0);
         };
@@ -230,11 +236,12 @@ impl Grouping {
         }
     }
 
-    /// The groups with the least indicators that share no lines, or few (002, step 5 of the
-    /// alternative algorithm and step 4 of the proposed one).
+    /// The groups with the least indicators that share no lines, or few (Klochko 2020, step 5 of
+    /// the alternative algorithm and step 4 of the proposed one).
     fn select(&mut self) -> Vec<Group> {
         let good = self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes);
-        let mut good: Vec<(BTreeSet<&LineId>, &Group)> = good.map(|group| (group.lines(), group)).collect();
+        let mut good: Vec<(BTreeSet<&LineId>, &Group)> =
+            good.map(|group| (group.lines(), group)).collect();
         good.sort_by(|a, b| a.1.indicator.total_cmp(&b.1.indicator).then_with(|| a.0.cmp(&b.0)));
         let mut taken: BTreeSet<LineId> = BTreeSet::new();
         let mut selected = Vec::new();
@@ -288,7 +295,13 @@ mod tests {
     }
 
     fn grouping(gate: TemporalGate) -> Grouping {
-        Grouping::new(GroupingRules { periods: 5, fixes: 3, gate, max_speed: 60.0, shared_lines: 0 })
+        Grouping::new(GroupingRules {
+            periods: 5,
+            fixes: 3,
+            gate,
+            max_speed: 60.0,
+            shared_lines: 0,
+        })
     }
 
     #[test]
@@ -311,7 +324,9 @@ mod tests {
         let mut grouping = grouping(TemporalGate::Distance(1.0));
         assert!(grouping.advance(&[fix(0, 0.0, 0, VelocityKnowledge::Unknown)]).is_empty());
         assert!(grouping.advance(&[fix(1, 7.0, 0, VelocityKnowledge::Unknown)]).is_empty());
-        assert!(grouping.clone().advance(&[fix(2, 20.0, 0, VelocityKnowledge::Unknown)]).is_empty());
+        assert!(
+            grouping.clone().advance(&[fix(2, 20.0, 0, VelocityKnowledge::Unknown)]).is_empty()
+        );
         assert_eq!(grouping.advance(&[fix(2, 14.5, 0, VelocityKnowledge::Unknown)]).len(), 1);
     }
 
@@ -324,7 +339,8 @@ mod tests {
         assert_eq!(grouping.advance(&[fix(3, 30.0, 0, VelocityKnowledge::Solved)]).len(), 1);
     }
 
-    /// Two targets on straight lines whose fixes share `lines` of the first camera and not the second.
+    /// Two targets on straight lines whose fixes share `lines` of the first camera and not the
+    /// second.
     fn two_that_cross(shared_lines: usize, merged_periods: &[u64]) -> Grouping {
         let rules = GroupingRules {
             periods: 5,
@@ -369,8 +385,11 @@ mod tests {
             }
             made
         };
-        let rules =
-            GroupingRules { shared_lines: 2, fixes: 2, ..grouping(TemporalGate::Distance(1.0)).rules };
+        let rules = GroupingRules {
+            shared_lines: 2,
+            fixes: 2,
+            ..grouping(TemporalGate::Distance(1.0)).rules
+        };
         let mut grouping = Grouping::new(rules);
         grouping.advance(&[of([0, 0], 0, 0.0), of([1, 1], 0, 50.0), of([0, 1], 0, 99.0)]);
         // The third comes last, as it wanders by half a metre. It shares a line a period with the
@@ -381,8 +400,8 @@ mod tests {
 
     #[test]
     fn a_group_without_velocity_is_extrapolated_along_the_line_through_all_its_fixes() {
-        let fixes =
-            [(0, 0.0), (1, 1.0), (2, 1.4)].map(|(period, x)| fix(period, x, 0, VelocityKnowledge::Unknown));
+        let fixes = [(0, 0.0), (1, 1.0), (2, 1.4)]
+            .map(|(period, x)| fix(period, x, 0, VelocityKnowledge::Unknown));
         let group = Group { fixes: fixes.to_vec(), indicator: 0.0, first_period: 1 };
         let (position, velocity) = group.trajectory().unwrap();
         assert!((velocity.x - 0.7).abs() < 1e-12 && (position.x - 1.5).abs() < 1e-12);

@@ -1,20 +1,22 @@
-//! The papers' way of finding targets (002): each period is solved for fixes, and fixes that follow from each other
-//! are grouped until a group is good enough to be a target. `initiation.method = "grouping"` chooses it in place of
-//! the hypotheses of [`Fusion`](crate::Fusion); `initiation.solver` chooses the system that a period is solved by.
+//! The papers' way of finding targets (Klochko 2020): each period is solved for fixes, and fixes
+//! that follow from each other are grouped until a group is good enough to be a target.
+//! `initiation.method = "grouping"` chooses it in place of the hypotheses of
+//! [`Fusion`](crate::Fusion); `initiation.solver` chooses the system that a period is solved by.
 //! What is made of a track once it has begun is the same for both.
 //!
 //! | here | unknowns | where it is from |
 //! |---|---|---|
-//! | [`pair`] | two ranges | 002, equations 7-9 |
-//! | [`triple`] | three ranges, velocity | 002, equations 10-11 |
+//! | [`pair`] | two ranges | Klochko 2020, eqs. 7-9 |
+//! | [`triple`] | three ranges, velocity | Klochko 2020, eqs. 10-11 |
 //! | [`stacked`] | n ranges, velocity | the same for n cameras |
 //! | [`stacked_with`] | n ranges, velocity, acceleration | the same with equation 5 in full |
 //! | [`pair_range_covariance`], [`triple_range_covariance`] | | the accuracy of ranges, equations 12 and 13 |
 //! | [`Grouping`] | | temporal processing, both algorithms |
 //!
-//! All work in the world frame: where the paper turns the axes of receiver k into those of receiver 1 (`P_k`) and has
-//! the base vector `b_k`, here the sight lines are world vectors and `b_k` is the difference of the cameras' centres.
-//! That is the same system in other axes. 004's detectors of manoeuvres are in `crossfix_filter`.
+//! All work in the world frame: where the paper turns the axes of receiver k into those of receiver
+//! 1 (`P_k`) and has the base vector `b_k`, here the sight lines are world vectors and `b_k` is the
+//! difference of the cameras' centres. That is the same system in other axes. Kalinov's detectors
+//! of manoeuvres are in `crossfix_filter`.
 
 mod accuracy;
 mod displacement;
@@ -45,10 +47,10 @@ pub struct RangeSolution {
     pub ranges: Vec<f64>,
     /// Velocity at the first line's time, m/s.
     pub velocity: Vector3<f64>,
-    /// Acceleration, m/s^2, where the motion has one (002, equation 5).
+    /// Acceleration, m/s^2, where the motion has one (Klochko 2020, eq. 5).
     pub acceleration: Option<Vector3<f64>>,
     /// The target at the first line's time, refined by the pair solution with the displacement
-    /// removed (002, below equation 11).
+    /// removed (Klochko 2020, below equation 11).
     pub position: Point3<f64>,
     /// How well the system was conditioned, and whether the pseudo-inverse had to be used.
     pub observability: Observability,

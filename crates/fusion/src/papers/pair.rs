@@ -2,10 +2,13 @@ use nalgebra::{Matrix3x2, Point3, Vector3};
 
 use crate::spatial::TimedLine;
 
-/// About how far away a target is, m: the longer range of the first line and the one that crosses it at the widest
-/// angle, the target taken to stand still; not less than the longest base.
+/// About how far away a target is, m: the longer range of the first line and the one that crosses
+/// it at the widest angle, the target taken to stand still; not less than the longest base.
 pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
-    let base = others.iter().map(|other| (other.line.origin - first.line.origin).norm()).fold(0.0, f64::max);
+    let base = others
+        .iter()
+        .map(|other| (other.line.origin - first.line.origin).norm())
+        .fold(0.0, f64::max);
     let along = |other: &TimedLine| first.line.direction.dot(&other.line.direction).abs();
     let elsewhere = others.iter().filter(|other| other.line.origin != first.line.origin);
     let widest = elsewhere.min_by(|one, other| along(one).total_cmp(&along(other)));
@@ -23,11 +26,11 @@ pub struct PairSolution {
     pub second_range: f64,
     /// The point on the first line, `M_1`.
     pub position: Point3<f64>,
-    /// `J = |e_2|^2`, m^2 (002, equation 9).
+    /// `J = |e_2|^2`, m^2 (Klochko 2020, eq. 9).
     pub indicator: f64,
 }
 
-/// The two-receiver algorithm: ranges along two lines by least squares (002, equations 7-9).
+/// The two-receiver algorithm: ranges along two lines by least squares (Klochko 2020, eqs. 7-9).
 ///
 /// `displacement` is how far the target moves between the first line's time and the second's
 /// (zero in the alternative algorithm, `V dt` in the proposed one's second step). `None` if the
@@ -54,10 +57,14 @@ pub struct PairSolution {
 /// assert!((fix.position - target).norm() < 1e-9);
 /// # Ok::<(), &str>(())
 /// ```
-pub fn pair(first: &TimedLine, second: &TimedLine, displacement: Vector3<f64>) -> Option<PairSolution> {
+pub fn pair(
+    first: &TimedLine,
+    second: &TimedLine,
+    displacement: Vector3<f64>,
+) -> Option<PairSolution> {
     let a1 = first.line.direction.into_inner();
     let a2 = second.line.direction.into_inner();
-    // r1 a1 - r2 a2' + dM - b2 = e2 (002, equation 4)
+    // r1 a1 - r2 a2' + dM - b2 = e2 (Klochko 2020, eq. 4)
     let a = Matrix3x2::from_columns(&[a1, -a2]);
     let b = (second.line.origin - first.line.origin) - displacement;
     let ranges = (a.transpose() * a).try_inverse()? * a.transpose() * b;

@@ -7,7 +7,7 @@ use super::{Displacement, RangeSolution, pair};
 use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
 /// The papers' system for n cameras: n ranges and the velocity from n lines, 3(n - 1) equations in
-/// n + 3 unknowns (002: "with n > 3 only the dimensions change"), unweighted.
+/// n + 3 unknowns (Klochko 2020: "with n > 3 only the dimensions change"), unweighted.
 ///
 /// Rank and pseudo-inverse as in [`super::triple`], which is the case n = 3. `None` for fewer than
 /// three lines, if all are of one camera, or if those that the range is refined with are parallel.
@@ -15,7 +15,7 @@ pub fn stacked(lines: &[TimedLine], velocity_scale: f64) -> Option<RangeSolution
     stacked_with(lines, Displacement::Velocity { velocity_scale })
 }
 
-/// The same with a motion of choice (002, equation 5): n ranges and three unknowns, or six with
+/// The same with a motion of choice (Klochko 2020, eq. 5): n ranges and three unknowns, or six with
 /// acceleration, from n lines of any instants; a camera may give several.
 ///
 /// With acceleration there are n + 6 unknowns for 3(n - 1) equations, so that five lines are the
@@ -57,11 +57,17 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     let dt = partner.time.seconds_since(first.time);
     let refined = pair(first, partner, displacement(velocity, acceleration, dt))?;
     x.truncate(n);
-    Some(RangeSolution { ranges: x, velocity, acceleration, position: refined.position, observability })
+    Some(RangeSolution {
+        ranges: x,
+        velocity,
+        acceleration,
+        position: refined.position,
+        observability,
+    })
 }
 
 /// The matrix, its columns scaled, and the right-hand side of `r1 a1 - r_k a_k' + dM_k = b_k`
-/// (002, equations 4 and 5); rows of zeros make up for equations that are missing.
+/// (Klochko 2020, eqs. 4 and 5); rows of zeros make up for equations that are missing.
 fn system(
     first: &TimedLine,
     others: &[TimedLine],
@@ -92,7 +98,7 @@ fn system(
 }
 
 /// The other camera's line most nearly perpendicular to the first: there the pair's range is best
-/// (002, equation 12).
+/// (Klochko 2020, eq. 12).
 fn widest_partner<'a>(first: &TimedLine, others: &'a [TimedLine]) -> Option<&'a TimedLine> {
     let along = |l: &TimedLine| l.line.direction.dot(&first.line.direction).abs();
     let elsewhere = others.iter().filter(|l| l.line.origin != first.line.origin);
@@ -114,7 +120,8 @@ mod tests {
     const POSITION: Point3<f64> = Point3::new(3.0, -5.0, 2.0);
     const VELOCITY: Vector3<f64> = Vector3::new(10.0, -4.0, 1.5);
     const ACCELERATION: Vector3<f64> = Vector3::new(-3.0, 2.0, 4.0);
-    const MOTION: Displacement = Displacement::Acceleration { velocity_scale: 15.0, acceleration_scale: 5.0 };
+    const MOTION: Displacement =
+        Displacement::Acceleration { velocity_scale: 15.0, acceleration_scale: 5.0 };
 
     fn five_cameras() -> Vec<Point3<f64>> {
         let mut cameras = orthogonal_cameras().to_vec();
@@ -165,7 +172,8 @@ mod tests {
         let once: Vec<_> = (0..5).map(|k| (five[k], 0.3 * k as f64)).collect();
         let twice: Vec<_> = (0..6).map(|k| (three[k % 3], 0.25 * k as f64)).collect();
         for seen in [once, twice] {
-            let lines: Vec<_> = seen.iter().map(|&(camera, t)| line_at(camera, turning(t), t)).collect();
+            let lines: Vec<_> =
+                seen.iter().map(|&(camera, t)| line_at(camera, turning(t), t)).collect();
             let solution = stacked_with(&lines, MOTION).unwrap();
             assert!(solution.observability.is_full(), "{:?}", solution.observability);
             assert!((solution.velocity - VELOCITY).norm() < 1e-6, "{:?}", solution.velocity);

@@ -5,13 +5,13 @@ use super::{RangeSolution, pair};
 use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
 /// The three-receiver algorithm: three ranges and the velocity from three lines of three times
-/// (002, equations 10-11), by the pseudo-inverse where the system cannot carry all six.
+/// (Klochko 2020, eqs. 10-11), by the pseudo-inverse where the system cannot carry all six.
 ///
-/// The system is regular only if the three times differ and the lines do not lie in a plane
-/// (`det A = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the
-/// lines, their deviation times the range: unknowns are scaled by the range and by `velocity_scale`, and a singular
-/// direction counts if the noise leaves it better known than its scale. `None` if even the first
-/// two lines are parallel.
+/// The system is regular only if the three times differ and the lines do not lie in a plane (`det
+/// A = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the lines,
+/// their deviation times the range: unknowns are scaled by the range and by `velocity_scale`, and a
+/// singular direction counts if the noise leaves it better known than its scale. `None` if even the
+/// first two lines are parallel.
 pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSolution> {
     let [first, second, third] = lines;
     let [a1, a2, a3] = lines.map(|l| l.line.direction.into_inner());
@@ -27,7 +27,8 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     }
     let b = Vector6::new(b2.x, b2.y, b2.z, b3.x, b3.y, b3.z);
 
-    // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long (benches/solvers).
+    // Fixed size, so nalgebra: faer's SVD of a 6x6 takes two to three times as long
+    // (benches/solvers).
     let range = typical_range(first, &[second, third]);
     let scale = Matrix6::from_diagonal(&Vector6::new(
         range,
@@ -95,8 +96,12 @@ mod tests {
         assert_eq!(solution.observability.weak_axis, None);
         assert!((solution.velocity - velocity).norm() < 1e-8);
         assert!((solution.position - position).norm() < 1e-8);
-        // FUSION.md has 20 for this geometry and these delays.
-        assert!((solution.observability.condition_number - 20.0).abs() < 2.0, "{:?}", solution.observability);
+        // The reference implementation has 20 for this geometry and these delays.
+        assert!(
+            (solution.observability.condition_number - 20.0).abs() < 2.0,
+            "{:?}",
+            solution.observability
+        );
     }
 
     #[test]
@@ -117,7 +122,8 @@ mod tests {
         let velocity = Vector3::new(5.0, 8.0, -1.0);
         let solve = |position: Point3<f64>| {
             let timed = cameras.iter().zip([0.0, 0.1, 0.2]);
-            let lines: Vec<_> = timed.map(|(c, t)| line_at(*c, position + velocity * t, t)).collect();
+            let lines: Vec<_> =
+                timed.map(|(c, t)| line_at(*c, position + velocity * t, t)).collect();
             triple([&lines[0], &lines[1], &lines[2]], 15.0).unwrap().observability
         };
         assert!(!solve(Point3::new(30.0, 1000.0, 50.0)).is_full());

@@ -22,8 +22,8 @@ pub struct MapSolution {
 }
 
 impl MapSolution {
-    /// What the lines alone say, against the prior scales: the farthest line's length and the velocity
-    /// prior. Not computed with the solution, as eigenvalues cost more than that.
+    /// What the lines alone say, against the prior scales: the farthest line's length and the
+    /// velocity prior. Not computed with the solution, as eigenvalues cost more than that.
     pub fn observability(&self) -> Observability {
         Observability::of_information(&self.information, self.scales.0, self.scales.1)
     }
@@ -68,7 +68,8 @@ pub fn map(
             let mut h = Matrix2x6::zeros();
             h.fixed_view_mut::<2, 3>(0, 0).copy_from(&tangents);
             h.fixed_view_mut::<2, 3>(0, 3).copy_from(&(tangents * dt));
-            let noise = if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
+            let noise =
+                if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
             let weight = noise.try_inverse()?;
             let target = tangents * line.origin.coords;
             data += h.transpose() * weight * h;
@@ -90,8 +91,10 @@ pub fn map(
         }
     }
     let mean = state?;
-    let scale =
-        lines.iter().map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm()).fold(0.0, f64::max);
+    let scale = lines
+        .iter()
+        .map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm())
+        .fold(0.0, f64::max);
     in_front(lines, reference, &mean).then_some(())?;
     // A nearly singular system is inverted to something that rounding leaves not quite symmetric.
     let inverse = (data + prior).cholesky()?.inverse();
@@ -105,7 +108,11 @@ pub fn map(
 }
 
 /// Whether a state at `reference` lies in front of every line's camera at the line's time.
-fn in_front(lines: &[TimedLine], reference: crossfix_message::Timestamp, mean: &Vector6<f64>) -> bool {
+fn in_front(
+    lines: &[TimedLine],
+    reference: crossfix_message::Timestamp,
+    mean: &Vector6<f64>,
+) -> bool {
     lines.iter().all(|TimedLine { line, time, .. }| {
         let dt = time.seconds_since(reference);
         let position = Point3::from(mean.fixed_rows::<3>(0) + mean.fixed_rows::<3>(3) * dt);
@@ -122,7 +129,9 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::super::Quantity;
-    use super::super::tests_support::{coplanar_cameras, line_at, noisy_line_at, orthogonal_cameras};
+    use super::super::tests_support::{
+        coplanar_cameras, line_at, noisy_line_at, orthogonal_cameras,
+    };
     use super::*;
 
     /// Root mean squared errors of position and velocity and the mean NEES over `runs` runs.
@@ -159,7 +168,7 @@ mod tests {
         let (position, velocity, nees) = monte_carlo(&orthogonal_cameras(), &[0.0, 0.1, 0.2], RUNS);
         // NEES: chi-square with 6 degrees of freedom, SD of the mean sqrt(12 / runs).
         assert!((nees - 6.0).abs() < 3.0 * (12.0 / f64::from(RUNS)).sqrt(), "{nees}");
-        // FUSION.md: 0.26 m and 2.1 m/s with a 30 m/s prior.
+        // The reference implementation's figures: 0.26 m and 2.1 m/s with a 30 m/s prior.
         assert!((position - 0.26).abs() < 0.03, "{position}");
         assert!((velocity - 2.1).abs() < 0.25, "{velocity}");
     }

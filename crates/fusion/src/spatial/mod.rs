@@ -1,7 +1,8 @@
 //! Spatial processing: sight lines of several cameras, taken at different times, become a fix.
 //!
-//! [`map`] is the weighted solution for position and velocity, with a prior on the velocity; [`Observability`] says
-//! what a system could see, and what not. The papers' own systems are in [`crate::papers`].
+//! [`map`] is the weighted solution for position and velocity, with a prior on the velocity;
+//! [`Observability`] says what a system could see, and what not. The papers' own systems are in
+//! [`crate::papers`].
 
 mod map;
 mod observability;
@@ -35,10 +36,12 @@ impl TimedLine {
         Self { line, time, time_sd_s: 0.0, origin_sd_m: 0.0 }
     }
 
-    /// Covariance of the direction to a target at `range` whose velocity has a prior of `velocity_sd` (m/s an
-    /// axis): the line's own, and what the uncertainty of its time and origin adds.
+    /// Covariance of the direction to a target at `range` whose velocity has a prior of
+    /// `velocity_sd` (m/s an axis): the line's own, and what the uncertainty of its time and origin
+    /// adds.
     pub(crate) fn noise_at(&self, range: f64, velocity_sd: f64) -> Matrix2<f64> {
-        let variance = (velocity_sd * TYPICAL_SPEED * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
+        let variance =
+            (velocity_sd * TYPICAL_SPEED * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
         self.line.covariance + Matrix2::identity() * (variance / range.powi(2))
     }
 }
@@ -70,8 +73,9 @@ pub enum VelocityKnowledge {
     Unknown,
 }
 
-/// How fast most targets are, as a share of the velocity prior, which is wide enough for the fastest: what an
-/// unsure clock moves a line by. With the whole of it the lines of unsure clocks would meet anywhere.
+/// How fast most targets are, as a share of the velocity prior, which is wide enough for the
+/// fastest: what an unsure clock moves a line by. With the whole of it the lines of unsure clocks
+/// would meet anywhere.
 pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 
 /// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s an axis.
@@ -80,7 +84,8 @@ pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
 /// The squared distance that a true value of `dimensions` stays within with probability `p`.
 pub(crate) fn chi_square(p: f64, dimensions: usize) -> f64 {
     // A positive number of degrees of freedom is all that the distribution asks for.
-    ChiSquared::new(dimensions as f64).map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(p))
+    ChiSquared::new(dimensions as f64)
+        .map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(p))
 }
 
 #[cfg(test)]

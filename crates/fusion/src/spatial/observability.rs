@@ -47,7 +47,10 @@ impl WeakAxis {
 
     /// Of a combination of ranges and then velocity, acceleration: a range that is not known is a
     /// place on that range's line that is not known.
-    pub(crate) fn of_ranges(combination: &[f64], directions: &[Unit<Vector3<f64>>]) -> Option<Self> {
+    pub(crate) fn of_ranges(
+        combination: &[f64],
+        directions: &[Unit<Vector3<f64>>],
+    ) -> Option<Self> {
         let (ranges, motion) = combination.split_at_checked(directions.len())?;
         let along = ranges.iter().zip(directions).map(|(range, a)| a.into_inner() * *range);
         let along = along.max_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap_or_default();
@@ -56,7 +59,9 @@ impl WeakAxis {
         let position = along.try_normalize(f64::MIN_POSITIVE).unwrap_or_default() * length;
         let mut parts = vec![(Quantity::Position, position)];
         let quantities = [Quantity::Velocity, Quantity::Acceleration];
-        parts.extend(quantities.into_iter().zip(motion.chunks_exact(3).map(Vector3::from_column_slice)));
+        parts.extend(
+            quantities.into_iter().zip(motion.chunks_exact(3).map(Vector3::from_column_slice)),
+        );
         Self::of_parts(&parts)
     }
 }
@@ -103,7 +108,11 @@ impl Observability {
     }
 
     /// Of a position and velocity whose data have given Fisher information, against prior scales.
-    pub fn of_information(information: &Matrix6<f64>, position_scale: f64, velocity_scale: f64) -> Self {
+    pub fn of_information(
+        information: &Matrix6<f64>,
+        position_scale: f64,
+        velocity_scale: f64,
+    ) -> Self {
         let [p, v] = [position_scale, velocity_scale];
         let scale = Matrix6::from_diagonal(&Vector6::new(p, p, p, v, v, v));
         let scaled = scale * information * scale;

@@ -64,6 +64,7 @@ impl Track {
             }
         }
         let models = motion.models(self.held);
-        BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &ties).map(Expectation::Near)
+        BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &ties)
+            .map(Expectation::Near)
     }
 }

@@ -15,8 +15,11 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
     // Next to no process noise: the truth flies straight, and the bound knows it.
-    let tracking =
-        Tracking { manoeuvres: Manoeuvres::None, acceleration_density: 1e-9, ..Tracking::default() };
+    let tracking = Tracking {
+        manoeuvres: Manoeuvres::None,
+        acceleration_density: 1e-9,
+        ..Tracking::default()
+    };
     let motion = Motion::new(&tracking).unwrap();
     let name: CameraName = "a".parse().unwrap();
     let (mut nees, mut square) = (0.0, 0.0);
@@ -58,8 +61,8 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
     }
     let nees = nees / f64::from(RUNS);
     assert!((nees - 6.0).abs() < 3.0 * (12.0 / f64::from(RUNS)).sqrt() + 0.1, "{nees}");
-    // FUSION.md: the bound from all five periods is 0.093 m at camera 1's last time; held to
-    // the last bearing's time, as here, it is a little wider.
+    // The reference implementation's figures: the bound from all five periods is 0.093 m at camera
+    // 1's last time; held to the last bearing's time, as here, it is a little wider.
     let rmse = (square / f64::from(RUNS)).sqrt();
     assert!((0.088..0.105).contains(&rmse), "{rmse}");
 }

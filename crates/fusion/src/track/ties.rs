@@ -1,4 +1,5 @@
-//! What ties a track to the errors that all bearings of a camera share, and what its bearings tell of them.
+//! What ties a track to the errors that all bearings of a camera share, and what its bearings tell
+//! of them.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -11,22 +12,27 @@ use crate::uncertainty::CameraUncertainty;
 use crate::update::Updated;
 use crate::visibility::Visibility;
 
-/// Bearings further apart than this share of the time for which one holds a track tell no noise from jerks.
+/// Bearings further apart than this share of the time for which one holds a track tell no noise
+/// from jerks.
 const CLOSE_BEARINGS: f64 = 0.1;
-/// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a mast is seen.
+/// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a
+/// mast is seen.
 const DRAW_S: f64 = 0.3;
 
-/// A camera's bearing holds a track for so many times what has lain between its last two, so that it may miss none and
-/// come late, ...
+/// A camera's bearing holds a track for so many times what has lain between its last two, so that
+/// it may miss none and come late, ...
 const HOLDING_PERIODS: f64 = 1.5;
 /// ... where these lay no further apart than so many times what a bearing holds a track for.
 const LONGEST_PERIOD: f64 = 2.0;
 
-/// Something beside a target is steady if it moves by less than this share of how far away it is from draw to draw, ...
+/// Something beside a target is steady if it moves by less than this share of how far away it is
+/// from draw to draw, ...
 const STEADY: f64 = 0.2;
-/// ... for so many draws, a second and a half. With half of it what flies by in the same direction is taken for the target.
+/// ... for so many draws, a second and a half. With half of it what flies by in the same direction
+/// is taken for the target.
 const STEADY_DRAWS: u32 = 5;
-/// So many cameras must have it beside the target: one may be turned, and it is for the others to accuse it.
+/// So many cameras must have it beside the target: one may be turned, and it is for the others to
+/// accuse it.
 const LEAST_BESIDE: usize = 2;
 
 /// What ties a track to the shared errors of a camera that has seen it.
@@ -67,7 +73,8 @@ impl Drawn {
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) -> Self {
-        let (offsets, count) = before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
+        let (offsets, count) =
+            before.map_or((Vector2::zeros(), 0.0), |drawn| (drawn.offsets, drawn.count));
         Self {
             offsets: offsets + innovation.offset,
             count: count + 1.0,
@@ -91,13 +98,15 @@ impl Drawn {
 }
 
 impl Ties {
-    /// What the camera has seen beside the target since the last draw, if it has long been in the same place.
+    /// What the camera has seen beside the target since the last draw, if it has long been in the
+    /// same place.
     fn steady_beside(&mut self) -> Option<Drawn> {
         let beside = self.beside.take().filter(|_| self.drawn.is_none());
         let place = beside.map(|drawn| drawn.offsets / drawn.count);
         let (before, draws) = self.steady;
         let stays = place.is_some_and(|place| (place - before).norm() < STEADY * before.norm());
-        self.steady = place.map_or((Vector2::zeros(), 0), |place| (place, if stays { draws + 1 } else { 0 }));
+        self.steady =
+            place.map_or((Vector2::zeros(), 0), |place| (place, if stays { draws + 1 } else { 0 }));
         beside.filter(|_| self.steady.1 >= STEADY_DRAWS)
     }
 
@@ -142,11 +151,14 @@ impl Ties {
         self.seen = Some(time);
     }
 
-    /// Whether the camera has given the track a bearing so lately that it holds it, as one does for `holding_s`
-    /// seconds: a camera that sees the target every two seconds has not lost it after one and a half.
+    /// Whether the camera has given the track a bearing so lately that it holds it, as one does for
+    /// `holding_s` seconds: a camera that sees the target every two seconds has not lost it after
+    /// one and a half.
     pub(super) fn has_seen_lately(&self, now: Timestamp, holding_s: f64) -> bool {
         let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
-        self.seen.is_some_and(|seen| now.seconds_since(seen) <= holding_s.max(HOLDING_PERIODS * period_s))
+        self.seen.is_some_and(|seen| {
+            now.seconds_since(seen) <= holding_s.max(HOLDING_PERIODS * period_s)
+        })
     }
 
     /// The same `interval` seconds on: the position goes on with the velocity.
@@ -184,20 +196,23 @@ impl Track {
         (line, time): (&SightLine, Timestamp),
         uncertainty: &CameraUncertainty,
     ) {
-        if let (Some(innovation), Some(ties)) = (self.innovation(time, line), self.ties.get_mut(camera)) {
+        if let (Some(innovation), Some(ties)) =
+            (self.innovation(time, line), self.ties.get_mut(camera))
+        {
             ties.beside = Some(Drawn::with(ties.beside, &innovation, line, uncertainty));
         }
     }
 
-    /// What the cameras have seen of the target since the last draw, if it is time for the next. Where as many
-    /// cameras as see it have long had something beside it in the same place, it is the target, and the poses are
-    /// worse than they say.
+    /// What the cameras have seen of the target since the last draw, if it is time for the next.
+    /// Where as many cameras as see it have long had something beside it in the same place, it is
+    /// the target, and the poses are worse than they say.
     pub(crate) fn draw(&mut self) -> Vec<Sample> {
         if self.updated.seconds_since(self.drawn) < DRAW_S {
             return Vec::new();
         }
         self.drawn = self.updated;
-        // Cameras see it at other times within a draw: a velocity that is not known moves it in between.
+        // Cameras see it at other times within a draw: a velocity that is not known moves it in
+        // between.
         let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
         let (mut samples, mut beside) = (Vec::new(), Vec::new());
         for (camera, ties) in &mut self.ties {
@@ -213,8 +228,8 @@ impl Track {
         samples
     }
 
-    /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances): what they
-    /// have done to the track is as well.
+    /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances):
+    /// what they have done to the track is as well.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
         let Some(ties) = self.ties.get_mut(camera) else {
             return;
@@ -225,11 +240,16 @@ impl Track {
         self.imm.add_covariance(&change);
     }
 
-    /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was taken off its
-    /// times, and its variance to be `ratio` times what it was: the track lies by as much beside where it was
-    /// thought to be. What makes a variance smaller has been learnt of the error that the track holds; what makes
-    /// it larger is an error that has come since, of which the track holds nothing.
-    pub(crate) fn set_clock(&mut self, camera: &CameraName, ClockChange { ahead, ratio }: ClockChange) {
+    /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was
+    /// taken off its times, and its variance to be `ratio` times what it was: the track lies by as
+    /// much beside where it was thought to be. What makes a variance smaller has been learnt of the
+    /// error that the track holds; what makes it larger is an error that has come since, of which
+    /// the track holds nothing.
+    pub(crate) fn set_clock(
+        &mut self,
+        camera: &CameraName,
+        ClockChange { ahead, ratio }: ClockChange,
+    ) {
         let Some(ties) = self.ties.get_mut(camera) else {
             return;
         };
@@ -249,15 +269,21 @@ impl Track {
     ) -> Option<f64> {
         let (now, state) = (self.updated, self.imm.combined());
         let (place, velocity) = (state.position(), state.velocity());
-        let expected =
-            |time: Timestamp| Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6);
+        let expected = |time: Timestamp| {
+            Unit::try_new(place + velocity * time.seconds_since(now) - line.origin, 1e-6)
+        };
         let last_three = &mut self.ties.get_mut(camera)?.last_three;
         last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
     }
 
-    /// Carries the ties to all cameras' errors through an update, by the mean over the models; returns the
-    /// mean squared distance of the bearing.
-    pub(super) fn carry(&mut self, camera: &CameraName, interval: f64, results: &[Option<Updated>]) -> f64 {
+    /// Carries the ties to all cameras' errors through an update, by the mean over the models;
+    /// returns the mean squared distance of the bearing.
+    pub(super) fn carry(
+        &mut self,
+        camera: &CameraName,
+        interval: f64,
+        results: &[Option<Updated>],
+    ) -> f64 {
         let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), Matrix6x3::zeros());
         for (result, weight) in results.iter().zip(self.imm.probabilities()) {
             if let Some(after) = result {
@@ -279,8 +305,8 @@ impl Track {
         nis
     }
 
-    /// The ties are carried by the mean over the models: where one model alone is surer than they allow, it is
-    /// not believed.
+    /// The ties are carried by the mean over the models: where one model alone is surer than they
+    /// allow, it is not believed.
     pub(super) fn keep_ties_possible(&mut self) {
         let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
         // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.

@@ -16,12 +16,13 @@ use crate::{Exposure, Sighting};
 const REACH: f64 = 1.5;
 /// A score beyond this counts no more: a track that has long been good can still be doubted.
 const MAX_SCORE: f64 = 40.0;
-/// A camera that is turned by no more than this shows a target beside where the others have it, rad.
+/// A camera that is turned by no more than this shows a target beside where the others have it,
+/// rad.
 const BESIDE_RAD: f64 = 0.1;
 
 impl Tracker {
-    /// Which tracks choose first: those that several cameras hold in their place, then those that one alone
-    /// follows, then those that are not sure. A ghost must not take a target's bearings.
+    /// Which tracks choose first: those that several cameras hold in their place, then those that
+    /// one alone follows, then those that are not sure. A ghost must not take a target's bearings.
     pub(super) fn in_order_of_choice(&self) -> [Vec<TrackId>; 3] {
         let mut order = [const { Vec::new() }; 3];
         for track in self.tracks.values().filter(|track| track.status != TrackStatus::Lost) {
@@ -53,7 +54,12 @@ impl Tracker {
             let taken = column.and_then(|column| {
                 let sighting = &exposure.sightings[column];
                 let time = (exposure.time, &exposure.uncertainty);
-                let taken = track.measurement_update(&exposure.camera, &sighting.line, time, &self.motion)?;
+                let taken = track.measurement_update(
+                    &exposure.camera,
+                    &sighting.line,
+                    time,
+                    &self.motion,
+                )?;
                 owners[column] = Some(*id);
                 Some(taken)
             });
@@ -66,24 +72,34 @@ impl Tracker {
                 let others = track.others_than(&exposure.camera, &self.motion);
                 noted.fittings.add(others, fitting(track, exposure, known, taken.is_some()));
             }
-            noted.third_differences.extend(taken.filter(|_| sure).and_then(|taken| taken.third_difference));
+            noted
+                .third_differences
+                .extend(taken.filter(|_| sure).and_then(|taken| taken.third_difference));
             let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
             let detection = self.config.detection_probability;
-            let missed = missed(track.visible_to(&exposure.camera, exposure.time, &self.motion), detection);
+            let missed =
+                missed(track.visible_to(&exposure.camera, exposure.time, &self.motion), detection);
             let seen_since = !sure || track.is_seen_since_look_of(&exposure.camera);
             let silent = sure && silent;
             let change = match gain {
                 // What one camera alone follows may be anything along its sight line.
                 Some(_) if sure && !track.is_held() => 0.0,
                 Some(gain) => gain + missed,
-                // What hides the target from all is no evidence against it: of what nobody sees time decides.
+                // What hides the target from all is no evidence against it: of what nobody sees
+                // time decides.
                 None if sees && !silent && seen_since => missed,
                 None => 0.0,
             };
             track.judge(change, MAX_SCORE);
             // Outside its field of view a camera has missed nothing.
             if gain.is_some() || sees {
-                track.look(&exposure.camera, exposure.time, gain.is_some(), detection, &self.motion);
+                track.look(
+                    &exposure.camera,
+                    exposure.time,
+                    gain.is_some(),
+                    detection,
+                    &self.motion,
+                );
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
                 noted.happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
@@ -103,7 +119,9 @@ impl Tracker {
         let stranger = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
         let origin = known.camera.pose().position();
         let mut candidates = Vec::new();
-        for (row, track) in ids.iter().enumerate().filter_map(|(row, id)| Some((row, self.tracks.get(id)?))) {
+        for (row, track) in
+            ids.iter().enumerate().filter_map(|(row, id)| Some((row, self.tracks.get(id)?)))
+        {
             if (track.position_at(exposure.time) - origin).norm() > REACH * self.max_range_m {
                 continue;
             }
@@ -123,8 +141,9 @@ impl Tracker {
             for (column, sighting) in open {
                 let fit = prediction.fit(&sighting.line, self.gate);
                 if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
-                    let gain = log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr)
-                        - missed(visible, detection);
+                    let gain =
+                        log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr)
+                            - missed(visible, detection);
                     candidates.push(Candidate { row, column, gain });
                 }
             }
@@ -139,7 +158,11 @@ fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
     let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
     let beside = exposure.sightings.iter().filter(|sighting| away(sighting) < BESIDE_RAD);
     if let Some(nearest) = beside.min_by(|one, other| away(one).total_cmp(&away(other))) {
-        track.gather_beside(&exposure.camera, (&nearest.line, exposure.time), &exposure.uncertainty);
+        track.gather_beside(
+            &exposure.camera,
+            (&nearest.line, exposure.time),
+            &exposure.uncertainty,
+        );
     }
 }
 

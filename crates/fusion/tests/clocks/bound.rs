@@ -37,14 +37,22 @@ impl Way {
         let first = (t / PIECE_S).floor();
         let u = t / PIECE_S - first;
         let v = 1.0 - u;
-        let weights =
-            [v.powi(3), 3.0 * u.powi(3) - 6.0 * u * u + 4.0, 1.0 + 3.0 * u * (1.0 + u * v), u.powi(3)];
-        weights.into_iter().enumerate().map(|(i, weight)| (first as usize + i, weight / 6.0)).collect()
+        let weights = [
+            v.powi(3),
+            3.0 * u.powi(3) - 6.0 * u * u + 4.0,
+            1.0 + 3.0 * u * (1.0 + u * v),
+            u.powi(3),
+        ];
+        weights
+            .into_iter()
+            .enumerate()
+            .map(|(i, weight)| (first as usize + i, weight / 6.0))
+            .collect()
     }
 }
 
-/// The least standard deviation, s (root mean square over these clocks), with which their offsets at
-/// the end of a scene of one target can be known, where poses are known to (rad, m).
+/// The least standard deviation, s (root mean square over these clocks), with which their offsets
+/// at the end of a scene of one target can be known, where poses are known to (rad, m).
 pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: (f64, f64), way: Way) -> f64 {
     let (path, end) = (&scene.paths[0], scene.time_s.end);
     let way_end = 3 * way.coefficients(end);
@@ -64,7 +72,8 @@ pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: (f64, f64), way: Way) -> 
         for (i, a) in [-1.0, 3.0, -3.0, 1.0].into_iter().enumerate() {
             for (k, b) in [-1.0, 3.0, -3.0, 1.0].into_iter().enumerate() {
                 for axis in 0..3 {
-                    information[(3 * (start + i) + axis, 3 * (start + k) + axis)] += a * b / PIECE_S.powi(5);
+                    information[(3 * (start + i) + axis, 3 * (start + k) + axis)] +=
+                        a * b / PIECE_S.powi(5);
                 }
             }
         }
@@ -75,7 +84,9 @@ pub fn bound(scene: &Scene, clocks: &[Clock], pose_sd: (f64, f64), way: Way) -> 
             let Some(place) = path(t).filter(|place| eye.camera.sees(*place)) else { continue };
             let mut shifts: Vec<(usize, Vector3<f64>)> = Vec::new();
             for (coefficient, weight) in way.at(t) {
-                shifts.extend((0..3).map(|axis| (3 * coefficient + axis, Vector3::ith(axis, weight))));
+                shifts.extend(
+                    (0..3).map(|axis| (3 * coefficient + axis, Vector3::ith(axis, weight))),
+                );
             }
             let velocity = velocity(path, t);
             if let Some(place) = clock.map(|clock| way_end + 2 * clock) {

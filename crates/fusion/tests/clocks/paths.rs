@@ -113,14 +113,17 @@ pub fn six() -> Vec<Eye> {
 }
 
 /// A straight flight of a minute before three cameras that see all of it: 150 m from it with lenses
-/// as wide as that needs (noise of an angle stays as it is), or `farther` times as far with narrower ones.
+/// as wide as that needs (noise of an angle stays as it is), or `farther` times as far with
+/// narrower ones.
 pub fn a_minute_in_sight(speed: f64, farther: f64, rate_hz: f64) -> Scene {
     let path = move || straight([-30.0 * speed, 0.0, 40.0], [speed, 0.0, 0.0]);
-    let places = [("a", [-60.0, -150.0, 2.0]), ("b", [60.0, -140.0, 5.0]), ("c", [0.0, 150.0, 3.0])];
+    let places =
+        [("a", [-60.0, -150.0, 2.0]), ("b", [60.0, -140.0, 5.0]), ("c", [0.0, 150.0, 3.0])];
     let eyes = places.into_iter().zip(site()).map(|((name, [x, y, z]), like)| {
         let (x, y) = (farther * x, farther * y);
         let narrow = eye(name, [x, y, z], [x, 0.0, 40.0], like.phase_s);
-        let ends = [0.0, FLIGHT_S].map(|t| narrow.camera.pose().camera_from_world(path()(t).unwrap()));
+        let ends =
+            [0.0, FLIGHT_S].map(|t| narrow.camera.pose().camera_from_world(path()(t).unwrap()));
         let widest = ends.iter().map(|end| (end.x / end.z).abs()).fold(0.0, f64::max);
         let lens = *narrow.camera.model().intrinsics();
         let wide = Intrinsics { fx: 950.0 / widest, fy: 950.0 / widest, ..lens };

@@ -37,7 +37,8 @@ impl Clock {
     }
 }
 
-/// Clocks of these cameras: up to 200 ms wrong, gaining or losing up to 50 ppm, reported to 0.1 to 0.2 s.
+/// Clocks of these cameras: up to 200 ms wrong, gaining or losing up to 50 ppm, reported to 0.1 to
+/// 0.2 s.
 pub fn random_clocks(cameras: &[&'static str], seed: u64) -> Vec<Clock> {
     let mut rng = ChaCha8Rng::seed_from_u64(10_000 + seed);
     let clock = |&camera: &&'static str| Clock {
@@ -128,7 +129,8 @@ impl Tally {
         let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
         self.knock(&mut fusion, scene, seed);
         let frames = scene.frames(seed);
-        let truths: Vec<f64> = frames.iter().map(|frame| frame.capture_time_ns as f64 / 1e9).collect();
+        let truths: Vec<f64> =
+            frames.iter().map(|frame| frame.capture_time_ns as f64 / 1e9).collect();
         let mut settled: f64 = 0.0;
         for (k, (frame, time)) in with_clocks(frames, clocks).iter().zip(truths).enumerate() {
             let start = Instant::now();
@@ -140,7 +142,8 @@ impl Tally {
             if k % LOOK_EVERY == 0 && time > 3.0 {
                 self.look(&fusion, scene, time);
                 let off = |c: &Clock| {
-                    clock_of(&fusion, c.camera).map_or(0.0, |e| (e.offset_s - c.offset_at(time)).abs())
+                    clock_of(&fusion, c.camera)
+                        .map_or(0.0, |e| (e.offset_s - c.offset_at(time)).abs())
                 };
                 if clocks.iter().any(|clock| off(clock) > SETTLED_S) {
                     settled = time;
@@ -174,7 +177,8 @@ impl Tally {
             let pose = eye.camera.pose();
             let turn = Rotation3::new(Vector3::from_fn(|_, _| rotation_sd * normal()));
             let step = Vector3::from_fn(|_, _| position_sd * normal());
-            let wrong = Pose::new(*(pose.rotation() * turn).matrix(), pose.position() + step).unwrap();
+            let wrong =
+                Pose::new(*(pose.rotation() * turn).matrix(), pose.position() + step).unwrap();
             let camera = Camera::new(*eye.camera.model().intrinsics(), wrong).unwrap();
             let message = CameraCalibration::new(&eye.name, &camera, Timestamp::EPOCH);
             fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();

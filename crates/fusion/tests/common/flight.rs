@@ -25,7 +25,8 @@ impl Flight {
         Self::with(FusionConfig::default(), scene, seed, |_| true)
     }
 
-    /// The same with another configuration, the frames as they arrive, and without those that get lost.
+    /// The same with another configuration, the frames as they arrive, and without those that get
+    /// lost.
     pub fn with(
         config: FusionConfig,
         scene: Scene,
@@ -40,7 +41,8 @@ impl Flight {
 
     /// Goes on with all frames taken before `seconds`.
     pub fn until(&mut self, seconds: f64) -> &mut Self {
-        while let Some(frame) = self.frames.next_if(|f| (f.capture_time_ns as f64) < seconds * 1e9) {
+        while let Some(frame) = self.frames.next_if(|f| (f.capture_time_ns as f64) < seconds * 1e9)
+        {
             self.fusion.ingest(&frame);
         }
         self

@@ -4,7 +4,9 @@
 use std::ops::Range;
 
 use crossfix_fusion::{Fusion, FusionConfig, Track};
-use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose, tangent_basis};
+use crossfix_geometry::{
+    Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose, tangent_basis,
+};
 use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, CameraName, ImageTrackState, Timestamp,
 };
@@ -49,10 +51,21 @@ pub struct Scene {
 /// A camera of 1920 x 1080 pixels, 69 degrees wide, that looks at a point; ten pictures a second.
 pub fn eye(name: &str, at: [f64; 3], looking_at: [f64; 3], phase_s: f64) -> Eye {
     let size = ImageSize { width: 1920, height: 1080 };
-    let lens =
-        Intrinsics { size, fx: 1400.0, fy: 1400.0, cx: 959.5, cy: 539.5, distortion: Distortion::None };
+    let lens = Intrinsics {
+        size,
+        fx: 1400.0,
+        fy: 1400.0,
+        cx: 959.5,
+        cy: 539.5,
+        distortion: Distortion::None,
+    };
     let pose = Pose::looking_at(at.into(), looking_at.into()).unwrap();
-    Eye { name: name.parse().unwrap(), camera: Camera::new(lens, pose).unwrap(), rate_hz: 10.0, phase_s }
+    Eye {
+        name: name.parse().unwrap(),
+        camera: Camera::new(lens, pose).unwrap(),
+        rate_hz: 10.0,
+        phase_s,
+    }
 }
 
 /// Three cameras about 150 m from where they all look, one after the other within a period.
@@ -82,9 +95,11 @@ pub fn calibration(eye: &Eye) -> CameraCalibration {
     CameraCalibration::new(&eye.name, &eye.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
 }
 
-/// The confirmed track within three metres of a path at its own time, the nearest if there are more.
+/// The confirmed track within three metres of a path at its own time, the nearest if there are
+/// more.
 pub fn found<'a>(fusion: &'a Fusion, path: &Path) -> Option<&'a Track> {
-    let distance = |track: &Track| Some((track.state().position() - path(track.updated.seconds())?).norm());
+    let distance =
+        |track: &Track| Some((track.state().position() - path(track.updated.seconds())?).norm());
     let near = fusion.tracks().filter(|track| track.is_confirmed());
     let near = near.filter_map(|track| Some((distance(track)?, track))).filter(|(d, _)| *d < 3.0);
     near.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, track)| track)
@@ -107,10 +122,19 @@ impl Scene {
         }
         exposures.sort_unstable();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        exposures.into_iter().map(|(time, i, k)| self.frame(&self.eyes[i], time, k, &mut rng)).collect()
+        exposures
+            .into_iter()
+            .map(|(time, i, k)| self.frame(&self.eyes[i], time, k, &mut rng))
+            .collect()
     }
 
-    fn frame(&self, eye: &Eye, capture_time_ns: i64, sequence: u64, rng: &mut ChaCha8Rng) -> BearingFrame {
+    fn frame(
+        &self,
+        eye: &Eye,
+        capture_time_ns: i64,
+        sequence: u64,
+        rng: &mut ChaCha8Rng,
+    ) -> BearingFrame {
         let seconds = capture_time_ns as f64 / 1e9;
         let mut tracks = Vec::new();
         for place in self.paths.iter().filter_map(|path| path(seconds)) {
@@ -118,13 +142,15 @@ impl Scene {
             let noise = Vector2::from_fn(|_, _| -> f64 { StandardNormal.sample(rng) }) * SD_RAD;
             let detected = rng.random::<f64>() < self.detection;
             if detected && eye.camera.sees(place) {
-                let exact = nalgebra::Unit::new_normalize(eye.camera.pose().camera_from_world(place));
+                let exact =
+                    nalgebra::Unit::new_normalize(eye.camera.pose().camera_from_world(place));
                 tracks.push(exact.into_inner() + tangent_basis(&exact) * noise);
             }
         }
         let false_ones = Poisson::new(self.clutter).map_or(0.0, |poisson| poisson.sample(rng));
         tracks.extend(clutter(&eye.camera, false_ones as usize, rng));
-        let tracks = tracks.into_iter().zip(1..).map(|(towards, id)| bearing(towards, id)).collect();
+        let tracks =
+            tracks.into_iter().zip(1..).map(|(towards, id)| bearing(towards, id)).collect();
         let camera = eye.name.to_string();
         BearingFrame { camera, sequence, capture_time_ns, tracks, ..Default::default() }
     }

@@ -4,19 +4,25 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_fusion::{
-    Fusion, FusionConfig, InitiationMethod, Manoeuvres, Output, SpatialSolver, TrackStatus, Weighting,
+    Fusion, FusionConfig, InitiationMethod, Manoeuvres, Output, SpatialSolver, TrackStatus,
+    Weighting,
 };
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, ImageTrackState, Timestamp, Track, TrackEventKind,
-    TrackState, Vector3,
+    BearingFrame, BearingTrack, CameraCalibration, ImageTrackState, Timestamp, Track,
+    TrackEventKind, TrackState, Vector3,
 };
 use nalgebra::{Matrix6, Point3};
 
 /// Three cameras that see the targets, one beside the first, and something that is no name.
 const NAMES: [&str; 5] = ["a", "b", "c", "d", "no/name"];
-const PLACES: [[f64; 3]; 5] =
-    [[-150.0, -20.0, 2.0], [90.0, -120.0, 5.0], [60.0, 140.0, 3.0], [-149.0, -20.0, 2.0], [1.0, 2.0, 3.0]];
+const PLACES: [[f64; 3]; 5] = [
+    [-150.0, -20.0, 2.0],
+    [90.0, -120.0, 5.0],
+    [60.0, 140.0, 3.0],
+    [-149.0, -20.0, 2.0],
+    [1.0, 2.0, 3.0],
+];
 /// Numbers that nobody expects of a camera, a clock or a lens.
 const ODD: [f64; 14] = [
     0.0,
@@ -49,8 +55,8 @@ const JUMPS: [i64; 12] = [
     i64::MAX,
     i64::MIN,
 ];
-/// Clutter bearings that a run may have in all, and those of a frame that are all alike: a fuzzer must
-/// get on. Whatever there are, a period takes a few tenths of a second.
+/// Clutter bearings that a run may have in all, and those of a frame that are all alike: a fuzzer
+/// must get on. Whatever there are, a period takes a few tenths of a second.
 const MOST_CLUTTER: usize = 6_000;
 const MOST_ALIKE: usize = 200;
 /// Operations of a run.
@@ -94,10 +100,14 @@ impl Bytes<'_> {
 fn config(bytes: &mut Bytes<'_>) -> FusionConfig {
     let mut config = FusionConfig::default();
     let choice = bytes.next();
-    config.tracking.manoeuvres =
-        [Manoeuvres::Models, Manoeuvres::SmoothedResidual, Manoeuvres::Innovation, Manoeuvres::None]
-            [usize::from(choice & 3)];
-    let solvers = [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
+    config.tracking.manoeuvres = [
+        Manoeuvres::Models,
+        Manoeuvres::SmoothedResidual,
+        Manoeuvres::Innovation,
+        Manoeuvres::None,
+    ][usize::from(choice & 3)];
+    let solvers =
+        [SpatialSolver::Map, SpatialSolver::Stacked, SpatialSolver::Triple, SpatialSolver::Pair];
     match choice >> 2 & 7 {
         0..=3 => {}
         grouping => {
@@ -144,7 +154,10 @@ fn configure_more(config: &mut FusionConfig, bytes: &mut Bytes<'_>) {
         let (field, value) = (bytes.below(8), bytes.odd());
         match field {
             1 => config.clocks.estimate = false,
-            2 => config.clocks.trusted = NAMES[..2].iter().filter_map(|name| name.parse().ok()).collect(),
+            2 => {
+                config.clocks.trusted =
+                    NAMES[..2].iter().filter_map(|name| name.parse().ok()).collect();
+            }
             3 => config.clocks.least_sd_s = value,
             4 => config.clocks.drift_sd = value,
             5 => config.initiation.pair_s = value,
@@ -173,8 +186,14 @@ fn with_pose(message: CameraCalibration, choice: u8, odd: f64) -> CameraCalibrat
 fn camera(at: [f64; 3]) -> Option<Camera> {
     let pose = Pose::looking_at(Point3::from(at), Point3::new(0.0, 0.0, 40.0)).ok()?;
     let size = ImageSize { width: 1920, height: 1080 };
-    let lens =
-        Intrinsics { size, fx: 1400.0, fy: 1400.0, cx: 959.5, cy: 539.5, distortion: Distortion::None };
+    let lens = Intrinsics {
+        size,
+        fx: 1400.0,
+        fy: 1400.0,
+        cx: 959.5,
+        cy: 539.5,
+        distortion: Distortion::None,
+    };
     Camera::new(lens, pose).ok()
 }
 
@@ -229,7 +248,8 @@ struct Run<'a> {
 
 impl Run<'_> {
     fn operate(&mut self) {
-        // The byte was taken by 13 when there were 13 operations: those below 13 mean what they meant.
+        // The byte was taken by 13 when there were 13 operations: those below 13 mean what they
+        // meant.
         match self.bytes.next() {
             kind if self.is_appended && kind >= 247 => self.of_cameras(kind),
             kind => self.operate_on(kind % 13),
@@ -242,7 +262,8 @@ impl Run<'_> {
         let value = self.bytes.odd();
         match kind % 3 {
             0 => {
-                let Some((camera, Ok(name))) = camera(PLACES[eye]).zip(Some(NAMES[eye].parse())) else {
+                let Some((camera, Ok(name))) = camera(PLACES[eye]).zip(Some(NAMES[eye].parse()))
+                else {
                     return;
                 };
                 let message = CameraCalibration::new(&name, &camera, Timestamp::EPOCH);
@@ -359,7 +380,8 @@ impl Run<'_> {
                 4 => Some([0.0, 0.0, 1.000_000_9]),
                 _ => Some([0.0, 0.0, 1.0]),
             };
-            let state = if kind & 8 == 0 { ImageTrackState::Tracking } else { ImageTrackState::Coasting };
+            let state =
+                if kind & 8 == 0 { ImageTrackState::Tracking } else { ImageTrackState::Coasting };
             let covariance = self.odd_covariance();
             let sound = bearing(nalgebra::Vector3::z(), covariance);
             let vector = vector.map(|[x, y, z]| Vector3 { x, y, z });
@@ -371,13 +393,16 @@ impl Run<'_> {
 
     /// Up to some hundred bearings of nothing, or of the same nothing.
     fn clutter(&mut self) {
-        let (eye, wanted, seed) = (self.bytes.below(4), self.bytes.below(256) * 8, self.bytes.next());
+        let (eye, wanted, seed) =
+            (self.bytes.below(4), self.bytes.below(256) * 8, self.bytes.next());
         let most = if seed & 1 == 0 { MOST_ALIKE } else { wanted };
         let count = wanted.min(self.clutter_left).min(most);
         self.clutter_left -= count;
         let mut state = u64::from(seed);
         let mut uniform = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             (state >> 33) as f64 / (1u64 << 31) as f64 - 0.5
         };
         let alike = nalgebra::Vector3::new(uniform(), 0.7 * uniform(), 1.0);
@@ -442,14 +467,19 @@ impl Run<'_> {
         for output in outputs {
             match output {
                 Output::Tracks(frame) => {
-                    assert_eq!(frame.sequence, self.frames_out, "the frames are numbered without gaps");
+                    assert_eq!(
+                        frame.sequence, self.frames_out,
+                        "the frames are numbered without gaps"
+                    );
                     self.frames_out += 1;
                     assert!(frame.tracks.is_sorted_by(|a, b| a.id < b.id), "{frame:?}");
                     frame.tracks.iter().for_each(assert_sound);
                 }
                 Output::Event(event) => {
-                    let first = event.kind() == TrackEventKind::Born && self.born.insert(event.track_id);
-                    let later = event.kind() != TrackEventKind::Born && self.born.contains(&event.track_id);
+                    let first =
+                        event.kind() == TrackEventKind::Born && self.born.insert(event.track_id);
+                    let later =
+                        event.kind() != TrackEventKind::Born && self.born.contains(&event.track_id);
                     assert!(first || later, "each track is born once, and first of all: {event:?}");
                 }
                 Output::Camera(..) => {}
@@ -487,8 +517,12 @@ impl Run<'_> {
     fn end(mut self) {
         let outputs = self.fusion.flush();
         self.check(&outputs);
-        let refused: u64 =
-            self.rejected.iter().filter(|(name, _)| **name != "rejected_bearing").map(|(_, n)| n).sum();
+        let refused: u64 = self
+            .rejected
+            .iter()
+            .filter(|(name, _)| **name != "rejected_bearing")
+            .map(|(_, n)| n)
+            .sum();
         let count = |name| self.fusion.counters().get(name);
         assert_eq!(count("frames"), self.sent.len() as u64);
         assert_eq!(count("frames"), count("exposures") + refused, "{:?}", self.fusion.counters());
@@ -516,7 +550,10 @@ fn assert_sound(track: &Track) {
     assert_eq!(track.covariance.len(), 36, "{track:?}");
     assert!(is_possible(&Matrix6::from_column_slice(&track.covariance)), "{track:?}");
     assert!(track.residuals.iter().all(|r| r.angle_rad.is_finite() && r.nis >= 0.0), "{track:?}");
-    assert!(track.state() != TrackState::Unspecified && !track.condition_number.is_nan(), "{track:?}");
+    assert!(
+        track.state() != TrackState::Unspecified && !track.condition_number.is_nan(),
+        "{track:?}"
+    );
 }
 
 /// Runs a fusion centre on bytes. Panics if it does, or if it answers with what cannot be.

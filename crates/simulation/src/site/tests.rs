@@ -25,7 +25,10 @@ fn bearings_point_at_the_truth_within_their_noise() {
             }
         }
         let sd = f64::sqrt(squares / count / 2.0);
-        assert!(count > 500.0 && (sd / site.noise_rad - 1.0).abs() < 0.06, "{layout:?}: {sd} of {count}");
+        assert!(
+            count > 500.0 && (sd / site.noise_rad - 1.0).abs() < 0.06,
+            "{layout:?}: {sd} of {count}"
+        );
     }
 }
 
@@ -36,7 +39,8 @@ fn a_target_in_view_is_reported_as_often_as_it_should() {
     let (mut seen, mut reported) = (0, 0);
     for exposure in simulated.bearings() {
         let camera = &simulated.cameras()[exposure.camera].camera;
-        seen += simulated.truth(exposure.time_s).filter(|t| simulated.sees(camera, t.position)).count();
+        seen +=
+            simulated.truth(exposure.time_s).filter(|t| simulated.sees(camera, t.position)).count();
         reported += exposure.frame.tracks.len();
     }
     let share = reported as f64 / seen as f64;
@@ -52,12 +56,17 @@ fn clutter_is_poisson_and_within_the_image() {
         let n = frame.tracks.len() as f64;
         (sum, squares, count) = (sum + n, squares + n * n, count + 1.0);
         for track in &frame.tracks {
-            assert!((0.0..1920.0).contains(&track.pixel_x) && (0.0..1080.0).contains(&track.pixel_y));
+            assert!(
+                (0.0..1920.0).contains(&track.pixel_x) && (0.0..1080.0).contains(&track.pixel_y)
+            );
         }
     }
     let mean = sum / count;
     let variance = squares / count - mean * mean;
-    assert!((mean - 5.0).abs() < 0.2 && (variance - 5.0).abs() < 0.6, "{mean} {variance} of {count}");
+    assert!(
+        (mean - 5.0).abs() < 0.2 && (variance - 5.0).abs() < 0.6,
+        "{mean} {variance} of {count}"
+    );
 }
 
 #[test]
@@ -65,7 +74,8 @@ fn the_same_seed_gives_the_same_bytes_in_order_of_time() {
     let site = Site { duration_s: 1.0, cameras: 7, layout: Layout::Grid, ..Site::default() };
     let bytes = |site: &Site| -> Vec<Vec<u8>> {
         let simulated = site.build().unwrap();
-        let calibrations: Vec<Vec<u8>> = simulated.calibrations().iter().map(Payload::encode).collect();
+        let calibrations: Vec<Vec<u8>> =
+            simulated.calibrations().iter().map(Payload::encode).collect();
         calibrations.into_iter().chain(simulated.bearings().map(|e| e.frame.encode())).collect()
     };
     assert_eq!(bytes(&site), bytes(&site));
@@ -86,7 +96,8 @@ fn every_place_of_a_grid_is_seen_by_several_cameras() {
         ..Site::default()
     };
     let simulated = site.build().unwrap();
-    let enough = simulated.truth(0.0).filter(|t| simulated.cameras_that_see(t.position) >= 3).count();
+    let enough =
+        simulated.truth(0.0).filter(|t| simulated.cameras_that_see(t.position) >= 3).count();
     assert!(enough > 900, "{enough} of 1000 are seen by three");
 }
 

@@ -1,8 +1,8 @@
 //! Where the compressed frames of an MP4 file lie, and when each is shown.
 //!
-//! The boxes are `mp4-atom`'s business. It is given whole boxes out of a buffer, which it cannot leave,
-//! and every loop here goes on to a later byte of the file or ends: a damaged file costs no more time and
-//! memory than its size.
+//! The boxes are `mp4-atom`'s business. It is given whole boxes out of a buffer, which it cannot
+//! leave, and every loop here goes on to a later byte of the file or ends: a damaged file costs no
+//! more time and memory than its size.
 
 use std::io::{Read, Seek, SeekFrom};
 
@@ -96,7 +96,9 @@ fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), Stri
                 return Err(format!("its index has more than {MAX_INDEX_BYTES} bytes"));
             }
             let mut bytes = vec![0; usize::try_from(size).map_err(|error| error.to_string())?];
-            file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut bytes)).map_err(text)?;
+            file.seek(SeekFrom::Start(at))
+                .and_then(|_| file.read_exact(&mut bytes))
+                .map_err(text)?;
             let damaged = |error: mp4_atom::Error| format!("its index is damaged: {error}");
             if kind == *b"moov" {
                 moov = Some(Moov::decode(&mut bytes.as_slice()).map_err(damaged)?);
@@ -110,7 +112,11 @@ fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), Stri
 }
 
 /// Kind and size of the box at a place; `None` if none lies there whole.
-fn head<R: Read + Seek>(file: &mut R, at: u64, end: u64) -> std::io::Result<Option<([u8; 4], u64)>> {
+fn head<R: Read + Seek>(
+    file: &mut R,
+    at: u64,
+    end: u64,
+) -> std::io::Result<Option<([u8; 4], u64)>> {
     const SHORT: u64 = 8;
     const LONG: u64 = 16;
     if end.saturating_sub(at) < SHORT {
@@ -170,12 +176,15 @@ impl Samples {
 
     /// The frames that the index itself lists.
     fn add_table(&mut self, table: &Stbl) -> Result<(), String> {
-        let (size_of, count): (Box<dyn Fn(usize) -> Option<u32>>, usize) = match &table.stsz.samples {
+        let (size_of, count): (Box<dyn Fn(usize) -> Option<u32>>, usize) = match &table.stsz.samples
+        {
             StszSamples::Identical { count, size } => {
                 let (count, size) = (*count as usize, *size);
                 (Box::new(move |index| (index < count).then_some(size)), count)
             }
-            StszSamples::Different { sizes } => (Box::new(|index| sizes.get(index).copied()), sizes.len()),
+            StszSamples::Different { sizes } => {
+                (Box::new(|index| sizes.get(index).copied()), sizes.len())
+            }
         };
         let chunks: Vec<u64> = match (&table.stco, &table.co64) {
             (Some(short), _) => short.entries.iter().map(|&offset| u64::from(offset)).collect(),
@@ -183,9 +192,11 @@ impl Samples {
             (None, None) => Vec::new(),
         };
         let times = table.stts.entries.iter();
-        let mut durations = times.flat_map(|e| std::iter::repeat_n(e.sample_delta, e.sample_count as usize));
+        let mut durations =
+            times.flat_map(|e| std::iter::repeat_n(e.sample_delta, e.sample_count as usize));
         let shifts = table.ctts.iter().flat_map(|ctts| &ctts.entries);
-        let mut shifts = shifts.flat_map(|e| std::iter::repeat_n(e.sample_offset, e.sample_count as usize));
+        let mut shifts =
+            shifts.flat_map(|e| std::iter::repeat_n(e.sample_offset, e.sample_count as usize));
         let mut runs = table.stsc.entries.iter().peekable();
         let mut a_chunk = 0;
         let mut number = 0;
@@ -224,10 +235,17 @@ impl Samples {
     }
 
     /// The frames of a fragment at a place of the file.
-    fn add_fragment(&mut self, at: u64, moof: &Moof, moov: &Moov, track: u32) -> Result<(), String> {
+    fn add_fragment(
+        &mut self,
+        at: u64,
+        moof: &Moof,
+        moov: &Moov,
+        track: u32,
+    ) -> Result<(), String> {
         /// A frame that others are needed for.
         const IS_NOT_SYNC: u32 = 1 << 16;
-        let usual = moov.mvex.iter().flat_map(|mvex| &mvex.trex).find(|trex| trex.track_id == track);
+        let usual =
+            moov.mvex.iter().flat_map(|mvex| &mvex.trex).find(|trex| trex.track_id == track);
         for part in moof.traf.iter().filter(|part| part.tfhd.track_id == track) {
             let head = &part.tfhd;
             let base = head.base_data_offset.unwrap_or(at);
@@ -243,9 +261,16 @@ impl Samples {
                     let or = |own: Option<u32>, part: Option<u32>, file: Option<u32>| {
                         own.or(part).or(file).unwrap_or(0)
                     };
-                    let size = or(entry.size, head.default_sample_size, usual.map(|u| u.default_sample_size));
-                    let flags =
-                        or(entry.flags, head.default_sample_flags, usual.map(|u| u.default_sample_flags));
+                    let size = or(
+                        entry.size,
+                        head.default_sample_size,
+                        usual.map(|u| u.default_sample_size),
+                    );
+                    let flags = or(
+                        entry.flags,
+                        head.default_sample_flags,
+                        usual.map(|u| u.default_sample_flags),
+                    );
                     let lasts = or(
                         entry.duration,
                         head.default_sample_duration,

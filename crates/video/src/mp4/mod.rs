@@ -46,7 +46,8 @@ impl Mp4Source {
         let mut file = BufReader::new(file);
         let index::Index { samples, timescale, parameters, length_bytes, missing } =
             index::read(&mut file).map_err(damaged)?;
-        let headers = parameters.iter().flat_map(|unit| [&[0, 0, 0, 1][..], &unit[..]].concat()).collect();
+        let headers =
+            parameters.iter().flat_map(|unit| [&[0, 0, 0, 1][..], &unit[..]].concat()).collect();
         let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
         let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
             .map_err(|error| damaged(in_words(&error)))?;
@@ -77,7 +78,8 @@ impl Mp4Source {
         let mut unit = if sample.is_sync { self.headers.clone() } else { Vec::new() };
         let mut rest = &bytes[..];
         while !rest.is_empty() {
-            let (length, after) = rest.split_at_checked(self.length_bytes).ok_or("it is cut off")?;
+            let (length, after) =
+                rest.split_at_checked(self.length_bytes).ok_or("it is cut off")?;
             let length = length.iter().fold(0_usize, |sum, &byte| sum << 8 | usize::from(byte));
             let (nal, after) = after.split_at_checked(length).ok_or("it is cut off")?;
             unit.extend([0, 0, 0, 1]);
@@ -133,7 +135,8 @@ impl Mp4Source {
         }
         let missing = std::mem::take(&mut self.missing);
         if missing > 0 {
-            self.failed.push_back(format!("the file ends before it and the {} after it", missing - 1));
+            self.failed
+                .push_back(format!("the file ends before it and the {} after it", missing - 1));
         }
     }
 }
@@ -141,8 +144,13 @@ impl Mp4Source {
 /// What the decoder says, in words for people: it counts its errors.
 fn in_words(error: &openh264::Error) -> String {
     let text = error.to_string();
-    let number: String =
-        text.split("Native:").nth(1).unwrap_or("").chars().take_while(char::is_ascii_digit).collect();
+    let number: String = text
+        .split("Native:")
+        .nth(1)
+        .unwrap_or("")
+        .chars()
+        .take_while(char::is_ascii_digit)
+        .collect();
     let number = if number.is_empty() { String::new() } else { format!(" (OpenH264 {number})") };
     format!("it is damaged, or builds on one that is{number}")
 }

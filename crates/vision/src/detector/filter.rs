@@ -3,7 +3,8 @@
 use crossfix_correlation::Plane;
 use pulp::Arch;
 
-/// Half side of the surroundings of a cell, cells: four times a target's side, which is two or three.
+/// Half side of the surroundings of a cell, cells: four times a target's side, which is two or
+/// three.
 pub(super) const SURROUNDINGS: usize = 4;
 
 /// Means of two by two; an odd last row or column is left out.
@@ -30,8 +31,8 @@ pub(super) struct Lines {
     means: Vec<f32>,
 }
 
-/// By how much each cell, smoothed by a quarter, a half and a quarter of its neighbours, is brighter than the square
-/// about it; beyond the border the border goes on.
+/// By how much each cell, smoothed by a quarter, a half and a quarter of its neighbours, is
+/// brighter than the square about it; beyond the border the border goes on.
 pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
     let (width, height) = (from.width(), from.height());
     to.reshape(width, height);
@@ -53,12 +54,14 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
             }
             means_along(sums, means);
             let out = to.row_mut(y as usize);
-            for (out, (near, mean)) in out[1..].iter_mut().zip(smoothed.windows(3).zip(&means[1..])) {
+            for (out, (near, mean)) in out[1..].iter_mut().zip(smoothed.windows(3).zip(&means[1..]))
+            {
                 *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
             }
             let last = width - 1;
             out[0] = 0.75 * smoothed[0] + 0.25 * smoothed[1.min(last)] - means[0];
-            out[last] = 0.75 * smoothed[last] + 0.25 * smoothed[last.saturating_sub(1)] - means[last];
+            out[last] =
+                0.75 * smoothed[last] + 0.25 * smoothed[last.saturating_sub(1)] - means[last];
             let ends = row(y + reach + 1).iter().zip(row(y - reach));
             sums.iter_mut().zip(ends).for_each(|(sum, (next, last))| *sum += next - last);
         }
@@ -134,12 +137,9 @@ mod tests {
 
     #[test]
     fn what_stands_out_is_bright_and_what_is_about_it_is_darker() {
-        let from =
-            Plane::from_fn(
-                41,
-                31,
-                |x, y| if (19..=21).contains(&x) && (14..=16).contains(&y) { 81.0 } else { 0.0 },
-            );
+        let from = Plane::from_fn(41, 31, |x, y| {
+            if (19..=21).contains(&x) && (14..=16).contains(&y) { 81.0 } else { 0.0 }
+        });
         let mut to = Plane::default();
         stand_out(&from, &mut to, &mut Lines::default());
         // The middle has 81 less nine cells of 81 of the square of 81 cells.

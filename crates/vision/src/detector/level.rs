@@ -1,5 +1,5 @@
-//! One scale of the image: by how much each cell stands out of its surroundings, how that has been over the last
-//! seconds, and how unlike that it is now.
+//! One scale of the image: by how much each cell stands out of its surroundings, how that has been
+//! over the last seconds, and how unlike that it is now.
 
 use crossfix_correlation::Plane;
 use pulp::Arch;
@@ -7,52 +7,59 @@ use pulp::Arch;
 use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Of a squared change beyond this many variances only so much is learnt, of mean and variance: what comes by is no noise of
-/// the place. With half of it flickering leaves are learnt in twice the time, without it the first target makes its path blind, and its place
-/// before it was found something that has come.
+/// Of a squared change beyond this many variances only so much is learnt, of mean and variance:
+/// what comes by is no noise of the place. With half of it flickering leaves are learnt in twice
+/// the time, without it the first target makes its path blind, and its place before it was found
+/// something that has come.
 const OUTLYING: f32 = 16.0;
-/// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a level, and with half of it
-/// each such step is two standard deviations.
+/// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
+/// level, and with half of it each such step is two standard deviations.
 const LEAST_SPREAD: f32 = 0.5;
-/// By how much a contrast is taken to vary from place to place when light changes, a share of it. With half of it a cloud's
-/// shadow changes sharp edges by three standard deviations.
+/// By how much a contrast is taken to vary from place to place when light changes, a share of it.
+/// With half of it a cloud's shadow changes sharp edges by three standard deviations.
 const CONTRAST_SPREAD: f32 = 0.03;
-/// Bounds of the sway, px: no scene is stiller than the first, and beyond the second it is not sway but another scene.
+/// Bounds of the sway, px: no scene is stiller than the first, and beyond the second it is not sway
+/// but another scene.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];
-/// Share of what has texture that changes at most, if it is the scene of the background that is seen: targets cover less,
-/// and another scene has hardly a cell in common.
+/// Share of what has texture that changes at most, if it is the scene of the background that is
+/// seen: targets cover less, and another scene has hardly a cell in common.
 const MOST_CHANGED: f32 = 0.3;
-/// The sway is told by the cells that a sway by so much changes by more than noise, px; with half of it fewer scenes tell
-/// theirs, with twice as much noise does.
+/// The sway is told by the cells that a sway by so much changes by more than noise, px; with half
+/// of it fewer scenes tell theirs, with twice as much noise does.
 const PROBE_PX: f32 = 0.25;
 /// What the sway is taken for before there is an image to tell, px.
 const FIRST_SWAY_PX: f32 = 0.5;
-/// Time constant with which a scene that has swayed is believed to be still again, s: a gust's or a step's. With half of it the
-/// second swing of a mast is taken for something that moves.
+/// Time constant with which a scene that has swayed is believed to be still again, s: a gust's or a
+/// step's. With half of it the second swing of a mast is taken for something that moves.
 const STILL_AGAIN_S: f64 = 0.3;
-/// Images over which the changes' persistence is a mean: a key frame of a codec, one in 12 to 30, must not count for all.
+/// Images over which the changes' persistence is a mean: a key frame of a codec, one in 12 to 30,
+/// must not count for all.
 const PERSISTENCE_IMAGES: f32 = 10.0;
-/// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a second later; with 3
-/// plots of noise are so many that more is asked of each candidate, and faint ones are found later too.
+/// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a
+/// second later; with 3 plots of noise are so many that more is asked of each candidate, and faint
+/// ones are found later too.
 pub(super) const LEAST_CHANGE: f32 = 3.5;
-/// Noise that lasts is not less by being looked at again: what stands out must do so against its variance over many images,
-/// `(1 + p) / (1 - p)` times that of one, but no more than so many times. That is a persistence p of 0.7; compressed video has
-/// 0.9 and would ask for 19, and lose birds and far drones.
+/// Noise that lasts is not less by being looked at again: what stands out must do so against its
+/// variance over many images, `(1 + p) / (1 - p)` times that of one, but no more than so many
+/// times. That is a persistence p of 0.7; compressed video has 0.9 and would ask for 19, and lose
+/// birds and far drones.
 const MOST_LASTING: f32 = 6.0;
 /// Cells that tell a spread, a contrast or a persistence to two per cent, ...
 const SAMPLES: usize = 4096;
-/// ... and the fewest that tell a contrast, or, of twice as many, a sway: fewer may be those of a target.
+/// ... and the fewest that tell a contrast, or, of twice as many, a sway: fewer may be those of a
+/// target.
 const LEAST_SAMPLES: usize = 100;
 const LEAST_TEXTURED: usize = 40;
-/// The contrast is told by cells that stand out by so many spreads, and never by more than this range: beyond it is another
-/// scene, or none.
+/// The contrast is told by cells that stand out by so many spreads, and never by more than this
+/// range: beyond it is another scene, or none.
 const CONTRAST_TOLD_BY: f32 = 4.0;
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
 /// Where and when an image was taken, for the background.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment {
-    /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y) plus this.
+    /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y)
+    /// plus this.
     pub(super) turned: [f64; 2],
     /// Time since the image before, s.
     pub(super) interval: f64,
@@ -80,8 +87,8 @@ impl Cells {
 
 /// One scale.
 ///
-/// The background's cells stay with the scene: when the camera turns they move over the image, by whole cells, and the
-/// image is sampled between its own.
+/// The background's cells stay with the scene: when the camera turns they move over the image, by
+/// whole cells, and the image is sampled between its own.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
@@ -106,8 +113,8 @@ pub(super) struct Level {
     pub(super) spread: f32,
     /// Mean square by which the scene sways, cells^2.
     sway: f32,
-    /// Correlation of an image's changes with the next one's, 0 to 1: that of a sensor's noise is 0, and of compressed
-    /// video's 0.9.
+    /// Correlation of an image's changes with the next one's, 0 to 1: that of a sensor's noise is
+    /// 0, and of compressed video's 0.9.
     pub(super) persistence: f32,
     /// Whether too many of the cells have changed for the scene to be that of the background.
     is_lost: bool,
@@ -170,7 +177,8 @@ impl Level {
         self.contrast * between(&self.mean, self.cell_of(place))
     }
 
-    /// What share of what stands out at a cell is new: 1 if the background has nothing there, 0 if it has the same.
+    /// What share of what stands out at a cell is new: 1 if the background has nothing there, 0 if
+    /// it has the same.
     pub(super) fn new_share(&self, [x, y]: [usize; 2]) -> f32 {
         let now = self.now.row(y)[x];
         if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
@@ -182,15 +190,16 @@ impl Level {
         LEAST_CHANGE * lasting.min(MOST_LASTING).sqrt()
     }
 
-    /// How much the scene about a cell stands out by itself, in spreads: the median over the ring from the end of the
-    /// cell's surroundings to twice that.
+    /// How much the scene about a cell stands out by itself, in spreads: the median over the ring
+    /// from the end of the cell's surroundings to twice that.
     pub(super) fn texture_about(&mut self, [x, y]: [usize; 2]) -> f32 {
         let reach = 2 * SURROUNDINGS as isize + 1;
         self.scratch.clear();
         for down in (-reach..=reach).step_by(2) {
             for right in (-reach..=reach).step_by(2) {
                 if right.abs().max(down.abs()) > reach / 2 {
-                    self.scratch.push(self.now.clamped(x as isize + right, y as isize + down).abs());
+                    self.scratch
+                        .push(self.now.clamped(x as isize + right, y as isize + down).abs());
                 }
             }
         }
@@ -245,7 +254,8 @@ impl Level {
                 .map(|(mean, now)| now / mean),
         );
         let told = self.scratch.len() >= LEAST_SAMPLES;
-        self.contrast = if told { median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1]) } else { 1.0 };
+        self.contrast =
+            if told { median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1]) } else { 1.0 };
         self.scratch.clear();
         self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
         self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
@@ -256,15 +266,19 @@ impl Level {
         let mean = self.mean.samples();
         let noise = self.spread * self.spread;
         for i in (width + 1..(width * height).saturating_sub(width + 1)).step_by(step / 2 + 1) {
-            let slope = slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
-            if probe * slope > noise && !known.iter().any(|cells| cells.are_near([i % width, i / width])) {
+            let slope =
+                slope_squared([mean[i - 1], mean[i + 1]], [mean[i - width], mean[i + width]]);
+            if probe * slope > noise
+                && !known.iter().any(|cells| cells.are_near([i % width, i / width]))
+            {
                 let usual = self.variance.samples()[i].max(noise);
                 let expected = probe * slope + usual;
                 let change = self.now.samples()[i] - self.contrast * mean[i];
                 told_by += 1;
                 changed += usize::from(change * change > LEAST_CHANGE * LEAST_CHANGE * expected);
                 slopes += slope / expected;
-                changes += ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
+                changes +=
+                    ((change * change).min(most * slope + OUTLYING * usual) - usual) / expected;
             }
         }
         let is_told = told_by >= LEAST_TEXTURED;
@@ -281,10 +295,15 @@ impl Level {
     fn learn(&mut self, share: f32, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         self.change.reshape(width, height);
-        let update =
-            CellUpdate { share, noise: self.spread * self.spread, sway: self.sway, contrast: self.contrast };
+        let update = CellUpdate {
+            share,
+            noise: self.spread * self.spread,
+            sway: self.sway,
+            contrast: self.contrast,
+        };
         for y in 0..height {
-            let (above, below) = (self.mean.row(y.saturating_sub(1)), self.mean.row((y + 1).min(height - 1)));
+            let (above, below) =
+                (self.mean.row(y.saturating_sub(1)), self.mean.row((y + 1).min(height - 1)));
             update.textures(above, self.mean.row(y), below, &mut self.scratch);
             let change = self.change.row_mut(y);
             change.fill(0.0);
@@ -307,9 +326,12 @@ impl Level {
         self.samples.swap(0, 1);
         let [before, now] = &mut self.samples;
         now.clear();
-        now.extend(changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)));
+        now.extend(
+            changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)),
+        );
         if before.len() == now.len() {
-            let product: f32 = now.iter().zip(before.iter()).map(|(now, before)| now * before).sum();
+            let product: f32 =
+                now.iter().zip(before.iter()).map(|(now, before)| now * before).sum();
             let squares: f32 = now.iter().chain(before.iter()).map(|change| change * change).sum();
             let told = (2.0 * product / squares.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0);
             self.persistence += (told - self.persistence) / PERSISTENCE_IMAGES;
@@ -361,7 +383,9 @@ impl CellUpdate {
         let Self { share, noise, contrast, .. } = self;
         Arch::new().dispatch(|| {
             let learnt = row.mean.iter_mut().zip(row.variance).zip(row.change);
-            for (((mean, variance), change), (now, texture)) in learnt.zip(row.now.iter().zip(row.textures)) {
+            for (((mean, variance), change), (now, texture)) in
+                learnt.zip(row.now.iter().zip(row.textures))
+            {
                 let off = now - contrast * *mean;
                 let usual = variance.max(noise);
                 *change = off / (usual + texture).sqrt();

@@ -1,14 +1,16 @@
-//! Finds what comes into the image, or moves in it, by itself (001, chapter 2).
+//! Finds what comes into the image, or moves in it, by itself (Lytvynets 2020, chapter 2).
 //!
-//! The image goes down a pyramid. On each scale ([`level`]) every cell is compared with what it has been over the last
-//! seconds: background, noise, sway of the scene, light. What stands out and did not before makes plots ([`plots`]);
-//! plots of one image after the other make candidates ([`candidates`]), of which those are found that chance, the noise
-//! and the scene's own texture explain less well than a target, by as much as one false find in so long asks for. What
-//! has been found is followed by its image from then on; here it is covered, so that it hides nothing and teaches
-//! nothing, and watched: where the background has the same, it was the scene.
+//! The image goes down a pyramid. On each scale ([`level`]) every cell is compared with what it has
+//! been over the last seconds: background, noise, sway of the scene, light. What stands out and did
+//! not before makes plots ([`plots`]); plots of one image after the other make candidates
+//! ([`candidates`]), of which those are found that chance, the noise and the scene's own texture
+//! explain less well than a target, by as much as one false find in so long asks for. What has been
+//! found is followed by its image from then on; here it is covered, so that it hides nothing and
+//! teaches nothing, and watched: where the background has the same, it was the scene.
 //!
-//! What comments say of other values of a constant is reasoned, unless they give figures: those were measured on real clips of
-//! a fixed camera, thermal and visible, as boxes within 10 px and false tracks a minute.
+//! What comments say of other values of a constant is reasoned, unless they give figures: those
+//! were measured on real clips of a fixed camera, thermal and visible, as boxes within 10 px and
+//! false tracks a minute.
 
 mod candidates;
 mod filter;
@@ -34,26 +36,29 @@ const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
 /// Fewest plots of what is found: two are a line, however far apart.
 const LEAST_PLOTS: u32 = 3;
-/// What is found has moved by more than so many times the scene's sway: a swing of twice its root mean square is common, ...
+/// What is found has moved by more than so many times the scene's sway: a swing of twice its root
+/// mean square is common, ...
 const SWAYS: f64 = 3.0;
-/// ... and twice the error of a plot's place, a cell over its strength. With half of the first hovering drones are found sooner
-/// (91.5 % of the thermal frames in place of 90.6) and no more false ones, but a mast swings as far.
+/// ... and twice the error of a plot's place, a cell over its strength. With half of the first
+/// hovering drones are found sooner (91.5 % of the thermal frames in place of 90.6) and no more
+/// false ones, but a mast swings as far.
 const PLACE_ERRORS: f64 = 2.0;
-/// Nats asked for above the odds of chance, as images of a minute are not as many as they seem: noise, clouds and leaves
-/// of one image are those of the next. With 2 it is 2.3 and 3.8 false tracks a
-/// minute (thermal, visible) in place of 1.1 and 3.1.
+/// Nats asked for above the odds of chance, as images of a minute are not as many as they seem:
+/// noise, clouds and leaves of one image are those of the next. With 2 it is 2.3 and 3.8 false
+/// tracks a minute (thermal, visible) in place of 1.1 and 3.1.
 const NOT_INDEPENDENT: f64 = 4.0;
 /// Fewest chances a minute that are reckoned with: before there has been a minute, nobody knows.
 const LEAST_CHANCES: f64 = 600.0;
-/// A known thing is covered with this much about it: a share of its sides, and px. With half of it rotors and shadows beyond the
-/// box are found as others.
+/// A known thing is covered with this much about it: a share of its sides, and px. With half of it
+/// rotors and shadows beyond the box are found as others.
 const COVER: [f64; 2] = [0.25, 2.0];
 /// Sides of a target in cells of the scale at which it stands out most.
 const TARGET_CELLS: f64 = 2.5;
 /// Half side of the part of the image in which it is told how a target stands out, cells.
 const PART_CELLS: usize = filter::SURROUNDINGS + 2;
-/// A watched thing is new in an image if the background lacks at least this share of what stands out (with half of it clouds
-/// and changing light make the scene new, with twice as much a target in front of its like is the scene), ...
+/// A watched thing is new in an image if the background lacks at least this share of what stands
+/// out (with half of it clouds and changing light make the scene new, with twice as much a target
+/// in front of its like is the scene), ...
 const NEW: f32 = 0.35;
 /// ... and if that is at least this share of the least strength of a plot.
 const STANDS_OUT: f32 = 0.7;
@@ -126,8 +131,8 @@ impl Detector {
         }
     }
 
-    /// Takes the next image, `interval` seconds after the last one. `turned` is by how much the scene has moved since the
-    /// first one: what is at (x, y) was at (x, y) plus this, px.
+    /// Takes the next image, `interval` seconds after the last one. `turned` is by how much the
+    /// scene has moved since the first one: what is at (x, y) was at (x, y) plus this, px.
     pub(crate) fn step(
         &mut self,
         image: &Plane,
@@ -171,7 +176,8 @@ impl Detector {
 
     /// Notes by how much what is watched stands out, before it is covered.
     fn watch(&mut self, known: &[Known]) {
-        self.watches.retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
+        self.watches
+            .retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
         for known in known.iter().filter(|known| known.is_watched) {
             let side = known.place.width.max(known.place.height) / TARGET_CELLS;
             let off = |level: &Level| (level.cell() as f64 / side).ln().abs();
@@ -180,10 +186,19 @@ impl Detector {
             let Some(level) = nearest else { return };
             let centre = known.place.centre();
             let place = [centre.x, centre.y];
-            let stands_out = stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
+            let stands_out =
+                stands_out_at(&self.levels[0].reduced, level, self.levels[level].cell(), place);
             match self.watches.iter_mut().find(|watch| watch.id == known.id) {
-                Some(watch) => (watch.level, watch.place, watch.stands_out) = (level, place, stands_out),
-                None => self.watches.push(Watch { id: known.id, level, place, stands_out, share_new: 1.0 }),
+                Some(watch) => {
+                    (watch.level, watch.place, watch.stands_out) = (level, place, stands_out);
+                }
+                None => self.watches.push(Watch {
+                    id: known.id,
+                    level,
+                    place,
+                    stands_out,
+                    share_new: 1.0,
+                }),
             }
         }
     }
@@ -200,7 +215,8 @@ impl Detector {
             if let Some(finer) = finer.last() {
                 halve(&finer.reduced, &mut level.reduced);
             }
-            let covered: Vec<Cells> = known.iter().map(|known| cells_of(level, &known.place)).collect();
+            let covered: Vec<Cells> =
+                known.iter().map(|known| cells_of(level, &known.place)).collect();
             level.see(moment, &covered);
         }
         if self.images > 0 {
@@ -215,14 +231,24 @@ impl Detector {
         for watch in &mut self.watches {
             let level = &self.levels[watch.level];
             let excess = watch.stands_out - level.background(watch.place);
-            let is_new = watch.stands_out.abs() > STANDS_OUT * level.least_strength() * level.spread
+            let is_new = watch.stands_out.abs()
+                > STANDS_OUT * level.least_strength() * level.spread
                 && excess.abs() >= NEW * watch.stands_out.abs();
             watch.share_new += share * (f64::from(u8::from(is_new)) - watch.share_new);
         }
-        self.watches.extract_if(.., |watch| watch.share_new < LEAST_NEW).map(|watch| watch.id).collect()
+        self.watches
+            .extract_if(.., |watch| watch.share_new < LEAST_NEW)
+            .map(|watch| watch.id)
+            .collect()
     }
 
-    fn find(&mut self, image: &Plane, interval: f64, turned: [f64; 2], known: &[Known]) -> Vec<Found> {
+    fn find(
+        &mut self,
+        image: &Plane,
+        interval: f64,
+        turned: [f64; 2],
+        known: &[Known],
+    ) -> Vec<Found> {
         plots::find(&mut self.levels, &mut self.plots);
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
         self.candidates.step(&self.plots, turned, interval, self.sides);
@@ -230,16 +256,20 @@ impl Detector {
         let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
         let sway_px = self.levels[0].sway_px();
         let is_found = |candidate: &Candidate| {
-            let moved =
-                SWAYS * sway_px + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
-            candidate.plots >= LEAST_PLOTS && candidate.gone_px > moved && candidate.log_ratio() > asked
+            let moved = SWAYS * sway_px
+                + PLACE_ERRORS * candidate.plot.cell / f64::from(candidate.plot.strength);
+            candidate.plots >= LEAST_PLOTS
+                && candidate.gone_px > moved
+                && candidate.log_ratio() > asked
         };
         let found = self.candidates.take_if(is_found);
         let found = found.iter().map(|candidate| Found {
             place: outline::outline(image, &candidate.plot),
             gone_px: candidate.gone_px,
         });
-        found.filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place))).collect()
+        found
+            .filter(|found| !known.iter().any(|known| overlap(&known.place, &found.place)))
+            .collect()
     }
 }
 
@@ -279,8 +309,9 @@ fn cells_of(level: &Level, place: &PixelBox) -> Cells {
 fn cover(reduced: &mut Plane, place: &PixelBox) {
     let sides = [reduced.width(), reduced.height()];
     let cell = CELLS[0] as f64;
-    let [first, last] = covered(place)
-        .map(|corner| [0, 1].map(|i| (corner[i] / cell).round().clamp(0.0, sides[i] as f64) as usize));
+    let [first, last] = covered(place).map(|corner| {
+        [0, 1].map(|i| (corner[i] / cell).round().clamp(0.0, sides[i] as f64) as usize)
+    });
     if first[0] >= last[0] {
         return;
     }
@@ -308,5 +339,6 @@ fn overlap(one: &PixelBox, other: &PixelBox) -> bool {
 fn touches(known: &PixelBox, plot: &Plot) -> bool {
     let ImagePoint { x, y } = known.centre();
     let reach = |side: f64| side.max(2.0 * plot.cell);
-    (plot.place.x - x).abs() <= reach(known.width) && (plot.place.y - y).abs() <= reach(known.height)
+    (plot.place.x - x).abs() <= reach(known.width)
+        && (plot.place.y - y).abs() <= reach(known.height)
 }

@@ -1,5 +1,5 @@
-//! The box of what has been found: all that differs from what is about it, brighter or darker, and is connected with
-//! the plot.
+//! The box of what has been found: all that differs from what is about it, brighter or darker, and
+//! is connected with the plot.
 
 use crossfix_correlation::Plane;
 
@@ -8,8 +8,8 @@ use crate::PixelBox;
 use crate::figure::{figure, smoothed};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Half sides of the window, the first in cells and the largest in pixels: doubled until what is found lies inside. A target of
-/// 50 px and its surroundings fit.
+/// Half sides of the window, the first in cells and the largest in pixels: doubled until what is
+/// found lies inside. A target of 50 px and its surroundings fit.
 const FIRST_REACH_CELLS: f64 = 4.0;
 const MOST_REACH: usize = 64;
 /// Sides of the box where no outline ends, in cells, and the least sides, px.
@@ -19,8 +19,8 @@ const LEAST_SIDE: f64 = 4.0;
 /// A box about what stands out at a plot.
 pub(super) fn outline(image: &Plane, plot: &Plot) -> PixelBox {
     let first = (FIRST_REACH_CELLS * plot.cell) as usize;
-    let reaches =
-        std::iter::successors(Some(first), |reach| Some(2 * reach)).take_while(|reach| *reach <= MOST_REACH);
+    let reaches = std::iter::successors(Some(first), |reach| Some(2 * reach))
+        .take_while(|reach| *reach <= MOST_REACH);
     let unknown = PixelBox::about(plot.place, UNKNOWN_CELLS * plot.cell, UNKNOWN_CELLS * plot.cell);
     reaches.filter_map(|reach| outline_within(image, plot, reach)).next().unwrap_or(unknown)
 }

@@ -7,14 +7,15 @@ use crate::ImagePoint;
 
 /// What stands out by less than this share of the change under it is not what came, but what went.
 const LEAST_OF_CHANGE: f32 = 0.5;
-/// Share of what stands out that the background does not have, least and most: less is the scene itself, and more is in the
-/// place of its opposite that went. With 0.1 a slow target is found when it has gone by a tenth of its size, with 3 the place
-/// that a target has left is another target.
+/// Share of what stands out that the background does not have, least and most: less is the scene
+/// itself, and more is in the place of its opposite that went. With 0.1 a slow target is found when
+/// it has gone by a tenth of its size, with 3 the place that a target has left is another target.
 const SHARES: [f32; 2] = [0.02, 1.5];
 /// Within so many cells one thing makes one plot: it is two or three cells large. ...
 const APART: f64 = 3.0;
-/// ... A darker ring about a bright one (and the other way round) reaches as far as its surroundings do from its ends, and has
-/// at most the share of it that a square of three cells has in one of nine, thrice: of several parts.
+/// ... A darker ring about a bright one (and the other way round) reaches as far as its
+/// surroundings do from its ends, and has at most the share of it that a square of three cells has
+/// in one of nine, thrice: of several parts.
 const RING: f64 = 7.0;
 const MOST_OF_RING: f32 = 0.4;
 /// Most plots of an image, those that stand out most. Enough for fifty targets and as much noise.
@@ -40,15 +41,16 @@ pub(super) struct Plot {
 }
 
 impl Plot {
-    /// A target is as large as two or three cells of the scale at which it stands out most; the noise of larger cells is
-    /// less, which makes up for a part of what they dilute.
+    /// A target is as large as two or three cells of the scale at which it stands out most; the
+    /// noise of larger cells is less, which makes up for a part of what they dilute.
     fn rank(&self) -> f64 {
         f64::from(self.strength) * self.cell.sqrt()
     }
 
     /// Whether a plot that stands out more makes this one.
     fn is_of(&self, other: &Self) -> bool {
-        let is_ring = self.is_brighter != other.is_brighter && self.strength < MOST_OF_RING * other.strength;
+        let is_ring =
+            self.is_brighter != other.is_brighter && self.strength < MOST_OF_RING * other.strength;
         let apart = APART * self.cell.max(other.cell);
         let reach = if is_ring { apart.max(RING * other.cell) } else { apart };
         (self.place.x - other.place.x).abs() < reach && (self.place.y - other.place.y).abs() < reach
@@ -56,7 +58,8 @@ impl Plot {
 
     /// Variance of its place, px^2 an axis.
     pub(super) fn variance(&self) -> f64 {
-        // A cell's top is known to a third of it, and a little more where the target's middle is not its top.
+        // A cell's top is known to a third of it, and a little more where the target's middle is
+        // not its top.
         (0.35 * self.cell).powi(2) + 0.1
     }
 }

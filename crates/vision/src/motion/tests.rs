@@ -9,8 +9,8 @@ const NOISE_SD: f64 = 0.1;
 /// Sides of a picture that nothing leaves, px.
 const SKY: [usize; 2] = [10_000_000; 2];
 
-/// A target whose acceleration has a standard deviation, seen through a reference that is the mean of its images, and what
-/// is believed of it.
+/// A target whose acceleration has a standard deviation, seen through a reference that is the mean
+/// of its images, and what is believed of it.
 struct Flight {
     rng: ChaCha8Rng,
     position: [f64; 2],
@@ -25,8 +25,10 @@ impl Flight {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let position = SKY.map(|side| side as f64 / 2.0);
-        let given =
-            position.map(|at| AxisMeasurement { position: at + 0.05 * normal(), variance: 0.05f64.powi(2) });
+        let given = position.map(|at| AxisMeasurement {
+            position: at + 0.05 * normal(),
+            variance: 0.05f64.powi(2),
+        });
         // The first image's own noise puts the target beside the reference's middle.
         let offset = [0, 1].map(|i| given[i].position - position[i] - NOISE_SD * normal());
         let velocity = [20.0 * normal(), 20.0 * normal()];
@@ -34,7 +36,8 @@ impl Flight {
         Self { position, velocity, offset, motion, images: 1.0, rng }
     }
 
-    /// The next image, its noise over what it is expected to be; returns the squared normalised innovation.
+    /// The next image, its noise over what it is expected to be; returns the squared normalised
+    /// innovation.
     fn step(&mut self, acceleration_sd: f64, noise_over: f64) -> f64 {
         let mut normal = || -> f64 { StandardNormal.sample(&mut self.rng) };
         for i in 0..2 {
@@ -45,8 +48,10 @@ impl Flight {
         self.motion.predict(INTERVAL, SKY);
         let noise = [0, 1].map(|_| noise_over * NOISE_SD * normal());
         let variance = self.motion.noise_factor() * NOISE_SD.powi(2);
-        let at = [0, 1]
-            .map(|i| AxisMeasurement { position: self.position[i] + self.offset[i] + noise[i], variance });
+        let at = [0, 1].map(|i| AxisMeasurement {
+            position: self.position[i] + self.offset[i] + noise[i],
+            variance,
+        });
         self.motion.tell_noise([variance; 2]);
         let surprise = self.motion.surprise(at);
         self.motion.update(&Evidence::of(at));
@@ -54,27 +59,33 @@ impl Flight {
         let place = self.motion.position();
         let share = if self.images < 20.0 { 1.0 / (self.images + 1.0) } else { 0.0 };
         for (i, at) in [place.x, place.y].into_iter().enumerate() {
-            self.offset[i] = (1.0 - share) * self.offset[i] + share * (at - self.position[i] - noise[i]);
+            self.offset[i] =
+                (1.0 - share) * self.offset[i] + share * (at - self.position[i] - noise[i]);
         }
         self.motion.learn(place, share, Some([variance; 2]));
         self.images += 1.0;
         surprise
     }
 
-    /// Squared normalised error of position and velocity of both axes: chi-square with four degrees of freedom.
+    /// Squared normalised error of position and velocity of both axes: chi-square with four degrees
+    /// of freedom.
     fn error(&self) -> f64 {
         let (place, velocity) = (self.motion.position(), self.motion.velocity());
         let off = [(place.x, velocity.x), (place.y, velocity.y)];
         (0..2)
             .map(|i| {
-                let error = nalgebra::Vector2::new(off[i].0 - self.position[i], off[i].1 - self.velocity[i]);
+                let error = nalgebra::Vector2::new(
+                    off[i].0 - self.position[i],
+                    off[i].1 - self.velocity[i],
+                );
                 (error.transpose() * self.motion.covariances()[i].try_inverse().unwrap() * error).x
             })
             .sum()
     }
 }
 
-/// Means over runs of the squared innovation and error in the last third of a second of a flight of two seconds.
+/// Means over runs of the squared innovation and error in the last third of a second of a flight of
+/// two seconds.
 fn consistency(acceleration_sd: f64) -> (f64, f64) {
     let (mut innovations, mut errors, mut count) = (0.0, 0.0, 0.0);
     for seed in 0..400 {
@@ -93,8 +104,9 @@ fn consistency(acceleration_sd: f64) -> (f64, f64) {
 
 #[test]
 fn what_is_believed_is_as_sure_as_it_is_right() {
-    // The errors of a flight are one sample, of variance 8: a standard error of 0.14. Between two ways of moving the
-    // innovations are smaller than the livelier's and larger than the calmer's, and in the mean over all as they should be.
+    // The errors of a flight are one sample, of variance 8: a standard error of 0.14. Between two
+    // ways of moving the innovations are smaller than the livelier's and larger than the calmer's,
+    // and in the mean over all as they should be.
     let livelinesses = [900.0, 600.0, 400.0, 180.0, 90.0, 36.0];
     let mut sum = 0.0;
     for acceleration_sd in livelinesses {

@@ -1,5 +1,5 @@
-//! The brightness of each pixel by an interacting multiple model filter of three models (003,
-//! section 3, table 1; errata).
+//! The brightness of each pixel by an interacting multiple model filter of three models (Solonar
+//! 2023, section 3, table 1; docs/papers.md).
 
 use pulp::{Arch, Simd, WithSimd};
 use serde::{Deserialize, Serialize};
@@ -13,8 +13,8 @@ const PARTS: usize = 5;
 /// Least probability of a model: one that has died cannot come back.
 const LEAST_PROBABILITY: f32 = 1e-6;
 
-/// The three models of 003, table 1. Brightness in levels of 8 bits, times in frames of a thirtieth of
-/// a second.
+/// The three models of Solonar 2023, table 1. Brightness in levels of 8 bits, times in frames of a
+/// thirtieth of a second.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ImmConfig {
@@ -64,8 +64,11 @@ impl ImmConfig {
             (1.0 + e * e - 2.0 * e) / (2.0 * k * k),
             (1.0 - e * e) / (2.0 * k),
         ];
-        let jumping =
-            Model { rate: ((1.0 - e) / k) as f32, keep: e as f32, noise: noise.map(|m| (m * jump) as f32) };
+        let jumping = Model {
+            rate: ((1.0 - e) / k) as f32,
+            keep: e as f32,
+            noise: noise.map(|m| (m * jump) as f32),
+        };
         [constant, drifting, jumping]
     }
 }
@@ -103,17 +106,29 @@ impl PixelImm {
             let mut first = [0.0; LANES];
             first[..pixels.len()].copy_from_slice(pixels);
             let [variance, rate_variance] = [variance, 1.0].map(Lanes::splat);
-            let state = [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
-            Block { states: [state; MODELS], probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS] }
+            let state =
+                [Lanes(first), Lanes::splat(0.0), variance, Lanes::splat(0.0), rate_variance];
+            Block {
+                states: [state; MODELS],
+                probabilities: [Lanes::splat(1.0 / MODELS as f32); MODELS],
+            }
         });
         Self { config, blocks: blocks.collect() }
     }
 
     /// Takes the measured brightnesses in, `interval` frames after the last ones, and writes the
-    /// filtered ones, steps 1 to 7 of 003, section 3. What of the slices is longer than the filters is left alone.
+    /// filtered ones, steps 1 to 7 of Solonar 2023, section 3. What of the slices is longer than
+    /// the filters is left alone.
     pub fn step(&mut self, measured: &[f32], interval: f32, variance: f32, filtered: &mut [f32]) {
         let (models, stay) = (self.config.models(interval), self.config.stay);
-        Arch::new().dispatch(Step { blocks: &mut self.blocks, models, stay, measured, variance, filtered });
+        Arch::new().dispatch(Step {
+            blocks: &mut self.blocks,
+            models,
+            stay,
+            measured,
+            variance,
+            filtered,
+        });
     }
 }
 
@@ -135,7 +150,8 @@ impl WithSimd for Step<'_> {
         for (block, (measured, filtered)) in self.blocks.iter_mut().zip(pixels) {
             let mut lane = [0.0; LANES];
             lane[..measured.len()].copy_from_slice(measured);
-            let Lanes(out) = block.step(&self.models, self.stay, Lanes(lane), Lanes::splat(self.variance));
+            let Lanes(out) =
+                block.step(&self.models, self.stay, Lanes(lane), Lanes::splat(self.variance));
             filtered.copy_from_slice(&out[..filtered.len()]);
         }
     }
@@ -144,7 +160,13 @@ impl WithSimd for Step<'_> {
 impl Block {
     /// One step of eight pixels; returns their filtered brightness.
     #[inline(always)]
-    fn step(&mut self, models: &[Model; MODELS], stay: f32, measured: Lanes, variance: Lanes) -> Lanes {
+    fn step(
+        &mut self,
+        models: &[Model; MODELS],
+        stay: f32,
+        measured: Lanes,
+        variance: Lanes,
+    ) -> Lanes {
         let leave = (1.0 - stay) / (MODELS - 1) as f32;
         let (before, states) = (self.probabilities, self.states);
         let zero = Lanes::splat(0.0);
@@ -263,6 +285,9 @@ mod tests {
         let [_, _, singer] = ImmConfig::default().models(1.0);
         // Upper triangular: the eigenvalues are 1 and e.
         assert!(singer.keep < 1.0 && singer.rate > 0.0);
-        assert!(singer.noise[0] > 0.0 && singer.noise[0] * singer.noise[2] >= singer.noise[1].powi(2) * 0.99);
+        assert!(
+            singer.noise[0] > 0.0
+                && singer.noise[0] * singer.noise[2] >= singer.noise[1].powi(2) * 0.99
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! How the reference follows the target's appearance (003): the ways that the papers name, and the
-//! mean that measures best in the loop.
+//! How the reference follows the target's appearance (Solonar 2023): the ways that the papers name,
+//! and the mean that measures best in the loop.
 
 mod imm;
 
@@ -16,19 +16,19 @@ use crate::frame::FRAME_INTERVAL;
 pub enum ReferenceStrategy {
     /// It stays the first image.
     Fixed,
-    /// Each image takes the place of the one before (003, Fig. 1).
+    /// Each image takes the place of the one before (Solonar 2023, Fig. 1).
     Replacement,
-    /// Exponential smoothing, `T+ = memory T + (1 - memory) image` (003, Fig. 2; erratum: 0.9 to 0.95
-    /// is the weight of the old).
+    /// Exponential smoothing, `T+ = memory T + (1 - memory) image` (Solonar 2023, Fig. 2; erratum:
+    /// 0.9 to 0.95 is the weight of the old).
     Smoothing {
         /// Weight of the old reference, 0 to 1.
         memory: f32,
     },
-    /// The interacting multiple model filter of each pixel (003, Fig. 3).
+    /// The interacting multiple model filter of each pixel (Solonar 2023, Fig. 3).
     PixelImm(ImmConfig),
     /// The mean of all images, and when they are many, exponential smoothing with a weight of
-    /// `least_share` for the new one; each image counts as much as it is certain to show the target.
-    /// The default.
+    /// `least_share` for the new one; each image counts as much as it is certain to show the
+    /// target. The default.
     Mean {
         /// Least weight of a new image, 0 to 1. Default 0.03.
         least_share: f32,
@@ -143,7 +143,8 @@ mod tests {
     #[test]
     fn a_mean_has_the_noise_of_a_mean() {
         let plane = Plane::from_fn(2, 2, |_, _| 0.0);
-        let mut adaptation = Adaptation::new(ReferenceStrategy::Mean { least_share: 0.0 }, &plane, 9.0, 1.0);
+        let mut adaptation =
+            Adaptation::new(ReferenceStrategy::Mean { least_share: 0.0 }, &plane, 9.0, 1.0);
         for _ in 0..8 {
             adaptation.take_in(&mut plane.clone(), &plane, 9.0, 1.0, 0.04);
         }

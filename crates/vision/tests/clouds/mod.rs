@@ -36,7 +36,8 @@ impl Scene {
         Self { rng, clouds, noise, contrast, waves }
     }
 
-    /// The image of a camera that looks `turned` pixels further right and down, with the target at a place in the scene.
+    /// The image of a camera that looks `turned` pixels further right and down, with the target at
+    /// a place in the scene.
     pub fn image(&mut self, target: Option<[f32; 2]>, turned: [f32; 2]) -> Plane {
         self.image_with(target, turned, |_, _| 0.0)
     }
@@ -53,7 +54,8 @@ impl Scene {
         let rng = &mut self.rng;
         Plane::from_fn(WIDTH, HEIGHT, |column, row| {
             let (x, y) = (column as f32 + turned[0], row as f32 + turned[1]);
-            let cloud: f32 = waves.iter().map(|[fx, fy, phase]| (fx * x + fy * y + phase).sin()).sum();
+            let cloud: f32 =
+                waves.iter().map(|[fx, fy, phase]| (fx * x + fy * y + phase).sin()).sum();
             let body = target.map_or(0.0, |[tx, ty]| {
                 let (u, v) = ((x - tx) / 4.0, (y - ty) / 2.4);
                 contrast * (-0.5 * (u * u + v * v).powi(2)).exp()

@@ -57,7 +57,8 @@ fn picture(bytes: &mut Bytes<'_>, frame: u32) -> Plane {
         (width, height) = (usize::from(bytes.next() % 64), usize::from(bytes.next() % 64));
     }
     let (level, texture) = (f32::from(bytes.next()), bytes.next());
-    let broken = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, -1e30][usize::from(texture % 5)];
+    let broken =
+        [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, -1e30][usize::from(texture % 5)];
     Plane::from_fn(width, height, |x, y| {
         let (dx, dy) = (x as f32 - 10.0 - 1.5 * frame as f32, y as f32 - 15.0);
         let scene = level + 90.0 * (-(dx * dx + dy * dy) / 10.0).exp();

@@ -30,7 +30,8 @@ pub use self::simulated::truth_frame;
 const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 /// How often the agent says how it does.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
-/// An agent that is this far behind its source is too slow for it: the fusion centre waits half a second.
+/// An agent that is this far behind its source is too slow for it: the fusion centre waits half a
+/// second.
 pub const BEHIND: Duration = Duration::from_millis(500);
 
 /// Run one camera host: find and follow targets, publish their bearings.
@@ -49,8 +50,9 @@ pub struct Args {
     /// Wait for the recorder as well.
     #[arg(long)]
     wait_for_recorder: bool,
-    /// When the source begins, seconds since the Unix epoch: the same for all agents of a replay. Without,
-    /// agents of files and scenes wait for each other, and one that is late joins those that play.
+    /// When the source begins, seconds since the Unix epoch: the same for all agents of a replay.
+    /// Without, agents of files and scenes wait for each other, and one that is late joins those
+    /// that play.
     #[arg(long, value_name = "SECONDS", value_parser = numbers::wall_time)]
     start_at: Option<f64>,
     /// Stop when stdin ends.
@@ -86,7 +88,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let file = CameraFile::load(&args.config, &args.sets)?;
     let camera = file.camera(&args.config)?;
     let network = config::load_network(&file.network)?;
-    let identity = CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
+    let identity =
+        CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
     let begins = source_begins(&file)?;
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
@@ -186,7 +189,8 @@ impl Agent {
         match &file.source {
             SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
             SourceConfig::Video { path, rate_hz, speed, .. } => {
-                let clock = FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
+                let clock =
+                    FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
@@ -201,7 +205,8 @@ impl Agent {
 
     /// Says calibration and health again when it is time.
     fn keep_up(&mut self) -> anyhow::Result<()> {
-        let due = |at: Option<Instant>, period: Duration| at.is_none_or(|at| at.elapsed() >= period);
+        let due =
+            |at: Option<Instant>, period: Duration| at.is_none_or(|at| at.elapsed() >= period);
         if due(self.calibrated_at, CALIBRATION_PERIOD) {
             self.calibrations.put(self.calibration.clone())?;
             self.calibrated_at = Some(Instant::now());
@@ -240,7 +245,10 @@ impl Agent {
 
     fn problems(&self) -> Vec<String> {
         let behind = (self.behind > BEHIND).then(|| {
-            format!("{:.1} s behind its source: this host is too slow for it", self.behind.as_secs_f64())
+            format!(
+                "{:.1} s behind its source: this host is too slow for it",
+                self.behind.as_secs_f64()
+            )
         });
         behind.into_iter().collect()
     }
@@ -343,7 +351,13 @@ impl Agent {
     }
 
     /// Publishes the recorded bearings of this camera.
-    fn replay(&mut self, path: &Path, begins: Timestamp, start: &Start, speed: f64) -> anyhow::Result<()> {
+    fn replay(
+        &mut self,
+        path: &Path,
+        begins: Timestamp,
+        start: &Start,
+        speed: f64,
+    ) -> anyhow::Result<()> {
         let pace = start.pace(speed);
         let key = Channel::Bearings(self.identity.name.clone());
         let mut lacks = Lacks::default();
@@ -369,8 +383,8 @@ impl Agent {
         Ok(())
     }
 
-    /// Says that nothing more will come, and closes; fails if the source ended by an error, or showed less
-    /// than it hid.
+    /// Says that nothing more will come, and closes; fails if the source ended by an error, or
+    /// showed less than it hid.
     fn finish(self, seen: anyhow::Result<()>) -> anyhow::Result<()> {
         self.say_health(true)?;
         let name = self.identity.name.clone();
@@ -381,7 +395,11 @@ impl Agent {
         link.close(leave)?;
         output::line(format!("camera `{name}`: {frames} frames published, {bad} bad frames"));
         seen?;
-        ensure!(bad <= frames, "camera `{name}`: {bad} of {} frames could not be decoded", frames + bad);
+        ensure!(
+            bad <= frames,
+            "camera `{name}`: {bad} of {} frames could not be decoded",
+            frames + bad
+        );
         Ok(())
     }
 }

@@ -13,8 +13,8 @@ use crate::pace::{Pace, wall_seconds};
 const POLL: Duration = Duration::from_millis(50);
 /// A recorder that is there hears an agent without a fusion centre after this long.
 const FUSION_PATIENCE: Duration = Duration::from_secs(10);
-/// Cameras wait this long for those of the network's file that are not there: time to start three of
-/// them by hand.
+/// Cameras wait this long for those of the network's file that are not there: time to start three
+/// of them by hand.
 const CAMERA_PATIENCE: Duration = Duration::from_secs(20);
 /// A source that is farther from what the site plays is of another time altogether, s: a day.
 const FARTHEST_S: f64 = 86_400.0;
@@ -22,7 +22,8 @@ const FARTHEST_S: f64 = 86_400.0;
 /// Where in the data, and when, an agent begins.
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
-    /// When the data begin by the wall's clock, seconds since the Unix epoch: what a scene counts from.
+    /// When the data begin by the wall's clock, seconds since the Unix epoch: what a scene counts
+    /// from.
     pub wall_s: f64,
     /// How far the site is in the data already, s: what lies before is not published.
     pub joined_s: f64,
@@ -36,8 +37,8 @@ impl Start {
         Self { wall_s: wall_seconds(), joined_s: 0.0, is_at_wall_time: false }
     }
 
-    /// At the beginning, at the next whole second of the wall's clock but one: agents that decide so at
-    /// the same moment begin a scene at the same time, if their hosts' clocks agree.
+    /// At the beginning, at the next whole second of the wall's clock but one: agents that decide
+    /// so at the same moment begin a scene at the same time, if their hosts' clocks agree.
     fn together() -> Self {
         Self::at_wall_time((wall_seconds() + 0.5).ceil())
     }
@@ -47,8 +48,8 @@ impl Start {
         Self { wall_s, joined_s: 0.0, is_at_wall_time: true }
     }
 
-    /// Whether what lies so far in the data is to be published: an agent that joins others is silent until
-    /// it has caught up with them.
+    /// Whether what lies so far in the data is to be published: an agent that joins others is
+    /// silent until it has caught up with them.
     pub fn is_caught_up(&self, data_s: f64, behind: Duration) -> bool {
         let has_joined = self.joined_s > 0.0;
         !has_joined || data_s >= self.joined_s && (self.is_at_wall_time || behind < BEHIND)
@@ -82,13 +83,14 @@ fn judge(health: &Health, cameras: &[CameraName]) -> Site {
             scene_begins: Timestamp::from_nanos(health.scene_begins_ns),
         };
     }
-    let is_present = |camera: &CameraName| health.present.iter().any(|name| name == camera.as_str());
+    let is_present =
+        |camera: &CameraName| health.present.iter().any(|name| name == camera.as_str());
     if cameras.iter().all(is_present) { Site::IsComplete } else { Site::Waits }
 }
 
 impl Agent {
-    /// Waits for those who must hear every frame, and for the other cameras; `None` if it was asked to
-    /// stop before.
+    /// Waits for those who must hear every frame, and for the other cameras; `None` if it was asked
+    /// to stop before.
     pub(super) fn wait(
         &mut self,
         recorder: bool,
@@ -103,13 +105,15 @@ impl Agent {
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
             lookout.look(Instant::now());
-            let [fusion, recording] =
-                [Channel::FusionAlive, Channel::RecorderAlive].map(|channel| lookout.is_here(&channel));
+            let [fusion, recording] = [Channel::FusionAlive, Channel::RecorderAlive]
+                .map(|channel| lookout.is_here(&channel));
             if fusion && (recording || !recorder) && has_ears(self)? {
                 break;
             }
             if !fusion && recording && begun.elapsed() >= FUSION_PATIENCE {
-                tracing::warn!("no fusion centre is there: beginning all the same, the recorder hears it");
+                tracing::warn!(
+                    "no fusion centre is there: beginning all the same, the recorder hears it"
+                );
                 self.appear()?;
                 return Ok(Some(Start::now()));
             }
@@ -144,10 +148,14 @@ impl Agent {
         );
         while !self.shutdown.requested() {
             if begun.elapsed() >= CAMERA_PATIENCE {
-                tracing::warn!("camera `{}` begins without cameras that are not there", self.identity.name);
+                tracing::warn!(
+                    "camera `{}` begins without cameras that are not there",
+                    self.identity.name
+                );
                 return Ok(Some(Start::now()));
             }
-            let Some(health) = reports.next(POLL).and_then(|r| decode::<Health>(&r.data).ok()) else {
+            let Some(health) = reports.next(POLL).and_then(|r| decode::<Health>(&r.data).ok())
+            else {
                 continue;
             };
             match judge(&health, &cameras) {
@@ -162,15 +170,25 @@ impl Agent {
     }
 
     /// Begins where the site is.
-    fn join(&self, file: &CameraFile, begins: Timestamp, now: Timestamp, scene_begins: Timestamp) -> Start {
+    fn join(
+        &self,
+        file: &CameraFile,
+        begins: Timestamp,
+        now: Timestamp,
+        scene_begins: Timestamp,
+    ) -> Start {
         let name = &self.identity.name;
         let is_scene = matches!(file.source, SourceConfig::Simulation { .. });
         let joined_s = now.seconds_since(if is_scene { scene_begins } else { begins });
         if !(0.0..FARTHEST_S).contains(&joined_s) {
-            tracing::warn!("camera `{name}` begins at its beginning: the site's data are of another time");
+            tracing::warn!(
+                "camera `{name}` begins at its beginning: the site's data are of another time"
+            );
             return Start::now();
         }
-        tracing::info!("camera `{name}` joins the others, {joined_s:.1} s after its source's beginning");
+        tracing::info!(
+            "camera `{name}` joins the others, {joined_s:.1} s after its source's beginning"
+        );
         Start { wall_s: scene_begins.seconds(), joined_s, is_at_wall_time: is_scene }
     }
 }

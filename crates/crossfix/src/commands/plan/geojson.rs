@@ -27,8 +27,12 @@ fn cell(frame: &LocalFrame, cell: &Cell, step_m: f64, cameras: &[PlannedCamera])
     let half = 0.5 * step_m;
     let corners = [(-half, -half), (half, -half), (half, half), (-half, half), (-half, -half)];
     let ring = corners.map(|(east, north)| position(frame, Point3::new(x + east, y + north, z)));
-    let names: Vec<&str> =
-        cell.cameras.iter().filter_map(|index| cameras.get(*index)).map(|c| c.name.as_str()).collect();
+    let names: Vec<&str> = cell
+        .cameras
+        .iter()
+        .filter_map(|index| cameras.get(*index))
+        .map(|c| c.name.as_str())
+        .collect();
     let accuracy = cell.accuracy.as_ref();
     let properties = json!({
         "kind": "cell",

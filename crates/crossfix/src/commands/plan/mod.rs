@@ -31,7 +31,8 @@ pub struct Args {
     /// The site's folder, with a file a camera (TOML).
     #[arg(value_name = "SITE_FOLDER")]
     site: PathBuf,
-    /// The volume's low corner, local ENU, metres. Default: a box round where the optical axes cross.
+    /// The volume's low corner, local ENU, metres. Default: a box round where the optical axes
+    /// cross.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, allow_hyphen_values = true, requires = "max")]
     min: Option<[f64; 3]>,
     /// The volume's high corner, local ENU, metres.
@@ -52,13 +53,15 @@ pub struct Args {
     /// Standard deviation of the cameras' positions, metres an axis.
     #[arg(long, default_value_t = 0.05, value_name = "METRES", value_parser = not_negative)]
     position_sd: f64,
-    /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its file.
+    /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
+    /// file.
     #[arg(long, value_name = "SECONDS", value_parser = not_negative)]
     clock_sd: Option<f64>,
     /// How fast targets fly, metres a second: what an error of a clock is worth.
     #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
     speed: f64,
-    /// What is known of a target's velocity beforehand: standard deviation, metres a second an axis; 0 is nothing.
+    /// What is known of a target's velocity beforehand: standard deviation, metres a second an
+    /// axis; 0 is nothing.
     #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
     velocity_prior_sd: f64,
     /// Size of the target, metres: how far it is seen; 0 is from anywhere.
@@ -76,7 +79,8 @@ pub struct Args {
     /// Write the cells, the cameras and the candidates as GeoJSON (WGS84); needs --anchor.
     #[arg(long, value_name = "FILE", requires = "anchor")]
     geojson: Option<PathBuf>,
-    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84 ellipsoid.
+    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
+    /// ellipsoid.
     #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = anchor, allow_hyphen_values = true)]
     anchor: Option<Geodetic>,
     /// Write the coloured volume as a picture for Rerun (.rrd).
@@ -85,14 +89,15 @@ pub struct Args {
 }
 
 fn window(text: &str) -> Result<f64, String> {
-    positive(text).and_then(|n| if n <= 60.0 { Ok(n) } else { Err("it must be at most 60 s".to_owned()) })
+    positive(text)
+        .and_then(|n| if n <= 60.0 { Ok(n) } else { Err("it must be at most 60 s".to_owned()) })
 }
 
 fn triple(text: &str) -> Result<[f64; 3], String> {
     let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
-    numbers
-        .try_into()
-        .map_err(|_| "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned())
+    numbers.try_into().map_err(|_| {
+        "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned()
+    })
 }
 
 fn anchor(text: &str) -> Result<Geodetic, String> {
@@ -110,7 +115,8 @@ impl Args {
             position_sd_m: self.position_sd,
             speed_mps: self.speed,
             velocity_prior_sd_mps: some(self.velocity_prior_sd),
-            target: some(self.target_size).map(|size_m| TargetSize { size_m, least_px: self.min_pixels }),
+            target: some(self.target_size)
+                .map(|size_m| TargetSize { size_m, least_px: self.min_pixels }),
             max_range_m: self.max_range,
         }
     }
@@ -161,7 +167,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         let draft = Draft::new(path, &[])?;
         picture::draw(&report, &cameras, draft.path())?;
         draft.keep()?;
-        tracing::info!("picture written to {0}; look at it with: rerun --bind 127.0.0.1 {0}", path.display());
+        tracing::info!(
+            "picture written to {0}; look at it with: rerun --bind 127.0.0.1 {0}",
+            path.display()
+        );
     }
     Ok(())
 }

@@ -1,8 +1,8 @@
 //! The figures of a plan, for programs and for people.
 
 use crossfix_evaluation::bound::{
-    Advice, Assumptions, Candidate, Cell, Contribution, PlannedCamera, Score, Summary, TargetSize, Volume,
-    advise, contributions, layers, predict, smallest_target,
+    Advice, Assumptions, Candidate, Cell, Contribution, PlannedCamera, Score, Summary, TargetSize,
+    Volume, advise, contributions, layers, predict, smallest_target,
 };
 use serde::Serialize;
 
@@ -37,8 +37,10 @@ impl Report {
     pub fn new(cameras: &[PlannedCamera], volume: &Volume, assumptions: Assumptions) -> Self {
         let cells = predict(cameras, volume, &assumptions);
         let advice = advise(cameras, volume, &assumptions);
-        let best = advice.as_ref().map(|advice| advice.best_apart(NAMED, APART * volume.diagonal_m()));
-        let smallest = |target: TargetSize| smallest_target(cameras, volume.middle(), target.least_px);
+        let best =
+            advice.as_ref().map(|advice| advice.best_apart(NAMED, APART * volume.diagonal_m()));
+        let smallest =
+            |target: TargetSize| smallest_target(cameras, volume.middle(), target.least_px);
         Self {
             smallest_target_m: assumptions.target.and_then(smallest),
             min_m: volume.min().into(),
@@ -70,7 +72,9 @@ pub fn assumed(report: &Report) -> String {
     let taken = &report.assumptions;
     let target = taken.target.map_or_else(
         || "targets of any size".to_owned(),
-        |target| format!("targets of {} m, seen where they span {} px", target.size_m, target.least_px),
+        |target| {
+            format!("targets of {} m, seen where they span {} px", target.size_m, target.least_px)
+        },
     );
     format!(
         "{} cells of {} m from {} to {} m (east, north, up)\n\
@@ -108,9 +112,14 @@ fn layer_table(report: &Report) -> String {
         ]
     };
     let mut rows = vec![head.map(str::to_owned).to_vec()];
-    let whole = report.layers.iter().all(|layer| (layer.altitude_m - layer.altitude_m.round()).abs() < 1e-6);
+    let whole = report
+        .layers
+        .iter()
+        .all(|layer| (layer.altitude_m - layer.altitude_m.round()).abs() < 1e-6);
     let decimals = if whole { 0 } else { 1 };
-    rows.extend(report.layers.iter().map(|layer| row(format!("{:.decimals$}", layer.altitude_m), layer)));
+    rows.extend(
+        report.layers.iter().map(|layer| row(format!("{:.decimals$}", layer.altitude_m), layer)),
+    );
     rows.push(row("all".to_owned(), &report.whole));
     output::table(&rows)
 }
@@ -149,8 +158,9 @@ fn median(score: &Score) -> Option<f64> {
 
 fn advice_table(report: &Report, advice: &Advice) -> String {
     let head = ["one more camera at [m]", "with a fix", "position SD [m]: 50 % of the volume"];
-    let row =
-        |name: String, score: &Score| vec![name, percent(score.fixed), output::number(median(score), 3)];
+    let row = |name: String, score: &Score| {
+        vec![name, percent(score.fixed), output::number(median(score), 3)]
+    };
     let mut rows = vec![head.map(str::to_owned).to_vec(), row("none".to_owned(), &advice.now)];
     rows.extend(report.best.iter().map(|best| row(place(best.position_m), &best.score)));
     format!(

@@ -2,9 +2,10 @@ use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Channel, Timestamp};
 
-/// What time it is in the data: the capture time heard last of each camera, and of the site. Not the
-/// greatest: one frame from the future must not move all that is said after it. Some messages do not say
-/// when they were said but since when they hold; in a recording they lie where they were said.
+/// What time it is in the data: the capture time heard last of each camera, and of the site. Not
+/// the greatest: one frame from the future must not move all that is said after it. Some messages
+/// do not say when they were said but since when they hold; in a recording they lie where they were
+/// said.
 #[derive(Debug, Default)]
 pub struct DataTime {
     cameras: BTreeMap<CameraName, Timestamp>,

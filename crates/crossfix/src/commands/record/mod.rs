@@ -27,8 +27,8 @@ pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// The recording (MCAP) to write. If it is there already it stays, and a new one is written beside
-    /// it: today-2.mcap.
+    /// The recording (MCAP) to write. If it is there already it stays, and a new one is written
+    /// beside it: today-2.mcap.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Replace a recording that is there already.
@@ -51,7 +51,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     let health = link.publisher(Channel::RecorderHealth, Delivery::Queued)?;
     let (mut writer, path) = create(&args.output, args.overwrite)?;
-    writer.sign(&Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") })?;
+    writer.sign(&Source {
+        run: link.run().to_string(),
+        host: network::host(),
+        ..Source::of("record")
+    })?;
     let mut recorder = Recorder::new(writer, &network, link.run());
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());
@@ -65,8 +69,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A new file under the name that was asked for, or under the first of `today-2.mcap`, `today-3.mcap` ..
-/// that is free: a recorder that is started again must not destroy what it recorded before.
+/// A new file under the name that was asked for, or under the first of `today-2.mcap`,
+/// `today-3.mcap` .. that is free: a recorder that is started again must not destroy what it
+/// recorded before.
 fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)> {
     // A device or a pipe has nothing that could be lost.
     if overwrite || (asked.exists() && !asked.is_file()) {

@@ -3,7 +3,9 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::time::Instant;
 
-use crossfix_message::{CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, glance};
+use crossfix_message::{
+    CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, glance,
+};
 use crossfix_recording::{Entry, RecordingError, RecordingWriter};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
@@ -67,7 +69,9 @@ impl Recorder {
     pub fn take(&mut self, received: Received) -> Result<(), RecordingError> {
         let Received { key, data, origin, at } = received;
         // It writes its own health down itself.
-        if key.channel == Channel::RecorderHealth && origin.is_some_and(|origin| origin.run == self.run) {
+        if key.channel == Channel::RecorderHealth
+            && origin.is_some_and(|origin| origin.run == self.run)
+        {
             return Ok(());
         }
         if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
@@ -77,7 +81,8 @@ impl Recorder {
             });
             return Ok(());
         }
-        let sender = origin.map_or_else(|| "an unknown program".to_owned(), |o| format!("run {}", o.run));
+        let sender =
+            origin.map_or_else(|| "an unknown program".to_owned(), |o| format!("run {}", o.run));
         if let Some(origin) = origin {
             let missing = self.reception.see(&key, origin, at);
             if missing > 0 {

@@ -28,7 +28,8 @@ pub struct Args {
     /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
     sets: Vec<String>,
-    /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the old.
+    /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the
+    /// old.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     output: Option<PathBuf>,
     /// Start this long after the first bearing, seconds of data time.
@@ -110,15 +111,18 @@ impl Range {
     }
 }
 
-/// The calibrations that hold at a range's beginning, ordered by key: each camera's last one before it, or
-/// else its first.
+/// The calibrations that hold at a range's beginning, ordered by key: each camera's last one before
+/// it, or else its first.
 fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
     let is_calibration = |key: &Key| matches!(key.channel, Channel::Calibration(_));
-    let cameras = RecordingReader::open(recording)?.keys().filter(|key| is_calibration(key)).count();
+    let cameras =
+        RecordingReader::open(recording)?.keys().filter(|key| is_calibration(key)).count();
     let mut found: BTreeMap<Key, Entry> = BTreeMap::new();
     recorded::find(recording, |entry| {
         let is_past = entry.data_time > range.from;
-        if is_calibration(&entry.key) && (!found.contains_key(&entry.key) || !range.is_whole && !is_past) {
+        if is_calibration(&entry.key)
+            && (!found.contains_key(&entry.key) || !range.is_whole && !is_past)
+        {
             found.insert(entry.key.clone(), entry);
         }
         // A torn file does not say beforehand how many there are.

@@ -117,7 +117,8 @@ impl OfflineFusion {
         if now == Timestamp::EPOCH && !ended {
             return Ok(());
         }
-        let is_due = self.healthy_at.is_none_or(|then| now.seconds_since(then).abs() >= HEALTH_PERIOD_S);
+        let is_due =
+            self.healthy_at.is_none_or(|then| now.seconds_since(then).abs() >= HEALTH_PERIOD_S);
         if !is_due && !ended {
             return Ok(());
         }
@@ -144,7 +145,8 @@ impl OfflineFusion {
             tracing::info!("{} {}", counter.name, counter.value);
         }
         let unread = ["received_malformed", "received_newer_version", "received_too_large"];
-        let unread = health.counters.iter().filter(|counter| unread.contains(&counter.name.as_str()));
+        let unread =
+            health.counters.iter().filter(|counter| unread.contains(&counter.name.as_str()));
         let unread: u64 = unread.map(|counter| counter.value).sum();
         anyhow::ensure!(
             unread < self.frames,

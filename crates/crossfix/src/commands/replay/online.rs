@@ -27,19 +27,25 @@ const SEAM_S: f64 = 0.1;
 
 /// Whether the cameras would publish it.
 fn is_cameras(channel: &Channel) -> bool {
-    !matches!(channel, Channel::Tracks | Channel::Events | Channel::FusionHealth | Channel::RecorderHealth)
+    !matches!(
+        channel,
+        Channel::Tracks | Channel::Events | Channel::FusionHealth | Channel::RecorderHealth
+    )
 }
 
 /// Publishes a range of a recording's bytes under the network's site.
 pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let network = config::load_network(network)?;
-    let Some(link) = network::open(&network, &Role::Cameras { and_fusion: args.tracks }, &shutdown)? else {
+    let Some(link) =
+        network::open(&network, &Role::Cameras { and_fusion: args.tracks }, &shutdown)?
+    else {
         return Ok(());
     };
     tracing::info!("publishing as the cameras of `{}` in {RUN_UP_S} s", link.site());
     let delivery = if args.speed > 0.0 { Delivery::Queued } else { Delivery::Every };
-    let mut stage = Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
+    let mut stage =
+        Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
     stage.appear(&network, args.tracks)?;
     let mut pass = Pass { goes_on: args.again, ..Pass::default() };
     // The run-up holds at any speed.
@@ -60,7 +66,10 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
             if !args.again || shutdown.requested() {
                 break;
             }
-            ensure!(stage.published > before, "nothing in that range can be played again and again");
+            ensure!(
+                stage.published > before,
+                "nothing in that range can be played again and again"
+            );
             pass.begin_again(range.from);
         }
     }
@@ -73,7 +82,8 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Where messages are published, each on the key that it was recorded from, in the site that listens now.
+/// Where messages are published, each on the key that it was recorded from, in the site that
+/// listens now.
 struct Stage {
     link: Link,
     delivery: Delivery,
@@ -108,7 +118,8 @@ impl Stage {
     }
 }
 
-/// One time through the recording: the first gives the recorded bytes, later ones go on in time and number.
+/// One time through the recording: the first gives the recorded bytes, later ones go on in time and
+/// number.
 #[derive(Debug, Default)]
 struct Pass {
     by_s: f64,
@@ -143,7 +154,8 @@ impl Pass {
     /// The message moved in time; `None` if it cannot be read.
     fn moved(&mut self, channel: &Channel, data: &[u8]) -> Option<Vec<u8>> {
         let by_s = self.by_s;
-        let moved = |nanos: &mut i64| *nanos = Timestamp::from_nanos(*nanos).plus_seconds(by_s).nanos();
+        let moved =
+            |nanos: &mut i64| *nanos = Timestamp::from_nanos(*nanos).plus_seconds(by_s).nanos();
         Some(match channel {
             Channel::Bearings(camera) => {
                 let mut message: BearingFrame = decode(data).ok()?;
@@ -203,8 +215,14 @@ mod tests {
         let entry = |sequence: u64| {
             let time = Timestamp::from_seconds(100.0 + sequence as f64 * 0.1);
             let frame =
-                BearingFrame { sequence, capture_time_ns: time.nanos(), ..Default::default() }.stamped();
-            Entry { key: key.clone(), data_time: time, arrival: time, data: frame.encode_unstamped() }
+                BearingFrame { sequence, capture_time_ns: time.nanos(), ..Default::default() }
+                    .stamped();
+            Entry {
+                key: key.clone(),
+                data_time: time,
+                arrival: time,
+                data: frame.encode_unstamped(),
+            }
         };
         let mut pass = Pass::default();
         let first: Vec<Entry> = (0..10).map(|k| pass.shifted(entry(k))).collect();

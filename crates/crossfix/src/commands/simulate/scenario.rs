@@ -64,14 +64,17 @@ fn table(dir: &Path, name: &str) -> anyhow::Result<csv::Writer<std::fs::File>> {
 /// exposures there are. Scoring times are those of the last camera's exposures.
 pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
     std::fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
-    let (mut detections, mut exposures) = (table(dir, "detections.csv")?, table(dir, "exposures.csv")?);
+    let (mut detections, mut exposures) =
+        (table(dir, "detections.csv")?, table(dir, "exposures.csv")?);
     let mut truth = table(dir, "truth.csv")?;
     let mut epochs = Vec::new();
     for exposure in site.bearings() {
         let (cam, scan) = (exposure.camera as u32, exposure.frame.sequence);
         // The time as the frame has it, to the nanosecond.
         let t = exposure.frame.capture_time_ns as f64 / 1e9;
-        for (det, (track, source)) in exposure.frame.tracks.iter().zip(&exposure.sources).enumerate() {
+        for (det, (track, source)) in
+            exposure.frame.tracks.iter().zip(&exposure.sources).enumerate()
+        {
             let u = turned(track.bearing.unwrap_or_default().into());
             let truth_id = source.map_or(-1, |id| id as i64);
             let sigma_rad = track.covariance_xx.sqrt();
@@ -118,7 +121,8 @@ fn description(site: &SimulatedSite, epochs: &[f64]) -> serde_json::Value {
     let about = site.description();
     let [half_x, half_y] = about.area_m.map(|side| side / 2.0);
     let [low, high] = about.heights_m;
-    let cameras: Vec<_> = site.cameras().iter().enumerate().map(|(id, c)| camera(id, c, about)).collect();
+    let cameras: Vec<_> =
+        site.cameras().iter().enumerate().map(|(id, c)| camera(id, c, about)).collect();
     json!({
         "format": FORMAT,
         "seed": about.seed,
@@ -132,7 +136,11 @@ fn description(site: &SimulatedSite, epochs: &[f64]) -> serde_json::Value {
     })
 }
 
-fn camera(id: usize, SiteCamera { camera, phase_s, .. }: &SiteCamera, site: &Site) -> serde_json::Value {
+fn camera(
+    id: usize,
+    SiteCamera { camera, phase_s, .. }: &SiteCamera,
+    site: &Site,
+) -> serde_json::Value {
     let pose = camera.pose();
     let axes = pose.rotation().matrix() * Matrix3::from_diagonal(&turned(Vector3::repeat(1.0)));
     let rows: Vec<Vec<f64>> = axes.row_iter().map(|row| row.iter().copied().collect()).collect();
@@ -160,7 +168,8 @@ mod tests {
     #[test]
     fn what_is_written_is_imported_as_it_was() {
         let dir = tempfile::tempdir().unwrap();
-        let site = Site { duration_s: 1.0, targets: 5, clutter: 2.0, ..Site::default() }.build().unwrap();
+        let site =
+            Site { duration_s: 1.0, targets: 5, clutter: 2.0, ..Site::default() }.build().unwrap();
         assert_eq!(write(&site, dir.path()).unwrap(), 120);
         let entries = scenario::read(dir.path()).unwrap();
         let mut frames = Vec::new();

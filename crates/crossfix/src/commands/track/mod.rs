@@ -21,11 +21,11 @@ use table::Table;
 /// Follow targets in a video, without a network.
 ///
 /// The table has a row for each target and frame, and an empty one for a frame without targets:
-/// frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy. Frames count from 0; x, y, w, h are the top left
-/// corner and the size of the box in pixels; ok is 1 while the target is measured or shortly predicted;
-/// us the microseconds that all targets of the frame took; id the target; certainty the probability
-/// that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy its velocity in
-/// pixels a second.
+/// frame,x,y,w,h,ok,us,id,certainty,sd_x,sd_y,vx,vy. Frames count from 0; x, y, w, h are the top
+/// left corner and the size of the box in pixels; ok is 1 while the target is measured or shortly
+/// predicted; us the microseconds that all targets of the frame took; id the target; certainty the
+/// probability that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy
+/// its velocity in pixels a second.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd\n  crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv"
@@ -33,8 +33,8 @@ use table::Table;
 pub struct Args {
     /// The video: .mp4 (H.264), .avi (Motion JPEG), .y4m, or a folder of PNG or JPEG images.
     video: PathBuf,
-    /// A target in the first frame that is followed (see --from): left,top,width,height in pixels. May
-    /// be given several times: the targets have the numbers 1, 2, ... in that order.
+    /// A target in the first frame that is followed (see --from): left,top,width,height in pixels.
+    /// May be given several times: the targets have the numbers 1, 2, ... in that order.
     #[arg(long = "box", value_name = "X,Y,W,H")]
     places: Vec<BoxArg>,
     /// Find targets, beside those of the boxes. Without a box that is done anyway.
@@ -53,7 +53,8 @@ pub struct Args {
     /// Where the target truly is (CSV with the columns frame,x,y,w,h), for that picture.
     #[arg(long, value_name = "FILE", requires = "save")]
     labels: Option<PathBuf>,
-    /// The tracker's configuration (TOML, the keys of a camera file's section `tracker`); its defaults without.
+    /// The tracker's configuration (TOML, the keys of a camera file's section `tracker`); its
+    /// defaults without.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Override a key of the configuration, e.g. margin_px=3.
@@ -89,12 +90,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut tracker = tracker(args)?;
     let clock = FrameClock { fallback_rate_hz: args.rate_hz, ..FrameClock::default() };
     let mut source = crossfix_video::open(&args.video, clock)?;
-    let inputs: Vec<&Path> = std::iter::once(&args.video).chain(&args.labels).map(PathBuf::as_path).collect();
-    let draft = |path: &Option<PathBuf>| path.as_deref().map(|path| Draft::new(path, &inputs)).transpose();
+    let inputs: Vec<&Path> =
+        std::iter::once(&args.video).chain(&args.labels).map(PathBuf::as_path).collect();
+    let draft =
+        |path: &Option<PathBuf>| path.as_deref().map(|path| Draft::new(path, &inputs)).transpose();
     let (written, drawn) = (draft(&args.csv)?, draft(&args.save)?);
     let mut table = Table::new(written.as_ref().map(Draft::path))?;
-    let picture =
-        drawn.as_ref().map(|draft| Picture::new(draft.path(), args.labels.as_deref())).transpose()?;
+    let picture = drawn
+        .as_ref()
+        .map(|draft| Picture::new(draft.path(), args.labels.as_deref()))
+        .transpose()?;
 
     let mut frames = 0_u64;
     let mut length = 0;

@@ -28,9 +28,15 @@ impl Picture {
         Ok(self.picture.finish()?)
     }
 
-    pub(super) fn show(&self, frame: &Frame, image: &Plane, tracks: &[ImageTrack]) -> anyhow::Result<()> {
+    pub(super) fn show(
+        &self,
+        frame: &Frame,
+        image: &Plane,
+        tracks: &[ImageTrack],
+    ) -> anyhow::Result<()> {
         let bytes: Vec<u8> = image.samples().iter().map(|v| v.clamp(0.0, 255.0) as u8).collect();
-        let jpeg = eye::jpeg(&bytes, image.width(), image.height()).context("cannot encode a picture")?;
+        let jpeg =
+            eye::jpeg(&bytes, image.width(), image.height()).context("cannot encode a picture")?;
         let targets: Vec<FollowedTarget> = tracks.iter().map(followed).collect();
         let label = self.labels.get(&frame.index).copied();
         self.picture.show(frame.capture.time, jpeg, &targets, label).context("cannot draw a frame")
@@ -38,7 +44,8 @@ impl Picture {
 }
 
 fn followed(track: &ImageTrack) -> FollowedTarget {
-    let PixelBox { x, y, width, height } = PixelBox::about(track.position, track.width, track.height);
+    let PixelBox { x, y, width, height } =
+        PixelBox::about(track.position, track.width, track.height);
     FollowedTarget {
         number: track.id.0,
         place: ImageBox { x, y, width, height },
@@ -59,7 +66,8 @@ fn followed(track: &ImageTrack) -> FollowedTarget {
 fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
     let context = || format!("cannot read the labels in {}", path.display());
     let mut reader = csv::Reader::from_path(path).with_context(context)?;
-    let columns: Vec<String> = reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
+    let columns: Vec<String> =
+        reader.headers().with_context(context)?.iter().map(str::to_owned).collect();
     for name in ["frame", "x", "y", "w", "h"] {
         if !columns.iter().any(|column| column.trim() == name) {
             bail!("{} has no column `{name}`; it needs frame,x,y,w,h", path.display());

@@ -18,9 +18,9 @@ impl Table {
     /// A table in a file, or on stdout.
     pub(super) fn new(path: Option<&Path>) -> anyhow::Result<Self> {
         let sink: Box<dyn Write> = match path {
-            Some(path) => {
-                Box::new(File::create(path).with_context(|| format!("cannot write {}", path.display()))?)
-            }
+            Some(path) => Box::new(
+                File::create(path).with_context(|| format!("cannot write {}", path.display()))?,
+            ),
             None => Box::new(io::stdout().lock()),
         };
         let mut writer = csv::Writer::from_writer(sink);
@@ -37,7 +37,8 @@ impl Table {
     ) -> anyhow::Result<()> {
         if tracks.is_empty() {
             let mut row = [const { String::new() }; COLUMNS.len()];
-            (row[0], row[5], row[6]) = (frame.to_string(), "0".to_owned(), format!("{microseconds:.1}"));
+            (row[0], row[5], row[6]) =
+                (frame.to_string(), "0".to_owned(), format!("{microseconds:.1}"));
             self.writer.write_record(row)?;
         }
         for track in tracks {
@@ -56,7 +57,8 @@ fn row(frame: u64, track: &ImageTrack, microseconds: f64) -> [String; COLUMNS.le
     let ok = u8::from(track.phase != TrackPhase::Searching);
     let deviation = |axis: usize| {
         let covariances = track.covariances.as_ref();
-        covariances.map_or_else(String::new, |both| format!("{:.3}", both[axis].m11.max(0.0).sqrt()))
+        covariances
+            .map_or_else(String::new, |both| format!("{:.3}", both[axis].m11.max(0.0).sqrt()))
     };
     [
         frame.to_string(),

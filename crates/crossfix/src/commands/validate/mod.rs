@@ -18,15 +18,17 @@ pub struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum What {
-    /// The image tracker: positioning, loss of track, consistency, reference strategies (000, 001, 003).
+    /// The image tracker: positioning, loss of track, consistency, reference strategies
+    /// (Herasymenko 2021, Lytvynets 2020, Solonar 2023).
     ///
-    /// Prints each figure with the paper's, ours, the Monte Carlo standard error and, where something
-    /// is asked of it, pass or fail.
+    /// Prints each figure with the paper's, ours, the Monte Carlo standard error and, where
+    /// something is asked of it, pass or fail.
     #[command(
         after_help = "Example:\n  crossfix validate tracker --runs 1000 --json tracker.json --plots plots"
     )]
     Tracker(Options),
-    /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (002, 004).
+    /// The fusion: detection, degenerate geometries, the Cramer-Rao bound, manoeuvres (Klochko
+    /// 2020, Kalinov 2019).
     ///
     /// Prints each figure with the paper's, a reference implementation's, ours, the Monte Carlo
     /// standard error and, where something is asked of it, pass or fail.
@@ -38,7 +40,7 @@ enum What {
 
 #[derive(Debug, clap::Args)]
 struct Options {
-    /// Monte Carlo runs of an experiment; the texts have 1000.
+    /// Monte Carlo runs of an experiment; the papers have 1000.
     #[arg(long, default_value_t = 200, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     runs: u32,
     /// Seed of everything random.
@@ -61,8 +63,9 @@ struct Options {
 pub fn run(what: &Args) -> anyhow::Result<()> {
     let (What::Tracker(args) | What::Fusion(args)) = &what.what;
     let options = ValidationOptions { runs: args.runs as usize, seed: args.seed };
-    let bar = ProgressBar::new(0)
-        .with_style(ProgressStyle::with_template("{elapsed_precise} [{bar:24}] {pos}/{len} {msg}")?);
+    let bar = ProgressBar::new(0).with_style(ProgressStyle::with_template(
+        "{elapsed_precise} [{bar:24}] {pos}/{len} {msg}",
+    )?);
     bar.enable_steady_tick(std::time::Duration::from_millis(200));
     let progress = |done, all, next: &str| {
         bar.set_length(all as u64);
@@ -85,7 +88,8 @@ pub fn run(what: &Args) -> anyhow::Result<()> {
         std::fs::write(path, json).with_context(|| format!("cannot write {}", path.display()))?;
     }
     if let Some(folder) = &args.plots {
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+        std::fs::create_dir_all(folder)
+            .with_context(|| format!("cannot make {}", folder.display()))?;
         for table in &tables {
             let path = folder.join(format!("{}.svg", table.name));
             plot::draw(table, &path).with_context(|| format!("cannot draw {}", path.display()))?;

@@ -1,6 +1,6 @@
 //! Tables as figures. Where series go over several places they are curves; where each has one, as
-//! those of camera layouts, they are rows with a point each. Ours are points with a bar of a standard
-//! error, the paper's figures crosses, a reference implementation's circles.
+//! those of camera layouts, they are rows with a point each. Ours are points with a bar of a
+//! standard error, the paper's figures crosses, a reference implementation's circles.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -32,7 +32,8 @@ const REFERENCE: RGBColor = RGBColor(30, 130, 60);
 /// Draws a table into an SVG file.
 pub fn draw(table: &Table, path: &Path) -> anyhow::Result<()> {
     let names: BTreeSet<&str> = table.rows.iter().map(|row| row.series.as_str()).collect();
-    let drawn = if names.len() == table.rows.len() { rows(table, path) } else { curves(table, path) };
+    let drawn =
+        if names.len() == table.rows.len() { rows(table, path) } else { curves(table, path) };
     drawn.map_err(|error| anyhow!("{error}"))
 }
 
@@ -165,8 +166,11 @@ fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
         let origin = area.get_base_pixel();
         let local = |(x, y): (i32, i32)| (x - origin.0, y - origin.1);
         whole.draw(&PathElement::new(bar.map(local), OURS.stroke_width(2)))?;
-        let marks =
-            [(Some(row.ours), Mark::Ours), (row.paper, Mark::Paper), (row.reference, Mark::Reference)];
+        let marks = [
+            (Some(row.ours), Mark::Ours),
+            (row.paper, Mark::Paper),
+            (row.reference, Mark::Reference),
+        ];
         for (value, mark) in marks.into_iter().filter_map(|(value, mark)| Some((value?, mark))) {
             mark.draw_at(&whole, local(at(value)), mark.colour())?;
         }

@@ -10,7 +10,9 @@ fn limit(limit: Option<Limit>) -> String {
         Some(Limit::AtMost(most)) => format!("<= {}", short(most)),
         Some(Limit::AtLeast(least)) => format!(">= {}", short(least)),
         Some(Limit::Between(least, most)) => format!("{} to {}", short(least), short(most)),
-        Some(Limit::Near { value, tolerance }) => format!("{} +- {}", short(value), short(tolerance)),
+        Some(Limit::Near { value, tolerance }) => {
+            format!("{} +- {}", short(value), short(tolerance))
+        }
     }
 }
 
@@ -19,9 +21,14 @@ fn short(value: f64) -> String {
     if value.abs() >= 1e7 {
         return format!("{value:.0e}");
     }
-    let digits = if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 6) };
+    let digits =
+        if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 6) };
     let text = format!("{value:.*}", digits as usize);
-    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+    if text.contains('.') {
+        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+    } else {
+        text
+    }
 }
 
 /// One table.
@@ -69,5 +76,9 @@ pub fn summary(tables: &[Table]) -> String {
     let rows = || tables.iter().flat_map(|table| &table.rows);
     let asked = rows().filter(|row| row.verdict() != Verdict::Information).count();
     let failed = rows().filter(|row| row.verdict() == Verdict::Fail).count();
-    format!("{} of {asked} figures are what they must be ({} figures in all)", asked - failed, rows().count())
+    format!(
+        "{} of {asked} figures are what they must be ({} figures in all)",
+        asked - failed,
+        rows().count()
+    )
 }

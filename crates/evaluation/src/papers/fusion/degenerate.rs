@@ -46,7 +46,12 @@ enum Degeneracy {
     OfTimes,
 }
 
-const fn reference(condition: f64, degeneracy: Degeneracy, papers: [f64; 2], map: [f64; 2]) -> Reference {
+const fn reference(
+    condition: f64,
+    degeneracy: Degeneracy,
+    papers: [f64; 2],
+    map: [f64; 2],
+) -> Reference {
     Reference { condition, degeneracy, errors: Some(ReferenceErrors { papers, map }) }
 }
 
@@ -123,7 +128,11 @@ fn answers(lines: &[TimedLine; 3]) -> [Option<Answer>; 3] {
 }
 
 /// The sight lines of the middle period.
-fn lines(layout: &Layout, target: &Target, mut noise: Option<&mut Noise>) -> Option<[TimedLine; 3]> {
+fn lines(
+    layout: &Layout,
+    target: &Target,
+    mut noise: Option<&mut Noise>,
+) -> Option<[TimedLine; 3]> {
     let cameras = layout.cameras().ok()?;
     let seen = cameras.iter().zip(layout.delays).map(|(camera, delay)| {
         let time = (PERIODS / 2) as f64 + delay;
@@ -144,7 +153,8 @@ struct Outcome {
 
 fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
     let target = Target::random(noise);
-    let (Some(noisy), Some(exact)) = (lines(layout, &target, Some(noise)), lines(layout, &target, None))
+    let (Some(noisy), Some(exact)) =
+        (lines(layout, &target, Some(noise)), lines(layout, &target, None))
     else {
         return [None; 3];
     };
@@ -207,23 +217,29 @@ fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> O
 
 /// Condition numbers, errors and what the fixes say of themselves.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
-    let (mut conditions, mut positions, mut velocities, mut says) = (vec![], vec![], vec![], vec![]);
+    let (mut conditions, mut positions, mut velocities, mut says) =
+        (vec![], vec![], vec![], vec![]);
     for (number, (layout, reference)) in LAYOUTS.iter().zip(&REFERENCES).enumerate() {
         let at = (number + 1) as f64;
         conditions.push(condition_row(layout, reference, at));
-        let runs = runs::all(CHEAP * options.runs, |index| run(layout, &mut Noise::new(options.seed, index)));
+        let runs = runs::all(CHEAP * options.runs, |index| {
+            run(layout, &mut Noise::new(options.seed, index))
+        });
         for (solver, name) in SOLVERS.into_iter().enumerate() {
-            let answered: Vec<&Outcome> = runs.iter().filter_map(|run| run[solver].as_ref()).collect();
+            let answered: Vec<&Outcome> =
+                runs.iter().filter_map(|run| run[solver].as_ref()).collect();
             let series = format!("{}: {name}", layout.name);
             let errors = reference.errors.as_ref();
             let expected = [errors.map(|e| e.papers), None, errors.map(|e| e.map)][solver];
             for (quantity, rows) in [&mut positions, &mut velocities].into_iter().enumerate() {
-                let errors: Vec<f64> = answered.iter().map(|outcome| outcome.errors[quantity]).collect();
+                let errors: Vec<f64> =
+                    answered.iter().map(|outcome| outcome.errors[quantity]).collect();
                 let figure = root_mean_square(&errors);
                 let mut row = Row::new(&series, at, figure);
                 if let Some(value) = expected.map(|expected| expected[quantity]) {
                     let digit = [0.01, 1.0][quantity];
-                    let tolerance = reference_tolerance(figure.1, errors.len(), REFERENCE_RUNS, digit);
+                    let tolerance =
+                        reference_tolerance(figure.1, errors.len(), REFERENCE_RUNS, digit);
                     row = row.reference(value);
                     row.limit = asked(solver, reference.degeneracy, value, tolerance);
                 }
@@ -232,7 +248,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             says.extend(said(&series, at, &answered, reference.degeneracy));
         }
     }
-    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "layout", y, rows };
+    let table =
+        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "layout", y, rows };
     vec![
         table(
             "degenerate-condition",
@@ -248,7 +265,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
 
 fn condition_row(layout: &Layout, reference: &Reference, at: f64) -> Row {
     let exact = lines(layout, &Target::at_rest(Point3::origin()), None);
-    let solution = exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
+    let solution =
+        exact.and_then(|[first, second, third]| triple([&first, &second, &third], VELOCITY_SD));
     let condition = solution.map_or(f64::NAN, |s| s.observability.condition_number);
     let row = Row::new(layout.name, at, (condition, 0.0));
     if reference.condition > SINGULAR {

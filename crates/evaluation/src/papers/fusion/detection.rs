@@ -1,8 +1,9 @@
-//! 002, tables 1 and 2: how well and how often the two algorithms find one and two targets.
+//! Klochko 2020, tables 1 and 2: how well and how often the two algorithms find one and two
+//! targets.
 //!
 //! The paper does not say what the noise of 0.1 m is added to: both readings are here. Nor does it
-//! give velocities, gates or how near is found: they are the reference implementation's, but for the
-//! spatial gate, which is told below.
+//! give velocities, gates or how near is found: they are the reference implementation's, but for
+//! the spatial gate, which is told below.
 
 use crossfix_filter::KinematicState;
 use crossfix_fusion::papers::{Grouping, GroupingRules, PeriodFix, TemporalGate, pair, triple};
@@ -23,13 +24,14 @@ const CHEAP: usize = 10;
 const MATCH_GATE: f64 = 4.1;
 /// Noise of each coordinate of M(i, j), m.
 const POSITION_SD: f64 = 0.1;
-/// The spatial gate of two receivers, m^2: `J <= beta`, equation 9. The lines of a true pair miss each
-/// other by what the target moves in the delay, up to 3.9 m SD, and the algorithm knows nothing of
-/// that, so the gate is four of these.
+/// The spatial gate of two receivers, m^2: `J <= beta`, equation 9. The lines of a true pair miss
+/// each other by what the target moves in the delay, up to 3.9 m SD, and the algorithm knows
+/// nothing of that, so the gate is four of these.
 const PAIR_GATE: f64 = 4.0 * 3.9 * 4.0 * 3.9;
 
-/// The scale that the rank is decided against, m/s: the paper knows nothing of velocities beforehand.
-/// With 15.6, as the targets have, half a per cent of exact periods would pass for degenerate.
+/// The scale that the rank is decided against, m/s: the paper knows nothing of velocities
+/// beforehand. With 15.6, as the targets have, half a per cent of exact periods would pass for
+/// degenerate.
 const VELOCITY_SCALE: f64 = 100.0;
 
 /// What the noise is added to.
@@ -118,7 +120,13 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
                     let velocity = (Vector3::zeros(), VelocityKnowledge::Unknown);
                     let observability = Observability::full(2, 1.0);
                     let lines = vec![one.clone(), two.clone()];
-                    fixes.push(period_fix(solution.position, velocity, Solver::Pair, observability, lines));
+                    fixes.push(period_fix(
+                        solution.position,
+                        velocity,
+                        Solver::Pair,
+                        observability,
+                        lines,
+                    ));
                 }
             }
         }
@@ -126,7 +134,8 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
             for one in first {
                 for two in second {
                     for three in third {
-                        let Some(solution) = triple([&one.1, &two.1, &three.1], VELOCITY_SCALE) else {
+                        let Some(solution) = triple([&one.1, &two.1, &three.1], VELOCITY_SCALE)
+                        else {
                             continue;
                         };
                         let velocity = (solution.velocity, VelocityKnowledge::Solved);
@@ -163,7 +172,12 @@ fn period_fix(
     PeriodFix { fix, lines }
 }
 
-fn run(cell: &Cell, reading: Reading, cameras: &[(CameraName, Camera)], noise: &mut Noise) -> Found {
+fn run(
+    cell: &Cell,
+    reading: Reading,
+    cameras: &[(CameraName, Camera)],
+    noise: &mut Noise,
+) -> Found {
     let targets: Vec<Target> = (0..cell.targets).map(|_| Target::random(noise)).collect();
     let mut grouping = Grouping::new(GroupingRules {
         periods: PERIODS,
@@ -200,7 +214,11 @@ fn run(cell: &Cell, reading: Reading, cameras: &[(CameraName, Camera)], noise: &
     let places: Vec<Point3<f64>> = targets.iter().map(|target| target.at(time)).collect();
     let distances = matched(&places, &ends);
     let near = distances.iter().filter(|&&distance| distance <= MATCH_GATE).count();
-    Found { all: near == targets.len(), counted: grouping.target_count() == targets.len(), distances }
+    Found {
+        all: near == targets.len(),
+        counted: grouping.target_count() == targets.len(),
+        distances,
+    }
 }
 
 /// The distances of targets to ends, each end for one target: the pairing of least total distance.
@@ -208,11 +226,14 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
     let distance = |t: usize, e: usize| (places[t] - ends[e]).norm();
     match (places.len(), ends.len()) {
         (_, 0) => Vec::new(),
-        (1, count) => (0..count).map(|e| distance(0, e)).min_by(f64::total_cmp).into_iter().collect(),
+        (1, count) => {
+            (0..count).map(|e| distance(0, e)).min_by(f64::total_cmp).into_iter().collect()
+        }
         (_, 1) => vec![distance(0, 0).min(distance(1, 0))],
         (_, _) => {
             // With no line shared, two targets give two groups at most.
-            let (straight, crossed) = ([distance(0, 0), distance(1, 1)], [distance(0, 1), distance(1, 0)]);
+            let (straight, crossed) =
+                ([distance(0, 0), distance(1, 1)], [distance(0, 1), distance(1, 0)]);
             let total = |pairs: &[f64; 2]| pairs.iter().sum::<f64>();
             if total(&straight) <= total(&crossed) { straight.to_vec() } else { crossed.to_vec() }
         }
@@ -248,7 +269,9 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             let receivers = if cell.receivers == 2 { "two" } else { "three" };
             let series = format!("{receivers} receivers, m = {}, {}", cell.targets, reading.name());
             let reference = cell.reference[reading as usize];
-            for (quantity, (figure, samples)) in figures(options, cell, reading).into_iter().enumerate() {
+            for (quantity, (figure, samples)) in
+                figures(options, cell, reading).into_iter().enumerate()
+            {
                 let Some(&value) = reference.get(quantity) else {
                     rows[quantity].push(Row::new(&series, cell.delays[1], figure));
                     continue;
@@ -270,12 +293,33 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             }
         }
     }
-    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "dt2, s", y, rows };
+    let table =
+        |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "dt2, s", y, rows };
     let [distances, deviations, probabilities, counts] = rows;
     vec![
-        table("detection-distance", "Mean distance from the target (002, tables 1 and 2)", "m", distances),
-        table("detection-deviation", "Its standard deviation (002, tables 1 and 2)", "m", deviations),
-        table("detection-probability", "Probability of finding all (002, tables 1 and 2)", "", probabilities),
-        table("detection-count", "Number of targets estimated rightly (002, step 5)", "share", counts),
+        table(
+            "detection-distance",
+            "Mean distance from the target (Klochko 2020, tables 1 and 2)",
+            "m",
+            distances,
+        ),
+        table(
+            "detection-deviation",
+            "Its standard deviation (Klochko 2020, tables 1 and 2)",
+            "m",
+            deviations,
+        ),
+        table(
+            "detection-probability",
+            "Probability of finding all (Klochko 2020, tables 1 and 2)",
+            "",
+            probabilities,
+        ),
+        table(
+            "detection-count",
+            "Number of targets estimated rightly (Klochko 2020, step 5)",
+            "share",
+            counts,
+        ),
     ]
 }

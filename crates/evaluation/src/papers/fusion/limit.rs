@@ -5,8 +5,8 @@ use crossfix_fusion::spatial::{TimedLine, map};
 use crossfix_fusion::{Fusion, FusionConfig, Output};
 use crossfix_geometry::{Bearing, Camera};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState, Payload,
-    Timestamp, TrackFrame, TrackState,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, ClockSource, ImageTrackState,
+    Payload, Timestamp, TrackFrame, TrackState,
 };
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
@@ -17,7 +17,8 @@ use super::super::runs::{self, Noise};
 use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
 
-/// Mean NEES of position and velocity where the covariance is honest: what 4000 runs leave to chance.
+/// Mean NEES of position and velocity where the covariance is honest: what 4000 runs leave to
+/// chance.
 const HONEST: Limit = Limit::Near { value: 6.0, tolerance: 0.15 };
 /// Standard deviation of the prior on the velocity, m/s, of the batch solution and of the fusion.
 const PRIOR_SD: f64 = 15.0;
@@ -25,8 +26,9 @@ const PRIOR_SD: f64 = 15.0;
 const DIVERGED_SDS: f64 = 10.0;
 const DIVERGED_M: f64 = 100.0;
 
-/// The least covariance of position and velocity at a time that any unbiased estimator can have from
-/// bearings of a target: the Cramer-Rao bound at the truth. `None` if they do not determine the six.
+/// The least covariance of position and velocity at a time that any unbiased estimator can have
+/// from bearings of a target: the Cramer-Rao bound at the truth. `None` if they do not determine
+/// the six.
 fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<Matrix6<f64>> {
     let mut information = FisherInformation::default();
     let noise = BearingNoise::isotropic(BEARING_SD)?;
@@ -91,7 +93,8 @@ impl Outcome {
         let time = flight.end();
         let limit = bound(&flight.exact, &flight.target, time)?;
         let truth = flight.target.at(time.seconds());
-        let (position, velocity) = (state.position() - truth, state.velocity() - flight.target.velocity);
+        let (position, velocity) =
+            (state.position() - truth, state.velocity() - flight.target.velocity);
         let error = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
         let own_sd = state.position_covariance().trace().sqrt();
         let trace = |block: usize| limit.fixed_view::<3, 3>(block, block).trace();
@@ -126,7 +129,9 @@ fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicS
     (last.time_ns == flight.end().nanos()).then_some(())?;
     let truth = flight.target.at(flight.end().seconds());
     let states = confirmed_states(&last);
-    states.into_iter().min_by(|a, b| (a.position() - truth).norm().total_cmp(&(b.position() - truth).norm()))
+    states
+        .into_iter()
+        .min_by(|a, b| (a.position() - truth).norm().total_cmp(&(b.position() - truth).norm()))
 }
 
 fn frame(seen: &Seen, camera: &CameraName) -> BearingFrame {
@@ -153,8 +158,10 @@ fn frame(seen: &Seen, camera: &CameraName) -> BearingFrame {
 
 /// The states of a frame's confirmed tracks.
 fn confirmed_states(frame: &TrackFrame) -> Vec<KinematicState> {
-    let sure =
-        frame.tracks.iter().filter(|t| matches!(t.state(), TrackState::Confirmed | TrackState::Coasting));
+    let sure = frame
+        .tracks
+        .iter()
+        .filter(|t| matches!(t.state(), TrackState::Confirmed | TrackState::Coasting));
     sure.filter_map(|track| {
         let position: Point3<f64> = track.position?.into();
         let velocity: Vector3<f64> = track.velocity?.into();
@@ -229,7 +236,12 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
     }
     let Rows { ratios, errors, consistency } = rows;
     vec![
-        table("fusion-bound", "Whole fusion: RMS error over the bound of all periods", "ratio", ratios),
+        table(
+            "fusion-bound",
+            "Whole fusion: RMS error over the bound of all periods",
+            "ratio",
+            ratios,
+        ),
         table("fusion-error", "Whole fusion: RMS error and the bound", "m, m/s", errors),
         table("fusion-nees", "Whole fusion: mean NEES, 6 is honest", "NEES", consistency),
         table("fusion-confirmed", "Whole fusion: runs with a confirmed track", "share", shares),
@@ -252,25 +264,31 @@ fn diverged(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
     Row::new(layout.name, at, (count as f64, 0.0)).limit(Limit::AtMost(0.0))
 }
 
-/// In how many runs of a layout the estimator had something to say: a fusion centre that is not told
-/// how fast targets are may take a few in a thousand for too fast.
+/// In how many runs of a layout the estimator had something to say: a fusion centre that is not
+/// told how fast targets are may take a few in a thousand for too fast.
 fn confirmed(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
-    Row::new(layout.name, at, share(outcomes.iter().map(Option::is_some))).limit(Limit::AtLeast(0.99))
+    Row::new(layout.name, at, share(outcomes.iter().map(Option::is_some)))
+        .limit(Limit::AtLeast(0.99))
 }
 
 /// The whole fusion where one period does not determine position and velocity, against the batch
 /// solution of the same bearings.
 pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
-    let [mut ratios, mut consistency, mut divergences, mut shares] = [vec![], vec![], vec![], vec![]];
+    let [mut ratios, mut consistency, mut divergences, mut shares] =
+        [vec![], vec![], vec![], vec![]];
     for (number, layout) in LAYOUTS.iter().enumerate().skip(1) {
         let at = (number + 1) as f64;
         let (ours, best) = (outcomes(options, layout, fused), outcomes(options, layout, batch));
-        let both: Vec<(&Outcome, &Outcome)> =
-            ours.iter().zip(&best).filter_map(|(ours, best)| ours.as_ref().zip(best.as_ref())).collect();
+        let both: Vec<(&Outcome, &Outcome)> = ours
+            .iter()
+            .zip(&best)
+            .filter_map(|(ours, best)| ours.as_ref().zip(best.as_ref()))
+            .collect();
         for (index, quantity) in ["position", "velocity"].into_iter().enumerate() {
             let ours: Vec<f64> = both.iter().map(|(ours, _)| ours.errors[index].powi(2)).collect();
             let best: Vec<f64> = both.iter().map(|(_, best)| best.errors[index].powi(2)).collect();
-            let row = Row::new(format!("{}: {quantity}", layout.name), at, root_ratio(&ours, &best));
+            let row =
+                Row::new(format!("{}: {quantity}", layout.name), at, root_ratio(&ours, &best));
             ratios.push(row.limit(Limit::AtMost(1.1)));
         }
         let nees: Vec<f64> = both.iter().map(|(ours, _)| ours.nees).collect();
@@ -280,9 +298,24 @@ pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
     }
     vec![
         table("fusion-degenerate", "Whole fusion: RMS error over the batch MAP's", "ratio", ratios),
-        table("fusion-degenerate-nees", "Whole fusion: mean NEES, 6 is honest", "NEES", consistency),
-        table("fusion-degenerate-diverged", "Whole fusion: runs that diverged", "runs", divergences),
-        table("fusion-degenerate-confirmed", "Whole fusion: runs with a confirmed track", "share", shares),
+        table(
+            "fusion-degenerate-nees",
+            "Whole fusion: mean NEES, 6 is honest",
+            "NEES",
+            consistency,
+        ),
+        table(
+            "fusion-degenerate-diverged",
+            "Whole fusion: runs that diverged",
+            "runs",
+            divergences,
+        ),
+        table(
+            "fusion-degenerate-confirmed",
+            "Whole fusion: runs with a confirmed track",
+            "share",
+            shares,
+        ),
     ]
 }
 

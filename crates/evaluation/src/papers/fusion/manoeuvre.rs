@@ -1,13 +1,14 @@
-//! 004, Fig. 11: what a quadcopter's sharp turns cost each filter.
+//! Kalinov 2019, Fig. 11: what a quadcopter's sharp turns cost each filter.
 //!
 //! The text has a trajectory "specified by a series of randomly selected control points" and prints
 //! no number. Here: points uniform in a box of 100 x 100 x 50 m, each at least 40 m from the one
-//! before, flown at 5 m/s on straight lines with a position measured every second, so that a leg has 8
-//! to 30 frames and a turn takes no time. Where a filter has something to tune, it is tuned for the
-//! noise at hand on other flights than those it is judged on.
+//! before, flown at 5 m/s on straight lines with a position measured every second, so that a leg
+//! has 8 to 30 frames and a turn takes no time. Where a filter has something to tune, it is tuned
+//! for the noise at hand on other flights than those it is judged on.
 
 use crossfix_filter::{
-    Imm, KinematicState, ModeRates, MotionModel, MotionModels, NormalisedInnovation, SmoothedResidual,
+    Imm, KinematicState, ModeRates, MotionModel, MotionModels, NormalisedInnovation,
+    SmoothedResidual,
 };
 use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
@@ -15,7 +16,7 @@ use super::super::ValidationOptions;
 use super::super::runs::{self, Noise};
 use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 
-/// Time between measurements, s (004: T = 1).
+/// Time between measurements, s (Kalinov 2019: T = 1).
 const STEP: f64 = 1.0;
 /// Speed, m/s.
 const SPEED: f64 = 5.0;
@@ -23,7 +24,8 @@ const SPEED: f64 = 5.0;
 const POINTS: usize = 12;
 /// Frames in which every filter settles from its start, not judged.
 const SETTLING: usize = 5;
-/// Standard deviation of everything at the start and after an alarm: `P = 1e5 I` (equations 5 and 8).
+/// Standard deviation of everything at the start and after an alarm: `P = 1e5 I` (equations 5 and
+/// 8).
 const IGNORANCE: f64 = 316.227_766_016_837_9;
 /// The text's threshold, in standard deviations of a measurement.
 const SCALE: f64 = 0.81;
@@ -46,7 +48,11 @@ impl Flight {
     fn new(deviation: f64, noise: &mut Noise) -> Self {
         let mut points: Vec<Point3<f64>> = Vec::new();
         while points.len() < POINTS {
-            let point = Point3::new(100.0 * noise.uniform(), 100.0 * noise.uniform(), 50.0 * noise.uniform());
+            let point = Point3::new(
+                100.0 * noise.uniform(),
+                100.0 * noise.uniform(),
+                50.0 * noise.uniform(),
+            );
             if points.last().is_none_or(|last| (point - last).norm() >= 40.0) {
                 points.push(point);
             }
@@ -63,7 +69,8 @@ impl Flight {
             }
             flown -= length;
         }
-        let measured = |place: &Point3<f64>| place + Vector3::from_fn(|_, _| deviation * noise.normal());
+        let measured =
+            |place: &Point3<f64>| place + Vector3::from_fn(|_, _| deviation * noise.normal());
         Self { measured: places.iter().map(measured).collect(), places, turns }
     }
 }
@@ -93,8 +100,10 @@ struct Followed {
 
 impl Method {
     fn follow(&self, flight: &Flight, deviation: f64) -> Followed {
-        let start =
-            KinematicState { mean: Vector6::zeros(), covariance: Matrix6::identity() * IGNORANCE.powi(2) };
+        let start = KinematicState {
+            mean: Vector6::zeros(),
+            covariance: Matrix6::identity() * IGNORANCE.powi(2),
+        };
         let spread = Matrix3::identity() * deviation.powi(2);
         let mut alarms = Vec::new();
         let places: Vec<Point3<f64>> = match self {
@@ -224,8 +233,8 @@ const TUNED: usize = 2;
 const NIS: usize = 6;
 const MODELS: usize = 7;
 
-/// The reference's RMS errors on x of the methods in their order at both noises, on flights that are
-/// not given; it prints 4.41 to 4.87 for the text's windows at 5 m.
+/// The reference's RMS errors on x of the methods in their order at both noises, on flights that
+/// are not given; it prints 4.41 to 4.87 for the paper's windows at 5 m.
 const REFERENCES: [[Option<f64>; 2]; 8] = [
     [Some(0.099), None],
     [Some(0.844), None],
@@ -269,7 +278,11 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
     for (index, method) in methods.iter().enumerate() {
         for (axis, label) in ["x", "y", "z"].into_iter().enumerate() {
             let roots: Vec<f64> = results.iter().map(|run| run[index].0[axis].sqrt()).collect();
-            let row = Row::new(format!("{}, {label}", method.name()), deviation, root_mean_square(&roots));
+            let row = Row::new(
+                format!("{}, {label}", method.name()),
+                deviation,
+                root_mean_square(&roots),
+            );
             let reference = REFERENCES[index][noise_number].filter(|_| axis == 0);
             errors.push(Row { reference, ..row });
         }
@@ -278,15 +291,18 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
             let row = |other: &str, figure| {
                 Row::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
             };
-            // "Much better" than a filter that knows of no manoeuvre: twice as good, or five times, in
-            // the reference. Against one that does, it loses (errata).
+            // "Much better" than a filter that knows of no manoeuvre: twice as good, or five times,
+            // in the reference. Against one that does, it loses (errata).
             ratios.push(row("low noise", over(LOW)).limit(Limit::AtMost(0.5)));
             ratios.push(row("tuned", over(TUNED)).limit(Limit::AtLeast(1.0)));
         }
         if matches!(method, Method::Smoothed(_) | Method::Nis(_)) {
-            let delays: Vec<Option<f64>> = results.iter().flat_map(|run| run[index].1.clone()).collect();
+            let delays: Vec<Option<f64>> =
+                results.iter().flat_map(|run| run[index].1.clone()).collect();
             let seen: Vec<f64> = delays.iter().flatten().copied().collect();
-            let row = |what: &str, figure| Row::new(format!("{}: {what}", method.name()), deviation, figure);
+            let row = |what: &str, figure| {
+                Row::new(format!("{}: {what}", method.name()), deviation, figure)
+            };
             if !seen.is_empty() {
                 let reference = delay_of_reference(method).filter(|_| noise_number == 0);
                 alarms.push(Row { reference, ..row("frames to the alarm", mean(&seen)) });
@@ -298,7 +314,8 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
         let name = format!("{} over {}", methods[one].name(), methods[other].name());
         Row::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
     };
-    // Which is best: the detector of innovations where turns stand out of the noise, else the models.
+    // Which is best: the detector of innovations where turns stand out of the noise, else the
+    // models.
     let turns_stand_out = SPEED * STEP > deviation;
     let worse_or_better = if turns_stand_out { Limit::AtMost(1.0) } else { Limit::AtLeast(1.0) };
     ratios.push(between(NIS, MODELS, worse_or_better));
@@ -306,8 +323,8 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
     [errors, ratios, alarms]
 }
 
-/// Frames from a turn to the alarm in the reference, in little noise; it has 2.0 to 2.2 for the text's
-/// detector.
+/// Frames from a turn to the alarm in the reference, in little noise; it has 2.0 to 2.2 for the
+/// text's detector.
 fn delay_of_reference(method: &Method) -> Option<f64> {
     match method {
         Method::Smoothed(_) => Some(2.1),
@@ -324,11 +341,22 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
             table.extend(rows);
         }
     }
-    let table = |name, title: &str, y, rows| Table { name, title: title.to_owned(), x: "noise, m", y, rows };
+    let table = |name, title: &str, y, rows| Table {
+        name,
+        title: title.to_owned(),
+        x: "noise, m",
+        y,
+        rows,
+    };
     let [errors, ratios, alarms] = tables;
     vec![
-        table("manoeuvre-error", "RMS error of the position on sharp turns (004, Fig. 11)", "m", errors),
+        table(
+            "manoeuvre-error",
+            "RMS error of the position on sharp turns (Kalinov 2019, Fig. 11)",
+            "m",
+            errors,
+        ),
         table("manoeuvre-ratio", "The same over all axes, over another filter's", "ratio", ratios),
-        table("manoeuvre-alarm", "Alarms after turns (004)", "", alarms),
+        table("manoeuvre-alarm", "Alarms after turns (Kalinov 2019)", "", alarms),
     ]
 }

@@ -1,4 +1,4 @@
-//! The fusion of 002 and the manoeuvres of 004.
+//! The fusion of Klochko 2020 and the manoeuvres of Kalinov 2019.
 
 mod degenerate;
 mod detection;
@@ -14,17 +14,22 @@ const VELOCITY_SD: f64 = 15.6;
 const REFERENCE_RUNS: usize = 300;
 
 pub(super) const EXPERIMENTS: [Experiment; 6] = [
-    Experiment { name: "detection (002, tables 1 and 2)", make: detection::tables },
+    Experiment { name: "detection (Klochko 2020, tables 1 and 2)", make: detection::tables },
     Experiment { name: "degenerate geometries, one period", make: degenerate::tables },
     Experiment { name: "bound of all periods, whole fusion", make: limit::fusion_tables },
     Experiment { name: "degenerate geometries, whole fusion", make: limit::degenerate_tables },
     Experiment { name: "bound of all periods, batch", make: limit::batch_tables },
-    Experiment { name: "manoeuvres (004, Fig. 11)", make: manoeuvre::tables },
+    Experiment { name: "manoeuvres (Kalinov 2019, Fig. 11)", make: manoeuvre::tables },
 ];
 
 /// How far ours may be from a reference figure: three standard errors of the difference, the
 /// reference's runs having the scatter that ours have over `samples` samples, and half of the
 /// reference's last digit.
-fn reference_tolerance(standard_error: f64, samples: usize, reference_samples: usize, digit: f64) -> f64 {
+fn reference_tolerance(
+    standard_error: f64,
+    samples: usize,
+    reference_samples: usize,
+    digit: f64,
+) -> f64 {
     3.0 * standard_error * (1.0 + samples as f64 / reference_samples as f64).sqrt() + digit / 2.0
 }

@@ -17,7 +17,8 @@ pub(super) const BEARING_SD: f64 = 0.1 / RANGE;
 /// Observation periods, of 1 s each.
 pub(super) const PERIODS: usize = 5;
 
-/// Elevation of the lines of sight at which three of them, 120 degrees apart, are perpendicular, deg.
+/// Elevation of the lines of sight at which three of them, 120 degrees apart, are perpendicular,
+/// deg.
 const ORTHOGONAL: f64 = 35.264_389_682_754_654;
 
 /// Three cameras round the origin, and when in each period they see.
@@ -56,7 +57,10 @@ impl Layout {
                 cy: 1999.5,
                 distortion: Distortion::None,
             };
-            Camera::new(intrinsics, Pose::looking_at(Point3::from(sight * -RANGE), Point3::origin())?)
+            Camera::new(
+                intrinsics,
+                Pose::looking_at(Point3::from(sight * -RANGE), Point3::origin())?,
+            )
         };
         self.azimuths.into_iter().map(camera).collect()
     }
@@ -84,13 +88,17 @@ pub(super) struct Target {
 }
 
 impl Target {
-    /// Uniform within 10 m of the origin on each axis in the middle of the periods, with a velocity of
-    /// [`VELOCITY_SD`]. The reference says no more than "within 10 m"; a ball, or another middle, leaves
-    /// all but coplanar lines as they are, and takes those further from its figures.
+    /// Uniform within 10 m of the origin on each axis in the middle of the periods, with a velocity
+    /// of [`VELOCITY_SD`]. The reference says no more than "within 10 m"; a ball, or another
+    /// middle, leaves all but coplanar lines as they are, and takes those further from its figures.
     pub fn random(noise: &mut Noise) -> Self {
         let middle_time = PERIODS as f64 / 2.0;
         let middle = Point3::from(Vector3::from_fn(|_, _| 20.0 * noise.uniform() - 10.0));
-        Self { middle, middle_time, velocity: Vector3::from_fn(|_, _| VELOCITY_SD * noise.normal()) }
+        Self {
+            middle,
+            middle_time,
+            velocity: Vector3::from_fn(|_, _| VELOCITY_SD * noise.normal()),
+        }
     }
 
     /// One that stays where it is.
@@ -109,7 +117,11 @@ pub(super) fn tangent_noise(noise: Option<&mut Noise>) -> Vector2<f64> {
 }
 
 /// The bearing of a place, moved by `offset` on its tangents, rad. `None` at the camera itself.
-pub(super) fn bearing(camera: &Camera, place: Point3<f64>, offset: Vector2<f64>) -> Option<Bearing> {
+pub(super) fn bearing(
+    camera: &Camera,
+    place: Point3<f64>,
+    offset: Vector2<f64>,
+) -> Option<Bearing> {
     let direction = Unit::try_new(camera.pose().camera_from_world(place), 1e-9)?;
     let moved = (direction.into_inner() + tangent_basis(&direction) * offset).normalize();
     Bearing::new(moved, Matrix2::identity() * BEARING_SD.powi(2)).ok()
