@@ -170,6 +170,7 @@ impl Fitter {
                 let changes = self.by_scale.row_mut(row).iter_mut().zip(self.by_turn.row_mut(row));
                 for (column, ((scale, turn), (by_x, by_y))) in changes.zip(slopes).enumerate() {
                     let x = column as f32 - centre[0];
+                    // d/ds T(s x, s y) and d/dphi T(R(phi) (x, y)) at s = 1, phi = 0.
                     *scale = x * by_x + y * by_y;
                     *turn = x * by_y - y * by_x;
                 }
@@ -185,6 +186,7 @@ impl Fitter {
                 Arch::new().dispatch(Products(planes))
             }
         };
+        // J'J and J'r of the planes without their means: a constant brightness is fitted along.
         let count = (width * height) as f64;
         for i in 0..PLANES {
             for j in i..PLANES {

@@ -314,6 +314,7 @@ impl WithSimd for Turned<'_> {
             for (column, out) in to.row_mut(row).iter_mut().enumerate() {
                 let u = column as f32;
                 let (x, y) = (start[0] + cos * u - sin * v, start[1] + sin * u + cos * v);
+                // Between the four samples about (x, y): along the two rows first, then down.
                 let (i, j) = (x as usize, y as usize);
                 let (fx, fy) = (x - i as f32, y - j as f32);
                 let at = j * stride + i;

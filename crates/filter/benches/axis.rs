@@ -1,6 +1,6 @@
 //! One step of a target's two Kalman filters: both axes predict and take a measurement in
 //! (Herasymenko 2021, eqs. 8-12; the thesis' chapter 7 allows 14.8 of the unit it prints, ns). With
-//! one target a step waits for the one before it; with many, as in a picture, they overlap.
+//! one target per step waits for the one before it; with many, as in a picture, they overlap.
 //!
 //! `cargo bench -p crossfix-filter`
 

@@ -168,6 +168,8 @@ impl Imm {
         self.states = states;
         let axis = along.into_inner() * along.transpose();
         for ((state, old), new) in self.states.iter_mut().zip(before.models()).zip(since.models()) {
+            // White acceleration of density q over T: q [T^3/3 T^2/2; T^2/2 T], here along one axis
+            // and for as much as the livelier model has more.
             let more = axis * (new.density - old.density).max(0.0);
             for (row, column, share) in [
                 (0, 0, interval.powi(3) / 3.0),

@@ -2,7 +2,7 @@ use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 /// Position and velocity in space with their covariance.
 ///
-/// Metres and metres a second, world frame; the order is x, y, z, vx, vy, vz.
+/// Metres and metres per second, world frame; the order is x, y, z, vx, vy, vz.
 ///
 /// ```
 /// use crossfix_filter::KinematicState;
@@ -28,7 +28,7 @@ impl KinematicState {
         Point3::from(self.mean.fixed_rows::<3>(0).into_owned())
     }
 
-    /// Velocity, metres a second.
+    /// Velocity, metres per second.
     pub fn velocity(&self) -> Vector3<f64> {
         self.mean.fixed_rows::<3>(3).into_owned()
     }
@@ -79,6 +79,7 @@ impl KinematicState {
         noise: &Matrix3<f64>,
     ) -> Option<(Self, f64)> {
         let innovation = measured - self.position();
+        // S = H P H' + R, by its Cholesky factor: nis = v' S^-1 v, K = P H' S^-1.
         let spread = self.position_covariance() + noise;
         let factor = spread.cholesky()?;
         let nis = innovation.dot(&factor.solve(&innovation));
@@ -89,6 +90,7 @@ impl KinematicState {
             mean: self.mean + gain * innovation,
             covariance: (covariance + covariance.transpose()) / 2.0,
         };
+        // -2 ln N(v; 0, S) = nis + 3 ln 2 pi + ln |S|, and |S| is the square of |L|.
         let normaliser = 3.0 * (2.0 * std::f64::consts::PI).ln()
             + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         Some((state, -(nis + normaliser) / 2.0))

@@ -13,7 +13,7 @@
 //! use crossfix_filter::{AxisFilter, AxisMeasurement};
 //!
 //! let measured = |position: f64| AxisMeasurement { position, variance: 0.25 };
-//! // Thirty images a second, and an acceleration of some 20 px/s^2.
+//! // Thirty images per second, and an acceleration of some 20 px/s^2.
 //! let interval = 1.0 / 30.0;
 //! let mut filter = AxisFilter::start(measured(10.3), measured(11.8), interval, 20.0);
 //! for (image, position) in [14.2, 15.7, 18.4, 19.9, 22.1].into_iter().enumerate() {

@@ -6,7 +6,7 @@ use pathfinding::prelude::{Matrix, kuhn_munkres};
 
 /// Gains are quantised, as the solver wants an order: steps of a millionth.
 const STEPS: f64 = 1e6;
-/// A knot of more pairs than this (all rows times all columns) is cut greedily: time is bounded.
+/// A cluster of more pairs than this (all rows times all columns) is cut greedily: time is bounded.
 const MAX_KNOT: usize = 40_000;
 
 /// A row and a column that may be paired, and what that is worth more than leaving both alone.
@@ -20,17 +20,17 @@ pub(crate) struct Candidate {
 /// The pairs (row, column) of greatest total gain, ordered by row; a gain of 0 and less is never
 /// taken.
 ///
-/// Candidates that touch no other's row or column decide themselves; only knots of several are
-/// solved as a whole, so the cost grows with the knots and not with the site.
+/// Candidates that touch no other's row or column decide themselves; only clusters of several are
+/// solved as a whole, so the cost grows with the clusters and not with the site.
 pub(crate) fn assign(candidates: &[Candidate]) -> Vec<(usize, usize)> {
     let mut pairs: Vec<(usize, usize)> =
-        knots(candidates).iter().flat_map(|knot| solve(knot)).collect();
+        clusters(candidates).iter().flat_map(|cluster| solve(cluster)).collect();
     pairs.sort_unstable();
     pairs
 }
 
 /// Groups of candidates that are linked through rows and columns.
-fn knots(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
+fn clusters(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
     let mut leader: Vec<usize> = (0..candidates.len()).collect();
     fn find(leader: &mut [usize], mut i: usize) -> usize {
         while leader[i] != i {
@@ -48,30 +48,30 @@ fn knots(candidates: &[Candidate]) -> Vec<Vec<Candidate>> {
             leader[a.max(b)] = a.min(b);
         }
     }
-    let mut knots: BTreeMap<usize, Vec<Candidate>> = BTreeMap::new();
+    let mut clusters: BTreeMap<usize, Vec<Candidate>> = BTreeMap::new();
     for (i, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.gain > 0.0) {
-        knots.entry(find(&mut leader, i)).or_default().push(*candidate);
+        clusters.entry(find(&mut leader, i)).or_default().push(*candidate);
     }
-    knots.into_values().collect()
+    clusters.into_values().collect()
 }
 
-fn solve(knot: &[Candidate]) -> Vec<(usize, usize)> {
-    if let [only] = knot {
+fn solve(cluster: &[Candidate]) -> Vec<(usize, usize)> {
+    if let [only] = cluster {
         return vec![(only.row, only.column)];
     }
     let places = |of: fn(&Candidate) -> usize| {
-        let mut values: Vec<usize> = knot.iter().map(of).collect();
+        let mut values: Vec<usize> = cluster.iter().map(of).collect();
         values.sort_unstable();
         values.dedup();
         values
     };
     let (rows, columns) = (places(|c| c.row), places(|c| c.column));
     if rows.len() * (columns.len() + rows.len()) > MAX_KNOT {
-        return greedy(knot);
+        return greedy(cluster);
     }
     // Each row has a column of its own where it gains nothing: it may stay alone.
     let mut gains = Matrix::new(rows.len(), columns.len() + rows.len(), 0i64);
-    for candidate in knot {
+    for candidate in cluster {
         let place = (rows.binary_search(&candidate.row), columns.binary_search(&candidate.column));
         if let (Ok(row), Ok(column)) = place {
             gains[(row, column)] = (candidate.gain * STEPS) as i64;
@@ -85,8 +85,8 @@ fn solve(knot: &[Candidate]) -> Vec<(usize, usize)> {
         .collect()
 }
 
-fn greedy(knot: &[Candidate]) -> Vec<(usize, usize)> {
-    let mut by_gain = knot.to_vec();
+fn greedy(cluster: &[Candidate]) -> Vec<(usize, usize)> {
+    let mut by_gain = cluster.to_vec();
     by_gain.sort_by(|a, b| {
         b.gain.total_cmp(&a.gain).then(a.row.cmp(&b.row)).then(a.column.cmp(&b.column))
     });
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_knot_too_large_is_cut_and_nobody_gets_two() {
+    fn a_cluster_too_large_is_cut_and_nobody_gets_two() {
         let side = 300;
         let gains: Vec<_> = (0..side)
             .flat_map(|r| (0..side).map(move |c| (r, c, 1.0 + ((r * 7 + c * 13) % 50) as f64)))

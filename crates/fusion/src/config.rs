@@ -78,11 +78,11 @@ pub enum Weighting {
 pub struct Bearings {
     /// `reported` (default) or `equal`.
     pub weighting: Weighting,
-    /// The standard deviation with `equal`, rad an axis. 1e-9 to 0.1. Default 0.001, a pixel of a
+    /// The standard deviation with `equal`, rad per axis. 1e-9 to 0.1. Default 0.001, a pixel of a
     /// 1000-pixel lens.
     pub equal_sd_rad: f64,
     /// What pose and lens leave unmodelled: added in square to each reported standard deviation,
-    /// rad an axis. 0 to 0.1. Default 0: calibrations are taken at their word.
+    /// rad per axis. 0 to 0.1. Default 0: calibrations are taken at their word.
     pub systematic_sd_rad: f64,
 }
 
@@ -140,7 +140,7 @@ pub struct Initiation {
     /// How long the bearings of two cameras must agree to start a track that no third camera sees,
     /// s, for `hypotheses`. 0.001 to 3600. Default 1.
     pub pair_s: f64,
-    /// Standard deviation of the velocity's prior, m/s an axis. 0.001 to 10000. Default 15.
+    /// Standard deviation of the velocity's prior, m/s per axis. 0.001 to 10000. Default 15.
     pub velocity_prior_sd_mps: f64,
     /// Fixes farther than this from a camera are ghosts, m. 0.01 to 1000000. Default 2000.
     pub max_range_m: f64,

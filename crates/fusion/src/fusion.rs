@@ -13,7 +13,7 @@ use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::site_time::{SiteTime, Turn};
 use crate::track::{Track, TrackId};
-use crate::tracker::{Happening, Tracker};
+use crate::tracker::{TrackChange, Tracker};
 use crate::uncertainty::PoseUncertainty;
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig, messages};
@@ -272,12 +272,12 @@ impl Fusion {
         if let Some(change) = camera.clock_change(&exposure) {
             self.tracker.set_clock(&exposure.camera, change);
         }
-        let mut happenings = Vec::new();
+        let mut changes = Vec::new();
         let (fittings, used) = if camera.is_excluded() {
             self.counters.count("exposures_of_excluded_cameras");
             self.tracker.compare(&exposure, camera.known())
         } else {
-            self.follow(&exposure, &mut happenings)
+            self.follow(&exposure, &mut changes)
         };
         for samples in self.tracker.draws() {
             for (camera, ratio) in self.cameras.learn_poses(&samples) {
@@ -285,8 +285,8 @@ impl Fusion {
             }
         }
         self.compare_clocks(&exposure, &used);
-        self.judge(&exposure, &fittings, outputs);
-        self.say(&exposure, happenings, outputs);
+        self.assess_camera(&exposure, &fittings, outputs);
+        self.emit_tracks(&exposure, changes, outputs);
     }
 
     /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns
@@ -294,14 +294,14 @@ impl Fusion {
     fn follow(
         &mut self,
         exposure: &Exposure,
-        happenings: &mut Vec<Happening>,
+        changes: &mut Vec<TrackChange>,
     ) -> (Fittings, Vec<(usize, TrackId)>) {
         let Self { cameras, tracker, initiator, unmet, counters, .. } = self;
         let Some(known) = cameras.known(&exposure.camera) else {
             return Default::default();
         };
         let step = tracker.step(exposure, known, cameras);
-        happenings.extend(step.happenings);
+        changes.extend(step.changes);
         let rest = Exposure { sightings: step.free, ..exposure.clone() };
         if tracker.has_sure() {
             unmet.found();
@@ -309,10 +309,10 @@ impl Fusion {
             unmet.see(&rest).into_iter().for_each(|name| counters.count(name));
         }
         for start in initiator.add(rest, &step.claims, cameras, tracker.motion()) {
-            happenings.extend(tracker.adopt(start, cameras));
+            changes.extend(tracker.adopt(start, cameras));
         }
         for start in initiator.hand_over(exposure, &step.used, known, tracker.motion()) {
-            happenings.extend(tracker.adopt(start, cameras));
+            changes.extend(tracker.adopt(start, cameras));
         }
         let seen = (step.third_differences.as_slice(), step.strangers);
         if let Some(camera) = cameras.get_mut(&exposure.camera) {
@@ -337,7 +337,12 @@ impl Fusion {
     }
 
     /// Learns from an exposure how far its camera can be believed.
-    fn judge(&mut self, exposure: &Exposure, fittings: &Fittings, outputs: &mut Vec<Output>) {
+    fn assess_camera(
+        &mut self,
+        exposure: &Exposure,
+        fittings: &Fittings,
+        outputs: &mut Vec<Output>,
+    ) {
         let judgement = self.cameras.judge(&exposure.camera, exposure.time, fittings);
         if judgement.suspects_clock {
             // Bearings compared and not used can tell.
@@ -371,22 +376,32 @@ impl Fusion {
     }
 
     /// Tells what has happened.
-    fn tell(&mut self, happenings: Vec<Happening>, time: Timestamp, outputs: &mut Vec<Output>) {
-        for happening in happenings {
-            self.counters.count(match happening.kind {
+    fn emit_events(
+        &mut self,
+        changes: Vec<TrackChange>,
+        time: Timestamp,
+        outputs: &mut Vec<Output>,
+    ) {
+        for change in changes {
+            self.counters.count(match change.kind {
                 crossfix_message::TrackEventKind::Born => "tracks_born",
                 crossfix_message::TrackEventKind::Confirmed => "tracks_confirmed",
                 crossfix_message::TrackEventKind::Merged => "tracks_merged",
                 crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
                 _ => "tracks_lost",
             });
-            outputs.push(Output::Event(messages::event(happening, time)));
+            outputs.push(Output::Event(messages::event(change, time)));
         }
     }
 
     /// Tells what has happened, and where all tracks are now.
-    fn say(&mut self, exposure: &Exposure, happenings: Vec<Happening>, outputs: &mut Vec<Output>) {
-        self.tell(happenings, exposure.time, outputs);
+    fn emit_tracks(
+        &mut self,
+        exposure: &Exposure,
+        changes: Vec<TrackChange>,
+        outputs: &mut Vec<Output>,
+    ) {
+        self.emit_events(changes, exposure.time, outputs);
         let due = self.tracker.due(exposure.time);
         let tracks: Vec<crossfix_message::Track> = due
             .iter()

@@ -5,15 +5,15 @@ use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackStat
 use crate::motion::Motion;
 use crate::spatial::Quantity;
 use crate::track::{Track, TrackStatus};
-use crate::tracker::Happening;
+use crate::tracker::TrackChange;
 
 /// Something that happened to a track.
-pub(crate) fn event(happening: Happening, time: Timestamp) -> TrackEvent {
+pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
     TrackEvent {
         time_ns: time.nanos(),
-        kind: happening.kind.into(),
-        track_id: happening.track.0,
-        other_id: happening.other.map_or(0, |id| id.0),
+        kind: change.kind.into(),
+        track_id: change.track.0,
+        other_id: change.other.map_or(0, |id| id.0),
         ..Default::default()
     }
     .stamped()

@@ -6,9 +6,9 @@ use crossfix_filter::{
 
 use crate::{ConfigError, Manoeuvres, Tracking};
 
-/// What a track's velocity may have become after a manoeuvre that a detector saw, m/s an axis.
+/// What a track's velocity may have become after a manoeuvre that a detector saw, m/s per axis.
 pub(crate) const REINITIALISED_VELOCITY_SD: f64 = 15.0;
-/// How far the position may be off by then, m an axis.
+/// How far the position may be off by then, m per axis.
 pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 
 /// The motion models of all tracks, and the detector that a new track gets.

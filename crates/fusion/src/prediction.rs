@@ -102,7 +102,7 @@ impl BearingPrediction {
     }
 
     /// Where a camera at `origin` should see a target of a state, as of the state's time; the
-    /// target may have moved by `moved` (m, standard deviation an axis) between that time and the
+    /// target may have moved by `moved` (m, standard deviation per axis) between that time and the
     /// exposure.
     pub(crate) fn of_state(
         state: &KinematicState,

@@ -142,12 +142,14 @@ impl RangeChart {
         let aside = self.direction.into_inner() + self.tangents * coordinates.fixed_rows::<2>(0);
         let (direction, length) = Unit::new_and_get(aside);
         let range = self.range * coordinates[2].exp();
+        // d (d/|d|) = (I - u u') T / |d| per coordinate across.
         let across = (self.tangents
             - direction.into_inner() * (direction.transpose() * self.tangents))
             / length;
         let mut place_by = Matrix3::zeros();
         place_by.fixed_view_mut::<3, 2>(0, 0).copy_from(&(across * range));
         place_by.set_column(2, &(direction.into_inner() * range));
+        // Velocity is kept in ranges per second, so that it scales with the unknown range.
         let velocity = (self.share + coordinates.fixed_rows::<3>(3)) * range;
         let mut state_by = Matrix6::zeros();
         state_by.fixed_view_mut::<3, 3>(0, 0).copy_from(&place_by);

@@ -289,6 +289,8 @@ impl Track {
         let before = self.imm.predicted(interval, motion.models(self.held));
         let by = model.by_position();
         let shifts = uncertainty.shifts(model, before.velocity());
+        // S = H P H' + H C s' + s C' H' + s s' + f R: the camera's errors s are in the bearing and,
+        // by the bearings that it has given before (C), in the track.
         let cross = by * self.ties_of(camera, interval).fixed_rows::<3>(0) * shifts.transpose();
         let spread = by * before.position_covariance() * by.transpose()
             + cross

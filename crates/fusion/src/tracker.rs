@@ -26,13 +26,13 @@ const MERGE_GATE: f64 = 11.34;
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Happening {
+pub(crate) struct TrackChange {
     pub(crate) kind: TrackEventKind,
     pub(crate) track: TrackId,
     pub(crate) other: Option<TrackId>,
 }
 
-impl Happening {
+impl TrackChange {
     fn new(kind: TrackEventKind, track: TrackId) -> Self {
         Self { kind, track, other: None }
     }
@@ -57,7 +57,7 @@ pub(crate) struct Tracker {
 /// What is noted while an exposure's bearings are given to the tracks.
 #[derive(Debug, Default)]
 struct Noted {
-    happenings: Vec<Happening>,
+    changes: Vec<TrackChange>,
     fittings: Fittings,
     third_differences: Vec<f64>,
 }
@@ -77,7 +77,7 @@ pub(crate) struct Step {
     pub(crate) third_differences: Vec<f64>,
     /// How many of its sightings no track has taken.
     pub(crate) strangers: usize,
-    pub(crate) happenings: Vec<Happening>,
+    pub(crate) changes: Vec<TrackChange>,
 }
 
 impl Tracker {
@@ -171,16 +171,16 @@ impl Tracker {
     }
 
     /// Goes back to a time: gives up the tracks that bearings of later times have updated.
-    pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<Happening> {
-        let mut happenings = Vec::new();
+    pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<TrackChange> {
+        let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
             track.published = None;
             if track.updated > time && track.status != TrackStatus::Lost {
                 track.status = TrackStatus::Lost;
-                happenings.push(Happening::new(TrackEventKind::Lost, track.id));
+                changes.push(TrackChange::new(TrackEventKind::Lost, track.id));
             }
         }
-        happenings
+        changes
     }
 
     /// All clocks have stepped by so much, s.
@@ -214,11 +214,11 @@ impl Tracker {
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
         // Where all cameras were silent for long, nothing has told the tracks yet that they are
         // lost.
-        let mut noted = Noted { happenings: self.review(exposure.time), ..Noted::default() };
+        let mut noted = Noted { changes: self.review(exposure.time), ..Noted::default() };
         for ids in self.in_order_of_choice() {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
         }
-        let Noted { mut happenings, fittings, third_differences } = noted;
+        let Noted { mut changes, fittings, third_differences } = noted;
         self.reacquire(exposure, known, &mut owners);
         let used =
             owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
@@ -233,10 +233,10 @@ impl Tracker {
                 free.push(sighting.clone());
             }
         }
-        happenings.extend(self.review(exposure.time));
-        happenings.extend(self.merge(exposure.time));
-        happenings.extend(self.prove(exposure.time, cameras));
-        Step { free, claims, used, fittings, third_differences, strangers, happenings }
+        changes.extend(self.review(exposure.time));
+        changes.extend(self.merge(exposure.time));
+        changes.extend(self.prove(exposure.time, cameras));
+        Step { free, claims, used, fittings, third_differences, strangers, changes }
     }
 
     /// What the cameras have seen of sure targets, by target, where it is time to compare them.

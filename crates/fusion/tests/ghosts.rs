@@ -22,7 +22,7 @@ fn quick_site() -> Vec<common::Eye> {
     eyes
 }
 
-/// Straight flights through where all cameras look, at up to 15 m/s an axis.
+/// Straight flights through where all cameras look, at up to 15 m/s per axis.
 fn crowd(count: usize, rng: &mut ChaCha8Rng) -> Vec<Path> {
     (0..count)
         .map(|_| {

@@ -170,6 +170,7 @@ impl CameraModel {
     /// `None` if it lies behind the camera.
     pub fn project(&self, direction: &Vector3<f64>) -> Option<Pixel> {
         let Intrinsics { fx, fy, cx, cy, distortion, .. } = self.intrinsics;
+        // On the plane z = 1, bent by the lens, then in pixels.
         let plane = match distortion {
             Distortion::Fisheye(k) => fisheye::project(k, direction),
             _ if direction.z <= 1e-9 => return None,

@@ -30,6 +30,7 @@ pub(crate) fn project(k: [f64; 4], direction: &Vector3<f64>) -> Vector2<f64> {
 /// the model has no inverse.
 pub(crate) fn unproject(k: [f64; 4], point: Vector2<f64>) -> Option<Vector3<f64>> {
     let wanted = point.norm();
+    // Newton's method for theta (1 + k1 theta^2 + ...) = |point|.
     let mut theta = wanted.min(std::f64::consts::PI);
     for _ in 0..50 {
         let step = (distorted_angle(k, theta) - wanted) / slope(k, theta);
@@ -38,6 +39,7 @@ pub(crate) fn unproject(k: [f64; 4], point: Vector2<f64>) -> Option<Vector3<f64>
             break;
         }
     }
+    // Where the polynomial falls again, its root is none of the lens.
     let found = (distorted_angle(k, theta) - wanted).abs() < 1e-9 && slope(k, theta) > 0.0;
     let (sin, cos) = theta.sin_cos();
     let across = if wanted > 1e-15 { point / wanted * sin } else { Vector2::zeros() };

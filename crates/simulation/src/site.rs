@@ -71,7 +71,7 @@ pub struct Site {
     /// False bearings that an exposure is expected to bring (Poisson), anywhere in the image.
     /// Default 1.
     pub clutter: f64,
-    /// Standard deviation of a bearing, rad an axis. Default 0.0005.
+    /// Standard deviation of a bearing, rad per axis. Default 0.0005.
     pub noise_rad: f64,
 }
 

@@ -22,7 +22,7 @@ const QUEUED_BATCHES: u32 = 16;
 /// The same of pictures: what a slow receiver sees is at most this much old.
 const PICTURE_BATCHES: u32 = 4;
 /// Bytes that the system holds for one receiver beyond that. Left to itself it takes four
-/// megabytes, and a receiver behind 5 kB a second would be told of tracks a quarter of an hour old
+/// megabytes, and a receiver behind 5 kB per second would be told of tracks a quarter of an hour old
 /// before it loses one.
 const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three

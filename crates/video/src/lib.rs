@@ -8,7 +8,7 @@
 //! use crossfix_message::Timestamp;
 //! use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
 //!
-//! /// A grey wall, seen ten times a second.
+//! /// A grey wall, seen ten times per second.
 //! struct Wall {
 //!     next: u64,
 //! }

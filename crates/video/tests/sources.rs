@@ -122,7 +122,7 @@ fn what_is_no_video_is_named() {
     assert!(matches!(kind(&mp4), VideoError::Damaged { .. }));
 }
 
-/// Ten frames of 64x48 at 10 a second, H.264, whole and in fragments: see `data/README.md`.
+/// Ten frames of 64x48 at 10 per second, H.264, whole and in fragments: see `data/README.md`.
 const MP4: [&[u8]; 2] = [include_bytes!("data/whole.mp4"), include_bytes!("data/fragmented.mp4")];
 
 #[test]

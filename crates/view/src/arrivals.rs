@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;
 
-/// Frames of a camera that are remembered: half a minute of 30 a second, and tracks follow within
+/// Frames of a camera that are remembered: half a minute of 30 per second, and tracks follow within
 /// one.
 const FRAMES_A_CAMERA: usize = 1000;
 

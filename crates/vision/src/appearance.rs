@@ -6,7 +6,7 @@ use crossfix_correlation::{
 };
 
 use crate::ImagePoint;
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::reference::Adaptation;
 use crate::{PixelBox, TrackerConfig};
 
@@ -45,7 +45,7 @@ pub(crate) struct Drift {
 
 /// Memory that all targets share.
 #[derive(Debug, Default)]
-pub(crate) struct Workshop {
+pub(crate) struct AppearanceScratch {
     pub(crate) resampler: Resampler,
     pub(crate) fitter: Fitter,
     memory: LowPassMemory,
@@ -136,6 +136,7 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
         let ([above, row, below], [target_above, target_row, target_below]) =
             (rows(reference), rows(target));
         for x in 1..width - 1 {
+            // Twice the central differences: hence the quarters below.
             let slopes = [row[x + 1] - row[x - 1], below[x] - above[x]];
             let of_target =
                 [target_row[x + 1] - target_row[x - 1], target_below[x] - target_above[x]];
@@ -147,6 +148,7 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
     }
     let pixels = (width.saturating_sub(2) * height.saturating_sub(2)) as f64;
     [0, 1].map(|axis| {
+        // G'T / G'G, without what the noise that both have in common adds to it.
         let steeper = (with[axis] - noise_answer * pixels) / own[axis].max(1e-12);
         steeper.max(LEAST_STEEPNESS) / contrast
     })
@@ -170,18 +172,18 @@ impl Appearance {
         place: PixelBox,
         noise: f32,
         config: &TrackerConfig,
-        workshop: &mut Workshop,
+        buffers: &mut AppearanceScratch,
     ) -> Self {
         let side = |length: f64| odd(length + 2.0 * config.margin_px);
         let (width, height) = (side(place.width), side(place.height));
         let centre = place.centre();
         let mut own = Plane::from_fn(width, height, |_, _| 0.0);
-        workshop.resampler.look(
+        buffers.resampler.look(
             image,
             View { x: centre.x, y: centre.y, scale: 1.0, turn_rad: 0.0 },
             &mut own,
         );
-        mend(&mut own);
+        replace_invalid(&mut own);
         without_mean(&mut own);
         let noise = noise * noise_kept(centre);
         let plain = Reference::new(own.clone(), Window::uniform(width, height));
@@ -207,7 +209,7 @@ impl Appearance {
             remembered: None,
             own,
         };
-        appearance.prepare(workshop);
+        appearance.prepare(buffers);
         appearance
     }
 
@@ -225,7 +227,7 @@ impl Appearance {
     }
 
     /// The look at first, to go on from.
-    pub(crate) fn at_first(&self, config: &TrackerConfig, workshop: &mut Workshop) -> Self {
+    pub(crate) fn at_first(&self, config: &TrackerConfig, buffers: &mut AppearanceScratch) -> Self {
         let (own, noise) = (self.anchor.clone(), self.anchor_noise);
         let adaptation = Adaptation::new(config.reference, &own, noise, config.noise_floor as f32);
         let mut first = Self {
@@ -237,7 +239,7 @@ impl Appearance {
             own,
             ..self.clone()
         };
-        first.prepare(workshop);
+        first.prepare(buffers);
         first
     }
 
@@ -288,13 +290,13 @@ impl Appearance {
         noise: f32,
         certainty: f32,
         interval: f64,
-        workshop: &mut Workshop,
+        buffers: &mut AppearanceScratch,
     ) -> f32 {
-        let mut view = std::mem::take(&mut workshop.view);
+        let mut view = std::mem::take(&mut buffers.view);
         view.reshape(self.own.width(), self.own.height());
         let seen = View { x: place.x, y: place.y, scale: self.scale, turn_rad: self.turn_rad };
-        workshop.resampler.look(image, seen, &mut view);
-        mend(&mut view);
+        buffers.resampler.look(image, seen, &mut view);
+        replace_invalid(&mut view);
         without_mean(&mut view);
         let noise = noise * noise_kept(place);
         let own_share =
@@ -313,11 +315,11 @@ impl Appearance {
             self.anchor_images += certainty;
             self.remembered = None;
         }
-        workshop.view = view;
+        buffers.view = view;
         self.changed += own_share.max(SHAPE_SHARE);
         if self.changed > MOST_CHANGED || anchor_share > 0.0 {
-            self.prepare(workshop);
-            self.is_like_anchor = self.compare_with_anchor(workshop);
+            self.prepare(buffers);
+            self.is_like_anchor = self.compare_with_anchor(buffers);
         }
         if self.is_like_anchor { anchor_share } else { own_share }
     }
@@ -338,13 +340,13 @@ impl Appearance {
 
     /// The working reference from the one in its own size and direction: the low-pass of least risk
     /// (Stein's estimate), scaled and turned.
-    fn prepare(&mut self, workshop: &mut Workshop) {
+    fn prepare(&mut self, buffers: &mut AppearanceScratch) {
         (self.changed, self.is_in_shape) = (0.0, true);
         let noise = self.adaptation.noise;
         let pixels = self.own.samples().len() as f32;
         let clear = pixels * noise < CLEAR_NOISE_SHARE * energy(&self.own);
         let mut least = f32::INFINITY;
-        let Workshop { memory, filtered, .. } = workshop;
+        let AppearanceScratch { memory, filtered, .. } = buffers;
         for (index, filter) in self.low_passes.iter().enumerate() {
             filter.apply(&self.own, memory, filtered);
             let taken: f32 = self
@@ -354,9 +356,12 @@ impl Appearance {
                 .zip(filtered.samples())
                 .map(|(a, b)| (a - b) * (a - b))
                 .sum();
+            // Stein's unbiased estimate of the squared error: |own - filtered|^2 + 2 sigma^2 tr(filter)
+            // - n sigma^2, as if the truth were known.
             let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
+                // Of what the filter takes away, white noise makes sigma^2 |1 - filter|^2 per pixel.
                 let noise_taken = noise * (1.0 - 2.0 * filter.own_weight() + filter.noise_gain());
                 self.taken = (taken / pixels - noise_taken).max(0.0);
                 self.smooth.copy_from(filtered);
@@ -375,7 +380,7 @@ impl Appearance {
             image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
             let middle = [width, height].map(|side| (side - 1.0) / 2.0);
             let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
-            workshop.resampler.look(
+            buffers.resampler.look(
                 smooth,
                 View { x: middle[0], y: middle[1], scale, turn_rad },
                 image,
@@ -387,14 +392,14 @@ impl Appearance {
     /// How the reference has drifted: each image was taken at an estimated place, and their errors
     /// add up; the anchor, to which almost nothing is added any more, stays. Returns whether they
     /// are alike at all.
-    fn compare_with_anchor(&mut self, workshop: &mut Workshop) -> bool {
+    fn compare_with_anchor(&mut self, buffers: &mut AppearanceScratch) -> bool {
         let index = self
             .low_passes
             .iter()
             .position(|f| f.deviation() >= ANCHOR_LOW_PASS)
             .unwrap_or(0)
             .max(self.chosen);
-        let Workshop { memory, filtered, fitter, .. } = workshop;
+        let AppearanceScratch { memory, filtered, fitter, .. } = buffers;
         let filter = &self.low_passes[index];
         if self.remembered != Some(index) {
             self.memory.update(|image| filter.apply(&self.anchor, memory, image));

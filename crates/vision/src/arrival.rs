@@ -7,7 +7,7 @@
 use crossfix_correlation::{Plane, Resampler, View};
 
 use crate::ImagePoint;
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::scene::Picture;
 
 /// What has not changed may seem to have by this share of the reference: registration, compression.
@@ -21,7 +21,7 @@ const SCENE_SHARE: f64 = 0.5;
 /// before clouds count as come, with twice as much a target that comes to where a cloud was counts
 /// as there before.
 const BEHIND: f64 = 0.35;
-/// How well the pictures are registered, px an axis.
+/// How well the pictures are registered, px per axis.
 const REGISTERED_PX: f64 = 0.25;
 /// Pixels that are one look: neighbours are blurred and compressed together, ...
 const PIXELS_A_LOOK: f64 = 4.0;
@@ -104,7 +104,7 @@ impl Comparison {
         self.now.reshape(placed.reference.width(), placed.reference.height());
         let ImagePoint { x, y } = placed.place;
         resampler.look(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
-        mend(&mut self.now);
+        replace_invalid(&mut self.now);
     }
 
     /// Compares what was looked at with what a picture has in a place. Where the target was `seen`

@@ -25,8 +25,8 @@ pub struct TrackerConfig {
     /// noise above it is measured in every image. The per-pixel filters' noises are in this unit.
     pub noise_floor: f64,
     /// Standard deviation of the white acceleration of the liveliest target, px/s^2 (Herasymenko
-    /// 2021, eq. 4: the largest acceleration by root 3). Default 900, a pixel a frame squared at 30
-    /// frames a second. How lively one is, from even flight on, is learnt of each; the papers'
+    /// 2021, eq. 4: the largest acceleration by root 3). Default 900, a pixel per frame squared at 30
+    /// frames per second. How lively one is, from even flight on, is learnt of each; the papers'
     /// algorithm takes all for the liveliest.
     pub acceleration_sd_px: f64,
     /// Standard deviation of the velocity of a target that is taken up, px/s. Default 120.

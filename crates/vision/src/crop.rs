@@ -10,7 +10,7 @@ pub(crate) const BRIGHTEST: f32 = 1e6;
 
 /// Makes broken samples (not finite, or beyond every brightness) black: one of them must not spoil
 /// a whole gate.
-pub(crate) fn mend(plane: &mut Plane) {
+pub(crate) fn replace_invalid(plane: &mut Plane) {
     let broken = |sample: &f32| u32::from(!matches!(sample.abs(), level if level <= BRIGHTEST));
     // Counting is quicker than stopping at the first.
     if plane.samples().iter().map(broken).sum::<u32>() == 0 {
@@ -29,7 +29,7 @@ const INWARDS: usize = 4;
 /// The part of an image with its upper left corner at a place, which may lie beyond the border.
 pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &mut Plane) {
     image.crop_into(corner[0], corner[1], sides[0], sides[1], part);
-    mend(part);
+    replace_invalid(part);
     let inside = |corner: isize, side: usize, all: usize| {
         let at = |edge: isize| (edge - corner).clamp(0, side as isize) as usize;
         at(0)..at(all as isize)
@@ -123,7 +123,7 @@ mod tests {
     fn broken_samples_become_black_and_others_stay() {
         let mut plane =
             Plane::from_fn(3, 2, |x, y| [[1.0, f32::NAN, 2.0], [1e30, 3.0, -1e30]][y][x]);
-        mend(&mut plane);
+        replace_invalid(&mut plane);
         assert_eq!(plane.samples(), [1.0, 0.0, 2.0, 0.0, 3.0, 0.0]);
     }
 }

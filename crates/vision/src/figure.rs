@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 
 use crossfix_correlation::Plane;
 
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::noise::{OF_MEDIAN, median};
 use crate::{ImagePoint, PixelBox};
 
@@ -129,7 +129,7 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
 /// goes on.
 pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usize; 2]) -> Plane {
     let mut part = image.crop(corner[0] - 1, corner[1] - 1, width + 2, height + 2);
-    mend(&mut part);
+    replace_invalid(&mut part);
     Plane::from_fn(width, height, |x, y| {
         (y..y + 3).map(|y| part.row(y)[x..x + 3].iter().sum::<f32>()).sum::<f32>() / 9.0
     })

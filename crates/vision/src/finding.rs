@@ -81,7 +81,7 @@ impl ImageTracker {
         let number = *id;
         *id = if is_candidate { number - 1 } else { number + 1 };
         let id = ImageTrackId(number);
-        let target = Follower::new(image, place, &mut self.bench, &self.config);
+        let target = Follower::new(image, place, &mut self.scratch, &self.config);
         let step = Step { measured: None, score: 1.0, certainty: 1.0, nis: None };
         self.tracks.push(describe(id, &target, TrackPhase::Tentative, step));
         self.followed.push(Followed {
@@ -147,7 +147,7 @@ impl ImageTracker {
         let PixelBox { x, y, width, height } = place;
         let corner = [x - width, y - height].map(|at| at as isize);
         let sides = [width, height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
-        let noise = self.bench.meter.variance_within(image, corner, sides, noise_floor as f32);
+        let noise = self.scratch.meter.variance_within(image, corner, sides, noise_floor as f32);
         meant(image, place, box_sd_px, noise.sqrt())
     }
 
@@ -218,24 +218,24 @@ impl ImageTracker {
         let frame = Frame {
             image,
             interval,
-            keepsake: None,
+            snapshot: None,
             scene: &self.scene,
             scene_moved: [0.0; 2],
             may_search: false,
             config: &self.config,
         };
-        let bench = &mut self.bench;
+        let scratch = &mut self.scratch;
         let sightings =
             self.followed.iter_mut().filter(|f| !f.is_candidate()).filter_map(|followed| {
                 let Follower::Posterior(target) = &mut followed.target else { return None };
-                let seen = target.sighting(frame, place, bench)?;
+                let seen = target.sighting(frame, place, scratch)?;
                 Some((followed, seen))
             });
         let best =
             sightings.max_by(|(_, one), (_, other)| one.log_ratio.total_cmp(&other.log_ratio));
         let Some((followed, seen)) = best else { return false };
         let Follower::Posterior(target) = &mut followed.target else { return false };
-        let step = target.go_on_at(frame, seen, &mut self.bench);
+        let step = target.go_on_at(frame, seen, &mut self.scratch);
         followed.measured_at = time;
         let track = describe(followed.id, &followed.target, TrackPhase::Tracking, step);
         if let Some(shown) = self.tracks.iter_mut().find(|shown| shown.id == followed.id) {

@@ -16,7 +16,7 @@ pub(crate) struct Frame<'a> {
     /// Time since the image before, s.
     pub(crate) interval: f64,
     /// A picture of a moment ago, in which every target was seen.
-    pub(crate) keepsake: Option<&'a Plane>,
+    pub(crate) snapshot: Option<&'a Plane>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a Scene,
     /// By how much everything in the image has moved since the scene was looked at last, as the

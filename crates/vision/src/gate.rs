@@ -11,7 +11,7 @@ use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::motion::Motion;
 use crate::posterior::{Posterior, Prior};
-use crate::target::{Target, Workbench};
+use crate::target::{Scratch, Target};
 
 /// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target
 /// cannot be seen when it cannot. A blur is shorter, a cloud longer. When it was chosen, of ten
@@ -119,28 +119,32 @@ impl Target {
         }
     }
 
-    /// The posterior over the placements in a region, of which the image is left in the bench's
+    /// The posterior over the placements in a region, of which the image is left in the scratch's
     /// gate.
     pub(crate) fn posterior(
         &self,
         frame: Frame<'_>,
         region: Region,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Posterior {
         let Frame { image, config, .. } = frame;
         let Region { origin, corner, sides, .. } = region;
-        crop(image, corner, sides, &mut bench.gate);
-        bench.correlator.statistics(&bench.gate, &self.appearance.working, &mut bench.statistics);
+        crop(image, corner, sides, &mut scratch.gate);
+        scratch.correlator.statistics(
+            &scratch.gate,
+            &self.appearance.working,
+            &mut scratch.statistics,
+        );
         let expected = self.expectation(
             self.noise,
             self.appearance.energy(),
             self.appearance.pixels(),
             config,
         );
-        log_ratios(&bench.statistics, expected, &mut bench.ratios);
-        mask_outside(&mut bench.ratios, origin, image);
+        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
+        mask_outside(&mut scratch.ratios, origin, image);
         let prior = self.prior(&self.motion, self.hidden, region, frame);
-        bench.map.of(&bench.ratios, &prior)
+        scratch.map.of(&scratch.ratios, &prior)
     }
 }
 

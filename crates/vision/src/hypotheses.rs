@@ -11,7 +11,7 @@ use crate::frame::{Frame, Step};
 use crate::gate::Region;
 use crate::motion::Motion;
 use crate::posterior::Posterior;
-use crate::target::{SEEN, Target, Workbench};
+use crate::target::{SEEN, Scratch, Target};
 use crate::{ImagePoint, TrackerConfig};
 
 /// Certainty of the best place below which the others are kept too.
@@ -117,7 +117,7 @@ impl Hypotheses {
         })
     }
 
-    /// The furthest of them from a place, px an axis.
+    /// The furthest of them from a place, px per axis.
     pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
@@ -159,12 +159,12 @@ impl Target {
     }
 
     /// Follows all places where the target may be into the image whose log ratios are in the
-    /// bench's map.
+    /// scratch's map.
     pub(crate) fn follow_hypotheses(
         &mut self,
         frame: Frame<'_>,
         region: Region,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Step {
         let config = frame.config;
         let mut before = std::mem::take(&mut self.hypotheses.all);
@@ -176,10 +176,10 @@ impl Target {
                 peak: None,
             });
         }
-        if let Some(one) = self.one_place(&before, frame, region, bench) {
-            return self.settle_on(one, frame, region, bench);
+        if let Some(one) = self.one_place(&before, frame, region, scratch) {
+            return self.settle_on(one, frame, region, scratch);
         }
-        let branches = self.branches(&before, frame, region, bench);
+        let branches = self.branches(&before, frame, region, scratch);
         self.hypotheses.all = kept(branches);
         let Some(best) = self.hypotheses.all.first().cloned() else {
             self.hypotheses.clear();
@@ -202,8 +202,8 @@ impl Target {
             h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
         };
         let sure: f64 = self.hypotheses.all.iter().filter(here).map(|h| h.weight).sum();
-        let look = self.look(column, row, region.origin, bench, config);
-        let is_there = self.doubt(frame, look, bench);
+        let look = self.look(column, row, region.origin, scratch, config);
+        let is_there = self.doubt(frame, look, scratch);
         let certainty = sure * is_there;
         self.hypotheses.doubted_s += frame.interval;
         if certainty > SEEN {
@@ -212,7 +212,7 @@ impl Target {
         } else if seen < 1.0 - DOUBT || is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
             self.missed += 1;
         }
-        self.learn(frame, look.place, look, certainty, bench);
+        self.learn(frame, look.place, look, certainty, scratch);
         self.settle(best.weight);
         let measured = (certainty > SEEN).then(|| self.measurement(&look));
         Step { measured, score: look.score, certainty, nis: None }
@@ -232,14 +232,14 @@ impl Target {
         before: &[Hypothesis],
         frame: Frame<'_>,
         region: Region,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Option<(Motion, Posterior)> {
         let near = self.peak_half();
         let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(before.len());
         let mut all = 0.0;
         for (index, hypothesis) in before.iter().enumerate() {
-            let posterior = bench.map.of(
-                &bench.ratios,
+            let posterior = scratch.map.of(
+                &scratch.ratios,
                 &self.prior(&hypothesis.motion, hypothesis.hidden, region, frame),
             );
             all += hypothesis.weight * posterior.evidence;
@@ -263,13 +263,13 @@ impl Target {
         (motion, posterior): (Motion, Posterior),
         frame: Frame<'_>,
         region: Region,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Step {
         self.motion = motion;
         self.hypotheses.clear();
         let [column, row] = posterior.peak;
-        let look = self.look(column, row, region.origin, bench, frame.config);
-        self.update(frame, &posterior, look, region.origin, bench)
+        let look = self.look(column, row, region.origin, scratch, frame.config);
+        self.update(frame, &posterior, look, region.origin, scratch)
     }
 
     /// Where each hypothesis may have gone, with their weights.
@@ -278,13 +278,13 @@ impl Target {
         before: &[Hypothesis],
         frame: Frame<'_>,
         region: Region,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Vec<Hypothesis> {
         let config = frame.config;
         let mut branches = Vec::with_capacity(before.len() * (MOST_PEAKS + 1));
         for hypothesis in before {
             let prior = self.prior(&hypothesis.motion, hypothesis.hidden, region, frame);
-            let posterior = bench.map.of(&bench.ratios, &prior);
+            let posterior = scratch.map.of(&scratch.ratios, &prior);
             let weight = hypothesis.weight * posterior.evidence;
             branches.push(Hypothesis {
                 weight: weight * posterior.unseen,
@@ -293,7 +293,7 @@ impl Target {
                 peak: None,
             });
             for _ in 0..MOST_PEAKS {
-                let (peak, part) = bench.map.take_peak(prior.near);
+                let (peak, part) = scratch.map.take_peak(prior.near);
                 let share = part.mass / posterior.evidence;
                 if share.is_nan() || share < LEAST {
                     break;

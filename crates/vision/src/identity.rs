@@ -7,7 +7,7 @@ use crate::frame::{FRAME_INTERVAL, Frame, Step};
 use crate::look::Look;
 use crate::motion::Motion;
 use crate::scene::{Picture, Scene};
-use crate::target::{Target, Workbench};
+use crate::target::{Scratch, Target};
 
 /// A target that was found again is believed after so long, s: until then a mistake costs what is
 /// known of where it went, and nothing is learnt of it.
@@ -125,7 +125,7 @@ impl Target {
         &self,
         frame: Frame<'_>,
         place: ImagePoint,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> f64 {
         let placed = Placed {
             reference: self.appearance.working.image(),
@@ -135,8 +135,8 @@ impl Target {
         };
         let longest = placed.reference.width().max(placed.reference.height()) as f64;
         let lost_since = self.identity.probation.as_ref().map(|probation| probation.picture);
-        let Workbench { workshop, comparison, .. } = bench;
-        comparison.look(frame.image, placed, &mut workshop.resampler);
+        let Scratch { buffers, comparison, .. } = scratch;
+        comparison.look(frame.image, placed, &mut buffers.resampler);
         let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
         let speed = self.identity.speed_px_s.max(self.least_speed(frame, place));
         let mut against = |picture: &Picture, then: ImagePoint| {
@@ -149,7 +149,7 @@ impl Target {
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
             }
-            comparison.with(picture, then, seen, placed, &mut workshop.resampler)
+            comparison.with(picture, then, seen, placed, &mut buffers.resampler)
         };
         let pictures = || frame.scene.pictures();
         let scene = pictures().find_map(|picture| against(picture, picture.then(place)));
@@ -189,12 +189,12 @@ impl Target {
     /// The probability that what is followed is the target and neither the scene nor noise: a chain
     /// of two states that sees whether what is at a place has come there, and stands out as the
     /// target does.
-    pub(crate) fn doubt(&mut self, frame: Frame<'_>, look: Look, bench: &mut Workbench) -> f64 {
+    pub(crate) fn doubt(&mut self, frame: Frame<'_>, look: Look, scratch: &mut Scratch) -> f64 {
         // Images that follow each other sooner tell no more together than one.
         let share = (frame.interval / FRAME_INTERVAL).min(1.0);
-        let placements = bench.ratios.samples().len() as f64;
+        let placements = scratch.ratios.samples().len() as f64;
         let above_noise = self.above_noise_log_ratio(look.contrast, placements);
-        let log_ratio = share * (self.arrival_log_ratio(frame, look.place, bench) + above_noise);
+        let log_ratio = share * (self.arrival_log_ratio(frame, look.place, scratch) + above_noise);
         let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
         let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
         let before = settled + (self.identity.is_there - settled) * kept;
@@ -217,12 +217,12 @@ impl Target {
 
     /// Follows what a search has found. If it is lost again soon it was something else, and the
     /// search goes on from what was known before.
-    pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+    pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
         if let Some(probation) = &mut self.identity.probation {
             probation.motion.predict(frame.interval, frame.sides());
             probation.unseen_s += frame.interval;
         }
-        let step = self.follow(frame, bench);
+        let step = self.follow(frame, scratch);
         if self.is_searching()
             && let Some(before) = self.identity.probation.take()
         {

@@ -55,12 +55,14 @@ impl WithSimd for LogRatios<'_> {
             self.statistics.covariance.samples().iter().zip(self.statistics.variance.samples());
         for (ratio, (covariance, variance)) in self.ratios.samples_mut().iter_mut().zip(statistics)
         {
+            // z = a / E is the contrast that fits best, u = v / E the variance of it.
             let z = covariance * pixels * per_energy;
             let excess = own.max(variance * pixels - flat) * per_mismatch;
             let u = (noise * noise + excess * excess).sqrt() * per_energy;
             let positive = z.max(0.0);
             let miss = z - contrast;
             let spread = contrast_variance + u;
+            // ln N(z; contrast, s + u) - ln N(z; 0, u), where z > 0.
             *ratio = positive * positive / (2.0 * u)
                 - miss * miss / (2.0 * spread)
                 - 0.5 * lanes::ln(spread / u);

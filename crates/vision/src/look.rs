@@ -5,7 +5,7 @@ use crossfix_filter::AxisMeasurement;
 use nalgebra::Matrix2;
 
 use crate::appearance::Drift;
-use crate::target::{LEAST_MEASUREMENT_SD, Target, Workbench};
+use crate::target::{LEAST_MEASUREMENT_SD, Scratch, Target};
 use crate::{ImagePoint, TrackerConfig};
 
 /// What noise and the reference do not explain is something else before the target: parts of it, of
@@ -45,14 +45,16 @@ impl Target {
         column: usize,
         row: usize,
         origin: [f64; 2],
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
         config: &TrackerConfig,
     ) -> Look {
         let working = &self.appearance.working;
         let freedom = if config.follow_shape { Freedom::ShiftScaleTurn } else { Freedom::Shift };
         let options = FitOptions { steps: 2, freedom, ..FitOptions::default() };
         let fit =
-            bench.workshop.fitter.fit(&bench.gate, working, column as f64, row as f64, options);
+            scratch.buffers.fitter.fit(&scratch.gate, working, column as f64, row as f64, options);
+        // What of the residuals the image's noise explains, to two of its standard deviations, and
+        // the reference's own noise; the rest is of another kind, and lies in connected parts.
         let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
         let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
         let contrast = fit.gain.max(least_contrast);
@@ -62,6 +64,7 @@ impl Target {
         let unexplained = (fit.residual_variance - explained - expected).max(0.0);
         let noise = image_noise + PIXELS_A_PART * unexplained;
         let covariance = self.covariance(&fit, self.motion.noise_factor() * noise, contrast);
+        // The reference may have moved off its anchor meanwhile.
         let drift = self.appearance.in_image(self.appearance.drift);
         let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
         let scaled = noise * (fit.gain / contrast).powi(2);
@@ -69,6 +72,7 @@ impl Target {
         let shape = fit.shape_variances(scaled).map(|[scale, turn]| {
             [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]
         });
+        // The correlation coefficient sqrt(signal / (signal + what is neither signal nor noise)).
         let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
         let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
         let score = (energy / (energy + rest + 1e-12)).sqrt();

@@ -5,7 +5,7 @@
 //! too.
 
 use crate::TrackerConfig;
-use crate::appearance::{Appearance, Workshop};
+use crate::appearance::{Appearance, AppearanceScratch};
 use crate::search::Background;
 use crate::target::Target;
 
@@ -38,14 +38,14 @@ impl Target {
     pub(crate) fn take_first_look(
         &mut self,
         config: &TrackerConfig,
-        workshop: &mut Workshop,
+        buffers: &mut AppearanceScratch,
     ) -> bool {
         if self.unseen_s < LAST_LOOK_S {
             return false;
         }
         let last = &self.appearance;
         let other = self.other_look.get_or_insert_with(|| {
-            let appearance = last.at_first(config, workshop);
+            let appearance = last.at_first(config, buffers);
             let is_like_the_first = last.likeness(&appearance) >= ALIKE;
             Box::new(OtherLook {
                 appearance,

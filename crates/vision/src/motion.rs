@@ -371,6 +371,8 @@ impl Motion {
     pub(crate) fn update(&mut self, evidence: &Evidence) {
         let Evidence { near, at, elsewhere, elsewhere_at } = *evidence;
         self.measured = at.map(|at| at.variance);
+        // L_w = N(z; H x_w, H P_w H' + R): how well each way of moving has predicted what is
+        // measured, by its logarithm so that none underflows.
         let likelihoods = [0, 1, 2, 3].map(|way: usize| {
             let axis = |i: usize| {
                 let prior = self.ways[way][i].found();
@@ -384,18 +386,21 @@ impl Motion {
         let mean: f64 = likelihoods.iter().zip(self.weights).map(|(l, w)| l * w).sum();
         let mut told = [0.0; WAYS];
         for (way, weight) in self.weights.iter_mut().enumerate() {
+            // Bayes' rule for the ways' weights, for as much of the posterior as measured anything.
             if mean > f64::MIN_POSITIVE {
                 *weight *= near * likelihoods[way] / mean + (1.0 - near);
             }
             for i in 0..2 {
                 let axis = &mut self.ways[way][i];
                 let prior = axis.found();
+                // The Kalman update K = P / (P + R) of where the reference is found ...
                 let gain = prior.variance / (prior.variance + at[i].variance);
                 told[way] += (1.0 - gain) / 2.0;
                 let here = AxisMeasurement {
                     position: prior.position + gain * (at[i].position - prior.position),
                     variance: (1.0 - gain) * prior.variance,
                 };
+                // ... is one of three parts of a mixture, which is replaced by its mean and variance.
                 let parts =
                     [(near, here), (elsewhere, elsewhere_at[i]), (1.0 - near - elsewhere, prior)];
                 let position: f64 = parts.iter().map(|(mass, part)| mass * part.position).sum();
@@ -403,6 +408,7 @@ impl Motion {
                     mass * (part.variance + (part.position - position).powi(2))
                 };
                 let variance = parts.iter().map(spread).sum::<f64>().min(4.0 * prior.variance);
+                // What of the measurement comes into the position itself: the rest is the offset's.
                 self.gains[way][i] = axis.slope() * (near * gain);
                 axis.condition(AxisMeasurement { position, variance });
             }

@@ -6,10 +6,10 @@ use crossfix_correlation::{Extent, Plane, Reference, Window};
 use crossfix_filter::{AxisFilter, AxisMeasurement, Innovation};
 use nalgebra::Matrix2;
 
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::frame::{Measurement, Step};
 use crate::reference::Adaptation;
-use crate::target::Workbench;
+use crate::target::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// A target under track.
@@ -104,7 +104,7 @@ impl PaperTarget {
         &mut self,
         image: &Plane,
         interval: f64,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
         config: &TrackerConfig,
     ) -> Step {
         if let Some(axes) = &mut self.axes {
@@ -114,19 +114,19 @@ impl PaperTarget {
         let gate_middle = ImagePoint { x: predicted.x.round(), y: predicted.y.round() };
         let sides = self.size.map(|side| (3.0 * side).round().max(1.0) as usize);
         let (gate, start) = crop(image, gate_middle, sides[0], sides[1]);
-        bench.gate = gate;
+        scratch.gate = gate;
         let extent = config.paper.extent;
-        bench.correlator.similarity(
-            &bench.gate,
+        scratch.correlator.similarity(
+            &scratch.gate,
             &self.reference,
             config.paper.similarity,
             extent,
             config.noise_floor as f32,
-            &mut bench.ratios,
+            &mut scratch.ratios,
         );
-        let peak = bench.ratios.peak();
+        let peak = scratch.ratios.peak();
         let refined =
-            if config.paper.sub_pixel { peak.refined(&bench.ratios) } else { peak.whole() };
+            if config.paper.sub_pixel { peak.refined(&scratch.ratios) } else { peak.whole() };
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
         let whole = |at: f64, gate: usize, reference: usize| {
@@ -136,8 +136,8 @@ impl PaperTarget {
             at + (reference as f64 - 1.0) / 2.0 - if wraps { gate as f64 } else { 0.0 }
         };
         let place = ImagePoint {
-            x: start[0] + whole(refined.x, bench.gate.width(), width) + self.middle[0],
-            y: start[1] + whole(refined.y, bench.gate.height(), height) + self.middle[1],
+            x: start[0] + whole(refined.x, scratch.gate.width(), width) + self.middle[0],
+            y: start[1] + whole(refined.y, scratch.gate.height(), height) + self.middle[1],
         };
         let nis = if let Some([x, y]) = &mut self.axes {
             let innovations = [
@@ -150,7 +150,7 @@ impl PaperTarget {
             None
         };
         let (seen, _) = crop(image, self.position(), width, height);
-        let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
+        let noise = scratch.meter.variance(&scratch.gate, config.noise_floor as f32);
         let adaptation = &mut self.adaptation;
         self.reference.update(|own| {
             adaptation.take_in(own, &seen, noise, 1.0, interval as f32);
@@ -175,7 +175,7 @@ fn crop(image: &Plane, middle: ImagePoint, width: usize, height: usize) -> (Plan
     let start = [(middle.x, width), (middle.y, height)]
         .map(|(at, side)| (at - (side as f64 - 1.0) / 2.0).round());
     let mut part = image.crop(start[0] as isize, start[1] as isize, width, height);
-    mend(&mut part);
+    replace_invalid(&mut part);
     (part, start)
 }
 
@@ -196,9 +196,9 @@ mod tests {
             });
             let place = PixelBox { x: 50.0, y: 38.0, width: 20.0, height: 14.0 };
             let mut target = PaperTarget::new(&image, place, &config);
-            let mut bench = Workbench::default();
+            let mut scratch = Scratch::default();
             for _ in 0..20 {
-                let step = target.step(&image, 1.0 / 30.0, &mut bench, &config);
+                let step = target.step(&image, 1.0 / 30.0, &mut scratch, &config);
                 let measured = step.measured.map(|m| m.place);
                 assert_eq!(measured, Some(place.centre()), "{whole_gate} {extent:?}");
             }

@@ -19,7 +19,7 @@ pub(crate) struct Prior {
     pub(crate) near: [usize; 2],
 }
 
-/// A part of the posterior: its mass, its mean and its variance an axis, in placements.
+/// A part of the posterior: its mass, its mean and its variance per axis, in placements.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Part {
     pub(crate) mass: f64,

@@ -60,8 +60,10 @@ impl Normal {
             return None;
         }
         let [xx, xy, yy] = self.slope_slope;
+        // About the means, so that a change of light is none of the shift ...
         let [xx, xy, yy] = [xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n];
         let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
+        // ... and solved by Cramer's rule: (slope slope') step = slope off.
         let determinant = xx * yy - xy * xy;
         let told = determinant > 1e-6 * (xx + yy).powi(2) && determinant > 0.0;
         let step = [(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant];
@@ -87,6 +89,7 @@ fn each_off(
         for x in overlap(width, left).step_by(STRIDE) {
             let i = (x as isize + left) as usize;
             let [a, b, c, d] = [above[i], above[i + 1], below[i], below[i + 1]];
+            // Linear interpolation between four pixels, and its derivatives.
             let [upper, lower] = [a + right * (b - a), c + right * (d - c)];
             let slope = [(b - a) + down * ((d - c) - (b - a)), lower - upper];
             take([x, y], slope, line[x] - upper - down * (lower - upper));

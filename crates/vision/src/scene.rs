@@ -8,7 +8,7 @@ use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::ImagePoint;
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
@@ -20,7 +20,7 @@ const SPACING_S: f64 = 0.6;
 /// About how old the picture is against which a change is asked for, s: a target has moved by its
 /// own size by then.
 const CHANGED_S: f64 = 1.0;
-/// Blocks of so many pixels a side are one pixel of the coarse picture by which the camera's turn
+/// Blocks of so many pixels per side are one pixel of the coarse picture by which the camera's turn
 /// is found: in single pixels the noise has more slope than clouds have, and the turn is taken for
 /// nothing.
 const COARSENESS: usize = 8;
@@ -178,7 +178,7 @@ impl Scene {
         }
         self.unlooked_s = 0.0;
         coarsened(image, &mut self.coarse, &mut self.sums);
-        mend(&mut self.coarse);
+        replace_invalid(&mut self.coarse);
         smooth(&mut self.coarse, &mut self.between);
         let Some((newest, others)) = self.pictures.split_first_mut() else { return };
         let before = newest.shift;
@@ -213,7 +213,7 @@ impl Scene {
         };
         self.taken += 1;
         kept.image.copy_from(image);
-        mend(&mut kept.image);
+        replace_invalid(&mut kept.image);
         kept.coarse.copy_from(&self.coarse);
         (kept.age_s, kept.shift, kept.number) = (0.0, [0.0; 2], self.taken);
         self.pictures.insert(0, kept);

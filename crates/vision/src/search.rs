@@ -5,12 +5,12 @@ use std::ops::Range;
 use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
-use crate::crop::{crop, mend};
+use crate::crop::{crop, replace_invalid};
 use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::look::Look;
 use crate::noise::{OF_MEDIAN, median};
-use crate::target::{Target, Workbench};
+use crate::target::{Scratch, Target};
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
@@ -99,34 +99,35 @@ struct Coarse {
 
 impl Coarse {
     /// Log ratios of every placement whose middle is in the given part of a coarse picture, into
-    /// `bench.ratios`.
+    /// `scratch.ratios`.
     fn ratios(
         &self,
         target: &Target,
         noise: f32,
         picture: &Plane,
         [columns, rows]: &[Range<usize>; 2],
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
         config: &TrackerConfig,
     ) {
         let (width, height) = (self.reference.image().width(), self.reference.image().height());
         let left = columns.start as isize - (width as isize - 1) / 2;
         let top = rows.start as isize - (height as isize - 1) / 2;
         let sides = [columns.len() + width - 1, rows.len() + height - 1];
-        crop(picture, [left, top], sides, &mut bench.gate);
-        bench.correlator.statistics(&bench.gate, &self.reference, &mut bench.statistics);
+        crop(picture, [left, top], sides, &mut scratch.gate);
+        scratch.correlator.statistics(&scratch.gate, &self.reference, &mut scratch.statistics);
         let pixels = (width * height) as f32;
+        // The mean of n pixels has an n-th of their noise's variance.
         let noise = noise / (self.coarseness * self.coarseness) as f32;
         let noise = noise.max((config.noise_floor * config.noise_floor) as f32);
         let expected =
             target.expectation(noise, self.reference.variance() * pixels, pixels, config);
-        log_ratios(&bench.statistics, expected, &mut bench.ratios);
+        log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
     }
 
     /// How much what has been correlated last looks like the reference.
-    fn likeness(&self, bench: &mut Workbench) -> Likeness {
-        let covariances = bench.statistics.covariance.samples();
-        let Search { contrasts, .. } = &mut bench.search;
+    fn likeness(&self, scratch: &mut Scratch) -> Likeness {
+        let covariances = scratch.statistics.covariance.samples();
+        let Search { contrasts, .. } = &mut scratch.search;
         contrasts.clear();
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
         let deviation =
@@ -170,12 +171,12 @@ struct Searched<'a> {
 /// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image,
 /// where it may hover; and by turns in its last look and its first, which stays if it is found by
 /// that.
-pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench) -> Found {
-    let mut change = std::mem::take(&mut bench.search.change);
+pub(crate) fn find(target: &mut Target, frame: Frame<'_>, scratch: &mut Scratch) -> Found {
+    let mut change = std::mem::take(&mut scratch.search.change);
     let is_change =
         target.searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
     if target.searches / 2 % 2 == 1 {
-        target.take_first_look(frame.config, &mut bench.workshop);
+        target.take_first_look(frame.config, &mut scratch.buffers);
     }
     target.searches += 1;
     let searched = if is_change {
@@ -183,8 +184,8 @@ pub(crate) fn find(target: &mut Target, frame: Frame<'_>, bench: &mut Workbench)
     } else {
         Searched { picture: frame.image, noise: target.noise, is_change }
     };
-    let found = find_in(target, frame, searched, bench);
-    bench.search.change = change;
+    let found = find_in(target, frame, searched, scratch);
+    scratch.search.change = change;
     if !found.accepted {
         target.take_last_look();
     }
@@ -195,7 +196,7 @@ fn find_in(
     target: &mut Target,
     frame: Frame<'_>,
     searched: Searched<'_>,
-    bench: &mut Workbench,
+    scratch: &mut Scratch,
 ) -> Found {
     let config = frame.config;
     let Searched { picture: image, noise, is_change } = searched;
@@ -216,34 +217,35 @@ fn find_in(
         first..(((at[i] + half[i]) / side).max(0.0) as usize + 1).min(last).max(first) + 1
     });
     let coarse = Coarse {
-        reference: coarse_reference(target, coarseness, &mut bench.workshop.resampler),
+        reference: coarse_reference(target, coarseness, &mut scratch.buffers.resampler),
         coarseness,
     };
     if !is_change {
-        remember_background(target, frame, &coarse, bench);
+        remember_background(target, frame, &coarse, scratch);
     }
 
-    let mut picture = std::mem::take(&mut bench.search.coarse);
+    let mut picture = std::mem::take(&mut scratch.search.coarse);
     coarsened(image, coarseness, &mut picture);
-    mend(&mut picture);
-    coarse.ratios(target, noise, &picture, &ranges, bench, config);
-    bench.search.coarse = picture;
-    let likeness = coarse.likeness(bench);
+    replace_invalid(&mut picture);
+    coarse.ratios(target, noise, &picture, &ranges, scratch, config);
+    scratch.search.coarse = picture;
+    let likeness = coarse.likeness(scratch);
     let area = Area { ranges, predicted: at, half, sides, coarseness, is_change };
-    let best = area.best_place(target, bench, config);
+    let best = area.best_place(target, scratch, config);
 
     // Once more at full resolution, where the coarse search says.
-    let peak = best_near(target, image, noise, best.place, (coarseness + 1) as f64, bench, config);
+    let peak =
+        best_near(target, image, noise, best.place, (coarseness + 1) as f64, scratch, config);
     if is_change {
         // Where it is the image says best: the change has the noise of two.
-        crop(frame.image, peak.corner, peak.sides, &mut bench.gate);
+        crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
     }
-    let look = target.look(peak.column, peak.row, peak.origin, bench, config);
+    let look = target.look(peak.column, peak.row, peak.origin, scratch, config);
     let usual = target.usual_contrast * f64::from(target.appearance.clear_share());
     let accepted = peak.log_ratio - best.background > LEAST_RATIO
         && best.margin > MARGIN
         && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
-        && target.arrival_log_ratio(frame, look.place, bench) >= 0.0;
+        && target.arrival_log_ratio(frame, look.place, scratch) >= 0.0;
     Found { look: Some(look), accepted }
 }
 
@@ -261,14 +263,14 @@ pub(crate) struct Peak {
 }
 
 /// The best of the placements within a reach of a place, px, at full resolution; the part that they
-/// cover is left in the bench's gate.
+/// cover is left in the scratch's gate.
 pub(crate) fn best_near(
     target: &Target,
     image: &Plane,
     noise: f32,
     place: [f64; 2],
     reach: f64,
-    bench: &mut Workbench,
+    scratch: &mut Scratch,
     config: &TrackerConfig,
 ) -> Peak {
     let working = target.appearance.working.image();
@@ -276,14 +278,18 @@ pub(crate) fn best_near(
     let origin = place.map(|at| at.round() - reach.ceil());
     let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
     let sides = reference.map(|side| 2 * reach.ceil() as usize + side);
-    crop(image, corner, sides, &mut bench.gate);
-    bench.correlator.statistics(&bench.gate, &target.appearance.working, &mut bench.statistics);
+    crop(image, corner, sides, &mut scratch.gate);
+    scratch.correlator.statistics(
+        &scratch.gate,
+        &target.appearance.working,
+        &mut scratch.statistics,
+    );
     let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
-    let mut fine = std::mem::take(&mut bench.search.fine);
-    log_ratios(&bench.statistics, target.expectation(noise, energy, pixels, config), &mut fine);
+    let mut fine = std::mem::take(&mut scratch.search.fine);
+    log_ratios(&scratch.statistics, target.expectation(noise, energy, pixels, config), &mut fine);
     let peak = fine.peak();
-    bench.search.fine = fine;
-    let covariance = bench.statistics.covariance.row(peak.row)[peak.column];
+    scratch.search.fine = fine;
+    let covariance = scratch.statistics.covariance.row(peak.row)[peak.column];
     let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
     Peak {
         column: peak.column,
@@ -314,21 +320,21 @@ fn remember_background(
     target: &mut Target,
     frame: Frame<'_>,
     coarse: &Coarse,
-    bench: &mut Workbench,
+    scratch: &mut Scratch,
 ) {
     let coarseness = coarse.coarseness;
     let known =
         target.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
-    let Some(keepsake) = frame.keepsake.filter(|_| !known && target.in_keepsake.is_some()) else {
+    let Some(snapshot) = frame.snapshot.filter(|_| !known && target.in_snapshot.is_some()) else {
         return;
     };
-    let mut picture = std::mem::take(&mut bench.search.coarse);
-    coarsened(keepsake, coarseness, &mut picture);
-    mend(&mut picture);
+    let mut picture = std::mem::take(&mut scratch.search.coarse);
+    coarsened(snapshot, coarseness, &mut picture);
+    replace_invalid(&mut picture);
     let whole = [0..picture.width(), 0..picture.height()];
-    coarse.ratios(target, target.noise, &picture, &whole, bench, frame.config);
-    bench.search.coarse = picture;
-    target.background = Some(Background { coarseness, ratios: bench.ratios.clone() });
+    coarse.ratios(target, target.noise, &picture, &whole, scratch, frame.config);
+    scratch.search.coarse = picture;
+    target.background = Some(Background { coarseness, ratios: scratch.ratios.clone() });
 }
 
 /// The best placement on the coarse picture.
@@ -356,7 +362,7 @@ struct Area {
 }
 
 impl Area {
-    fn best_place(&self, target: &Target, bench: &mut Workbench, config: &TrackerConfig) -> Best {
+    fn best_place(&self, target: &Target, scratch: &mut Scratch, config: &TrackerConfig) -> Best {
         let Self { ranges, predicted, half, sides, coarseness, is_change } = self;
         let (sides, coarseness) = (*sides, *coarseness);
         let side = coarseness as f64;
@@ -369,7 +375,7 @@ impl Area {
             if *is_change {
                 return 0.0;
             }
-            let (Some(background), Some(seen)) = (&target.background, target.in_keepsake) else {
+            let (Some(background), Some(seen)) = (&target.background, target.in_snapshot) else {
                 return 0.0;
             };
             let near = (middle(column) - seen.x).abs() <= sides[0] as f64
@@ -384,7 +390,7 @@ impl Area {
         for (y, row) in ranges[1].clone().enumerate() {
             let across = (middle(row) - predicted[1]).powi(2) / variances[1];
             for (x, column) in ranges[0].clone().enumerate() {
-                let ratio = &mut bench.ratios.row_mut(y)[x];
+                let ratio = &mut scratch.ratios.row_mut(y)[x];
                 *ratio -= background_at(column, row);
                 // Where even the flat prior cannot reach the best, the logarithm is spared.
                 if f64::from(*ratio) + (density + flat).ln() <= most {
@@ -400,8 +406,8 @@ impl Area {
         }
         let near = sides.map(|s| ((s / coarseness) / 4).max(2));
         let mut rival = f32::NEG_INFINITY;
-        for y in 0..bench.ratios.height() {
-            for (x, ratio) in bench.ratios.row(y).iter().enumerate() {
+        for y in 0..scratch.ratios.height() {
+            for (x, ratio) in scratch.ratios.row(y).iter().enumerate() {
                 if x.abs_diff(best[0]) > near[0] || y.abs_diff(best[1]) > near[1] {
                     rival = rival.max(*ratio);
                 }
@@ -410,7 +416,7 @@ impl Area {
         let (column, row) = (ranges[0].start + best[0], ranges[1].start + best[1]);
         Best {
             place: [middle(column), middle(row)],
-            margin: bench.ratios.row(best[1])[best[0]] - rival,
+            margin: scratch.ratios.row(best[1])[best[0]] - rival,
             background: background_at(column, row),
         }
     }

@@ -4,7 +4,7 @@ use crate::PixelBox;
 use crate::frame::{Frame, Step};
 use crate::look::Look;
 use crate::search::{LEAST_RATIO, best_near, half_sides};
-use crate::target::{Target, Workbench};
+use crate::target::{Scratch, Target};
 
 /// What is found may be so many times larger or smaller than the target was, a side: outlines lose
 /// what is as bright as the sky behind it. With half of it a panning camera's target is right in
@@ -29,16 +29,16 @@ impl Target {
         &mut self,
         frame: Frame<'_>,
         found: PixelBox,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Option<Sighting> {
         if !self.is_searching() || !self.may_be(frame, found) {
             return None;
         }
-        let last = self.seen_as_it_looks(frame, found, bench);
-        if !self.take_first_look(frame.config, &mut bench.workshop) {
+        let last = self.seen_as_it_looks(frame, found, scratch);
+        if !self.take_first_look(frame.config, &mut scratch.buffers) {
             return last;
         }
-        let first = self.seen_as_it_looks(frame, found, bench);
+        let first = self.seen_as_it_looks(frame, found, scratch);
         self.take_last_look();
         let first = first.map(|first| Sighting { by_first_look: true, ..first });
         [last, first]
@@ -64,16 +64,16 @@ impl Target {
         &mut self,
         frame: Frame<'_>,
         found: PixelBox,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Option<Sighting> {
         let [width, height] = self.appearance.sides();
         let reach = OFF_SIDES * found.width.max(found.height).max(width).max(height);
         let at = found.centre();
         let peak =
-            best_near(self, frame.image, self.noise, [at.x, at.y], reach, bench, frame.config);
-        let look = self.look(peak.column, peak.row, peak.origin, bench, frame.config);
-        let has_come =
-            peak.log_ratio > LEAST_RATIO && self.arrival_log_ratio(frame, look.place, bench) >= 0.0;
+            best_near(self, frame.image, self.noise, [at.x, at.y], reach, scratch, frame.config);
+        let look = self.look(peak.column, peak.row, peak.origin, scratch, frame.config);
+        let has_come = peak.log_ratio > LEAST_RATIO
+            && self.arrival_log_ratio(frame, look.place, scratch) >= 0.0;
         has_come.then_some(Sighting { look, log_ratio: peak.log_ratio, by_first_look: false })
     }
 
@@ -82,11 +82,11 @@ impl Target {
         &mut self,
         frame: Frame<'_>,
         sighting: Sighting,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Step {
         let Sighting { look, by_first_look, .. } = sighting;
         if by_first_look {
-            self.take_first_look(frame.config, &mut bench.workshop);
+            self.take_first_look(frame.config, &mut scratch.buffers);
         }
         self.hypotheses.clear();
         self.begin_probation(frame.scene);

@@ -6,7 +6,7 @@ use crossfix_correlation::{Correlator, Plane, Statistics};
 use crossfix_filter::{AxisMeasurement, Gate};
 use nalgebra::Matrix2;
 
-use crate::appearance::{Appearance, Workshop};
+use crate::appearance::{Appearance, AppearanceScratch};
 use crate::arrival::Comparison;
 use crate::config::GateRule;
 use crate::crop::crop;
@@ -62,8 +62,8 @@ const SHAPE_FLOOR: f64 = 0.05;
 
 /// Memory that all targets of a tracker share.
 #[derive(Debug, Default)]
-pub(crate) struct Workbench {
-    pub(crate) workshop: Workshop,
+pub(crate) struct Scratch {
+    pub(crate) buffers: AppearanceScratch,
     pub(crate) correlator: Correlator,
     pub(crate) meter: NoiseMeter,
     pub(crate) gate: Plane,
@@ -95,8 +95,8 @@ pub(crate) struct Target {
     /// Time since it was last seen, s.
     pub(crate) unseen_s: f64,
     pub(crate) last_seen: ImagePoint,
-    /// Where it was in the tracker's keepsake picture.
-    pub(crate) in_keepsake: Option<ImagePoint>,
+    /// Where it was in the tracker's snapshot picture.
+    pub(crate) in_snapshot: Option<ImagePoint>,
     pub(crate) background: Option<Background>,
     /// What else it is searched for as, while it is lost.
     pub(crate) other_look: Option<Box<OtherLook>>,
@@ -130,18 +130,18 @@ impl Target {
     pub(crate) fn new(
         image: &Plane,
         place: PixelBox,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
         config: &TrackerConfig,
     ) -> Self {
         let centre = place.centre();
         let around = [place.width, place.height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
         let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
-        crop(image, corner.map(|at| at as isize), around, &mut bench.gate);
-        let noise = bench.meter.variance(&bench.gate, config.noise_floor as f32);
+        crop(image, corner.map(|at| at as isize), around, &mut scratch.gate);
+        let noise = scratch.meter.variance(&scratch.gate, config.noise_floor as f32);
         let variance = config.given_sd_px.powi(2) + config.centre_sd_px.powi(2);
         let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
         Self {
-            appearance: Appearance::new(image, place, noise, config, &mut bench.workshop),
+            appearance: Appearance::new(image, place, noise, config, &mut scratch.buffers),
             motion: Motion::at_rest(given, config.start_velocity_sd_px, config.acceleration_sd_px),
             hidden: 0.0,
             noise,
@@ -154,7 +154,7 @@ impl Target {
             is_new: true,
             unseen_s: 0.0,
             last_seen: centre,
-            in_keepsake: None,
+            in_snapshot: None,
             background: None,
             other_look: None,
             identity: Identity::new(),
@@ -226,7 +226,7 @@ impl Target {
     }
 
     /// Follows the target into the next image.
-    pub(crate) fn step(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+    pub(crate) fn step(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
         let interval = frame.interval;
         self.may_move_with_scene(frame);
         self.note_last_place(frame);
@@ -238,11 +238,11 @@ impl Target {
         *scale = (*scale + SCALE_WALK.powi(2) * frames).min(0.09);
         *turn = (*turn + TURN_WALK.powi(2) * frames).min(0.25);
         if self.is_searching() {
-            self.search(frame, bench)
+            self.search(frame, scratch)
         } else if self.identity.is_on_probation() {
-            self.follow_on_probation(frame, bench)
+            self.follow_on_probation(frame, scratch)
         } else {
-            self.follow(frame, bench)
+            self.follow(frame, scratch)
         }
     }
 
@@ -252,7 +252,7 @@ impl Target {
         &mut self,
         frame: Frame<'_>,
         place: ImagePoint,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Step {
         let Frame { image, interval, config, .. } = frame;
         let variance = config.given_sd_px.powi(2);
@@ -268,7 +268,7 @@ impl Target {
         }
         self.identity.is_given();
         let share =
-            self.appearance.learn(image, place, self.noise, 1.0, interval, &mut bench.workshop);
+            self.appearance.learn(image, place, self.noise, 1.0, interval, &mut scratch.buffers);
         self.motion.learn(place, f64::from(share), None);
         self.seen(place);
         self.hypotheses.clear();
@@ -277,7 +277,7 @@ impl Target {
         Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
     }
 
-    pub(crate) fn follow(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+    pub(crate) fn follow(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
         let Frame { image, config, .. } = frame;
         let reach = self.hypotheses.reach(self.position());
         let half = self.half_gate(image, config);
@@ -285,7 +285,7 @@ impl Target {
         let half = [0, 1]
             .map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
         let whole = Region::about(self, half);
-        let noise = bench.meter.variance_within(
+        let noise = scratch.meter.variance_within(
             image,
             whole.corner,
             whole.sides,
@@ -296,17 +296,17 @@ impl Target {
 
         // The whole gate is looked at only where the middle of it leaves a doubt.
         let middle = self.middle_of_gate(whole.half, config).map(|half| Region::about(self, half));
-        let sure = middle.map(|middle| (self.posterior(frame, middle, bench), middle));
+        let sure = middle.map(|middle| (self.posterior(frame, middle, scratch), middle));
         let (posterior, region) = match sure.filter(|(posterior, _)| posterior.near.mass > SURE) {
             Some(sure) => sure,
-            None => (self.posterior(frame, whole, bench), whole),
+            None => (self.posterior(frame, whole, scratch), whole),
         };
         if self.must_doubt(&posterior, config) {
-            return self.follow_hypotheses(frame, region, bench);
+            return self.follow_hypotheses(frame, region, scratch);
         }
         let [column, row] = posterior.peak;
-        let look = self.look(column, row, region.origin, bench, config);
-        self.update(frame, &posterior, look, region.origin, bench)
+        let look = self.look(column, row, region.origin, scratch, config);
+        self.update(frame, &posterior, look, region.origin, scratch)
     }
 
     /// Takes the posterior into the filters and the target's image into the reference.
@@ -316,9 +316,9 @@ impl Target {
         posterior: &Posterior,
         look: Look,
         origin: [f64; 2],
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) -> Step {
-        let is_there = self.doubt(frame, look, bench);
+        let is_there = self.doubt(frame, look, scratch);
         let doubted = posterior.doubted(is_there);
         let certainty = doubted.near.mass;
         let found = look.found();
@@ -343,7 +343,7 @@ impl Target {
             self.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
             self.motion.update(&Evidence::of(found));
             self.seen(look.place);
-            self.learn(frame, look.place, look, certainty, bench);
+            self.learn(frame, look.place, look, certainty, scratch);
             return step(Some(measured));
         }
         // Whether it is the target that is followed is said by the certainty, and the covariance is
@@ -358,7 +358,7 @@ impl Target {
             self.missed += 1;
         }
         self.hidden = hidden;
-        self.learn(frame, estimate, look, certainty, bench);
+        self.learn(frame, estimate, look, certainty, scratch);
         step((certainty > SEEN).then_some(measured))
     }
 
@@ -411,7 +411,7 @@ impl Target {
         place: ImagePoint,
         look: Look,
         certainty: f64,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
     ) {
         let Frame { image, interval, .. } = frame;
         if certainty < 0.05 {
@@ -438,9 +438,9 @@ impl Target {
             if seen && self.appearance.is_in_shape() {
                 self.follow_shape(look);
             }
-            let (certainty, workshop) = (certainty as f32, &mut bench.workshop);
+            let (certainty, buffers) = (certainty as f32, &mut scratch.buffers);
             let share =
-                self.appearance.learn(image, place, self.noise, certainty, interval, workshop);
+                self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
             let variances = [look.covariance.m11, look.covariance.m22];
             self.motion.learn(place, f64::from(share), Some(variances));
         }
@@ -462,7 +462,7 @@ impl Target {
         self.appearance.reshape(steps[0], steps[1]);
     }
 
-    fn search(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Step {
+    fn search(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
         // Nothing is known of its contrast any more but what it usually is.
         let share = (frame.interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);
@@ -472,15 +472,15 @@ impl Target {
             self.missed += 1;
             return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
         }
-        self.find_again(frame, bench).unwrap_or_else(|score| {
+        self.find_again(frame, scratch).unwrap_or_else(|score| {
             self.missed += 1;
             Step { measured: None, score, certainty: 0.0, nis: None }
         })
     }
 
     /// Takes what a search finds, if it is believed; else its score.
-    fn find_again(&mut self, frame: Frame<'_>, bench: &mut Workbench) -> Result<Step, f64> {
-        let found = crate::search::find(self, frame, bench);
+    fn find_again(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Result<Step, f64> {
+        let found = crate::search::find(self, frame, scratch);
         let Some(look) = found.look.filter(|_| found.accepted) else {
             return Err(found.look.map_or(0.0, |look| look.score));
         };

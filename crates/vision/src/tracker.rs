@@ -7,7 +7,7 @@ use crate::detector::Detector;
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
-use crate::target::{Target, Workbench};
+use crate::target::{Scratch, Target};
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// Steps longer or shorter than these are taken as these: after a pause nothing is known of a
@@ -89,23 +89,23 @@ impl Follower {
     pub(crate) fn new(
         image: &Plane,
         place: PixelBox,
-        bench: &mut Workbench,
+        scratch: &mut Scratch,
         config: &TrackerConfig,
     ) -> Self {
         match config.algorithm {
             Algorithm::Posterior => {
-                Self::Posterior(Box::new(Target::new(image, place, bench, config)))
+                Self::Posterior(Box::new(Target::new(image, place, scratch, config)))
             }
             Algorithm::Paper => Self::Paper(Box::new(PaperTarget::new(image, place, config))),
         }
     }
 
-    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, bench: &mut Workbench) -> Step {
+    fn step(&mut self, frame: Frame<'_>, cue: Option<ImagePoint>, scratch: &mut Scratch) -> Step {
         match (self, cue) {
-            (Self::Posterior(target), None) => target.step(frame, bench),
-            (Self::Posterior(target), Some(place)) => target.take_place(frame, place, bench),
+            (Self::Posterior(target), None) => target.step(frame, scratch),
+            (Self::Posterior(target), Some(place)) => target.take_place(frame, place, scratch),
             (Self::Paper(target), None) => {
-                target.step(frame.image, frame.interval, bench, frame.config)
+                target.step(frame.image, frame.interval, scratch, frame.config)
             }
             (Self::Paper(target), Some(place)) => {
                 target.take_place(frame.image, place, frame.interval, frame.config)
@@ -189,13 +189,13 @@ const STAYS_S: f64 = 1.5;
 
 /// A picture of a moment ago in which every target was seen: what a lost target is not.
 #[derive(Debug)]
-struct Keepsake {
+struct BackgroundSnapshot {
     picture: Plane,
     taken: Timestamp,
 }
 
-/// Age at which a keepsake is replaced, s.
-const KEEPSAKE_AGE: f64 = 0.5;
+/// Age at which a snapshot is replaced, s.
+const SNAPSHOT_AGE_S: f64 = 0.5;
 
 /// Images that must agree with each other before the tracker believes them and not the last one.
 const RESYNCHRONISE_AFTER: u32 = 3;
@@ -222,8 +222,8 @@ impl Shot {
 #[derive(Debug)]
 pub struct ImageTracker {
     pub(crate) config: TrackerConfig,
-    pub(crate) bench: Workbench,
-    keepsake: Option<Keepsake>,
+    pub(crate) scratch: Scratch,
+    snapshot: Option<BackgroundSnapshot>,
     pub(crate) scene: Scene,
     pub(crate) detector: Option<Detector>,
     pub(crate) waiting: Vec<PixelBox>,
@@ -248,8 +248,8 @@ impl ImageTracker {
         let detector = config.detector.clone().map(Detector::new);
         Ok(Self {
             config,
-            bench: Workbench::default(),
-            keepsake: None,
+            scratch: Scratch::default(),
+            snapshot: None,
             scene: Scene::default(),
             detector,
             waiting: Vec::new(),
@@ -305,7 +305,7 @@ impl ImageTracker {
         self.last = Some(shot);
 
         self.tracks.clear();
-        let keepsake = self.keepsake.as_ref().map(|keepsake| &keepsake.picture);
+        let snapshot = self.snapshot.as_ref().map(|snapshot| &snapshot.picture);
         let posterior = self.config.algorithm == Algorithm::Posterior;
         let before = self.scene.turned();
         if posterior {
@@ -316,7 +316,7 @@ impl ImageTracker {
         let frame = Frame {
             image,
             interval,
-            keepsake,
+            snapshot,
             scene: &self.scene,
             scene_moved,
             may_search: false,
@@ -335,7 +335,7 @@ impl ImageTracker {
             if frame.may_search {
                 followed.searched = Some(time);
             }
-            let step = followed.target.step(frame, followed.cue.take(), &mut self.bench);
+            let step = followed.target.step(frame, followed.cue.take(), &mut self.scratch);
             if step.measured.is_some() {
                 followed.measured_at = time;
             }
@@ -386,7 +386,7 @@ impl ImageTracker {
             (followed.measured_at, followed.since, followed.searched) =
                 (shot.time, shot.time, None);
         }
-        self.keepsake = None;
+        self.snapshot = None;
         self.scene.clear();
         self.last = None;
         self.detector = self.config.detector.clone().map(Detector::new);
@@ -403,21 +403,21 @@ impl ImageTracker {
         let new = self
             .followed
             .iter()
-            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.in_keepsake.is_none()));
+            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.in_snapshot.is_none()));
         let old =
-            self.keepsake.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= KEEPSAKE_AGE);
+            self.snapshot.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= SNAPSHOT_AGE_S);
         let posterior = self.config.algorithm == Algorithm::Posterior;
         if !posterior || self.followed.is_empty() || !all_seen || !(new || old) {
             return;
         }
-        let keepsake = self
-            .keepsake
-            .get_or_insert_with(|| Keepsake { picture: Plane::default(), taken: time });
-        keepsake.picture.copy_from(image);
-        keepsake.taken = time;
+        let snapshot = self
+            .snapshot
+            .get_or_insert_with(|| BackgroundSnapshot { picture: Plane::default(), taken: time });
+        snapshot.picture.copy_from(image);
+        snapshot.taken = time;
         for followed in &mut self.followed {
             if let Follower::Posterior(target) = &mut followed.target {
-                target.in_keepsake = Some(target.last_seen);
+                target.in_snapshot = Some(target.last_seen);
             }
         }
     }

@@ -11,7 +11,7 @@ use crate::recorded::{self, Lacks};
 /// Write the confirmed tracks of a recording as a table.
 ///
 /// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m: seconds since the Unix epoch, metres,
-/// metres a second, what the track is (confirmed or coasting; with --all also tentative and
+/// metres per second, what the track is (confirmed or coasting; with --all also tentative and
 /// one-camera), how many cameras have given it a bearing within the second before, and the root of
 /// the sum of the position's variances, metres. With --times, the state of each track at those
 /// times from its last frame at or before them, extrapolated with its velocity.

@@ -35,7 +35,7 @@ pub struct Args {
     /// The folder to write a rendered video (Y4M) of each camera to.
     #[arg(long, value_name = "DIR")]
     video: Option<PathBuf>,
-    /// Standard deviation of a bearing in the recording, pixels an axis.
+    /// Standard deviation of a bearing in the recording, pixels per axis.
     #[arg(long, default_value_t = 0.3, value_name = "PIXELS")]
     noise_px: f64,
     /// Override a key of the scene, e.g. duration_s=10.

@@ -22,7 +22,7 @@ const SYNC_RATE: f64 = 59.94006;
 /// Rate of the RTK samples, Hz.
 const RTK_RATE: f64 = 5.0;
 
-/// Standard deviation of the fitted places, m an axis: the poses' residual is declared as their
+/// Standard deviation of the fitted places, m per axis: the poses' residual is declared as their
 /// rotation's, and refitted centres of the same cameras agree to 3 to 7 cm (the data's README).
 const FITTED_POSITION_SD_M: f64 = 0.05;
 

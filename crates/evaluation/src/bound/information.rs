@@ -127,7 +127,7 @@ impl FromIterator<f64> for TimeOffsets {
 pub struct FisherInformation(Matrix6<f64>);
 
 impl FisherInformation {
-    /// Nothing but a prior on the velocity: its standard deviation, m/s an axis.
+    /// Nothing but a prior on the velocity: its standard deviation, m/s per axis.
     pub fn velocity_prior(sd_mps: f64) -> Self {
         let known = sd_mps.powi(-2);
         Self(Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, known, known, known)))
@@ -195,7 +195,7 @@ pub struct CommonErrors {
 }
 
 impl CommonErrors {
-    /// Errors of the camera's rotation (rad an axis), position (m an axis) and clock (s).
+    /// Errors of the camera's rotation (rad per axis), position (m per axis) and clock (s).
     ///
     /// A wrong clock shows a target of `speed_mps` where it was or will be: for a direction of
     /// flight that nobody knows beforehand, a displacement of `speed * clock / root 3` on each

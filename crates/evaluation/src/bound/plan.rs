@@ -39,15 +39,15 @@ pub struct TargetSize {
 pub struct Assumptions {
     /// How long a target has been seen, s; it flies straight for so long.
     pub window_s: f64,
-    /// Standard deviation of a place in the image, pixels an axis, independent from frame to frame.
+    /// Standard deviation of a place in the image, pixels per axis, independent from frame to frame.
     pub pixel_sd_px: f64,
-    /// Standard deviation of a camera's rotation, rad an axis.
+    /// Standard deviation of a camera's rotation, rad per axis.
     pub rotation_sd_rad: f64,
-    /// Standard deviation of a camera's position, m an axis.
+    /// Standard deviation of a camera's position, m per axis.
     pub position_sd_m: f64,
     /// How fast a target flies, m/s: what an error of the clock is worth.
     pub speed_mps: f64,
-    /// What is known of a target's velocity beforehand: standard deviation, m/s an axis; none is
+    /// What is known of a target's velocity beforehand: standard deviation, m/s per axis; none is
     /// nothing.
     pub velocity_prior_sd_mps: Option<f64>,
     /// How small a target must be seen; none is however small.

@@ -94,7 +94,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         [0.22, 0.24, 0.26, 0.44, 0.91],
         [0.27, 0.38, 0.30, 0.55, 1.89],
     ];
-    // Half a degree a frame.
+    // Half a degree per frame.
     let silhouette = Silhouette::new(SIDES[0], SIDES[1]);
     let stamps: Vec<Stamp> = (0..FRAMES)
         .map(|frame| Stamp::Drawn(silhouette.turned(1.0, (0.5 * frame as f64).to_radians())))

@@ -172,6 +172,8 @@ impl Cameras {
             information += weighed * sample.by_position;
             pull += weighed * sample.offset;
         }
+        // The weighted least-squares place, and P = W - W A (A' W A)^-1 A' W, which takes from a
+        // residual what the place has explained: REML.
         let spread = information.try_inverse()?;
         let place = spread * pull;
         let of_camera = |(sample, weight): (&Sample, &Matrix2<f64>)| {

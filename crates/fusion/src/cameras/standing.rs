@@ -145,7 +145,7 @@ impl Standing {
 mod tests {
     use super::*;
 
-    /// The verdicts on a camera that gives the same evidence `rate` times a second.
+    /// The verdicts on a camera that gives the same evidence `rate` times per second.
     fn verdicts(fittings: &[&[Fitting]], rate: f64) -> Vec<CameraStanding> {
         let mut standing = Standing::default();
         let mut verdicts = Vec::new();

@@ -375,6 +375,7 @@ impl Seen {
         let away = target - sight.line.origin.coords;
         let range = away.norm();
         let direction = away / range;
+        // The direction's derivative by the target's place: B' (I - u u') / r.
         let across: Matrix2x3<f64> = sight.line.basis.transpose()
             * (Matrix3::identity() - direction * direction.transpose())
             / range;
@@ -392,6 +393,7 @@ impl Quadratic {
         let (pull, information) = (seen.pull * weight, seen.information * weight);
         let shifts = &target.shifts[..target.count];
         let Basis { first, place, .. } = target.basis;
+        // The place is the sum of four coefficients, each times its weight a: J = [a1 I .. a4 I].
         for (i, a) in place.iter().enumerate() {
             let row = 3 * (first + i);
             let mut part = self.gradient.fixed_rows_mut::<3>(row);
@@ -408,6 +410,7 @@ impl Quadratic {
                 below += tied.transpose();
             }
         }
+        // A camera's errors move the place as it sees it by `shift` each.
         for (one, shift) in shifts {
             self.gradient[points + one] += shift.dot(&pull);
             let told = information * shift;

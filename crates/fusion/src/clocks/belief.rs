@@ -7,7 +7,7 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, DVector, Matrix6};
 
 use super::ClockEstimate;
-use super::common_time::{Common, Reading, common_time};
+use super::common_time::{ClockReading, Common, common_time};
 
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
 const OFFSET_WALK: f64 = 1e-12;
@@ -274,7 +274,7 @@ impl Belief {
     }
 
     /// Forgets all that was learnt of any clock.
-    pub(super) fn begin_anew(&mut self) {
+    pub(super) fn reset_all(&mut self) {
         let mut anew = Self { epoch: self.epoch, ..Self::default() };
         let mut cameras: Vec<(&CameraName, &Clock)> = self.cameras.iter().collect();
         // In the order in which they were heard: the reference first.
@@ -289,8 +289,10 @@ impl Belief {
     /// Finds out how much each clock says of true time, by where they stand now.
     fn settle(&mut self) {
         let clocks = self.cameras.values();
-        let stands =
-            |clock: &Clock| Reading { offset: self.relative(clock, 0, 0.0), variance: clock.prior };
+        let stands = |clock: &Clock| ClockReading {
+            offset: self.relative(clock, 0, 0.0),
+            variance: clock.prior,
+        };
         self.common = common_time(&clocks.map(stands).collect::<Vec<_>>());
     }
 
@@ -348,7 +350,7 @@ impl Belief {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
             // No clock is worse known than what was reported of it, as far as that is believed.
             sd_s: (own + common)
-                .min(Reading { offset, variance: clock.prior }.believed(offset))
+                .min(ClockReading { offset, variance: clock.prior }.believed(offset))
                 .sqrt(),
             relative_sd_s: own.sqrt(),
             drift,
@@ -515,7 +517,7 @@ mod tests {
         belief.calibrate(&name("c"), None);
         assert_eq!(belief.pose(&name("c")), None);
         assert!(belief.covariance.clone().cholesky().is_some());
-        belief.begin_anew();
+        belief.reset_all();
         assert!(belief.covariance.clone().cholesky().is_some());
         assert_eq!(of(&belief, "b").offset_s, 0.0);
         assert!(belief.pose(&name("b")).is_some());

@@ -21,12 +21,12 @@ const APART: f64 = 0.5;
 
 /// Where a clock stands against any one of them, s, and the variance reported of it, s^2.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Reading {
+pub(super) struct ClockReading {
     pub(super) offset: f64,
     pub(super) variance: f64,
 }
 
-impl Reading {
+impl ClockReading {
     fn liars_variance(self) -> f64 {
         LIARS_SD_S.powi(2).max(self.variance)
     }
@@ -70,10 +70,11 @@ struct Maximum {
 }
 
 /// How much each clock says of true time. Clocks that are right by definition say all.
-pub(super) fn common_time(clocks: &[Reading]) -> Common {
+pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
     let right = clocks.iter().filter(|clock| clock.variance <= 0.0).count();
     if right > 0 {
-        let share = |clock: &Reading| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
+        let share =
+            |clock: &ClockReading| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
         return Common { shares: clocks.iter().map(share).collect(), variance: 0.0 };
     }
     // By where they stand and not by the cameras' names: rounding decides nothing.
@@ -93,7 +94,7 @@ pub(super) fn common_time(clocks: &[Reading]) -> Common {
 }
 
 /// The maximum above a common offset.
-fn climb(clocks: &[Reading], order: &[usize], start: f64) -> Maximum {
+fn climb(clocks: &[ClockReading], order: &[usize], start: f64) -> Maximum {
     let mut offset = start;
     let (mut shares, mut variance) = (Vec::new(), 0.0);
     for _ in 0..STEPS {
@@ -135,9 +136,9 @@ mod tests {
 
     /// What clocks of so many deviations say together that stand so, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
-        let clocks: Vec<Reading> = clocks
+        let clocks: Vec<ClockReading> = clocks
             .iter()
-            .map(|(offset, sd)| Reading { offset: *offset, variance: sd.powi(2) })
+            .map(|(offset, sd)| ClockReading { offset: *offset, variance: sd.powi(2) })
             .collect();
         let Common { shares, variance } = common_time(&clocks);
         (

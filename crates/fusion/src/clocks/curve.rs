@@ -60,6 +60,8 @@ impl Curve {
     /// Adds to a matrix of information what is known of the coefficients beforehand: a white jerk
     /// of this power spectral density (m^2/s^5), and that nothing flies beyond all bounds.
     pub(super) fn add_prior(&self, information: &mut DMatrix<f64>, jerk_density: f64) {
+        // The third difference of the coefficients is the jerk times the cube of a piece's length,
+        // and white jerk of density q has the variance q / length over a piece.
         let share = (self.points() as f64).recip();
         add_differences(
             information,
@@ -92,6 +94,7 @@ impl Curve {
         let n = 3 * self.points();
         let mut information = DMatrix::zeros(n, n);
         let mut pull = DVector::zeros(n);
+        // The normal equations A'A c = A'p of p(t) = sum of w_i(t) c_i, weighted by 1 / sd^2.
         for (time_s, place) in places {
             let Basis { first, place: weights, .. } = self.basis(time_s);
             for i in 0..4 {

@@ -11,8 +11,8 @@ mod adjustment;
 mod belief;
 mod common_time;
 mod curve;
-mod lesson;
 mod window;
+mod window_update;
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,8 +21,8 @@ use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Matrix6;
 
 use self::belief::Belief;
-use self::lesson::{Lesson, lesson};
 use self::window::{Role, Window};
+use self::window_update::{WindowUpdate, window_update};
 use crate::config::Clocks;
 use crate::ingress::Exposure;
 use crate::track::{Track, TrackId};
@@ -318,8 +318,8 @@ impl ClockEstimator {
 
     /// Keeps what a window has told.
     fn close(&mut self, window: &Window) {
-        match lesson(&self.belief, window) {
-            Lesson::Learnt(belief) => {
+        match window_update(&self.belief, window) {
+            WindowUpdate::Accepted(belief) => {
                 self.belief = *belief;
                 self.refused = 0;
                 for camera in window.checked_cameras() {
@@ -328,8 +328,8 @@ impl ClockEstimator {
                     }
                 }
             }
-            Lesson::Nothing => {}
-            Lesson::Anew(belief) => {
+            WindowUpdate::Uninformative => {}
+            WindowUpdate::Contradicts(belief) => {
                 self.refused += 1;
                 if self.refused >= MAX_REFUSED {
                     self.refused = 0;
@@ -359,8 +359,8 @@ impl ClockEstimator {
     /// Looks at what the next open window tells so far; after the last it counts.
     fn look(&mut self, mut round: Round) {
         if let Some(window) = self.windows.get(round.next) {
-            if let Lesson::Learnt(next) =
-                lesson(round.belief.as_ref().unwrap_or(&self.belief), window)
+            if let WindowUpdate::Accepted(next) =
+                window_update(round.belief.as_ref().unwrap_or(&self.belief), window)
             {
                 round.belief = Some(*next);
                 round.cleared.extend(window.checked_cameras());

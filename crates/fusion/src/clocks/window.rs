@@ -15,7 +15,7 @@ const MAX_CAMERAS: usize = 8;
 /// So many of them may be links in the beginning, ...
 const MAX_LINKS: usize = 4;
 /// ... until all that are wanted and see the target have been heard, s.
-const ROLL_CALL_S: f64 = 0.5;
+const ADMISSION_S: f64 = 0.5;
 /// A camera says nothing of its clock that can be checked with fewer bearings than this.
 const LEAST_SIGHTS: usize = 5;
 /// Bearings this far from the window's beginning are not of it, s.
@@ -85,7 +85,7 @@ impl Window {
             return;
         }
         let known = self.cameras.iter().position(|known| known == camera);
-        let no_link = self.links >= MAX_LINKS && time_s < ROLL_CALL_S;
+        let no_link = self.links >= MAX_LINKS && time_s < ADMISSION_S;
         if known.is_none() && (self.cameras.len() >= MAX_CAMERAS || (role == Role::Link && no_link))
         {
             return;

@@ -36,9 +36,9 @@ impl Fusion {
             let by_s = exposure.time.seconds_since(time);
             self.refuse(exposure.refused(RejectionReason::Future { by_s }), outputs);
         }
-        let happenings = self.tracker.restart(time);
+        let changes = self.tracker.restart(time);
         self.cameras.forget_strangers();
-        self.tell(happenings, time, outputs);
+        self.emit_events(changes, time, outputs);
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
         self.clocks = ClockEstimator::new(self.config.clocks.clone());

@@ -13,7 +13,7 @@ use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
 use crossfix_message::{CameraName, Solver, Timestamp};
 use nalgebra::{Matrix3, Vector3, Vector6};
 
-use super::coincidence::Coincidence;
+use super::one_target::OneTargetTest;
 use super::sight::Sight;
 use super::{MAX_LINES, Start, lines_with_pose};
 use crate::cameras::KnownCamera;
@@ -86,7 +86,7 @@ struct Reading {
     /// The camera that saw it first, and the number of what it saw.
     of: (CameraName, u64),
     track: Box<Track>,
-    coincidence: Coincidence,
+    one_target: OneTargetTest,
     newest: LineId,
 }
 
@@ -119,7 +119,7 @@ impl Look<'_> {
 pub(super) struct Handover {
     tracking: Tracking,
     gate: Gate,
-    /// How fast targets are, m/s, standard deviation an axis.
+    /// How fast targets are, m/s, standard deviation per axis.
     speed: f64,
     pair_s: f64,
     max_range_m: f64,
@@ -281,18 +281,12 @@ impl Reading {
         let first_ratio = if is_joint { 0.0 } else { first_ratio };
         match expected {
             Expectation::Near(prediction) => {
-                self.coincidence.see(
-                    camera,
-                    timed,
-                    prediction,
-                    (density, rules.speed),
-                    first_ratio,
-                );
+                self.one_target.see(camera, timed, prediction, (density, rules.speed), first_ratio);
             }
-            Expectation::Along { .. } if self.coincidence.knows(camera) => {}
+            Expectation::Along { .. } if self.one_target.knows(camera) => {}
             Expectation::Along { .. } => {
                 let range = (self.track.state().position() - line.origin).norm();
-                self.coincidence.see_first(camera, (line, *time), rules.speed / range, first_ratio);
+                self.one_target.see_first(camera, (line, *time), rules.speed / range, first_ratio);
             }
         }
         self.newest = (camera.clone(), exposure.sequence, index);
@@ -300,7 +294,7 @@ impl Reading {
     }
 
     fn ratio(&self) -> f64 {
-        self.coincidence.log_ratio().unwrap_or(f64::NEG_INFINITY)
+        self.one_target.log_ratio().unwrap_or(f64::NEG_INFINITY)
     }
 }
 
@@ -467,11 +461,11 @@ impl Handover {
                         let fit = expected.fit(line, self.gate)?;
                         let ratio = log_likelihood_ratio(&fit, 1.0, self.strangers_per_sr(known))
                             - unlikely;
-                        let coincidence = Coincidence::of_one(camera, one.sight.clone());
+                        let one_target = OneTargetTest::of_one(camera, one.sight.clone());
                         let mut reading = Reading {
                             of: (camera.clone(), one.number),
                             track: Box::new(track),
-                            coincidence,
+                            one_target,
                             newest: name,
                         };
                         reading.take(look, index, &expected, ratio, self)?;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crossfix_filter::Gate;
 use crossfix_message::{CameraName, Solver, Timestamp};
 
-use super::coincidence::Coincidence;
+use super::one_target::OneTargetTest;
 use super::seeds::{Seed, SeedFinder};
 use super::selection::Selection;
 use super::{NamedLine, Start, lines_of};
@@ -24,7 +24,7 @@ const MAX_BRANCHES: usize = 3;
 const MAX_FAMILY: usize = 100;
 /// Hypotheses that are kept of those with the same lines in the newest period.
 const MAX_ALIKE: usize = 20;
-/// A way this much less likely than its family's best (log-likelihood) is given up.
+/// A way this much less likely than its tree's best (log-likelihood) is given up.
 const FAMILY_MARGIN: f64 = 15.0;
 /// A hypothesis less likely than this is clutter.
 const LEAST_SCORE: f64 = -12.0;
@@ -37,8 +37,8 @@ const MAX_HYPOTHESES: usize = 6_000;
 /// One reading of the bearings: these are one target's.
 #[derive(Clone, Debug)]
 struct Hypothesis {
-    /// What began alike belongs to one family.
-    family: u64,
+    /// What began alike belongs to one tree.
+    tree: u64,
     /// Apart, as hypotheses are sorted often.
     track: Box<Track>,
     /// Its lines of the last periods with the number of the period, in order of time.
@@ -47,7 +47,7 @@ struct Hypothesis {
     periods: usize,
     born: Timestamp,
     /// Whether its lines are rather of several targets that one camera each sees.
-    coincidence: Coincidence,
+    one_target: OneTargetTest,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
@@ -62,14 +62,14 @@ pub(super) struct Hypotheses {
     /// How long two cameras alone must agree, s.
     pair_s: f64,
     max_range_m: f64,
-    /// How fast targets are, m/s, standard deviation an axis.
+    /// How fast targets are, m/s, standard deviation per axis.
     speed: f64,
     shared_lines: usize,
     hypotheses: Vec<Hypothesis>,
     /// Lines that a track has used which cannot hold its place alone.
     claims: BTreeMap<LineId, TrackId>,
     period: u64,
-    families: u64,
+    trees: u64,
     /// When each camera was exposed last.
     exposed: BTreeMap<CameraName, Timestamp>,
 }
@@ -113,7 +113,7 @@ impl Hypotheses {
             hypotheses: Vec::new(),
             claims: BTreeMap::new(),
             period: 0,
-            families: 0,
+            trees: 0,
             exposed: BTreeMap::new(),
         }
     }
@@ -148,7 +148,7 @@ impl Hypotheses {
         }
         // What one camera alone sees may be anywhere: it begins anew when another sees it too.
         self.hypotheses.retain(|h| {
-            h.cameras().len() >= 2 && h.coincidence.log_ratio().is_none_or(|r| r > LEAST_SCORE)
+            h.cameras().len() >= 2 && h.one_target.log_ratio().is_none_or(|r| r > LEAST_SCORE)
         });
         let seeds = self.finder.find(exposures, cameras);
         self.begin(seeds, exposures, motion);
@@ -206,7 +206,7 @@ impl Hypotheses {
             child.track.score += ratio;
             child.track.look(&exposure.camera, exposure.time, true, detection, motion);
             if let Some(Expectation::Near(prediction)) = &prediction {
-                child.coincidence.see(
+                child.one_target.see(
                     &exposure.camera,
                     (&line.line, exposure.time, exposure.uncertainty.time_sd_s),
                     prediction,
@@ -225,17 +225,17 @@ impl Hypotheses {
         if expected {
             hypothesis.track.score += miss;
             hypothesis.track.look(&exposure.camera, exposure.time, false, detection, motion);
-            hypothesis.coincidence.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
+            hypothesis.one_target.miss(&exposure.camera, (1.0 - detection).ln(), interval_s);
         }
         next.push(hypothesis);
     }
 
-    /// Keeps the best few of each family.
+    /// Keeps the best few of each tree.
     fn prune_families(&mut self) {
         self.sort();
-        let mut families: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
+        let mut trees: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
         self.hypotheses.retain(|h| {
-            let (best, count) = families.entry(h.family).or_insert((h.track.score, 0));
+            let (best, count) = trees.entry(h.tree).or_insert((h.track.score, 0));
             *count += 1;
             *count <= MAX_FAMILY
                 && h.track.score > *best - FAMILY_MARGIN
@@ -265,7 +265,7 @@ impl Hypotheses {
             let Some(time) = seed.time() else {
                 continue;
             };
-            self.families += 1;
+            self.trees += 1;
             let (state, velocity) = (seed.solution.state, VelocityKnowledge::Solved);
             // Eigenvalues cost more than all the rest: they are for those that are confirmed.
             let observability = Observability::unexamined(6);
@@ -278,8 +278,8 @@ impl Hypotheses {
             track.score = seed.score;
             let lines =
                 seed.lines.iter().map(|((camera, ..), timed)| (camera, &timed.line, timed.time));
-            let mut coincidence =
-                Coincidence::begin(lines, (fix.state.position(), self.speed), seed.score);
+            let mut one_target =
+                OneTargetTest::begin(lines, (fix.state.position(), self.speed), seed.score);
             for ((camera, sequence, index), timed) in &seed.lines {
                 let seen_from = (camera, timed.line.origin);
                 let of = |exposure: &&&Exposure| {
@@ -291,17 +291,17 @@ impl Hypotheses {
                     track.expectation(timed.time, seen_from, uncertainty, motion)
                 });
                 if let (Some(own), Some(Expectation::Near(prediction))) = (own, expected) {
-                    coincidence.begin_shift(camera, &own.line, &prediction);
+                    one_target.begin_shift(camera, &own.line, &prediction);
                 }
             }
             let lines = seed.lines.iter().map(|(id, _)| (self.period, id.clone())).collect();
             self.hypotheses.push(Hypothesis {
-                family: self.families,
+                tree: self.trees,
                 track,
                 lines,
                 periods: 1,
                 born: time,
-                coincidence,
+                one_target,
             });
         }
     }
@@ -339,7 +339,7 @@ impl Hypotheses {
                     >= self.pair_s
                     && hypothesis.track.is_placed();
                 let agreed = hypothesis.cameras().len() >= 3 || pair_holds;
-                let one = hypothesis.coincidence.log_ratio().is_none_or(|ratio| ratio >= pairs);
+                let one = hypothesis.one_target.log_ratio().is_none_or(|ratio| ratio >= pairs);
                 let likely = agreed && one && hypothesis.track.score >= self.tracking.confirm_score;
                 likely && hypothesis.periods >= self.needed && {
                     let state = hypothesis.track.predicted(now, motion);

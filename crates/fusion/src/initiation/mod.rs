@@ -3,9 +3,9 @@
 //! together is found either by following hypotheses ([`Hypotheses`]) or, as in
 //! Klochko 2020, by solving each period for fixes and grouping these ([`Grouped`]).
 
-mod coincidence;
 mod handover;
 mod hypotheses;
+mod one_target;
 mod passing;
 mod period;
 mod seeds;

@@ -24,7 +24,7 @@ pub(crate) enum Passing {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Passings {
     max_range_m: f64,
-    /// How fast targets are, m/s, standard deviation an axis.
+    /// How fast targets are, m/s, standard deviation per axis.
     speed: f64,
 }
 
@@ -43,6 +43,8 @@ impl Passings {
             return Passing::Nowhere;
         }
         let by_m = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
+        // What may be between lines of one target: noise at their ranges, poses, and its own motion
+        // between the two instants.
         let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
         let poses = first.origin_sd_m + second.origin_sd_m;
         let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);

@@ -307,6 +307,8 @@ impl SeedFinder {
     /// Logarithm of the density of the lines as a new target's: the density of new targets times
     /// the integral over all positions and velocities.
     fn log_evidence(&self, lines: &[NamedLine], solution: &MapSolution) -> Option<f64> {
+        // Laplace's approximation: the integral of exp(-chi^2 / 2) over six unknowns is the value at
+        // its best times (2 pi)^3 |P|^1/2; half of the powers of 2 pi are the prior's.
         let factor = solution.state.covariance.cholesky()?;
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
         let velocity = 3.0 * self.initiation.velocity_prior_sd_mps.ln();

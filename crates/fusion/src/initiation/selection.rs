@@ -1,4 +1,5 @@
-//! Which readings of the bearings go together: the set of greatest total score without common
+//! Which leaves go together, where a leaf is one way in which some bearings may be one target's:
+//! the set of greatest total score without common
 //! lines.
 
 use std::cell::Cell;
@@ -6,25 +7,25 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::spatial::LineId;
 
-/// Comparisons of readings in one period, about a tenth of a second's worth; half of them are kept
+/// Comparisons of leaves in one period, about a tenth of a second's worth; half of them are kept
 /// for the question how sure each choice is.
 const MAX_COMPARISONS: usize = 20_000_000;
 /// Passes of the local search; each makes the total greater, and few are ever needed.
 const MAX_PASSES: usize = 20;
 
-/// A reading of the bearings and what it is worth.
+/// Bearings that may be one target's, and what that is worth.
 #[derive(Clone, Debug)]
-struct Reading {
+struct Leaf {
     score: f64,
     /// Numbers of its lines, ascending.
     lines: Vec<usize>,
 }
 
-/// All readings with what they have in common.
+/// All leaves with what they have in common.
 #[derive(Clone, Debug)]
 pub(super) struct Selection {
-    readings: Vec<Reading>,
-    /// The readings that use a line, by the line's number.
+    leaves: Vec<Leaf>,
+    /// The leaves that use a line, by the line's number.
     users: Vec<Vec<usize>>,
     shared_lines: usize,
     chosen: BTreeSet<usize>,
@@ -34,17 +35,17 @@ pub(super) struct Selection {
 }
 
 impl Selection {
-    /// The best set found of readings, given as scores with lines; `shared_lines` is how many lines
-    /// two chosen ones may have in common. Readings of score 0 and less are never chosen.
+    /// The best set found of leaves, given as scores with lines; `shared_lines` is how many lines
+    /// two chosen ones may have in common. Leaves of score 0 and less are never chosen.
     ///
-    /// Choosing the best first lets a reading of several targets' bearings shut them all out. So
+    /// Choosing the best first lets a leaf of several targets' bearings shut them all out. So
     /// the choice is improved by exchange: one goes out if those that it kept out are worth more.
     pub(super) fn new<'a>(
         scored: impl Iterator<Item = (f64, &'a [(u64, LineId)])>,
         shared_lines: usize,
     ) -> Self {
         let mut numbers: BTreeMap<&LineId, usize> = BTreeMap::new();
-        let mut readings = Vec::new();
+        let mut leaves = Vec::new();
         for (score, lines) in scored {
             let mut own: Vec<usize> = Vec::with_capacity(lines.len());
             for (_, id) in lines {
@@ -52,58 +53,58 @@ impl Selection {
                 own.push(*numbers.entry(id).or_insert(next));
             }
             own.sort_unstable();
-            readings.push(Reading { score, lines: own });
+            leaves.push(Leaf { score, lines: own });
         }
         let mut users = vec![Vec::new(); numbers.len()];
-        for (i, reading) in readings.iter().enumerate() {
-            for &line in &reading.lines {
+        for (i, leaf) in leaves.iter().enumerate() {
+            for &line in &leaf.lines {
                 users[line].push(i);
             }
         }
         let mut selection = Self {
-            readings,
+            leaves,
             users,
             shared_lines,
             chosen: BTreeSet::new(),
             budget: Cell::new(MAX_COMPARISONS),
         };
-        selection.fill(&(0..selection.readings.len()).collect::<Vec<_>>());
+        selection.fill(&(0..selection.leaves.len()).collect::<Vec<_>>());
         selection.exchange();
         selection
     }
 
-    /// The chosen readings, ascending.
+    /// The chosen leaves, ascending.
     pub(super) fn chosen(&self) -> impl Iterator<Item = usize> + '_ {
         self.chosen.iter().copied()
     }
 
-    /// What the total would lose if a chosen reading were wrong, and every other of its lines that
+    /// What the total would lose if a chosen leaf were wrong, and every other of its lines that
     /// `alike` holds for with it.
     pub(super) fn loss_without(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
         let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
         let gained: f64 =
-            self.additions(&without, &others).iter().map(|&i| self.readings[i].score).sum();
+            self.additions(&without, &others).iter().map(|&i| self.leaves[i].score).sum();
         // Where there was no time to look for others, nothing is sure.
-        if self.budget.get() == 0 { 0.0 } else { self.readings[chosen].score - gained }
+        if self.budget.get() == 0 { 0.0 } else { self.leaves[chosen].score - gained }
     }
 
-    /// Readings that have a line in common with one.
+    /// Leaves that have a line in common with one.
     fn neighbours(&self, of: usize) -> impl Iterator<Item = usize> {
-        let lines = &self.readings[of].lines;
+        let lines = &self.leaves[of].lines;
         let all: BTreeSet<usize> =
             lines.iter().flat_map(|&line| self.users[line].iter().copied()).collect();
         all.into_iter().filter(move |&i| i != of)
     }
 
     fn clash(&self, one: usize, other: usize) -> bool {
-        let (a, b) = (&self.readings[one].lines, &self.readings[other].lines);
+        let (a, b) = (&self.leaves[one].lines, &self.leaves[other].lines);
         a.iter().filter(|line| b.binary_search(line).is_ok()).count() > self.shared_lines
     }
 
-    fn fits(&self, reading: usize, choice: &BTreeSet<usize>) -> bool {
-        let lines = &self.readings[reading].lines;
+    fn fits(&self, leaf: usize, choice: &BTreeSet<usize>) -> bool {
+        let lines = &self.leaves[leaf].lines;
         let cost = lines.iter().map(|&line| self.users[line].len()).sum();
         let left = self.budget.get().checked_sub(cost);
         self.budget.set(left.unwrap_or(0));
@@ -111,19 +112,19 @@ impl Selection {
             return false;
         }
         let near = lines.iter().flat_map(|&line| &self.users[line]);
-        near.filter(|i| choice.contains(i)).all(|&i| i != reading && !self.clash(reading, i))
+        near.filter(|i| choice.contains(i)).all(|&i| i != leaf && !self.clash(leaf, i))
     }
 
-    /// Those of some readings that fit beside a choice and each other, the best first.
+    /// Those of some leaves that fit beside a choice and each other, the best first.
     fn additions(&self, choice: &BTreeSet<usize>, among: &[usize]) -> Vec<usize> {
         let mut by_score: Vec<usize> = among.to_vec();
         by_score.sort_by(|&a, &b| {
-            self.readings[b].score.total_cmp(&self.readings[a].score).then(a.cmp(&b))
+            self.leaves[b].score.total_cmp(&self.leaves[a].score).then(a.cmp(&b))
         });
         let mut choice = choice.clone();
         let mut added = Vec::new();
         for i in by_score {
-            if self.readings[i].score > 0.0 && self.fits(i, &choice) {
+            if self.leaves[i].score > 0.0 && self.fits(i, &choice) {
                 choice.insert(i);
                 added.push(i);
             }
@@ -146,17 +147,17 @@ impl Selection {
                 let mut without = self.chosen.clone();
                 without.remove(&out);
                 let added = self.additions(&without, &others);
-                let gained: f64 = added.iter().map(|&i| self.readings[i].score).sum();
+                let gained: f64 = added.iter().map(|&i| self.leaves[i].score).sum();
                 if self.budget.get() < MAX_COMPARISONS / 2 {
                     return;
                 }
-                if gained > self.readings[out].score + 1e-9 {
+                if gained > self.leaves[out].score + 1e-9 {
                     self.chosen = without;
                     self.chosen.extend(added);
                     better = true;
                 }
             }
-            for i in 0..self.readings.len() {
+            for i in 0..self.leaves.len() {
                 if self.chosen.contains(&i) {
                     continue;
                 }
@@ -164,8 +165,8 @@ impl Selection {
                     .neighbours(i)
                     .filter(|k| self.chosen.contains(k) && self.clash(i, *k))
                     .collect();
-                let lost: f64 = against.iter().map(|&k| self.readings[k].score).sum();
-                if self.readings[i].score > lost + 1e-9 {
+                let lost: f64 = against.iter().map(|&k| self.leaves[k].score).sum();
+                if self.leaves[i].score > lost + 1e-9 {
                     against.iter().for_each(|k| {
                         self.chosen.remove(k);
                     });
@@ -184,12 +185,12 @@ impl Selection {
 mod tests {
     use super::*;
 
-    fn select(readings: &[(f64, &[usize])], shared: usize) -> Selection {
+    fn select(leaves: &[(f64, &[usize])], shared: usize) -> Selection {
         let lines = |ids: &[usize]| -> Vec<(u64, LineId)> {
             ids.iter().map(|&i| (0, ("a".parse().unwrap(), 0, i))).collect()
         };
         let owned: Vec<(f64, Vec<(u64, LineId)>)> =
-            readings.iter().map(|(s, l)| (*s, lines(l))).collect();
+            leaves.iter().map(|(s, l)| (*s, lines(l))).collect();
         Selection::new(owned.iter().map(|(s, l)| (*s, l.as_slice())), shared)
     }
 

@@ -93,11 +93,13 @@ impl Sight {
         let seen = to_tangents * line.direction.into_inner();
         let alone = seen - to_tangents * self.direction.into_inner();
         let alone = log_density(&(own + Matrix2::identity() * self.variance), alone)?;
+        // z = E' d - L s with the camera's shift s ~ N(shift, known): S = spread + L known L'.
         let GivenShift { shift, left, spread } = prediction.given_shift(line, self.factor());
         let known = self.shift_covariance.unwrap_or(shift);
         let spread = spread + left * known * left.transpose();
         let off = seen - left * (to_tangents * self.shift);
         let together = log_density(&spread, off)?;
+        // And the shift is learnt as in any Kalman filter: K = known L' S^-1.
         let gain = known * left.transpose() * spread.try_inverse()?;
         self.shift += prediction.basis() * (gain * off);
         self.shift_covariance = Some(known - gain * left * known);
@@ -118,6 +120,7 @@ impl Sight {
         let off = line.direction.into_inner() - self.direction.into_inner();
         self.squares += off.norm_squared() / (self.variance + reported);
         self.coordinates += 2.0;
+        // The two states of a constant rate, direction and rate, updated by the direction alone.
         let spread = self.variance + reported * self.factor();
         let (gain, rate_gain) = (self.variance / spread, self.tie / spread);
         self.direction = Unit::new_normalize(self.direction.into_inner() + off * gain);

@@ -2,7 +2,7 @@ use nalgebra::Vector3;
 
 /// How a target moves between the instants of two lines (Klochko 2020, eq. 5).
 ///
-/// The scales say what is known beforehand, as standard deviations an axis: the rank is decided
+/// The scales say what is known beforehand, as standard deviations per axis: the rank is decided
 /// against them, and where the data cannot carry an unknown the answer stays near zero of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Displacement {

@@ -30,7 +30,7 @@ impl MapSolution {
 }
 
 /// The weighted solution for any number of lines of any times: position and velocity at
-/// `reference`, with a zero-mean prior of `velocity_sd` (m/s an axis) on the velocity.
+/// `reference`, with a zero-mean prior of `velocity_sd` (m/s per axis) on the velocity.
 ///
 /// Where the papers' system is regular this is its solution, weighted by what each line is worth;
 /// where it is not, the prior stands in for what cannot be seen. `None` for fewer than two lines,

@@ -26,7 +26,7 @@ pub struct TimedLine {
     pub time: Timestamp,
     /// Standard deviation of that time, s.
     pub time_sd_s: f64,
-    /// Standard deviation of the line's origin, m an axis.
+    /// Standard deviation of the line's origin, m per axis.
     pub origin_sd_m: f64,
 }
 
@@ -37,7 +37,7 @@ impl TimedLine {
     }
 
     /// Covariance of the direction to a target at `range` whose velocity has a prior of
-    /// `velocity_sd` (m/s an axis): the line's own, and what the uncertainty of its time and origin
+    /// `velocity_sd` (m/s per axis): the line's own, and what the uncertainty of its time and origin
     /// adds.
     pub(crate) fn noise_at(&self, range: f64, velocity_sd: f64) -> Matrix2<f64> {
         let variance =
@@ -78,7 +78,7 @@ pub enum VelocityKnowledge {
 /// would meet anywhere.
 pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 
-/// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s an axis.
+/// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s per axis.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
 
 /// The squared distance that a true value of `dimensions` stays within with probability `p`.

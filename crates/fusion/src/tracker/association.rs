@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crossfix_message::TrackEventKind;
 
-use super::{Happening, Noted, Tracker, log_likelihood_ratio, missed};
+use super::{Noted, TrackChange, Tracker, log_likelihood_ratio, missed};
 use crate::assignment::{Candidate, assign};
 use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
@@ -102,7 +102,7 @@ impl Tracker {
                 );
             }
             if taken.is_some_and(|taken| taken.manoeuvre) {
-                noted.happenings.push(Happening::new(TrackEventKind::Manoeuvre, *id));
+                noted.changes.push(TrackChange::new(TrackEventKind::Manoeuvre, *id));
             }
         }
     }

@@ -2,7 +2,7 @@
 
 use crossfix_message::{Timestamp, TrackEventKind, track_id};
 
-use super::{Happening, Tracker, mahalanobis_squared, same_target};
+use super::{TrackChange, Tracker, mahalanobis_squared, same_target};
 use crate::cameras::Cameras;
 use crate::initiation::Start;
 use crate::motion::Motion;
@@ -25,8 +25,8 @@ const FOUND_AGAIN_GATE: f64 = 30.7;
 
 impl Tracker {
     /// Confirms, coasts and gives up.
-    pub(super) fn review(&mut self, now: Timestamp) -> Vec<Happening> {
-        let mut happenings = Vec::new();
+    pub(super) fn review(&mut self, now: Timestamp) -> Vec<TrackChange> {
+        let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
             let silent_s = now.seconds_since(track.updated);
             let unseen = silent_s > self.config.coasting_after_s;
@@ -37,11 +37,11 @@ impl Tracker {
                 TrackStatus::Lost => {}
                 _ if hopeless || track.score < DROP_SCORE => {
                     track.status = TrackStatus::Lost;
-                    happenings.push(Happening::new(TrackEventKind::Lost, track.id));
+                    changes.push(TrackChange::new(TrackEventKind::Lost, track.id));
                 }
                 TrackStatus::Tentative if track.score >= self.config.confirm_score => {
                     track.status = TrackStatus::Confirmed;
-                    happenings.push(Happening::new(TrackEventKind::Confirmed, track.id));
+                    changes.push(TrackChange::new(TrackEventKind::Confirmed, track.id));
                 }
                 TrackStatus::Confirmed | TrackStatus::Coasting | TrackStatus::OneCamera => {
                     track.status = if track.is_a_direction(now, &self.motion) {
@@ -55,11 +55,11 @@ impl Tracker {
                 TrackStatus::Tentative => {}
             }
         }
-        happenings
+        changes
     }
 
     /// A coasting track beside a live one was the same target: the live one goes on.
-    pub(super) fn merge(&mut self, now: Timestamp) -> Vec<Happening> {
+    pub(super) fn merge(&mut self, now: Timestamp) -> Vec<TrackChange> {
         let coasting = self.tracks.values().filter(|t| t.status == TrackStatus::Coasting);
         let live: Vec<&Track> =
             self.tracks.values().filter(|t| t.status == TrackStatus::Confirmed).collect();
@@ -78,14 +78,14 @@ impl Tracker {
                 if let Some(track) = self.tracks.get_mut(&old) {
                     track.status = TrackStatus::Lost;
                 }
-                Happening { kind: TrackEventKind::Merged, track: old, other: Some(live) }
+                TrackChange { kind: TrackEventKind::Merged, track: old, other: Some(live) }
             })
             .collect()
     }
 
     /// Compares each track a few times while it is young with those that were there before it: a
     /// detector that reports the two ends of a target makes two tracks.
-    pub(super) fn prove(&mut self, now: Timestamp, cameras: &Cameras) -> Vec<Happening> {
+    pub(super) fn prove(&mut self, now: Timestamp, cameras: &Cameras) -> Vec<TrackChange> {
         let is_due = |track: &&Track| {
             let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
             track.status == TrackStatus::Confirmed
@@ -93,7 +93,7 @@ impl Tracker {
                 && now.seconds_since(track.born) >= next_s
         };
         let due: Vec<TrackId> = self.tracks.values().filter(is_due).map(|track| track.id).collect();
-        let mut happenings = Vec::new();
+        let mut changes = Vec::new();
         for id in due {
             let older = self.tracks.range(..id).map(|(_, old)| old);
             let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
@@ -109,7 +109,7 @@ impl Tracker {
                 track.comparisons += 1;
                 if let Some(old) = same {
                     track.status = TrackStatus::Lost;
-                    happenings.push(Happening {
+                    changes.push(TrackChange {
                         kind: TrackEventKind::Merged,
                         track: id,
                         other: Some(old),
@@ -120,7 +120,7 @@ impl Tracker {
                 old.has_ends = true;
             }
         }
-        happenings
+        changes
     }
 
     /// Takes a track over that the initiation has found, and numbers it. Where it has used the
@@ -128,7 +128,7 @@ impl Tracker {
     /// it is the same target found again: it goes on under the old number. Where it lies elsewhere,
     /// the old one was wrong and is given up; but two cameras are not enough to say so, as their
     /// lines cross anywhere.
-    pub(crate) fn adopt(&mut self, start: Start, cameras: &Cameras) -> Vec<Happening> {
+    pub(crate) fn adopt(&mut self, start: Start, cameras: &Cameras) -> Vec<TrackChange> {
         let Start { mut track, cameras: seen_by, claimed_by } = start;
         let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
         let unheld: Vec<&Track> =
@@ -159,18 +159,18 @@ impl Tracker {
         let id = TrackId(track_id(self.began.unwrap_or(track.updated), self.next_number));
         self.next_number += 1;
         track.id = id;
-        let mut happenings = vec![Happening::new(TrackEventKind::Born, id)];
+        let mut changes = vec![TrackChange::new(TrackEventKind::Born, id)];
         for old in wrong {
             if let Some(track) = self.tracks.get_mut(&old) {
                 track.status = TrackStatus::Lost;
             }
-            happenings.push(Happening::new(TrackEventKind::Lost, old));
+            changes.push(TrackChange::new(TrackEventKind::Lost, old));
         }
         if track.is_confirmed() {
-            happenings.push(Happening::new(TrackEventKind::Confirmed, id));
+            changes.push(TrackChange::new(TrackEventKind::Confirmed, id));
         }
         self.tracks.insert(id, track);
-        happenings
+        changes
     }
 }
 

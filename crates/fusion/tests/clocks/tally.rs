@@ -85,7 +85,7 @@ pub struct Tally {
     pub excluded: u64,
     /// Latest time at which a clock was not settled, s, of each flight.
     pub settled: Vec<f64>,
-    /// Standard deviations of the cameras' poses, rad and m an axis: calibrations are off by these,
+    /// Standard deviations of the cameras' poses, rad and m per axis: calibrations are off by these,
     /// and say so.
     pub pose_sd: (f64, f64),
     frames: u32,

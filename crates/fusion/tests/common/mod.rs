@@ -48,7 +48,7 @@ pub struct Scene {
     pub clutter: f64,
 }
 
-/// A camera of 1920 x 1080 pixels, 69 degrees wide, that looks at a point; ten pictures a second.
+/// A camera of 1920 x 1080 pixels, 69 degrees wide, that looks at a point; ten pictures per second.
 pub fn eye(name: &str, at: [f64; 3], looking_at: [f64; 3], phase_s: f64) -> Eye {
     let size = ImageSize { width: 1920, height: 1080 };
     let lens = Intrinsics {

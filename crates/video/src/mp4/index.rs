@@ -8,9 +8,9 @@ use std::io::{Read, Seek, SeekFrom};
 
 use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak};
 
-/// The longest index that is read, bytes: a day of 60 frames a second.
+/// The longest index that is read, bytes: a day of 60 frames per second.
 const MAX_INDEX_BYTES: u64 = 128 << 20;
-/// The most frames of a file: 19 hours of 60 a second.
+/// The most frames of a file: 19 hours of 60 per second.
 const MAX_SAMPLES: usize = 1 << 22;
 /// A compressed frame larger than this is damage.
 const MAX_SAMPLE_BYTES: u64 = 64 << 20;

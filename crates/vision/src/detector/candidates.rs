@@ -25,7 +25,7 @@ const SCALES: f64 = 2.5;
 const MOST_OF_PLOT: f64 = 4.0;
 /// Plots of something that keeps to its place tell at most so much together: what comes and goes in
 /// the same place, as a branch in the wind, makes as many as a target. With half of it false tracks
-/// are 0.4 and 1.5 a minute (thermal, visible) in place of 1.1 and 3.1, but what a shaken camera
+/// are 0.4 and 1.5 per minute (thermal, visible) in place of 1.1 and 3.1, but what a shaken camera
 /// sees in noise is found in 76 % of the images in place of 89; with twice as much they are 13 and
 /// 49.
 const MOST_IN_PLACE: f64 = 8.0;
@@ -149,6 +149,7 @@ impl Candidate {
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
+        // ln N(off; 0, S) of the place against the density of plots of nothing there.
         let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
         let told = (MAKES_PLOT.ln() + there - chance.ln()).min(MOST_OF_PLOT);
         self.motion_log_ratio = (self.motion_log_ratio + told).min(

@@ -43,6 +43,7 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
         line.clear();
         line.resize(width, 0.0);
     }
+    // The square's means by running sums: down the columns here, along the rows in `means_along`.
     for y in -reach..=reach {
         sums.iter_mut().zip(row(y)).for_each(|(sum, sample)| *sum += sample);
     }
@@ -58,10 +59,12 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
             {
                 *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
             }
+            // At the ends the border goes on: its weight is added to the border's own.
             let last = width - 1;
             out[0] = 0.75 * smoothed[0] + 0.25 * smoothed[1.min(last)] - means[0];
             out[last] =
                 0.75 * smoothed[last] + 0.25 * smoothed[last.saturating_sub(1)] - means[last];
+            // The square moves a row down: the next row comes in, the last goes out.
             let ends = row(y + reach + 1).iter().zip(row(y - reach));
             sums.iter_mut().zip(ends).for_each(|(sum, (next, last))| *sum += next - last);
         }

@@ -10,7 +10,7 @@
 //!
 //! What comments say of other values of a constant is reasoned, unless they give figures: those
 //! were measured on real clips of a fixed camera, thermal and visible, as boxes within 10 px and
-//! false tracks a minute.
+//! false tracks per minute.
 
 mod candidates;
 mod filter;
@@ -20,7 +20,7 @@ mod plots;
 
 use crossfix_correlation::Plane;
 
-use crate::crop::mend;
+use crate::crop::replace_invalid;
 use crate::{DetectorConfig, ImagePoint, ImageTrackId, PixelBox};
 use candidates::{Candidate, Candidates};
 use filter::{Lines, between, halve, stand_out};
@@ -45,7 +45,7 @@ const SWAYS: f64 = 3.0;
 const PLACE_ERRORS: f64 = 2.0;
 /// Nats asked for above the odds of chance, as images of a minute are not as many as they seem:
 /// noise, clouds and leaves of one image are those of the next. With 2 it is 2.3 and 3.8 false
-/// tracks a minute (thermal, visible) in place of 1.1 and 3.1.
+/// tracks per minute (thermal, visible) in place of 1.1 and 3.1.
 const NOT_INDEPENDENT: f64 = 4.0;
 /// Fewest chances a minute that are reckoned with: before there has been a minute, nobody knows.
 const LEAST_CHANCES: f64 = 600.0;
@@ -148,7 +148,7 @@ impl Detector {
         }
         let Some(finest) = self.levels.first_mut() else { return Findings::default() };
         halve(image, &mut finest.reduced);
-        mend(&mut finest.reduced);
+        replace_invalid(&mut finest.reduced);
         self.watch(known);
         for known in known {
             cover(&mut self.levels[0].reduced, &known.place);

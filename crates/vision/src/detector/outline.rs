@@ -30,6 +30,8 @@ fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> 
     let corner = [plot.place.x, plot.place.y].map(|at| at.round() as isize - reach as isize);
     let side = 2 * reach + 1;
     let mut window = smoothed(image, corner, [side; 2]);
+    // Background and its spread from the window's border, by medians: a target that reaches out of
+    // the window must not count.
     let border = (0..side).flat_map(|i| [[i, 0], [i, side - 1], [0, i], [side - 1, i]]);
     let mut border: Vec<f32> = border.map(|[x, y]| window.row(y)[x]).collect();
     let around = median(&mut border);
@@ -38,6 +40,7 @@ fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> 
 
     let sign = if plot.is_brighter { 1.0 } else { -1.0 };
     let height = |[x, y]: [usize; 2]| sign * (window.row(y)[x] - around);
+    // The figure grows from what stands out most near the plot.
     let near = reach - reach.min((1.5 * plot.cell).ceil() as usize)
         ..side.min(reach + (1.5 * plot.cell).ceil() as usize + 1);
     let places = near.clone().flat_map(|y| near.clone().map(move |x| [x, y]));

@@ -56,7 +56,7 @@ impl Plot {
         (self.place.x - other.place.x).abs() < reach && (self.place.y - other.place.y).abs() < reach
     }
 
-    /// Variance of its place, px^2 an axis.
+    /// Variance of its place, px^2 per axis.
     pub(super) fn variance(&self) -> f64 {
         // A cell's top is known to a third of it, and a little more where the target's middle is
         // not its top.

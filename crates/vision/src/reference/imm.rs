@@ -18,13 +18,13 @@ const LEAST_PROBABILITY: f32 = 1e-6;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ImmConfig {
-    /// Intensity `K_M` of the order-0 model, levels a frame. Default 0.05.
+    /// Intensity `K_M` of the order-0 model, levels per frame. Default 0.05.
     pub constant_sd: f32,
-    /// Rate noise `sigma_M` of the order-1 model, levels a frame squared. Default 0.4.
+    /// Rate noise `sigma_M` of the order-1 model, levels per frame squared. Default 0.4.
     pub drift_sd: f32,
     /// Rate noise of Singer's model, levels a frame to the power of 1.5. Default 120: the jumps.
     pub jump_sd: f32,
-    /// Singer's manoeuvre constant `k_m`, 1 a frame. Default 1.
+    /// Singer's manoeuvre constant `k_m`, 1 per frame. Default 1.
     pub jump_rate: f32,
     /// Probability that the model stays from frame to frame. Default 0.99.
     pub stay: f32,
@@ -80,7 +80,7 @@ struct Block {
     probabilities: [Lanes; MODELS],
 }
 
-/// The filters of one colour channel of a reference: 18 numbers a pixel. A colour reference has one
+/// The filters of one colour channel of a reference: 18 numbers per pixel. A colour reference has one
 /// of these a channel.
 ///
 /// ```

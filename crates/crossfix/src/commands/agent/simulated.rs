@@ -80,7 +80,7 @@ impl Agent {
     }
 }
 
-/// Publishes where the targets of a scene really are, ten times a second.
+/// Publishes where the targets of a scene really are, ten times per second.
 struct TruthPublisher {
     publisher: LinkPublisher,
     world: World,

@@ -28,7 +28,7 @@ const DEFAULT_RATE_HZ: f64 = 30.0;
     after_help = "Examples:\n  crossfix plan configs/site --target-size 1\n  crossfix plan configs/site --min -80,-80,10 --max 80,80,120 --save plan.rrd\n  crossfix plan configs/site --geojson plan.geojson --anchor 48.3538,11.7861,490"
 )]
 pub struct Args {
-    /// The site's folder, with a file a camera (TOML).
+    /// The site's folder, with a file per camera (TOML).
     #[arg(value_name = "SITE_FOLDER")]
     site: PathBuf,
     /// The volume's low corner, local ENU, metres. Default: a box round where the optical axes
@@ -44,23 +44,23 @@ pub struct Args {
     /// How long a target has been seen, flying straight, seconds (at most 60).
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
     window: f64,
-    /// Standard deviation of a target's place in the image, pixels an axis.
+    /// Standard deviation of a target's place in the image, pixels per axis.
     #[arg(long, default_value_t = 0.5, value_name = "PIXELS", value_parser = positive)]
     pixel_sd: f64,
-    /// Standard deviation of the cameras' rotation, degrees an axis.
+    /// Standard deviation of the cameras' rotation, degrees per axis.
     #[arg(long, default_value_t = 0.02, value_name = "DEGREES", value_parser = not_negative)]
     rotation_sd_deg: f64,
-    /// Standard deviation of the cameras' positions, metres an axis.
+    /// Standard deviation of the cameras' positions, metres per axis.
     #[arg(long, default_value_t = 0.05, value_name = "METRES", value_parser = not_negative)]
     position_sd: f64,
     /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
     /// file.
     #[arg(long, value_name = "SECONDS", value_parser = not_negative)]
     clock_sd: Option<f64>,
-    /// How fast targets fly, metres a second: what an error of a clock is worth.
+    /// How fast targets fly, metres per second: what an error of a clock is worth.
     #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
     speed: f64,
-    /// What is known of a target's velocity beforehand: standard deviation, metres a second an
+    /// What is known of a target's velocity beforehand: standard deviation, metres per second per
     /// axis; 0 is nothing.
     #[arg(long, default_value_t = 15.0, value_name = "METRES_PER_SECOND", value_parser = not_negative)]
     velocity_prior_sd: f64,

@@ -25,7 +25,7 @@ use table::Table;
 /// left corner and the size of the box in pixels; ok is 1 while the target is measured or shortly
 /// predicted; us the microseconds that all targets of the frame took; id the target; certainty the
 /// probability that it is there; sd_x, sd_y the standard deviations of its place in pixels; vx, vy
-/// its velocity in pixels a second.
+/// its velocity in pixels per second.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  crossfix track clip.mp4 --box 100,80,20,14 --csv clip.csv\n  crossfix track clip.mp4 --detect --csv clip.csv --save clip.rrd\n  crossfix track clip.mp4 --from 120 --box 100,80,20,14 --box 310,95,12,9 --csv clip.csv"
@@ -60,7 +60,7 @@ pub struct Args {
     /// Override a key of the configuration, e.g. margin_px=3.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
-    /// Frame rate of image folders, frames a second.
+    /// Frame rate of image folders, frames per second.
     #[arg(long, default_value_t = 30.0, value_name = "HZ", value_parser = numbers::rate)]
     rate_hz: f64,
 }

@@ -9,10 +9,10 @@ use crate::spatial::TYPICAL_SPEED;
 use crate::visibility::independent_share;
 
 /// Logarithm of the probability that a camera is blind for a target that it should see.
-const BLIND: f64 = -4.6;
+const LOG_NEVER_DETECTED: f64 = -4.6;
 /// A camera whose clock shifts its bearings by so many times their own variance agrees with
 /// nothing.
-const VAGUE: f64 = 10.0;
+const INCONCLUSIVE: f64 = 10.0;
 
 /// How much likelier it is that lines are one target's than that every camera sees a target of its
 /// own, which no other camera sees.
@@ -21,16 +21,16 @@ const VAGUE: f64 = 10.0;
 /// that one camera each sees, their lines cross, and only how well these agree with one place and
 /// velocity tells: one target has six numbers, two lines have four each.
 #[derive(Clone, Debug)]
-pub(super) struct Coincidence {
+pub(super) struct OneTargetTest {
     sights: Vec<(CameraName, Sight)>,
     /// Cameras that should see the target and never have, with the logarithm of that probability.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
     /// Whether clocks are so uncertain that it says nothing.
-    vague: bool,
+    inconclusive: bool,
 }
 
-impl Coincidence {
+impl OneTargetTest {
     /// Of the lines of a beginning, with its log-likelihood ratio; the target may be as fast as
     /// `speed` (m/s, standard deviation) at a place.
     pub(super) fn begin<'a>(
@@ -42,7 +42,12 @@ impl Coincidence {
             let range = (place - line.origin).norm();
             (camera.clone(), Sight::first(line, time, speed / range))
         };
-        Self { sights: lines.map(sight).collect(), silent: Vec::new(), log_ratio, vague: false }
+        Self {
+            sights: lines.map(sight).collect(),
+            silent: Vec::new(),
+            log_ratio,
+            inconclusive: false,
+        }
     }
 
     /// Of what one camera has followed so far.
@@ -51,7 +56,7 @@ impl Coincidence {
             sights: vec![(camera.clone(), sight)],
             silent: Vec::new(),
             log_ratio: 0.0,
-            vague: false,
+            inconclusive: false,
         }
     }
 
@@ -103,7 +108,7 @@ impl Coincidence {
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
         // What an unsure clock shifts a bearing by is not known before the velocity is.
         let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
-        self.vague |= clock > VAGUE * line.covariance.trace() / 2.0;
+        self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
         sight.update(line);
     }
 
@@ -114,14 +119,14 @@ impl Coincidence {
         }
         let more = log_miss * independent_share(interval_s);
         match self.silent.iter_mut().find(|(name, _)| name == camera) {
-            Some((_, log)) => *log = (*log + more).max(BLIND),
-            None => self.silent.push((camera.clone(), more.max(BLIND))),
+            Some((_, log)) => *log = (*log + more).max(LOG_NEVER_DETECTED),
+            None => self.silent.push((camera.clone(), more.max(LOG_NEVER_DETECTED))),
         }
     }
 
     /// The log-likelihood ratio; `None` if clocks are too uncertain for it.
     pub(super) fn log_ratio(&self) -> Option<f64> {
-        if self.vague {
+        if self.inconclusive {
             return None;
         }
         let never = |camera: &CameraName| self.sights.iter().all(|(name, _)| name != camera);

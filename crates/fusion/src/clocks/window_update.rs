@@ -37,17 +37,17 @@ const FIRST_DENSITY: i32 = 0;
 const EVEN: f64 = 1.0;
 
 /// What a window says to a belief.
-pub(super) enum Lesson {
+pub(super) enum WindowUpdate {
     /// What is believed with it.
-    Learnt(Box<Belief>),
+    Accepted(Box<Belief>),
     /// It is too short, sees no clock that could be learnt, or is no target's.
-    Nothing,
+    Uninformative,
     /// It fits only if all that was learnt before is forgotten: this is what it says then.
-    Anew(Box<Belief>),
+    Contradicts(Box<Belief>),
 }
 
 /// A belief before a window, and the part of the state that the window tells of.
-struct Pupil<'a> {
+struct JumpTest<'a> {
     belief: Belief,
     components: Vec<usize>,
     window: &'a Window,
@@ -55,34 +55,34 @@ struct Pupil<'a> {
 
 /// A belief after a window. If the window does not fit it well, the clock of a camera may have
 /// jumped.
-pub(super) fn lesson(belief: &Belief, window: &Window) -> Lesson {
+pub(super) fn window_update(belief: &Belief, window: &Window) -> WindowUpdate {
     let window = window.checked();
     let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S)
     else {
-        return Lesson::Nothing;
+        return WindowUpdate::Uninformative;
     };
     let mut belief = belief.clone();
     belief.advance(window.start.plus_seconds(last));
     let clocks = window.cameras.iter().filter(|camera| belief.place(camera).is_some()).count();
     if clocks == 0 || window.cameras.len() < 2 {
-        return Lesson::Nothing;
+        return WindowUpdate::Uninformative;
     }
     let components = components(&belief, &window);
-    Pupil { belief, components, window: &window }.learn()
+    JumpTest { belief, components, window: &window }.learn()
 }
 
-impl Pupil<'_> {
-    fn learn(mut self) -> Lesson {
+impl JumpTest<'_> {
+    fn learn(mut self) -> WindowUpdate {
         let plain = adjust(&self.belief, self.window, &self.components);
         let fitting = plain.as_ref().filter(|adjusted| fits(adjusted));
         if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
-            return Lesson::Learnt(Box::new(self.learnt(self.belief.clone(), adjusted)));
+            return WindowUpdate::Accepted(Box::new(self.learnt(self.belief.clone(), adjusted)));
         }
         let suspects = self.suspects(plain.as_ref());
         if let Some(belief) =
             suspects.first().and_then(|camera| self.jumped_within(camera, plain.as_ref()))
         {
-            return Lesson::Learnt(Box::new(belief));
+            return WindowUpdate::Accepted(Box::new(belief));
         }
         let mut best = fitting.map(|adjusted| (adjusted.clone(), self.belief.clone()));
         for camera in suspects {
@@ -98,13 +98,13 @@ impl Pupil<'_> {
             }
         }
         if let Some((adjusted, belief)) = best {
-            return Lesson::Learnt(Box::new(self.learnt(belief, &adjusted)));
+            return WindowUpdate::Accepted(Box::new(self.learnt(belief, &adjusted)));
         }
-        self.belief.begin_anew();
+        self.belief.reset_all();
         self.components = components(&self.belief, self.window);
         let anew = adjust(&self.belief, self.window, &self.components).filter(fits);
-        anew.map_or(Lesson::Nothing, |adjusted| {
-            Lesson::Anew(Box::new(self.learnt(self.belief.clone(), &adjusted)))
+        anew.map_or(WindowUpdate::Uninformative, |adjusted| {
+            WindowUpdate::Contradicts(Box::new(self.learnt(self.belief.clone(), &adjusted)))
         })
     }
 
