@@ -34,8 +34,7 @@ pub struct BearingTrack {
     /// Unit vector towards the target in the camera's frame.
     #[prost(message, optional, tag = "2")]
     pub bearing: ::core::option::Option<Vector3>,
-    /// Variance along the first tangent, the camera's x axis made perpendicular to the bearing;
-    /// rad^2.
+    /// Variance along the first tangent, the camera's x axis made perpendicular to the bearing; rad^2.
     #[prost(double, tag = "3")]
     pub covariance_xx: f64,
     /// Covariance of both tangents; rad^2.
@@ -44,8 +43,7 @@ pub struct BearingTrack {
     /// Variance along the second tangent, bearing x first tangent; rad^2.
     #[prost(double, tag = "5")]
     pub covariance_yy: f64,
-    /// Centre of the target in the recorded (distorted) image, pixels; (0, 0) is the middle of the
-    /// top left pixel.
+    /// Centre of the target in the recorded (distorted) image, pixels; (0, 0) is the middle of the top left pixel.
     #[prost(double, tag = "6")]
     pub pixel_x: f64,
     #[prost(double, tag = "7")]
@@ -66,8 +64,7 @@ pub struct BearingTrack {
     /// Whether this exposure measured it.
     #[prost(enumeration = "ImageTrackState", tag = "13")]
     pub state: i32,
-    /// Probability that the target is where the bearing shows and nowhere else, 0 to 1; 0 where
-    /// nobody has said.
+    /// Probability that the target is where the bearing shows and nowhere else, 0 to 1; 0 where nobody has said.
     #[prost(double, tag = "14")]
     pub certainty: f64,
 }
@@ -134,15 +131,13 @@ pub struct CameraCalibration {
     /// The camera's centre in the world, metres.
     #[prost(message, optional, tag = "12")]
     pub position: ::core::option::Option<Vector3>,
-    /// Covariance of the pose's error, 6x6 row by row: a small rotation about the camera's axes
-    /// (rad), then the position in the world (m). The error is the true pose less the stated one: a
-    /// camera that is turned by d more than it says, and stands by c farther than it says. All
-    /// zeros: exact. Empty: not declared; then a careful survey's (1 mrad, 5 cm an axis) is
-    /// assumed, and what the sight lines show of it is learnt.
+    /// Covariance of the pose's error, 6x6 row by row: a small rotation about the camera's axes (rad), then the
+    /// position in the world (m). The error is the true pose less the stated one: a camera that is turned by d more
+    /// than it says, and stands by c farther than it says. All zeros: exact. Empty: not declared; then a careful
+    /// survey's (1 mrad, 5 cm an axis) is assumed, and what the sight lines show of it is learnt.
     #[prost(double, repeated, tag = "13")]
     pub pose_covariance: ::prost::alloc::vec::Vec<f64>,
-    /// The calibration holds from this time on: frames that were captured before it are read with
-    /// the one before it.
+    /// The calibration holds from this time on: frames that were captured before it are read with the one before it.
     #[prost(sfixed64, tag = "14")]
     pub valid_from_ns: i64,
     /// SHA-256 of this message with this field empty.
@@ -172,9 +167,8 @@ pub struct CameraResidual {
 #[serde(default)]
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Track {
-    /// Number of the track: the data time at which the fusion centre's run began in whole seconds,
-    /// times 2^20, and the track's number in that run, from 1. Live it is unique over restarts; the
-    /// same data replayed give the same numbers.
+    /// Number of the track: the data time at which the fusion centre's run began in whole seconds, times 2^20, and the
+    /// track's number in that run, from 1. Live it is unique over restarts; the same data replayed give the same numbers.
     #[prost(uint64, tag = "1")]
     pub id: u64,
     #[prost(enumeration = "TrackState", tag = "2")]
@@ -203,16 +197,15 @@ pub struct Track {
     /// Capture time of the newest bearing used.
     #[prost(sfixed64, tag = "10")]
     pub updated_ns: i64,
-    /// The direction (world, unit) along which the position, or the velocity, is not determined
-    /// better than by what was assumed of it; absent where the rank is full.
+    /// The direction (world, unit) along which the position, or the velocity, is not determined better than by what was
+    /// assumed of it; absent where the rank is full.
     #[prost(message, optional, tag = "11")]
     pub weak_position_axis: ::core::option::Option<Vector3>,
     #[prost(message, optional, tag = "12")]
     pub weak_velocity_axis: ::core::option::Option<Vector3>,
 }
-/// The 3D tracks that one exposure has changed: those that it updated or whose life has changed;
-/// each track is in a frame at least every half second. What is not in a frame goes on as it was
-/// said last.
+/// The 3D tracks that one exposure has changed: those that it updated or whose life has changed; each track is in a
+/// frame at least every half second. What is not in a frame goes on as it was said last.
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -278,8 +271,7 @@ pub struct CameraHealth {
     /// How far its clock is ahead, seconds: taken off its capture times.
     #[prost(double, tag = "4")]
     pub clock_offset_s: f64,
-    /// Standard deviation of the offset against true time, seconds. What all clocks may have in
-    /// common cannot be seen.
+    /// Standard deviation of the offset against true time, seconds. What all clocks may have in common cannot be seen.
     #[prost(double, tag = "5")]
     pub clock_offset_sd_s: f64,
     /// Standard deviation of the offset against what all clocks of the site say together, seconds.
@@ -325,13 +317,11 @@ pub struct Health {
     /// What a person should look at now, in plain words.
     #[prost(string, repeated, tag = "10")]
     pub problems: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// The data time at which a scene begins that cameras play in step; 0 without. The fusion
-    /// centre says again what a camera has said, so that one that is started later plays the same
-    /// scene.
+    /// The data time at which a scene begins that cameras play in step; 0 without. The fusion centre says again what a
+    /// camera has said, so that one that is started later plays the same scene.
     #[prost(sfixed64, tag = "11")]
     pub scene_begins_ns: i64,
-    /// From the fusion centre: the cameras that have been there for a second and more, ordered by
-    /// name.
+    /// From the fusion centre: the cameras that have been there for a second and more, ordered by name.
     #[prost(string, repeated, tag = "12")]
     pub present: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// From the fusion centre: the time of the data has gone on since the report before.
@@ -526,9 +516,8 @@ pub enum TrackState {
     Coasting = 3,
     /// Given up; said once.
     Lost = 4,
-    /// Sure, but one camera alone follows it: its direction is known and its range is not. The
-    /// position lies on that camera's sight line, and the covariance says how far along it the
-    /// target may be.
+    /// Sure, but one camera alone follows it: its direction is known and its range is not. The position lies on
+    /// that camera's sight line, and the covariance says how far along it the target may be.
     OneCamera = 5,
 }
 impl TrackState {
