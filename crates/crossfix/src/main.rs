@@ -36,9 +36,9 @@ use crate::commands::Command;
 /// Where in the air a small thing is, with nothing but cameras.
 ///
 /// Agents on camera hosts follow small targets and publish bearings; a fusion centre turns the
-/// bearings of three and more cameras into 3D tracks. Start with `crossfix demo`.
+/// bearings of three and more cameras into 3D tracks.
 #[derive(Debug, Parser)]
-#[command(name = "crossfix", version, propagate_version = true, after_help = parts::left_out())]
+#[command(name = "crossfix", version, propagate_version = true, after_help = parts::closing_words())]
 struct Cli {
     #[command(flatten)]
     logging: logging::LoggingArgs,

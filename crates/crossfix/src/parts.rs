@@ -6,13 +6,14 @@ const PARTS: [(&str, &str, bool); 2] = [
     ("pictures for Rerun", "viewer", cfg!(feature = "viewer")),
 ];
 
-/// A line for the help: what is left out, and how to have it; nothing of a whole build.
-pub fn left_out() -> String {
-    let lines = PARTS.iter().filter(|(.., is_here)| !is_here);
-    let lines = lines.map(|(part, feature, _)| {
-        format!("This build leaves out {part} (`--features {feature}`).")
-    });
-    lines.collect::<Vec<_>>().join("\n")
+/// The end of the help: where to start, or what is left out and how to have it.
+pub fn closing_words() -> String {
+    let lines: Vec<String> = PARTS
+        .iter()
+        .filter(|(.., is_here)| !is_here)
+        .map(|(part, feature, _)| format!("This build leaves out {part} (`--features {feature}`)."))
+        .collect();
+    if lines.is_empty() { "Start with `crossfix demo`.".to_owned() } else { lines.join("\n") }
 }
 
 /// The error of asking for a part that is left out.

@@ -6,7 +6,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
+use crossfix_geometry::{
+    Bearing, Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose,
+};
 use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
     ImageTrackState, Key, Payload, SiteName, Timestamp, TrueState, TruthFrame,
@@ -185,6 +187,7 @@ fn camera_entries(
     let height = f64::from(lens.resolution[1]);
     let bearings = Key::new(site.clone(), Channel::Bearings(name.clone()));
     let mut entries = Vec::new();
+    let mut without_direction = 0_u64;
     for label in labels {
         let fraction = label.pixel.map_or(0.5, |pixel| pixel.y() / height);
         let seconds = fitted.rtk_seconds(label.frame, fraction, lens.fps);
@@ -194,15 +197,27 @@ fn camera_entries(
         let time = Timestamp::from_seconds(seconds);
         let track =
             label.pixel.map(|pixel| bearing_track(&camera, pixel, fitted.residual_sigma_rad));
+        // In the corner of a wide lens the model may have no inverse: one such label is no reason to
+        // do without all others.
+        let track = track.and_then(|track| {
+            without_direction += u64::from(track.is_err());
+            track.ok()
+        });
         let frame = BearingFrame {
             camera: name.to_string(),
             sequence: label.frame,
             capture_time_ns: time.nanos(),
             clock_source: ClockSource::FrameCount.into(),
-            tracks: track.transpose()?.into_iter().collect(),
+            tracks: track.into_iter().collect(),
             ..Default::default()
         };
         entries.push(imported(bearings.clone(), time, frame.encode()));
+    }
+    if without_direction > 0 {
+        tracing::warn!(
+            "camera `{name}`: {without_direction} labels are left out, as the lens model shows no \
+             direction at their pixels"
+        );
     }
     let start = entries.iter().map(|entry| entry.data_time).min().unwrap_or_default();
     let calibration = CameraCalibration::new(&name, &camera, start)
@@ -212,7 +227,9 @@ fn camera_entries(
     Ok(entries)
 }
 
-fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> anyhow::Result<BearingTrack> {
+/// # Errors
+/// The lens model shows no direction at the pixel.
+fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> Result<BearingTrack, GeometryError> {
     let direction = camera.model().direction(pixel)?;
     let bearing = Bearing::new(direction.into_inner(), Matrix2::identity() * sigma.powi(2))?;
     Ok(BearingTrack {
@@ -284,7 +301,42 @@ fn velocity_between(before: &Sample, at: &Sample, after: &Sample) -> Vector3<f64
 
 #[cfg(test)]
 mod tests {
+    use crossfix_message::decode;
+    use serde_json::json;
+
     use super::*;
+
+    #[test]
+    fn a_label_where_the_lens_has_no_direction_is_left_out_and_the_others_are_not() {
+        // A barrel so strong that the polynomial turns back within the image.
+        let lens: LensFile = serde_json::from_value(json!({
+            "K-matrix": [[500.0, 0.0, 960.0], [0.0, 500.0, 540.0], [0.0, 0.0, 1.0]],
+            "distCoeff": [-0.3, 0.0, 0.0, 0.0],
+            "fps": 30.0,
+            "resolution": [1920, 1080],
+        }))
+        .unwrap();
+        let fitted: FittedCamera = serde_json::from_value(json!({
+            "name": "wide",
+            "R_world_to_cam": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            "centre_enu_m": [0.0, 0.0, 0.0],
+            "clock_offset_s": 0.0,
+            "clock_rate": 0.0,
+            "readout_fraction_of_frame": 0.0,
+            "residual_sigma_rad": 0.001,
+        }))
+        .unwrap();
+        let split = Split { test_rtk_index_ranges: vec![[0.0, 1e6]], cameras: BTreeMap::default() };
+        let label = |frame, x, y| Label { frame, pixel: Some(Pixel::new(x, y)) };
+        let labels = [label(0, 960.0, 540.0), label(1, 3.0, 3.0), label(2, 1000.0, 500.0)];
+        let site = "test".parse().unwrap();
+        let entries = camera_entries(&site, &fitted, &lens, &labels, &split).unwrap();
+        let seen: Vec<usize> = entries[1..]
+            .iter()
+            .map(|entry| decode::<BearingFrame>(&entry.data).unwrap().tracks.len())
+            .collect();
+        assert_eq!(seen, [1, 0, 1]);
+    }
 
     #[test]
     fn the_velocity_beside_a_masked_sample_is_that_of_the_curve() {

@@ -84,7 +84,7 @@ struct Answer {
     observability: Option<Observability>,
 }
 
-/// 002 to the letter (equations 10 and 11): the inverse, or the minimum-norm solution where the
+/// Klochko 2020 to the letter (equations 10 and 11): the inverse, or the minimum-norm solution where the
 /// condition number is out of all measure, and the range refined from the pair.
 fn papers_inverse(lines: &[TimedLine; 3]) -> Option<Answer> {
     let [first, second, third] = lines;
