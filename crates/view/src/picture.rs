@@ -32,6 +32,19 @@ const AIR_M: f64 = 25.0;
 /// second, so the fusion centre that held it is gone.
 const GHOST_S: f64 = 3.0;
 
+/// The picture is laid out about tracks that are known better than this, m: one that is far off must
+/// not make all others small.
+const LAID_OUT_SD_M: f64 = 5.0;
+
+/// What is shown of the cameras' images.
+#[derive(Clone, Copy, Debug)]
+enum Shown {
+    /// All: while more comes, nobody knows where.
+    WholeImages,
+    /// The parts in which targets were.
+    WhereTargetsWere,
+}
+
 struct CameraView {
     index: u64,
     camera: Camera,
@@ -119,7 +132,7 @@ impl Picture {
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
     pub fn finish(self) -> Result<(), ViewError> {
-        self.lay_out()?;
+        self.lay_out(Shown::WhereTargetsWere)?;
         self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
@@ -165,13 +178,13 @@ impl Picture {
             view.hash.clone_from(&message.hash);
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
             draw::residual_plot(&self.stream, &name, view.index)?;
-            self.lay_out()?;
+            self.lay_out(Shown::WholeImages)?;
         }
         Ok(())
     }
 
     /// Lays the picture out about what is known of cameras and tracks by now.
-    fn lay_out(&self) -> Result<(), ViewError> {
+    fn lay_out(&self, shown: Shown) -> Result<(), ViewError> {
         let mut extent =
             Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
         if self.flown.is_empty() {
@@ -186,7 +199,12 @@ impl Picture {
             .iter()
             .map(|(name, view)| blueprint::CameraPanel {
                 name: name.clone(),
-                shown: view.region.map(|region| region.shown(&view.camera, view.scale)),
+                shown: match shown {
+                    Shown::WholeImages => None,
+                    Shown::WhereTargetsWere => {
+                        view.region.map(|region| region.shown(&view.camera, view.scale))
+                    }
+                },
             })
             .collect();
         blueprint::send(&self.stream, &cameras, &extent)
@@ -267,11 +285,12 @@ impl Picture {
             draw::track(&self.stream, track, trail.make_contiguous())?;
             self.drawn
                 .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
-            if track.state() == TrackState::Confirmed {
+            let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
+            if track.state() == TrackState::Confirmed && variance < LAID_OUT_SD_M.powi(2) {
                 let is_first = self.flown.is_empty();
                 self.flown.include(place);
                 if is_first {
-                    self.lay_out()?;
+                    self.lay_out(Shown::WholeImages)?;
                 }
             }
         }
