@@ -1,24 +1,52 @@
-//! Who is there, and a word where nobody is.
+//! Who is there, and a word on who is not.
 
 use std::time::{Duration, Instant};
 
 use crossfix_message::{CameraName, Channel};
 use crossfix_transport::{Link, NetworkConfig, Presence};
 
-/// How long nobody may be there before that is said, and how often it is said again.
+/// How long somebody may be missing before that is said, and how often it is said again that nobody
+/// is there.
 const PATIENCE: Duration = Duration::from_secs(3);
 const PERIOD: Duration = Duration::from_secs(60);
 /// Names in a line; the rest is a number.
 const NAMED: usize = 8;
 
-/// Looks who of those that a component needs is there, and says who comes, who goes, and that
-/// nobody is.
+/// Looks who of those that a component needs is there, and says who comes, who goes, and who is
+/// missing.
 pub struct Lookout {
     presence: Presence,
     site: String,
     others: Vec<Other>,
-    alone_since: Option<Instant>,
+    absence: Absence,
+}
+
+/// When it is time to say who is missing.
+#[derive(Debug, Default)]
+struct Absence {
+    since: Option<Instant>,
     said: Option<Instant>,
+}
+
+impl Absence {
+    /// Whether it is now, where so many of so many are there and some of them have just come.
+    fn is_due(&mut self, here: usize, of: usize, came: bool, now: Instant) -> bool {
+        if came || here == of {
+            *self = Self::default();
+        }
+        if here == of {
+            return false;
+        }
+        let since = *self.since.get_or_insert(now);
+        // That nobody is there is said again; that one of several is not may be meant.
+        let again = |said: Instant| here == 0 && now.saturating_duration_since(said) >= PERIOD;
+        let is_due =
+            now.saturating_duration_since(since) >= PATIENCE && self.said.is_none_or(again);
+        if is_due {
+            self.said = Some(now);
+        }
+        is_due
+    }
 }
 
 struct Other {
@@ -61,29 +89,25 @@ impl Lookout {
 
     fn new(link: &Link, others: Vec<Other>) -> anyhow::Result<Self> {
         let (presence, site) = (link.presence()?, link.site().to_string());
-        Ok(Self { presence, site, others, alone_since: None, said: None })
+        Ok(Self { presence, site, others, absence: Absence::default() })
     }
 
     /// Looks again; to be called about once a second.
     pub fn look(&mut self, now: Instant) {
+        let mut came = false;
         for other in &mut self.others {
             let is_here = self.presence.is_alive(&other.channel);
             if is_here != other.is_here {
                 let what = if is_here { "is there" } else { "is gone" };
                 tracing::info!("{} {what}", other.name);
             }
+            came |= is_here && !other.is_here;
             other.was_here = other.is_here;
             other.is_here = is_here;
         }
-        if self.others.iter().any(|other| other.is_here) {
-            (self.alone_since, self.said) = (None, None);
-            return;
-        }
-        let since = *self.alone_since.get_or_insert(now);
-        let is_due = self.said.is_none_or(|said| now.saturating_duration_since(said) >= PERIOD);
-        if is_due && now.saturating_duration_since(since) >= PATIENCE {
-            self.said = Some(now);
-            tracing::warn!("{}", self.nobody());
+        let here = self.others.iter().filter(|other| other.is_here).count();
+        if self.absence.is_due(here, self.others.len(), came, now) {
+            tracing::warn!("{}", self.missing());
         }
     }
 
@@ -99,16 +123,42 @@ impl Lookout {
         here.filter_map(|other| other.channel.camera()).map(ToString::to_string).collect()
     }
 
-    fn nobody(&self) -> String {
-        let mut named: Vec<String> = self
-            .others
+    fn missing(&self) -> String {
+        let missing: Vec<&Other> = self.others.iter().filter(|other| !other.is_here).collect();
+        let mut named: Vec<String> = missing
             .iter()
             .take(NAMED)
             .map(|other| format!("{} at {}", other.name, other.endpoint))
             .collect();
-        if self.others.len() > NAMED {
-            named.push(format!("{} more", self.others.len() - NAMED));
+        if missing.len() > NAMED {
+            named.push(format!("{} more", missing.len() - NAMED));
         }
-        format!("nobody of site `{}` is there: waiting for {}", self.site, named.join(", "))
+        let named = named.join(", ");
+        if missing.len() == self.others.len() {
+            format!("nobody of site `{}` is there: waiting for {named}", self.site)
+        } else {
+            format!("waiting for {named}; the others of site `{}` are there", self.site)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn that_nobody_is_there_is_said_again_and_who_is_missing_beside_others_once() {
+        let begun = Instant::now();
+        let mut absence = Absence::default();
+        let mut said = |here, came, seconds| {
+            absence.is_due(here, 3, came, begun + Duration::from_secs(seconds))
+        };
+        assert!(!said(0, false, 0), "they may be on their way");
+        assert!(said(0, false, 3));
+        assert!(!said(0, false, 4) && said(0, false, 63), "again after a minute");
+        assert!(!said(2, true, 70), "the third may be on its way");
+        assert!(said(2, false, 73));
+        assert!(!said(2, false, 500), "one that is switched off is no reason for a line a minute");
+        assert!(!said(3, true, 510) && !said(2, false, 511) && said(2, false, 514), "it has gone");
     }
 }
