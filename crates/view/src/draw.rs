@@ -167,6 +167,12 @@ pub(crate) fn track(
     Ok(())
 }
 
+/// The root of the sum of the variances of a track's position, m.
+pub(crate) fn position_sd(track: &Track) -> f64 {
+    let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
+    variance.max(0.0).sqrt()
+}
+
 /// What a track's label says: its number, and what it is or how fast, how high and how sure.
 fn label(track: &Track, speed: f64, height: f64) -> String {
     let number = TrackNumber(track.id);
@@ -176,8 +182,7 @@ fn label(track: &Track, speed: f64, height: f64) -> String {
         TrackState::OneCamera => return format!("{number} (one camera)"),
         _ => "",
     };
-    let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
-    let sd = variance.max(0.0).sqrt();
+    let sd = position_sd(track);
     format!("{number}  {what}{height:.0} m  {speed:.0} m/s  \u{b1}{sd:.2}")
 }
 

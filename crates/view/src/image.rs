@@ -7,7 +7,7 @@ use rerun::RecordingStream;
 use rerun_types::archetypes::{Boxes2D, LineStrips2D, Points2D};
 use rerun_types::components::Radius;
 
-use crate::draw::SIGMAS;
+use crate::draw::{SIGMAS, position_sd};
 use crate::paths::image_path;
 use crate::{ViewError, colour};
 
@@ -91,9 +91,8 @@ impl Ring {
         }
         let pixel = camera.project(place)?;
         let range = (place - camera.pose().position()).norm();
-        let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
         // A bound on the deviation across the line of sight, in pixels.
-        let deviation = variance.max(0.0).sqrt() / range * camera.model().intrinsics().fx;
+        let deviation = position_sd(track) / range * camera.model().intrinsics().fx;
         let radius = (SIGMAS * deviation).max(LEAST_RING_PX);
         Some(Self { centre: [pixel.x(), pixel.y()], radius, id: track.id })
     }

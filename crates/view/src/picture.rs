@@ -285,8 +285,8 @@ impl Picture {
             draw::track(&self.stream, track, trail.make_contiguous())?;
             self.drawn
                 .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
-            let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
-            if track.state() == TrackState::Confirmed && variance < LAID_OUT_SD_M.powi(2) {
+            let is_sure = draw::position_sd(track) < LAID_OUT_SD_M;
+            if track.state() == TrackState::Confirmed && is_sure {
                 let is_first = self.flown.is_empty();
                 self.flown.include(place);
                 if is_first {
@@ -338,6 +338,7 @@ impl Picture {
         self.trails.remove(&id);
         if self.drawn.remove(&id).is_some() {
             self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
+            self.rings()?;
         }
         Ok(())
     }
