@@ -10,7 +10,9 @@ use std::error::Error;
 use std::path::PathBuf;
 
 use crossfix_fusion::{Fusion, FusionConfig, Output};
-use crossfix_message::{BearingFrame, CameraCalibration, Channel, DecodeError, decode};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, DecodeError, TrackNumber, decode,
+};
 use crossfix_recording::{Entry, RecordingReader};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -23,8 +25,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     // What still waits for slower cameras.
     say(&fusion.flush());
     for track in fusion.tracks().filter(|track| track.is_confirmed()) {
-        let (position, velocity) = (track.state().position(), track.state().velocity());
-        println!("at the end {position:.2} m, {velocity:.2} m/s");
+        let (place, velocity) = (track.state().position(), track.state().velocity());
+        let speed = velocity.norm();
+        println!("at the end ({:.2}, {:.2}, {:.2}) m, {speed:.2} m/s", place.x, place.y, place.z);
     }
     Ok(())
 }
@@ -49,7 +52,8 @@ fn say(outputs: &[Output]) {
         match output {
             Output::Event(event) => {
                 let seconds = event.time_ns as f64 * 1e-9;
-                println!("{seconds:.3} s: track {} {}", event.track_id, event.kind().as_str_name());
+                let track = TrackNumber(event.track_id);
+                println!("{seconds:.3} s: track {track} {}", event.kind().as_str_name());
             }
             Output::Camera(camera, standing) => println!("camera {camera}: {standing:?}"),
             // Positions of every exposure, and bearings of no use: more than one wants to read.
