@@ -29,9 +29,10 @@ struct Absence {
 }
 
 impl Absence {
-    /// Whether it is now, where so many of so many are there and some of them have just come.
-    fn is_due(&mut self, here: usize, of: usize, came: bool, now: Instant) -> bool {
-        if came || here == of {
+    /// Whether it is now, where so many of so many are there; `changed` if one of them has just come
+    /// or gone, of which others may be about to follow.
+    fn is_due(&mut self, here: usize, of: usize, changed: bool, now: Instant) -> bool {
+        if changed || here == of {
             *self = Self::default();
         }
         if here == of {
@@ -94,19 +95,19 @@ impl Lookout {
 
     /// Looks again; to be called about once a second.
     pub fn look(&mut self, now: Instant) {
-        let mut came = false;
+        let mut changed = false;
         for other in &mut self.others {
             let is_here = self.presence.is_alive(&other.channel);
             if is_here != other.is_here {
                 let what = if is_here { "is there" } else { "is gone" };
                 tracing::info!("{} {what}", other.name);
             }
-            came |= is_here && !other.is_here;
+            changed |= is_here != other.is_here;
             other.was_here = other.is_here;
             other.is_here = is_here;
         }
         let here = self.others.iter().filter(|other| other.is_here).count();
-        if self.absence.is_due(here, self.others.len(), came, now) {
+        if self.absence.is_due(here, self.others.len(), changed, now) {
             tracing::warn!("{}", self.missing());
         }
     }
@@ -150,8 +151,8 @@ mod tests {
     fn that_nobody_is_there_is_said_again_and_who_is_missing_beside_others_once() {
         let begun = Instant::now();
         let mut absence = Absence::default();
-        let mut said = |here, came, seconds| {
-            absence.is_due(here, 3, came, begun + Duration::from_secs(seconds))
+        let mut said = |here, changed, seconds| {
+            absence.is_due(here, 3, changed, begun + Duration::from_secs(seconds))
         };
         assert!(!said(0, false, 0), "they may be on their way");
         assert!(said(0, false, 3));
@@ -159,6 +160,7 @@ mod tests {
         assert!(!said(2, true, 70), "the third may be on its way");
         assert!(said(2, false, 73));
         assert!(!said(2, false, 500), "one that is switched off is no reason for a line a minute");
-        assert!(!said(3, true, 510) && !said(2, false, 511) && said(2, false, 514), "it has gone");
+        assert!(!said(3, true, 510) && !said(2, true, 511) && said(2, false, 514), "it has gone");
+        assert!(!said(0, true, 515) && said(0, false, 518), "and so have the others");
     }
 }

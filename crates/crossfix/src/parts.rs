@@ -16,6 +16,12 @@ pub fn closing_words() -> String {
     if lines.is_empty() { "Start with `crossfix demo`.".to_owned() } else { lines.join("\n") }
 }
 
+/// What a build without the viewer says to whoever asks for a picture.
+#[cfg(not(feature = "viewer"))]
+pub fn no_pictures() -> anyhow::Error {
+    is_left_out("pictures for Rerun", "viewer")
+}
+
 /// The error of asking for a part that is left out.
 #[cfg(not(all(feature = "centre", feature = "viewer")))]
 pub fn is_left_out(part: &str, feature: &str) -> anyhow::Error {

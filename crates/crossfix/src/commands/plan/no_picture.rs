@@ -9,5 +9,5 @@ use crate::parts;
 
 /// Says that there is none.
 pub fn draw(_: &Report, _: &[PlannedCamera], _: &Path) -> anyhow::Result<()> {
-    Err(parts::is_left_out("pictures for Rerun", "viewer"))
+    Err(parts::no_pictures())
 }

@@ -13,7 +13,7 @@ pub(super) enum Picture {}
 
 impl Picture {
     pub(super) fn new(_: &Path, _: Option<&Path>) -> anyhow::Result<Self> {
-        Err(parts::is_left_out("pictures for Rerun", "viewer"))
+        Err(parts::no_pictures())
     }
 
     pub(super) fn finish(self) -> anyhow::Result<()> {
