@@ -1,6 +1,5 @@
 //! Which leaves go together, where a leaf is one way in which some bearings may be one target's:
-//! the set of greatest total score without common
-//! lines.
+//! the set of greatest total score without common lines.
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
