@@ -14,7 +14,7 @@ use crate::motion::Motion;
 use crate::site_time::{SiteTime, Turn};
 use crate::track::{Track, TrackId};
 use crate::tracker::{TrackChange, Tracker};
-use crate::uncertainty::PoseUncertainty;
+use crate::uncertainty::{LastingNoise, PoseUncertainty};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig, messages};
 
@@ -97,7 +97,17 @@ impl Fusion {
         let is_declared = calibration.pose_covariance.is_some();
         let declared = calibration.pose_covariance;
         let pose_covariance = declared.unwrap_or_else(PoseUncertainty::of_careful_survey);
-        let known = KnownCamera { camera: calibration.camera, pose_covariance, is_declared };
+        let lasting = calibration.lasting_noise.map_or(LastingNoise::NONE, |noise| LastingNoise {
+            sd_rad: noise.sd_rad,
+            time_s: noise.time_s,
+        });
+        let known = KnownCamera {
+            camera: calibration.camera,
+            pose_covariance,
+            lasting,
+            clock_walk: calibration.clock_wander_s.powi(2),
+            is_declared,
+        };
         self.cameras.calibrate(calibration.name, calibration.valid_from, known);
         Ok(())
     }

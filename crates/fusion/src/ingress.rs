@@ -154,7 +154,7 @@ fn sighting(
 pub(crate) fn read(
     frame: &BearingFrame,
     name: &CameraName,
-    KnownCamera { camera, pose_covariance: pose, .. }: &KnownCamera,
+    KnownCamera { camera, pose_covariance: pose, lasting, clock_walk, .. }: &KnownCamera,
     config: &Bearings,
     counters: &mut Counters,
 ) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
@@ -189,6 +189,8 @@ pub(crate) fn read(
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty {
             pose: Some(PoseUncertainty::new(*pose)),
+            clock_walk: *clock_walk,
+            lasting: *lasting,
             axes: *camera.pose().rotation(),
             ..CameraUncertainty::of_time(sd)
         },

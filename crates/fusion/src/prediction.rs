@@ -5,9 +5,9 @@ use std::f64::consts::PI;
 
 use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, MotionModels};
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix3x2, Matrix6x3, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix3x2, Point3, Vector2};
 
-use crate::uncertainty::CameraUncertainty;
+use crate::uncertainty::{CameraUncertainty, SharedTies};
 
 /// Where a camera should see a target, and how surely.
 #[derive(Clone, Debug)]
@@ -69,7 +69,7 @@ impl BearingPrediction {
         models: &MotionModels,
         origin: Point3<f64>,
         uncertainty: &CameraUncertainty,
-        ties: &Matrix6x3<f64>,
+        ties: &SharedTies,
     ) -> Option<Self> {
         // Process noise is the same along all axes: what it adds to a direction is a multiple of
         // the identity, and only what the models share has to be projected.
@@ -218,7 +218,7 @@ mod tests {
             &models,
             camera,
             &CameraUncertainty::of_time(0.0),
-            &Matrix6x3::zeros(),
+            &SharedTies::zeros(),
         )
         .unwrap();
         let gate = Gate::with_probability(0.9999);

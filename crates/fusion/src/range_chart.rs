@@ -9,9 +9,9 @@
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::passing_ranges;
-use nalgebra::{
-    Matrix2x3, Matrix3, Matrix3x2, Matrix6, Matrix6x2, Matrix6x3, Point3, Unit, Vector3, Vector6,
-};
+use nalgebra::{Matrix2x3, Matrix3, Matrix3x2, Matrix6, Matrix6x2, Point3, Unit, Vector3, Vector6};
+
+use crate::uncertainty::SharedTies;
 
 /// Coordinates of a target's state about one state.
 // Made and used in one update: never stored, so the size of the larger variant costs nothing.
@@ -63,8 +63,8 @@ impl Chart {
     pub(crate) fn expressed(
         &self,
         covariance: &Matrix6<f64>,
-        ties: &Matrix6x3<f64>,
-    ) -> (Matrix6<f64>, Matrix6x3<f64>) {
+        ties: &SharedTies,
+    ) -> (Matrix6<f64>, SharedTies) {
         match self {
             Self::Cartesian(_) => (*covariance, *ties),
             Self::ByRange(chart) => {

@@ -195,7 +195,7 @@ impl Track {
         by.fixed_view_mut::<2, 3>(0, 3).copy_from(&(model.by_position() * dt));
         // The least-squares solution errs by -P H' R^-1 times the error of the line.
         let covariance = -(fix.state.covariance * by.transpose() * inverse * shifts);
-        self.ties.insert(camera.clone(), Ties::begun(*time, covariance));
+        self.ties.insert(camera.clone(), Ties::begun(*time, covariance, uncertainty.lasting));
         self.information += by.transpose() * inverse * by;
         Some(())
     }
@@ -363,7 +363,7 @@ impl Track {
             results.push(result);
             likely
         })?;
-        let nis = self.carry(camera, interval, &results);
+        let nis = self.carry((camera, uncertainty.lasting), interval, &results);
         self.gather_information(interval, line, uncertainty);
         self.updated = time;
         self.follower = Some(line.origin);

@@ -1,11 +1,51 @@
 //! What is uncertain of a camera as a whole, beside the noise of each bearing.
 
 use crossfix_geometry::{BearingModel, tangent_basis};
-use nalgebra::{Matrix2, Matrix2x3, Matrix6, Rotation3, Unit, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, Unit, Vector2, Vector3};
 
 /// Variances that differ by less than this share of them are one: what turning them leaves is far
 /// less.
 const ROUNDING: f64 = 1e-9;
+
+/// Errors that bearings of a camera share: two of its pose, one of its clock, and two that last from
+/// one bearing of a target to the next.
+pub(crate) const SHARED: usize = 5;
+/// Where the clock's is among them.
+pub(crate) const OF_CLOCK: usize = 2;
+/// Where those are that last.
+pub(crate) const LASTING: usize = 3;
+
+/// What a deviation of each shared error does to a bearing, rad.
+pub(crate) type Shifts = SMatrix<f64, 2, SHARED>;
+
+/// Covariance of position and velocity with the shared errors, each in its own deviations.
+pub(crate) type SharedTies = SMatrix<f64, 6, SHARED>;
+
+/// The part of a bearing's noise that the next bearing of the same target has, too: a tracker that
+/// sits beside the target's middle does so for a while.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct LastingNoise {
+    /// Standard deviation per tangent, rad.
+    pub(crate) sd_rad: f64,
+    /// Time after which e^-1 of it is left, s.
+    pub(crate) time_s: f64,
+}
+
+impl LastingNoise {
+    /// None: each bearing errs anew.
+    pub(crate) const NONE: Self = Self { sd_rad: 0.0, time_s: 1.0 };
+
+    /// The variance of white noise of bearings `interval_s` apart that averages out as slowly, rad^2.
+    pub(crate) fn as_white(&self, interval_s: f64) -> f64 {
+        let kept = (-interval_s.max(1e-3) / self.time_s).exp();
+        self.variance() * (1.0 + kept) / (1.0 - kept)
+    }
+
+    /// Its variance, rad^2.
+    pub(crate) fn variance(&self) -> f64 {
+        self.sd_rad.powi(2)
+    }
+}
 
 /// Covariance of a camera's pose in the world's axes as declared: rotation (rad), then position
 /// (m).
@@ -64,6 +104,10 @@ pub(crate) struct CameraUncertainty {
     /// Whether the clock's error is taken for noise of each bearing: where the velocity is not
     /// known yet, what it shifts the bearings by is not either.
     pub(crate) clock_is_noise: bool,
+    /// What the clock wanders by beside its offset and its drift, s^2/s.
+    pub(crate) clock_walk: f64,
+    /// The part of its bearings' noise that lasts.
+    pub(crate) lasting: LastingNoise,
     /// World from camera: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,
 }
@@ -77,20 +121,25 @@ impl CameraUncertainty {
             pose: None,
             pose_scale: 1.0,
             clock_is_noise: false,
+            clock_walk: 0.0,
+            lasting: LastingNoise::NONE,
             axes: Rotation3::identity(),
         }
     }
 
-    /// How the camera's shared errors (two of its pose, one of its clock) shift a bearing, rad,
-    /// each in units of its own deviation: what pose and clock are off by hits every bearing of the
-    /// camera alike, and more bearings do not average it away. `own` is the covariance that the
-    /// bearing reports.
-    pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Matrix2x3<f64> {
-        let mut shifts = Matrix2x3::zeros();
+    /// How the camera's shared errors shift a bearing, rad, each in units of its own deviation: what
+    /// pose and clock are off by hits every bearing of the camera alike, what lasts those of a
+    /// while, and more bearings do not average it away.
+    pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Shifts {
+        let mut shifts = Shifts::zeros();
         let pose = self.declared_pose(model) * self.pose_scale.sqrt();
         shifts.fixed_view_mut::<2, 2>(0, 0).copy_from(&pose);
         if self.time_sd_s > 0.0 && !self.clock_is_noise {
-            shifts.set_column(2, &(model.by_time(velocity) * self.time_sd_s));
+            shifts.set_column(OF_CLOCK, &(model.by_time(velocity) * self.time_sd_s));
+        }
+        if self.lasting.sd_rad > 0.0 {
+            let lasting = self.turn(model) * self.lasting.sd_rad;
+            shifts.fixed_view_mut::<2, 2>(0, LASTING).copy_from(&lasting);
         }
         shifts
     }
@@ -171,6 +220,8 @@ mod tests {
             pose: Some(PoseUncertainty::new(pose)),
             clock_is_noise: false,
             pose_scale: 1.0,
+            clock_walk: 0.0,
+            lasting: LastingNoise::NONE,
             axes: Rotation3::identity(),
         };
         // 10 m/s along the first tangent: 0.2 rad/s.

@@ -5,10 +5,10 @@ use std::f64::consts::PI;
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x2, Matrix6x3, Point3, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
 use crate::range_chart::Chart;
-use crate::uncertainty::CameraUncertainty;
+use crate::uncertainty::{CameraUncertainty, SharedTies};
 
 /// Rounds of the iterated update: from a range known to a factor of three it takes four or five.
 const MAX_ROUNDS: usize = 10;
@@ -26,7 +26,7 @@ pub(crate) struct Measured<'a> {
     pub(crate) camera: &'a CameraUncertainty,
     /// Covariance of the state with the camera's shared errors, each of these in its own
     /// deviations.
-    pub(crate) ties: &'a Matrix6x3<f64>,
+    pub(crate) ties: &'a SharedTies,
 }
 
 /// A state after a bearing.
@@ -40,7 +40,7 @@ pub(crate) struct Updated {
     /// What the update does to the state's covariance with any error: `carried * ties`, ...
     pub(crate) carried: Matrix6<f64>,
     /// ... less, of the camera's own errors, `gain * shifts`.
-    pub(crate) gained: Matrix6x3<f64>,
+    pub(crate) gained: SharedTies,
 }
 
 /// The state after a bearing of its time; `seen_from` is where the camera stands that follows the

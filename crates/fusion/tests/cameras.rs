@@ -6,10 +6,12 @@
 mod common;
 
 use common::{Eye, Scene, eye, found, fusion_of, site, straight};
-use crossfix_fusion::{CameraStanding, ClockEstimate, Clocks, Fusion, FusionConfig};
-use crossfix_geometry::{Camera, Pose};
-use crossfix_message::{BearingFrame, CameraCalibration, CameraName, Timestamp};
-use nalgebra::{Matrix6, Point3, Rotation3, Vector3};
+use std::collections::BTreeMap;
+
+use crossfix_fusion::{CameraStanding, ClockEstimate, Clocks, Fusion, FusionConfig, Output};
+use crossfix_geometry::{Camera, Pose, tangent_basis};
+use crossfix_message::{BearingFrame, CameraCalibration, CameraName, LastingNoise, Timestamp};
+use nalgebra::{Matrix6, Point3, Rotation3, Unit, Vector2, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -209,25 +211,78 @@ fn nees_with_wrong_poses(runs: u32, rotation_sd: f64, position_sd: f64) -> f64 {
             let message = wrongly_posed(eye, (rotation_sd, position_sd), &mut rng);
             fusion.calibrate(&message.with_pose_sd(rotation_sd, position_sd)).unwrap();
         }
-        let mut outputs = Vec::new();
-        for frame in scene.frames(1000 + u64::from(run)) {
-            outputs.extend(fusion.ingest(&frame));
-        }
-        outputs.extend(fusion.flush());
-        let last = outputs.iter().rev().find_map(|output| match output {
-            crossfix_fusion::Output::Tracks(frame) => Some(frame),
-            _ => None,
-        });
-        let frame = last.unwrap();
-        let track = &frame.tracks[0];
-        let covariance =
-            Matrix6::from_row_slice(&track.covariance).fixed_view::<3, 3>(0, 0).into_owned();
-        let place: Point3<f64> = track.position.unwrap().into();
-        let truth = scene.paths[0](frame.time_ns as f64 / 1e9).unwrap();
-        let error = place - truth;
-        sum += (error.transpose() * covariance.try_inverse().unwrap() * error).x;
+        sum += last_nees(&mut fusion, &scene.frames(1000 + u64::from(run)), &scene.paths[0]);
     }
     sum / f64::from(runs)
+}
+
+/// The squared distance of the last track's place from the path, by its covariance: three if that
+/// is honest.
+fn last_nees(fusion: &mut Fusion, frames: &[BearingFrame], path: &common::Path) -> f64 {
+    let mut outputs: Vec<Output> = frames.iter().flat_map(|frame| fusion.ingest(frame)).collect();
+    outputs.extend(fusion.flush());
+    let last = outputs.iter().rev().find_map(|output| match output {
+        Output::Tracks(frame) => Some(frame),
+        _ => None,
+    });
+    let frame = last.unwrap();
+    let track = &frame.tracks[0];
+    let covariance =
+        Matrix6::from_row_slice(&track.covariance).fixed_view::<3, 3>(0, 0).into_owned();
+    let place: Point3<f64> = track.position.unwrap().into();
+    let error = place - path(frame.time_ns as f64 / 1e9).unwrap();
+    (error.transpose() * covariance.try_inverse().unwrap() * error).x
+}
+
+/// Mean NEES over runs in which each camera's bearings err by `noise` beside their own noise, of
+/// which the fusion knows what is `declared`.
+fn nees_with_lasting_noise(runs: u32, noise: LastingNoise, declared: Option<LastingNoise>) -> f64 {
+    let scene = Scene::new(vec![straight([-40.0, 30.0, 50.0], [8.0, -6.0, 0.5])], 8.0);
+    let mut sum = 0.0;
+    for run in 0..runs {
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        for eye in &scene.eyes {
+            if let Some(noise) = declared {
+                let message = common::calibration(eye).with_lasting_errors(noise, 0.0);
+                fusion.calibrate(&message).unwrap();
+            }
+        }
+        let mut frames = scene.frames(1000 + u64::from(run));
+        let mut rng = ChaCha8Rng::seed_from_u64(u64::from(run));
+        let mut errors: BTreeMap<String, (f64, Vector2<f64>)> = BTreeMap::new();
+        for frame in &mut frames {
+            let time_s = frame.capture_time_ns as f64 / 1e9;
+            let mut drawn = || -> Vector2<f64> {
+                Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng)) * noise.sd_rad
+            };
+            let error = match errors.get(&frame.camera) {
+                None => drawn(),
+                Some((before_s, before)) => {
+                    let kept = (-(time_s - before_s) / noise.time_s).exp();
+                    before * kept + drawn() * (1.0 - kept * kept).sqrt()
+                }
+            };
+            errors.insert(frame.camera.clone(), (time_s, error));
+            for track in &mut frame.tracks {
+                let direction = Unit::new_normalize(Vector3::from(track.bearing.unwrap()));
+                let moved = direction.into_inner() + tangent_basis(&direction) * error;
+                track.bearing = Some(moved.normalize().into());
+            }
+        }
+        sum += last_nees(&mut fusion, &frames, &scene.paths[0]);
+    }
+    sum / f64::from(runs)
+}
+
+#[test]
+fn noise_that_lasts_is_in_the_covariance_where_it_is_declared() {
+    let runs = 200;
+    let noise = LastingNoise { sd_rad: 5e-4, time_s: 1.0 };
+    let standard_error = (6.0 / f64::from(runs)).sqrt();
+    let nees = nees_with_lasting_noise(runs, noise, Some(noise));
+    assert!((nees - 3.0).abs() < 4.0 * standard_error, "{nees}");
+    let unknown = nees_with_lasting_noise(runs, noise, None);
+    assert!(unknown > 6.0, "{unknown}: the noise would not matter");
 }
 
 #[test]

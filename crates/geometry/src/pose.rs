@@ -35,6 +35,11 @@ impl Pose {
         Ok(Self { rotation: Rotation3::from_matrix_unchecked(nearest), position })
     }
 
+    /// A camera at the world's origin whose axes are the world's: where nothing is known.
+    pub fn at_origin() -> Self {
+        Self { rotation: Rotation3::identity(), position: Point3::origin() }
+    }
+
     /// A level camera at `position` whose optical axis goes through `target`.
     ///
     /// # Errors

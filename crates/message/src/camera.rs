@@ -18,8 +18,21 @@ pub struct Calibration {
     /// Covariance of the pose in the world's axes, rotation about them (rad), then position (m);
     /// `None`: exact.
     pub pose_covariance: Option<Matrix6<f64>>,
+    /// The part of its bearings' noise that lasts from one to the next; `None`: each errs anew.
+    pub lasting_noise: Option<LastingNoise>,
+    /// What its clock wanders by, s after one second.
+    pub clock_wander_s: f64,
     /// It holds from this time on.
     pub valid_from: Timestamp,
+}
+
+/// Noise of bearings that lasts from one to the next.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LastingNoise {
+    /// Standard deviation per tangent, rad.
+    pub sd_rad: f64,
+    /// Time after which e^-1 of it is left, s.
+    pub time_s: f64,
 }
 
 /// Why a [`CameraCalibration`] cannot be used.
@@ -36,6 +49,12 @@ pub enum CalibrationError {
         /// What is wrong.
         #[source]
         source: GeometryError,
+    },
+    /// It says nothing of where the camera stands.
+    #[error("camera `{camera}` has a lens and no pose: calibrate it (crossfix calibrate)")]
+    NoPose {
+        /// The camera.
+        camera: CameraName,
     },
     /// The pose's covariance is none: not finite, not symmetric, or negative along some axis.
     #[error("the calibration of camera `{camera}`: pose_covariance is no covariance")]
@@ -99,23 +118,10 @@ impl CameraCalibration {
         let shape = |part| CalibrationError::Shape { camera: name.clone(), part };
         let geometry = |source| CalibrationError::Geometry { camera: name.clone(), source };
 
-        let distortion = match self.distortion_model() {
-            DistortionModel::Unspecified | DistortionModel::None => Distortion::None,
-            DistortionModel::BrownConrady => Distortion::BrownConrady(
-                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
-            ),
-            DistortionModel::Fisheye => Distortion::Fisheye(
-                self.distortion.as_slice().try_into().map_err(|_| shape("distortion"))?,
-            ),
-        };
-        let intrinsics = Intrinsics {
-            size: ImageSize { width: self.width, height: self.height },
-            fx: self.fx,
-            fy: self.fy,
-            cx: self.cx,
-            cy: self.cy,
-            distortion,
-        };
+        let intrinsics = self.lens(&name)?;
+        if self.rotation.is_empty() && self.position.is_none() {
+            return Err(CalibrationError::NoPose { camera: name });
+        }
         let rotation: [f64; 9] =
             self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
         let position = self.position.ok_or_else(|| shape("position"))?;
@@ -134,21 +140,96 @@ impl CameraCalibration {
             }
         };
         let valid_from = Timestamp::from_nanos(self.valid_from_ns);
-        Ok(Calibration { name, camera, pose_covariance, valid_from })
+        let noise = LastingNoise { sd_rad: self.lasting_noise_rad, time_s: self.lasting_noise_s };
+        let is_noise = (0.0..1.0).contains(&noise.sd_rad) && (0.0..1e6).contains(&noise.time_s);
+        if !is_noise {
+            return Err(shape("lasting_noise"));
+        }
+        if !(0.0..1.0).contains(&self.clock_wander_s) {
+            return Err(shape("clock_wander_s"));
+        }
+        let lasts = noise.sd_rad > 0.0 && noise.time_s > 0.0;
+        Ok(Calibration {
+            name,
+            camera,
+            pose_covariance,
+            lasting_noise: lasts.then_some(noise),
+            clock_wander_s: self.clock_wander_s,
+            valid_from,
+        })
+    }
+
+    /// The camera's lens, whether or not its pose is known.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Shape`] where the coefficients are too few or too many.
+    pub fn lens(&self, name: &CameraName) -> Result<Intrinsics, CalibrationError> {
+        let shape = || CalibrationError::Shape { camera: name.clone(), part: "distortion" };
+        let distortion = match self.distortion_model() {
+            DistortionModel::Unspecified | DistortionModel::None => Distortion::None,
+            DistortionModel::BrownConrady => Distortion::BrownConrady(
+                self.distortion.as_slice().try_into().map_err(|_| shape())?,
+            ),
+            DistortionModel::Fisheye => {
+                Distortion::Fisheye(self.distortion.as_slice().try_into().map_err(|_| shape())?)
+            }
+        };
+        Ok(Intrinsics {
+            size: ImageSize { width: self.width, height: self.height },
+            fx: self.fx,
+            fy: self.fy,
+            cx: self.cx,
+            cy: self.cy,
+            distortion,
+        })
+    }
+
+    /// The same calibration with an uncertain pose: the covariance of a small rotation about the
+    /// camera's axes (rad), then of the position (m).
+    #[must_use]
+    pub fn with_pose_covariance(mut self, covariance: &Matrix6<f64>) -> Self {
+        self.pose_covariance = covariance.as_slice().to_vec();
+        self.hash = self.content_hash();
+        self
+    }
+
+    /// The same calibration with what of the bearings' noise lasts, and what the clock wanders by (s
+    /// after one second).
+    #[must_use]
+    pub fn with_lasting_errors(mut self, noise: LastingNoise, clock_wander_s: f64) -> Self {
+        (self.lasting_noise_rad, self.lasting_noise_s) = (noise.sd_rad, noise.time_s);
+        self.clock_wander_s = clock_wander_s;
+        self.hash = self.content_hash();
+        self
+    }
+
+    /// The message for a camera of which nobody knows yet where it stands: its lens alone.
+    ///
+    /// # Errors
+    /// [`GeometryError::Intrinsics`] where the numbers are no lens's.
+    pub fn of_lens(
+        name: &CameraName,
+        intrinsics: Intrinsics,
+        valid_from: Timestamp,
+    ) -> Result<Self, GeometryError> {
+        let camera = Camera::new(intrinsics, Pose::at_origin())?;
+        let mut message = Self::new(name, &camera, valid_from);
+        message.rotation.clear();
+        message.position = None;
+        message.hash = message.content_hash();
+        Ok(message)
     }
 
     /// The same calibration with an uncertain pose: standard deviations of the rotation about each
     /// of the camera's axes (rad) and of the position along each of the world's (m).
     #[must_use]
-    pub fn with_pose_sd(mut self, rotation_sd: f64, position_sd: f64) -> Self {
+    pub fn with_pose_sd(self, rotation_sd: f64, position_sd: f64) -> Self {
         let mut covariance = Matrix6::<f64>::zeros();
         for axis in 0..3 {
             covariance[(axis, axis)] = rotation_sd.powi(2);
             covariance[(axis + 3, axis + 3)] = position_sd.powi(2);
         }
-        self.pose_covariance = covariance.as_slice().to_vec();
-        self.hash = self.content_hash();
-        self
+        self.with_pose_covariance(&covariance)
     }
 }
 

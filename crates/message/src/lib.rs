@@ -24,7 +24,7 @@ mod size;
 mod time;
 mod track;
 
-pub use camera::{Calibration, CalibrationError};
+pub use camera::{Calibration, CalibrationError, LastingNoise};
 pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};
 pub use name::{CameraName, NameError, SiteName};
@@ -42,4 +42,4 @@ mod wire {
 }
 
 /// The version of the message definitions that this build speaks.
-pub const VERSION: Version = Version { major: 1, minor: 1 };
+pub const VERSION: Version = Version { major: 1, minor: 2 };

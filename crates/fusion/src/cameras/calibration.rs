@@ -6,6 +6,8 @@ use crossfix_geometry::Camera;
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix6, Point3};
 
+use crate::uncertainty::LastingNoise;
+
 /// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of
 /// a clock that runs wild, those that lie farthest in the future are forgotten.
 const MAX_UPCOMING: usize = 8;
@@ -16,6 +18,10 @@ pub(crate) struct KnownCamera {
     pub(crate) camera: Camera,
     /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
     pub(crate) pose_covariance: Matrix6<f64>,
+    /// The part of its bearings' noise that lasts.
+    pub(crate) lasting: LastingNoise,
+    /// What its clock wanders by, beside offset and drift: s^2/s.
+    pub(crate) clock_walk: f64,
     /// Whether somebody has said how sure the pose is.
     pub(crate) is_declared: bool,
 }
@@ -101,6 +107,8 @@ mod tests {
         KnownCamera {
             camera: Camera::new(intrinsics, pose).unwrap(),
             pose_covariance: Matrix6::identity(),
+            lasting: LastingNoise::NONE,
+            clock_walk: 0.0,
             is_declared: false,
         }
     }

@@ -41,6 +41,8 @@ struct Clock {
     prior: f64,
     /// The same of its drift.
     drift_prior: f64,
+    /// What its offset wanders by beside, s^2/s.
+    walk: f64,
 }
 
 /// Offsets and drifts of all clocks against the first, and what the poses are off by (world's axes:
@@ -68,12 +70,13 @@ impl Belief {
         self.cameras.contains_key(camera)
     }
 
-    /// Makes a camera known: standard deviations of its clock's offset (s) and drift (s/s), and the
-    /// covariance of its pose.
+    /// Makes a camera known: standard deviations of its clock's offset (s) and drift (s/s), what the
+    /// offset wanders by beside that (s^2/s), and the covariance of its pose.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
         [offset_sd, drift_sd]: [f64; 2],
+        walk: f64,
         pose: Option<Matrix6<f64>>,
     ) {
         let (prior, drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
@@ -91,7 +94,7 @@ impl Belief {
                 self.covariance[(place + i, place + i)] = common + own[i];
             }
         }
-        self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior });
+        self.cameras.insert(camera.clone(), Clock { place, pose: None, prior, drift_prior, walk });
         self.settle();
         self.calibrate(camera, pose);
     }
@@ -184,6 +187,24 @@ impl Belief {
             offset += drift * dt;
             self.covariance[(k, k)] += OFFSET_WALK * dt;
             self.covariance[(k + 1, k + 1)] += DRIFT_WALK * dt;
+        }
+        self.wander(dt, &clocks);
+    }
+
+    /// Lets the clocks wander that do: the reference against all others.
+    fn wander(&mut self, dt: f64, places: &[usize]) {
+        for clock in self.cameras.values_mut() {
+            let walked = clock.walk * dt;
+            clock.prior += walked;
+            match clock.place {
+                _ if walked == 0.0 => {}
+                Some(place) => self.covariance[(place, place)] += walked,
+                None => {
+                    for (&k, &l) in places.iter().flat_map(|k| places.iter().map(move |l| (k, l))) {
+                        self.covariance[(k, l)] += walked;
+                    }
+                }
+            }
         }
     }
 
@@ -281,7 +302,7 @@ impl Belief {
         cameras.sort_by_key(|(_, clock)| clock.place.map_or(0, |place| place + 1));
         for (camera, clock) in cameras {
             let pose = clock.pose.map(|pose| pose.reported);
-            anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], pose);
+            anew.add(camera, [clock.prior.sqrt(), clock.drift_prior.sqrt()], clock.walk, pose);
         }
         *self = anew;
     }
@@ -394,7 +415,7 @@ mod tests {
     fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
         let mut belief = Belief::default();
         for (camera, pose) in ["a", "b", "c"].into_iter().zip(poses) {
-            belief.add(&name(camera), [0.1, 3e-5], pose);
+            belief.add(&name(camera), [0.1, 3e-5], 0.0, pose);
         }
         belief.advance(Timestamp::EPOCH);
         let components: Vec<usize> = ["b", "c"]

@@ -18,7 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::Matrix6;
+use nalgebra::{Matrix2, Matrix6};
 
 use self::belief::Belief;
 use self::window::{Role, Window};
@@ -93,6 +93,10 @@ struct Round {
     cleared: BTreeSet<CameraName>,
 }
 
+/// A clock that wanders as far as the least deviation in this time is none to be taken at its word,
+/// s: as long as a window of the estimate.
+const WALK_S: f64 = 8.0;
+
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockEstimator {
@@ -147,13 +151,16 @@ impl ClockEstimator {
         if !self.config.estimate {
             return;
         }
-        let uncertain =
-            reported_sd_s >= self.config.least_sd_s && !self.config.trusted.contains(camera);
+        let walks = (reported.clock_walk * WALK_S).sqrt();
+        let uncertain = reported_sd_s.max(walks) >= self.config.least_sd_s
+            && !self.config.trusted.contains(camera);
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
         let Some(before) = self.reported.get_mut(camera) else {
             self.needed |= uncertain;
             self.reported.insert(camera.clone(), Reported::new(reported_sd_s));
-            self.belief.add(camera, deviations, reported.pose.map(|pose| *pose.covariance()));
+            let pose = reported.pose.map(|pose| *pose.covariance());
+            let walk = if uncertain { reported.clock_walk } else { 0.0 };
+            self.belief.add(camera, deviations, walk, pose);
             self.forget_provisional();
             return;
         };
@@ -280,7 +287,11 @@ impl ClockEstimator {
         };
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
-        self.windows[index].add(camera, role, time, *line, track.position_at(exposure.time).coords);
+        let window = &mut self.windows[index];
+        let lasting = exposure.uncertainty.lasting.as_white(window.since_last(camera, time));
+        let covariance = line.covariance + Matrix2::identity() * lasting;
+        let line = SightLine { covariance, ..*line };
+        window.add(camera, role, time, line, track.position_at(exposure.time).coords);
     }
 
     /// The worst standard deviation of a clock among all cameras, s.

@@ -106,6 +106,13 @@ impl Window {
         }
     }
 
+    /// How long after the camera's last bearing in the window a time is, s.
+    pub(super) fn since_last(&self, camera: &CameraName, time: Timestamp) -> f64 {
+        let index = self.cameras.iter().position(|known| known == camera);
+        let last = self.sights.iter().rev().find(|sight| Some(sight.camera) == index);
+        last.map_or(f64::INFINITY, |last| time.seconds_since(self.start) - last.time_s)
+    }
+
     /// Lets every other bearing of each camera go.
     fn thin(&mut self) {
         self.thinned *= 2;

@@ -3,12 +3,12 @@
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix6x3, Point3};
+use nalgebra::Point3;
 
 use super::{Track, log_range_sd};
 use crate::motion::Motion;
 use crate::prediction::{BearingPrediction, Fit};
-use crate::uncertainty::CameraUncertainty;
+use crate::uncertainty::{CameraUncertainty, SharedTies};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 
 /// What a camera should see of a track.
@@ -27,7 +27,7 @@ pub(crate) enum Expectation {
         /// The camera that looks now, ...
         camera: CameraUncertainty,
         /// ... and what ties the track to its errors.
-        ties: Matrix6x3<f64>,
+        ties: SharedTies,
     },
 }
 

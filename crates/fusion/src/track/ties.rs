@@ -3,12 +3,12 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x3, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix6, Unit, Vector2};
 
 use super::{Innovation, Track};
 use crate::cameras::{ClockChange, LastThree, Sample};
 use crate::motion::Motion;
-use crate::uncertainty::CameraUncertainty;
+use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, SharedTies};
 use crate::update::Updated;
 use crate::visibility::Visibility;
 
@@ -39,7 +39,9 @@ const LEAST_BESIDE: usize = 2;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Ties {
     /// Covariance of position and velocity with the errors, each in its own deviations.
-    pub(super) covariance: Matrix6x3<f64>,
+    pub(super) covariance: SharedTies,
+    /// How long that of the errors lasts that pass, s.
+    lasting_s: f64,
     /// Whether the camera can see the target, when it was exposed last.
     pub(super) visibility: Visibility,
     /// When it gave the track its last bearing, ...
@@ -62,6 +64,8 @@ pub(super) struct Drawn {
     by_position: Matrix2x3<f64>,
     /// Covariance of each bearing's noise, rad^2.
     noise: Matrix2<f64>,
+    /// Variance of what lasts of it, and so is no less in the mean, rad^2.
+    lasting: f64,
     pose: Matrix2<f64>,
 }
 
@@ -80,6 +84,7 @@ impl Drawn {
             count: count + 1.0,
             by_position: innovation.model.by_position(),
             noise: innovation.model.covariance_of(line) * uncertainty.factor,
+            lasting: uncertainty.lasting.variance(),
             pose: uncertainty.declared_pose(&innovation.model),
         }
     }
@@ -91,7 +96,9 @@ impl Drawn {
             camera: camera.clone(),
             offset: self.offsets / self.count,
             by_position: self.by_position,
-            noise: self.noise / self.count + moved * moved.transpose(),
+            noise: self.noise / self.count
+                + moved * moved.transpose()
+                + Matrix2::identity() * self.lasting,
             pose: self.pose,
         }
     }
@@ -112,7 +119,8 @@ impl Ties {
 
     pub(super) fn new(time: Timestamp) -> Self {
         Self {
-            covariance: Matrix6x3::zeros(),
+            covariance: SharedTies::zeros(),
+            lasting_s: LastingNoise::NONE.time_s,
             visibility: Visibility::new(time),
             seen: None,
             period_s: 0.0,
@@ -124,8 +132,15 @@ impl Ties {
     }
 
     /// Of a camera that has given the bearing with which the track begins.
-    pub(super) fn begun(time: Timestamp, covariance: Matrix6x3<f64>) -> Self {
-        Self { covariance, visibility: Visibility::seen(time), seen: Some(time), ..Self::new(time) }
+    pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: LastingNoise) -> Self {
+        let lasting_s = lasting.time_s;
+        Self {
+            covariance,
+            lasting_s,
+            visibility: Visibility::seen(time),
+            seen: Some(time),
+            ..Self::new(time)
+        }
     }
 
     /// All clocks have stepped by so much, s.
@@ -161,19 +176,23 @@ impl Ties {
         })
     }
 
-    /// The same `interval` seconds on: the position goes on with the velocity.
-    pub(super) fn predicted(&self, interval: f64) -> Matrix6x3<f64> {
+    /// The same `interval` seconds on: the position goes on with the velocity, and what lasts is
+    /// partly gone.
+    pub(super) fn predicted(&self, interval: f64) -> SharedTies {
         let mut covariance = self.covariance;
         let velocity = covariance.fixed_rows::<3>(3).into_owned();
         let mut position = covariance.fixed_rows_mut::<3>(0);
         position += velocity * interval;
+        let kept = (-interval.abs() / self.lasting_s).exp();
+        let mut lasting = covariance.fixed_columns_mut::<2>(LASTING);
+        lasting *= kept;
         covariance
     }
 }
 
 impl Track {
-    pub(super) fn ties_of(&self, camera: &CameraName, interval: f64) -> Matrix6x3<f64> {
-        self.ties.get(camera).map_or_else(Matrix6x3::zeros, |ties| ties.predicted(interval))
+    pub(super) fn ties_of(&self, camera: &CameraName, interval: f64) -> SharedTies {
+        self.ties.get(camera).map_or_else(SharedTies::zeros, |ties| ties.predicted(interval))
     }
 
     /// Keeps a bearing for the next draw.
@@ -253,7 +272,7 @@ impl Track {
         let Some(ties) = self.ties.get_mut(camera) else {
             return;
         };
-        let mut shared = ties.covariance.fixed_columns_mut::<1>(2);
+        let mut shared = ties.covariance.fixed_columns_mut::<1>(OF_CLOCK);
         let moved = shared.clone_owned() * ahead;
         let change = shared.clone_owned() * shared.transpose() * (ratio.min(1.0) - 1.0);
         shared *= ratio.min(ratio.recip()).sqrt();
@@ -280,11 +299,11 @@ impl Track {
     /// returns the mean squared distance of the bearing.
     pub(super) fn carry(
         &mut self,
-        camera: &CameraName,
+        (camera, lasting): (&CameraName, LastingNoise),
         interval: f64,
         results: &[Option<Updated>],
     ) -> f64 {
-        let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), Matrix6x3::zeros());
+        let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), SharedTies::zeros());
         for (result, weight) in results.iter().zip(self.imm.probabilities()) {
             if let Some(after) = result {
                 nis += after.nis * weight;
@@ -299,6 +318,7 @@ impl Track {
             ties.covariance = carried * ties.predicted(interval);
             if name == camera {
                 ties.covariance -= gained;
+                ties.lasting_s = lasting.time_s;
             }
         }
         self.keep_ties_possible();

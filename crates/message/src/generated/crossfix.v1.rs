@@ -143,6 +143,16 @@ pub struct CameraCalibration {
     /// SHA-256 of this message with this field empty.
     #[prost(bytes = "vec", tag = "15")]
     pub hash: ::prost::alloc::vec::Vec<u8>,
+    /// The part of the bearings' noise that lasts from one bearing of a target to the next, beside what each states:
+    /// standard deviation per tangent (rad), and the time after which e^-1 of it is left (s). 0: each errs anew.
+    #[prost(double, tag = "16")]
+    pub lasting_noise_rad: f64,
+    #[prost(double, tag = "17")]
+    pub lasting_noise_s: f64,
+    /// What the camera's clock wanders by beside its offset and its drift, s after one second; it grows with the root
+    /// of the time. 0: an ordinary quartz.
+    #[prost(double, tag = "18")]
+    pub clock_wander_s: f64,
 }
 /// What one camera contributed to a track's newest update, and how well it fitted.
 #[derive(serde::Serialize, serde::Deserialize)]
