@@ -16,6 +16,17 @@
 //! # Ok::<(), crossfix_calibration::IntrinsicsError>(())
 //! ```
 
+mod flight;
 mod intrinsics;
+mod lens;
+mod site_file;
 
+pub use flight::{
+    CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
+    Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, calibrate_flight,
+};
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
+pub use lens::LensUncertainty;
+pub use site_file::{
+    BearingError, CalibratedCamera, ClockCorrection, SiteCalibration, SiteFileError,
+};

@@ -21,6 +21,8 @@ mod network;
 mod output;
 mod pace;
 mod parts;
+#[cfg(feature = "centre")]
+mod recalibration;
 mod recorded;
 mod repeats;
 #[cfg(feature = "centre")]

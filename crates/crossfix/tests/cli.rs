@@ -4,9 +4,22 @@
 
 use assert_cmd::Command;
 
-const COMMANDS: [&str; 14] = [
-    "demo", "agent", "track", "fuse", "record", "replay", "view", "info", "simulate", "import",
-    "export", "evaluate", "check", "plan",
+const COMMANDS: [&str; 15] = [
+    "demo",
+    "agent",
+    "track",
+    "fuse",
+    "record",
+    "replay",
+    "view",
+    "info",
+    "simulate",
+    "import",
+    "export",
+    "evaluate",
+    "check",
+    "plan",
+    "calibrate",
 ];
 
 fn crossfix() -> Command {

@@ -1,7 +1,8 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crossfix_recording::RecordingWriter;
 
+use crate::import::drone_tracking::{Part, Sample};
 use crate::import::{drone_tracking, scenario};
 use crate::output::{self, Draft};
 
@@ -19,9 +20,11 @@ pub struct Args {
 enum Source {
     /// The drone-tracking-datasets of ETH Zurich: labels of several cameras, RTK truth.
     ///
-    /// Data times are RTK seconds from the Unix epoch. Only the split's test part is imported.
+    /// Data times are RTK seconds from the Unix epoch, or with --raw the seconds that each camera
+    /// counts by its frames.
     #[command(
-        after_help = "Example:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap"
+        after_help = "Examples:\n  crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG -o eth.mcap\n  \
+                      crossfix import drone-tracking-datasets DIR --dataset 3 --cameras gopro3,sony5100,sonyG --part calibration --raw --log-out rtk.csv -o cal.mcap"
     )]
     DroneTrackingDatasets {
         /// The folder with calibration/, poses.json and datasetN/.
@@ -35,6 +38,16 @@ enum Source {
         /// Which poses and which test part of poses.json.
         #[arg(long, default_value = "half", value_name = "NAME")]
         split: String,
+        /// Which part of the split.
+        #[arg(long, default_value = "test", value_enum, value_name = "PART")]
+        part: Part,
+        /// As the cameras recorded it: times counted by frames, the lenses of their files, and no
+        /// poses.
+        #[arg(long)]
+        raw: bool,
+        /// Write the drone's RTK places of that part beside it, as a log (CSV).
+        #[arg(long, value_name = "FILE")]
+        log_out: Option<PathBuf>,
         /// The recording to write (MCAP).
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
@@ -52,9 +65,23 @@ enum Source {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let (mut entries, path) = match &args.source {
-        Source::DroneTrackingDatasets { dir, dataset, cameras, split, output } => {
-            let selection = drone_tracking::Selection { dataset: *dataset, cameras, split };
-            (drone_tracking::read(dir, &selection)?, output)
+        Source::DroneTrackingDatasets {
+            dir,
+            dataset,
+            cameras,
+            split,
+            part,
+            raw,
+            log_out,
+            output,
+        } => {
+            let (dataset, part, is_raw) = (*dataset, *part, *raw);
+            let selection = drone_tracking::Selection { dataset, cameras, split, part, is_raw };
+            let flight = drone_tracking::read(dir, &selection)?;
+            if let Some(path) = log_out {
+                write_log(path, &flight.log)?;
+            }
+            (flight.entries, output)
         }
         Source::Scenario { dir, output } => (scenario::read(dir)?, output),
     };
@@ -69,4 +96,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     draft.keep()?;
     output::line(format!("{messages} messages written to {}", path.display()));
     Ok(())
+}
+
+/// Writes places as a log that `calibrate flight --log` reads.
+fn write_log(path: &Path, samples: &[Sample]) -> anyhow::Result<()> {
+    let mut text = String::from("time_s,east_m,north_m,up_m\n");
+    for (time_s, place) in samples {
+        text += &format!("{time_s:.3},{:.4},{:.4},{:.4}\n", place.x, place.y, place.z);
+    }
+    output::write_file(path, &[], text.as_bytes())
 }

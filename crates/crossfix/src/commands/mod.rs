@@ -9,6 +9,8 @@ pub mod numbers;
 pub mod record;
 pub mod track;
 
+#[cfg(feature = "centre")]
+pub mod calibrate;
 #[cfg(all(feature = "centre", feature = "viewer"))]
 pub mod demo;
 #[cfg(feature = "centre")]
@@ -56,6 +58,7 @@ pub enum Centre {
     Import(import::Args),
     Export(export::Args),
     Evaluate(evaluate::Args),
+    Calibrate(calibrate::Args),
     Plan(plan::Args),
     Simulate(simulate::Args),
     Validate(validate::Args),
@@ -70,6 +73,7 @@ impl Centre {
             Self::Import(args) => import::run(&args),
             Self::Export(args) => export::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
+            Self::Calibrate(args) => calibrate::run(&args),
             Self::Plan(args) => plan::run(&args),
             Self::Simulate(args) => simulate::run(&args),
             Self::Validate(args) => validate::run(&args),

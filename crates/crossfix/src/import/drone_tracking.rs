@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use crossfix_geometry::{
-    Bearing, Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose,
+    Bearing, Camera, CameraModel, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, Pose,
 };
 use crossfix_message::{
     BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ClockSource,
@@ -33,10 +33,37 @@ pub struct Selection<'a> {
     pub dataset: u32,
     pub cameras: &'a [String],
     pub split: &'a str,
+    pub part: Part,
+    /// As the cameras recorded it: times by their own counts of frames, lenses by their files, no
+    /// poses.
+    pub is_raw: bool,
 }
+
+/// A part of a split.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// That to which the poses of poses.json were fitted.
+    Calibration,
+    /// The rest.
+    Test,
+    /// Both.
+    All,
+}
+
+/// What was read.
+pub struct Flight {
+    pub entries: Vec<Entry>,
+    /// The drone's places by RTK, with all that is wrong of them.
+    pub log: Vec<Sample>,
+}
+
+/// Standard deviation of a raw label, pixels: what is found of these cameras. It is only said where
+/// nobody has calibrated them.
+const RAW_LABEL_SD_PX: f64 = 1.0;
 
 #[derive(Debug, Deserialize)]
 struct Split {
+    calibration_rtk_index_ranges: Vec<[f64; 2]>,
     test_rtk_index_ranges: Vec<[f64; 2]>,
     cameras: BTreeMap<String, FittedCamera>,
 }
@@ -82,23 +109,43 @@ impl FittedCamera {
         (own - self.clock_offset_s + readout) * (1.0 + self.clock_rate)
     }
 
-    fn camera(&self, lens: &LensFile) -> anyhow::Result<Camera> {
-        let mut coefficients = lens.distortion.clone();
+    fn camera(&self, intrinsics: Intrinsics) -> anyhow::Result<Camera> {
+        let camera_from_world = Matrix3::from(self.R_world_to_cam).transpose();
+        let pose = Pose::new(camera_from_world.transpose(), Point3::from(self.centre_enu_m))?;
+        Ok(Camera::new(intrinsics, pose)?)
+    }
+}
+
+impl LensFile {
+    fn intrinsics(&self) -> anyhow::Result<Intrinsics> {
+        let mut coefficients = self.distortion.clone();
         coefficients.resize(5, 0.0);
         let [k1, k2, p1, p2, k3] = coefficients[..] else {
             bail!("distCoeff has more than five coefficients");
         };
-        let intrinsics = Intrinsics {
-            size: ImageSize { width: lens.resolution[0], height: lens.resolution[1] },
-            fx: lens.k[0][0],
-            fy: lens.k[1][1],
-            cx: lens.k[0][2],
-            cy: lens.k[1][2],
+        Ok(Intrinsics {
+            size: ImageSize { width: self.resolution[0], height: self.resolution[1] },
+            fx: self.k[0][0],
+            fy: self.k[1][1],
+            cx: self.k[0][2],
+            cy: self.k[1][2],
             distortion: Distortion::BrownConrady([k1, k2, p1, p2, k3]),
-        };
-        let camera_from_world = Matrix3::from(self.R_world_to_cam).transpose();
-        let pose = Pose::new(camera_from_world.transpose(), Point3::from(self.centre_enu_m))?;
-        Ok(Camera::new(intrinsics, pose)?)
+        })
+    }
+}
+
+impl Part {
+    fn holds(self, split: &Split, rtk_seconds: f64) -> bool {
+        let index = rtk_seconds * RTK_RATE;
+        let within =
+            |ranges: &[[f64; 2]]| ranges.iter().any(|[low, high]| (*low..*high).contains(&index));
+        let (calibration, test) =
+            (&split.calibration_rtk_index_ranges, &split.test_rtk_index_ranges);
+        match self {
+            Self::Calibration => within(calibration),
+            Self::Test => within(test),
+            Self::All => within(calibration) || within(test),
+        }
     }
 }
 
@@ -119,8 +166,8 @@ fn parse_json<T: serde::de::DeserializeOwned>(path: &Path) -> anyhow::Result<T> 
         .with_context(|| format!("{} is not as expected", path.display()))
 }
 
-/// Reads the test part of a split: calibrations, bearings of every frame, truth.
-pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>> {
+/// Reads a part of a split: calibrations, bearings of every frame, truth.
+pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Flight> {
     let site: SiteName = format!("drone-tracking-{}", selection.dataset).parse()?;
     let poses = dir.join("poses.json");
     let mut all: BTreeMap<String, serde_json::Value> = parse_json(&poses)?;
@@ -134,7 +181,10 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>>
         })?;
 
     let folder = dir.join(format!("dataset{}", selection.dataset));
-    let mut entries = truth(&folder, &site, &split, &masked)?;
+    let is_wanted = |rtk_seconds: f64| selection.part.holds(&split, rtk_seconds);
+    let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"))?;
+    let log = rtk.iter().map(|(_, sample)| *sample).filter(|sample| is_wanted(sample.0)).collect();
+    let mut entries = truth(&rtk, &masked, &site, is_wanted);
     for wanted in selection.cameras {
         let found = split.cameras.iter().find(|(_, camera)| camera.name == *wanted);
         let Some((key, fitted)) = found else {
@@ -147,14 +197,10 @@ pub fn read(dir: &Path, selection: &Selection<'_>) -> anyhow::Result<Vec<Entry>>
         };
         let lens: LensFile = parse_json(&lens_path(dir, wanted, selection.dataset))?;
         let labels = read_labels(&folder.join("detections").join(format!("{key}.txt")))?;
-        entries.extend(camera_entries(&site, fitted, &lens, &labels, &split)?);
+        let source = CameraSource { site: &site, fitted, lens: &lens, is_raw: selection.is_raw };
+        entries.extend(source.entries(&labels, is_wanted)?);
     }
-    Ok(entries)
-}
-
-fn in_test_part(split: &Split, rtk_seconds: f64) -> bool {
-    let index = rtk_seconds * RTK_RATE;
-    split.test_rtk_index_ranges.iter().any(|[low, high]| (*low..*high).contains(&index))
+    Ok(Flight { entries, log })
 }
 
 fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
@@ -175,62 +221,97 @@ fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
         .collect()
 }
 
-fn camera_entries(
-    site: &SiteName,
-    fitted: &FittedCamera,
-    lens: &LensFile,
-    labels: &[Label],
-    split: &Split,
-) -> anyhow::Result<Vec<Entry>> {
-    let name: CameraName = fitted.name.parse()?;
-    let camera = fitted.camera(lens).with_context(|| format!("camera `{name}`"))?;
-    let height = f64::from(lens.resolution[1]);
-    let bearings = Key::new(site.clone(), Channel::Bearings(name.clone()));
-    let mut entries = Vec::new();
-    let mut without_direction = 0_u64;
-    for label in labels {
-        let fraction = label.pixel.map_or(0.5, |pixel| pixel.y() / height);
-        let seconds = fitted.rtk_seconds(label.frame, fraction, lens.fps);
-        if !in_test_part(split, seconds) {
-            continue;
+/// What the labels of a camera are read with.
+struct CameraSource<'a> {
+    site: &'a SiteName,
+    fitted: &'a FittedCamera,
+    lens: &'a LensFile,
+    is_raw: bool,
+}
+
+impl CameraSource<'_> {
+    /// Its calibration, and its bearings of the frames whose RTK seconds are wanted.
+    fn entries(
+        &self,
+        labels: &[Label],
+        is_wanted: impl Fn(f64) -> bool,
+    ) -> anyhow::Result<Vec<Entry>> {
+        let name: CameraName = self.fitted.name.parse()?;
+        let intrinsics = self.lens.intrinsics()?;
+        let model = CameraModel::new(intrinsics).with_context(|| format!("camera `{name}`"))?;
+        let height = f64::from(self.lens.resolution[1]);
+        let bearings = Key::new(self.site.clone(), Channel::Bearings(name.clone()));
+        let mut entries = Vec::new();
+        let mut without_direction = 0_u64;
+        for label in labels {
+            let fraction = label.pixel.map_or(0.5, |pixel| pixel.y() / height);
+            let seconds = self.fitted.rtk_seconds(label.frame, fraction, self.lens.fps);
+            if !is_wanted(seconds) {
+                continue;
+            }
+            let own_s = label.frame as f64 / self.lens.fps;
+            let time = Timestamp::from_seconds(if self.is_raw { own_s } else { seconds });
+            let track = label.pixel.map(|pixel| bearing_track(&model, pixel, self.label_sd_rad()));
+            // In the corner of a wide lens the model may have no inverse: one such label is no
+            // reason to do without all others.
+            let track = track.and_then(|track| {
+                without_direction += u64::from(track.is_err());
+                track.ok()
+            });
+            let frame = BearingFrame {
+                camera: name.to_string(),
+                sequence: label.frame,
+                capture_time_ns: time.nanos(),
+                clock_source: ClockSource::FrameCount.into(),
+                tracks: track.into_iter().collect(),
+                ..Default::default()
+            };
+            entries.push(imported(bearings.clone(), time, frame.encode()));
         }
-        let time = Timestamp::from_seconds(seconds);
-        let track =
-            label.pixel.map(|pixel| bearing_track(&camera, pixel, fitted.residual_sigma_rad));
-        // In the corner of a wide lens the model may have no inverse: one such label is no reason to
-        // do without all others.
-        let track = track.and_then(|track| {
-            without_direction += u64::from(track.is_err());
-            track.ok()
-        });
-        let frame = BearingFrame {
-            camera: name.to_string(),
-            sequence: label.frame,
-            capture_time_ns: time.nanos(),
-            clock_source: ClockSource::FrameCount.into(),
-            tracks: track.into_iter().collect(),
-            ..Default::default()
-        };
-        entries.push(imported(bearings.clone(), time, frame.encode()));
+        if without_direction > 0 {
+            tracing::warn!(
+                "camera `{name}`: {without_direction} labels are left out, as the lens model shows \
+                 no direction at their pixels"
+            );
+        }
+        let start = entries.iter().map(|entry| entry.data_time).min().unwrap_or_default();
+        let calibration = self.calibration(&name, intrinsics, start)?;
+        let key = Key::new(self.site.clone(), Channel::Calibration(name));
+        entries.insert(0, imported(key, Timestamp::EPOCH, calibration.encode()));
+        Ok(entries)
     }
-    if without_direction > 0 {
-        tracing::warn!(
-            "camera `{name}`: {without_direction} labels are left out, as the lens model shows no \
-             direction at their pixels"
-        );
+
+    fn label_sd_rad(&self) -> f64 {
+        if self.is_raw {
+            RAW_LABEL_SD_PX / self.lens.k[0][0]
+        } else {
+            self.fitted.residual_sigma_rad
+        }
     }
-    let start = entries.iter().map(|entry| entry.data_time).min().unwrap_or_default();
-    let calibration = CameraCalibration::new(&name, &camera, start)
-        .with_pose_sd(fitted.residual_sigma_rad, FITTED_POSITION_SD_M);
-    let key = Key::new(site.clone(), Channel::Calibration(name));
-    entries.insert(0, imported(key, Timestamp::EPOCH, calibration.encode()));
-    Ok(entries)
+
+    fn calibration(
+        &self,
+        name: &CameraName,
+        intrinsics: Intrinsics,
+        start: Timestamp,
+    ) -> anyhow::Result<CameraCalibration> {
+        if self.is_raw {
+            return Ok(CameraCalibration::of_lens(name, intrinsics, start)?);
+        }
+        let camera = self.fitted.camera(intrinsics).with_context(|| format!("camera `{name}`"))?;
+        Ok(CameraCalibration::new(name, &camera, start)
+            .with_pose_sd(self.fitted.residual_sigma_rad, FITTED_POSITION_SD_M))
+    }
 }
 
 /// # Errors
 /// The lens model shows no direction at the pixel.
-fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> Result<BearingTrack, GeometryError> {
-    let direction = camera.model().direction(pixel)?;
+fn bearing_track(
+    model: &CameraModel,
+    pixel: Pixel,
+    sigma: f64,
+) -> Result<BearingTrack, GeometryError> {
+    let direction = model.direction(pixel)?;
     let bearing = Bearing::new(direction.into_inner(), Matrix2::identity() * sigma.powi(2))?;
     Ok(BearingTrack {
         track_id: 1,
@@ -246,19 +327,23 @@ fn bearing_track(camera: &Camera, pixel: Pixel, sigma: f64) -> Result<BearingTra
     })
 }
 
-/// The RTK samples of the test part, without the masked ones.
+/// The truth of the wanted RTK seconds, without the masked samples.
 fn truth(
-    folder: &Path,
-    site: &SiteName,
-    split: &Split,
+    rtk: &[(usize, Sample)],
     masked: &[f64],
-) -> anyhow::Result<Vec<Entry>> {
-    let rtk = rtk_samples(&folder.join("trajectory").join("rtk.txt"), masked)?;
+    site: &SiteName,
+    is_wanted: impl Fn(f64) -> bool,
+) -> Vec<Entry> {
     let key = Key::new(site.clone(), Channel::Truth);
+    let good: Vec<Sample> = rtk
+        .iter()
+        .filter(|(index, _)| !masked.contains(&(*index as f64)))
+        .map(|(_, sample)| *sample)
+        .collect();
     let mut entries = Vec::new();
-    for window in rtk.windows(3) {
+    for window in good.windows(3) {
         let (seconds, place) = window[1];
-        if !in_test_part(split, seconds) {
+        if !is_wanted(seconds) {
             continue;
         }
         let velocity = Some(velocity_between(&window[0], &window[1], &window[2]).into());
@@ -268,14 +353,14 @@ fn truth(
             TruthFrame { time_ns: time.nanos(), targets: vec![state], ..Default::default() };
         entries.push(imported(key.clone(), time, frame.encode()));
     }
-    Ok(entries)
+    entries
 }
 
 /// A place and when (s) the drone was there.
-type Sample = (f64, Point3<f64>);
+pub type Sample = (f64, Point3<f64>);
 
-/// The RTK samples that are not masked, in order of time.
-fn rtk_samples(path: &Path, masked: &[f64]) -> anyhow::Result<Vec<Sample>> {
+/// The RTK samples with their rows' numbers, in order of time.
+fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
     let text = read_text(path)?;
     let rows = text
         .lines()
@@ -286,9 +371,10 @@ fn rtk_samples(path: &Path, masked: &[f64]) -> anyhow::Result<Vec<Sample>> {
     let sample = |(k, row): (usize, Vec<f64>)| {
         // Four columns: an index first.
         let offset = usize::from(row.len() > 3);
-        (k as f64 / RTK_RATE, Point3::new(row[offset], row[offset + 1], row[offset + 2]))
+        let place = Point3::new(row[offset], row[offset + 1], row[offset + 2]);
+        (k, (k as f64 / RTK_RATE, place))
     };
-    Ok(rows.enumerate().filter(|(k, _)| !masked.contains(&(*k as f64))).map(sample).collect())
+    Ok(rows.enumerate().map(sample).collect())
 }
 
 /// The velocity at the second of three samples: that of the parabola through them, which where they
@@ -326,11 +412,11 @@ mod tests {
             "residual_sigma_rad": 0.001,
         }))
         .unwrap();
-        let split = Split { test_rtk_index_ranges: vec![[0.0, 1e6]], cameras: BTreeMap::default() };
         let label = |frame, x, y| Label { frame, pixel: Some(Pixel::new(x, y)) };
         let labels = [label(0, 960.0, 540.0), label(1, 3.0, 3.0), label(2, 1000.0, 500.0)];
         let site = "test".parse().unwrap();
-        let entries = camera_entries(&site, &fitted, &lens, &labels, &split).unwrap();
+        let source = CameraSource { site: &site, fitted: &fitted, lens: &lens, is_raw: false };
+        let entries = source.entries(&labels, |_| true).unwrap();
         let seen: Vec<usize> = entries[1..]
             .iter()
             .map(|entry| decode::<BearingFrame>(&entry.data).unwrap().tracks.len())

@@ -9,6 +9,7 @@ use crossfix_message::{Channel, Key, Timestamp};
 use crossfix_recording::{Entry, RecordingReader};
 
 use crate::commands::numbers;
+use crate::recalibration::Recalibration;
 use crate::recorded::{self, Lacks};
 
 /// Play a recording again: onto Zenoh, or with --fuse straight into the fusion.
@@ -25,6 +26,10 @@ pub struct Args {
     /// The fusion's configuration (TOML); its defaults without.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]
     config: Option<PathBuf>,
+    /// The site's calibration (TOML, by crossfix calibrate) in the place of what was recorded:
+    /// bearings are made anew from the recorded pixels, and times corrected.
+    #[arg(long, value_name = "FILE", requires = "fuse")]
+    calibration: Option<PathBuf>,
     /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
     sets: Vec<String>,
@@ -55,9 +60,10 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let range = Range::of(args)?;
+    let recalibration = args.calibration.as_deref().map(Recalibration::load).transpose()?;
+    let range = Range::of(args, recalibration.as_ref())?;
     match (&args.output, &args.network) {
-        (Some(output), _) => offline::fuse(args, output, range),
+        (Some(output), _) => offline::fuse(args, output, range, recalibration),
         (None, Some(network)) => online::publish(args, network, range),
         (None, None) => anyhow::bail!("give --fuse with an output, or --network"),
     }
@@ -74,7 +80,7 @@ struct Range {
 
 impl Range {
     /// The range that was asked for, which counts from the first bearing or track of the recording.
-    fn of(args: &Args) -> anyhow::Result<Self> {
+    fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<Self> {
         let to_s = args.to.unwrap_or(f64::INFINITY);
         ensure!(args.from < to_s, "--from {} is not before --to {to_s}", args.from);
         let is_whole = args.from == 0.0 && args.to.is_none();
@@ -85,6 +91,10 @@ impl Range {
         let mut first: Option<Timestamp> = None;
         let mut last: Option<Timestamp> = None;
         recorded::for_each(&args.recording, &mut Lacks::default(), |_, entry| {
+            let entry = match recalibration {
+                Some(recalibration) => recalibration.applied(entry),
+                None => entry,
+            };
             if matches!(entry.key.channel, Channel::Bearings(_) | Channel::Tracks) {
                 first = Some(first.map_or(entry.data_time, |first| first.min(entry.data_time)));
                 last = last.max(Some(entry.data_time));

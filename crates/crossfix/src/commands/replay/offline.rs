@@ -12,6 +12,7 @@ use super::{Args, Range, calibrations};
 use crate::centre::Centre;
 use crate::config::FusionFile;
 use crate::output::{self, Draft};
+use crate::recalibration::{Recalibration, Reordered};
 use crate::recorded::{self, Lacks};
 use crate::shutdown::Shutdown;
 
@@ -31,7 +32,12 @@ struct OfflineFusion {
 }
 
 /// Fuses a recording's bearings and writes all that was recorded, with new tracks.
-pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
+pub fn fuse(
+    args: &Args,
+    output: &Path,
+    range: Range,
+    recalibration: Option<Recalibration>,
+) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
     let draft = Draft::new(output, &[&args.recording])?;
@@ -46,6 +52,10 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     };
     run.writer.sign(&Source::of("replay --fuse"))?;
     for entry in calibrations(&args.recording, range)? {
+        let entry = match &recalibration {
+            Some(recalibration) => recalibration.applied(entry),
+            None => entry,
+        };
         run.centre.take(&entry.key.channel, &entry.data, "");
         if !range.is_whole {
             run.writer.write(&Entry { data_time: range.from.max(entry.data_time), ..entry })?;
@@ -53,14 +63,27 @@ pub fn fuse(args: &Args, output: &Path, range: Range) -> anyhow::Result<()> {
     }
     let mut lacks = Lacks::default();
     let (mut first, mut until) = (None, Timestamp::MIN);
-    recorded::for_each_until(&args.recording, &mut lacks, &shutdown, |_, entry| {
+    let mut take = |entry: Entry| {
         if range.holds(&entry) {
             first.get_or_insert(entry.data_time);
             until = until.max(entry.data_time);
             run.take(&entry)?;
         }
         Ok(())
-    })?;
+    };
+    let mut reordered = recalibration.map(Reordered::new);
+    recorded::for_each_until(
+        &args.recording,
+        &mut lacks,
+        &shutdown,
+        |_, entry| match &mut reordered {
+            Some(reordered) => reordered.take(entry, &mut take),
+            None => take(entry),
+        },
+    )?;
+    if let Some(reordered) = &mut reordered {
+        reordered.finish(&mut take)?;
+    }
     lacks.say(&args.recording);
     lacks.ensure_found(run.frames > 0, "bearings in that range", &args.recording)?;
     run.finish(args, output)?;

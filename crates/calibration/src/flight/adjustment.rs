@@ -1,0 +1,406 @@
+//! The least-squares adjustment of a flight: cameras, clocks, lenses, the target's way and the
+//! log's bias, all at once.
+
+use crossfix_geometry::Intrinsics;
+use nalgebra::{DMatrix, Vector2, Vector3};
+
+use super::model::{CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen};
+use super::noise::{LabelNoise, Tails, Whitening};
+use super::normal::{ChainCovariance, NormalEquations, Solution, Term};
+use super::spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
+use crate::lens;
+
+/// Labels farther apart in time than this have errors of their own, s. No more than the distance of
+/// the spline's knots, or the equations' band is too narrow.
+pub(super) const LONGEST_PAIR_S: f64 = KNOT_S;
+/// Unknowns of the target's way that two labels in a row touch: five coefficients.
+const BAND: usize = 3 * (SPAN + 1);
+/// Prior of what is not known at all: wide against anything that a site has.
+const WIDE_ROTATION_RAD: f64 = 10.0;
+const WIDE_M: f64 = 1e4;
+const WIDE_S: f64 = 1e4;
+/// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
+/// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
+/// one all clocks of a site may be off alike, as a log of metres does not tell.
+const RATE_SD: f64 = 2e-4;
+/// Beside cameras the jerk may have so many times the power that was found. The likeliest way is
+/// smoother than the way is, and a scene that is drawn together as a whole has less jerk and the
+/// same labels: with a log of metres it shrank by 4 % at once the power, by 0.4 % at ten times and by
+/// 0.2 % at a hundred.
+const WIDER: f64 = 10.0;
+/// A sensor is read out in between nothing and a frame's time: so much of it, and give or take.
+const READOUT_SHARE: f64 = 0.5;
+
+/// What a label counts, in deviations, that the way does not reach or that lies behind its camera.
+const UNSEEN: f64 = 1e3;
+
+/// What all residuals are held against.
+#[derive(Clone, Debug)]
+pub(super) struct Priors {
+    /// Power of the target's jerk, m^2/s^5.
+    pub(super) jerk: f64,
+    /// Of each camera.
+    pub(super) cameras: Vec<CameraPriors>,
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct CameraPriors {
+    pub(super) noise: LabelNoise,
+    /// Of the lens's file.
+    pub(super) lens: Intrinsics,
+    /// Time between frames, s.
+    pub(super) frame_s: f64,
+    /// Power of the clock's random walk, s^2/s.
+    pub(super) wander: f64,
+}
+
+/// The unknowns.
+#[derive(Clone, Debug)]
+pub(super) struct State {
+    pub(super) way: Spline,
+    pub(super) cameras: Vec<CameraState>,
+    /// The log's bias, an axis each.
+    pub(super) bias: [Knots; 3],
+}
+
+/// A residual that is one by its deviation, and what it hangs on.
+type Row = (Vec<Term>, f64);
+
+/// Takes rows in that have their tails in common.
+trait Sink {
+    fn take(&mut self, rows: &[Row], tails: Tails);
+}
+
+struct Linear(NormalEquations);
+
+impl Sink for Linear {
+    fn take(&mut self, rows: &[Row], tails: Tails) {
+        let weight =
+            tails.weight(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
+        for (terms, residual) in rows {
+            self.0.add(terms, *residual, weight);
+        }
+    }
+}
+
+struct Cost(f64);
+
+impl Sink for Cost {
+    fn take(&mut self, rows: &[Row], tails: Tails) {
+        self.0 +=
+            tails.loss(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
+    }
+}
+
+/// A flight to be adjusted.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Flight<'a> {
+    pub(super) cameras: &'a [CameraLabels],
+    pub(super) log: &'a FlightLog,
+}
+
+impl State {
+    /// Unknowns of the target's way.
+    pub(super) fn chain(&self) -> usize {
+        3 * self.way.coefficients.len()
+    }
+
+    /// Where each camera's unknowns begin, and at last the bias's.
+    pub(super) fn starts(&self) -> Vec<usize> {
+        let mut next = self.chain();
+        let mut starts = vec![next];
+        for camera in &self.cameras {
+            next += camera.unknowns();
+            starts.push(next);
+        }
+        starts
+    }
+
+    fn others(&self) -> usize {
+        let cameras: usize = self.cameras.iter().map(CameraState::unknowns).sum();
+        cameras + 3 * self.bias[0].values.len()
+    }
+
+    fn moved(&self, step: &[f64]) -> Self {
+        let mut next = self.clone();
+        let (way, mut rest) = step.split_at(self.chain());
+        for (coefficient, step) in next.way.coefficients.iter_mut().zip(way.chunks_exact(3)) {
+            *coefficient += Vector3::from_column_slice(step);
+        }
+        for camera in &mut next.cameras {
+            let (own, after) = rest.split_at(camera.unknowns());
+            camera.step(own);
+            rest = after;
+        }
+        for (axis, step) in next.bias.iter_mut().zip(rest.chunks_exact(self.bias[0].values.len())) {
+            axis.values.iter_mut().zip(step).for_each(|(value, step)| *value += step);
+        }
+        next
+    }
+
+    /// What a camera's label differs by, where the way reaches it.
+    pub(super) fn see(
+        &self,
+        camera: usize,
+        label: &super::Label,
+    ) -> Option<(usize, [f64; SPAN], Seen)> {
+        let camera = &self.cameras[camera];
+        let weights = self.way.weights(camera.time_s(label))?;
+        let seen = camera.see(label, self.way.place(&weights), self.way.velocity(&weights))?;
+        Some((weights.first, weights.place, seen))
+    }
+
+    fn all(&self, flight: &Flight<'_>, priors: &Priors, sink: &mut impl Sink) {
+        self.way_rows(priors, sink);
+        self.log_rows(flight.log, sink);
+        let starts = self.starts();
+        for (index, camera) in flight.cameras.iter().enumerate() {
+            self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);
+            self.prior_rows(index, starts[index], &priors.cameras[index], sink);
+        }
+    }
+
+    /// White jerk: over an interval its mean has the variance power / interval, so that the third
+    /// difference has power x interval^5.
+    fn way_rows(&self, priors: &Priors, sink: &mut impl Sink) {
+        let width = if self.cameras.is_empty() { 1.0 } else { WIDER };
+        let scale = (width * priors.jerk * KNOT_S.powi(5)).sqrt().recip();
+        for first in 0..self.way.intervals() {
+            let difference = self.way.third_difference(first);
+            for axis in 0..3 {
+                let term = |k: usize| (3 * (first + k) + axis, THIRD_DIFFERENCE[k] * scale);
+                let terms = (0..SPAN).map(term).collect();
+                sink.take(&[(terms, difference[axis] * scale)], Tails::Normal);
+            }
+        }
+        // Where nothing holds the way, the origin does, from very far.
+        for unknown in 0..self.chain() {
+            let value = self.way.coefficients[unknown / 3][unknown % 3] / WIDE_M;
+            sink.take(&[(vec![(unknown, 1.0 / WIDE_M)], value)], Tails::Normal);
+        }
+    }
+
+    fn log_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
+        let bias_start = self.starts()[self.cameras.len()];
+        let knots = self.bias[0].values.len();
+        let scale = log.errors.sd_m.recip();
+        for sample in &log.samples {
+            let Some(weights) = self.way.weights(sample.time_s) else { continue };
+            let place = self.way.place(&weights);
+            let rows = [0, 1, 2].map(|axis| {
+                let of_bias = self.bias[axis].weights(sample.time_s);
+                let chain =
+                    (0..SPAN).map(|k| (3 * (weights.first + k) + axis, weights.place[k] * scale));
+                let bias =
+                    of_bias.map(|(k, weight)| (bias_start + axis * knots + k, weight * scale));
+                let stated = place[axis] + self.bias[axis].at(sample.time_s);
+                (chain.chain(bias).collect(), (stated - sample.position[axis]) * scale)
+            });
+            sink.take(&rows, Tails::Heavy);
+        }
+        self.bias_rows(log, bias_start, sink);
+    }
+
+    /// A bias that forgets itself: `b' = f b + noise`, of the same deviation at all times.
+    fn bias_rows(&self, log: &FlightLog, start: usize, sink: &mut impl Sink) {
+        let errors = &log.errors;
+        let kept = (-self.bias[0].step_s / errors.drift_time_s).exp();
+        let first = errors.drift_sd_m.max(1e-9).recip();
+        let next = first / (1.0 - kept * kept).sqrt();
+        for (axis, bias) in self.bias.iter().enumerate() {
+            let start = start + axis * bias.values.len();
+            sink.take(&[(vec![(start, first)], bias.values[0] * first)], Tails::Normal);
+            for (k, pair) in bias.values.windows(2).enumerate() {
+                let terms = vec![(start + k, -kept * next), (start + k + 1, next)];
+                sink.take(&[(terms, (pair[1] - kept * pair[0]) * next)], Tails::Normal);
+            }
+        }
+    }
+
+    fn label_rows(
+        &self,
+        index: usize,
+        start: usize,
+        camera: &CameraLabels,
+        priors: &CameraPriors,
+        sink: &mut impl Sink,
+    ) {
+        let mut before: Option<(f64, Placed)> = None;
+        for label in &camera.labels {
+            let placed = self.placed(index, label);
+            let Some(placed) = placed else {
+                // As far off as can be: or it would pay to have it out of sight.
+                sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
+                before = None;
+                continue;
+            };
+            let earlier = before.filter(|(time_s, earlier)| {
+                label.time_s - time_s < LONGEST_PAIR_S && placed.first - earlier.first <= 1
+            });
+            let whitening = priors
+                .noise
+                .after(earlier.map(|(time_s, _)| label.time_s - time_s), priors.frame_s);
+            let earlier = earlier.as_ref().map(|(_, earlier)| earlier);
+            sink.take(&self.whitened(index, start, &placed, earlier, whitening), Tails::Heavy);
+            before = Some((label.time_s, placed));
+        }
+    }
+
+    fn placed(&self, index: usize, label: &super::Label) -> Option<Placed> {
+        let (first, weights, seen) = self.see(index, label)?;
+        let wander = self.cameras[index].clock.wander.weights(label.time_s);
+        Some(Placed { first, weights, seen, wander })
+    }
+
+    /// A label's residual less what of it is the one's before, by the deviation of what is new.
+    fn whitened(
+        &self,
+        index: usize,
+        start: usize,
+        now: &Placed,
+        before: Option<&Placed>,
+        Whitening { kept, sd_px }: Whitening,
+    ) -> [Row; 2] {
+        let own = self.cameras[index].own();
+        let first = before.map_or(now.first, |before| before.first);
+        [0, 1].map(|axis| {
+            let mut chain = [0.0; BAND];
+            let mut terms: Vec<Term> = Vec::with_capacity(BAND + own + 4);
+            let mut own_terms = [0.0; super::model::MOST_OWN];
+            let mut residual = 0.0;
+            let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
+            for (part, share) in parts.into_iter().flatten() {
+                let share = share / sd_px;
+                residual += part.seen.residual[axis] * share;
+                for (k, weight) in part.weights.iter().enumerate() {
+                    for dimension in 0..3 {
+                        chain[3 * (part.first - first + k) + dimension] +=
+                            part.seen.by_place[(axis, dimension)] * weight * share;
+                    }
+                }
+                for (term, by_own) in own_terms.iter_mut().zip(&part.seen.by_own) {
+                    *term += by_own[axis] * share;
+                }
+                for (knot, weight) in part.wander {
+                    terms.push((start + own + knot, part.seen.by_time[axis] * weight * share));
+                }
+            }
+            let used = 3 * (now.first - first + SPAN);
+            terms
+                .extend(chain[..used].iter().enumerate().map(|(k, value)| (3 * first + k, *value)));
+            terms.extend(own_terms[..own].iter().enumerate().map(|(k, value)| (start + k, *value)));
+            (terms, residual)
+        })
+    }
+
+    /// What is known of a camera before anything is seen.
+    fn prior_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
+        let camera = &self.cameras[index];
+        let mut hold = |unknown: usize, value: f64, sd: f64| {
+            sink.take(&[(vec![(start + unknown, sd.recip())], value / sd)], Tails::Normal);
+        };
+        for axis in 0..3 {
+            hold(axis, 0.0, WIDE_ROTATION_RAD);
+            hold(axis + 3, camera.centre[axis], WIDE_M);
+        }
+        let clock = &camera.clock;
+        hold(CLOCK, 0.0, WIDE_S);
+        let readout = READOUT_SHARE * priors.frame_s;
+        hold(CLOCK + 2, clock.readout_s - readout, readout);
+        let values = lens::values(&camera.intrinsics);
+        let known = lens::values(&priors.lens);
+        let deviations = lens::prior_sd(&priors.lens);
+        for (k, sd) in deviations.into_iter().enumerate() {
+            hold(POSE_AND_CLOCK + k, values[k] - known[k], sd);
+        }
+        // The wander's mean and slope are the clock's: the wander itself is held to nought as wide
+        // as it may go.
+        let own = camera.own();
+        let wander = &clock.wander;
+        let span = wander.step_s * (wander.values.len() - 1) as f64;
+        for (k, value) in wander.values.iter().enumerate() {
+            hold(own + k, *value, (priors.wander * span).sqrt());
+        }
+        let rate = (vec![(start + CLOCK + 1, RATE_SD.recip())], clock.rate / RATE_SD);
+        sink.take(&[rate], Tails::Heavy);
+        let step = (priors.wander * wander.step_s).sqrt().recip();
+        for (k, pair) in wander.values.windows(2).enumerate() {
+            let terms = vec![(start + own + k, -step), (start + own + k + 1, step)];
+            sink.take(&[(terms, (pair[1] - pair[0]) * step)], Tails::Normal);
+        }
+    }
+}
+
+/// A label's residual and what of the way it hangs on.
+#[derive(Clone, Copy, Debug)]
+struct Placed {
+    first: usize,
+    weights: [f64; SPAN],
+    seen: Seen,
+    wander: [(usize, f64); 2],
+}
+
+/// Steps at most; from a start within a metre and a tenth of a second five to eight are enough.
+const MOST_STEPS: usize = 30;
+/// A step that changes the cost by less than this is the last: in units of log likelihood.
+const SETTLED: f64 = 0.01;
+
+/// A state that no step makes likelier, and the information on all but the way.
+pub(super) struct Adjusted {
+    pub(super) state: State,
+    pub(super) information: DMatrix<f64>,
+    /// Of the way, all else held.
+    pub(super) way_covariance: ChainCovariance,
+    pub(super) cost: f64,
+}
+
+/// Levenberg and Marquardt's way down from a start. `None`: something is tied to nothing, or is not
+/// a number.
+pub(super) fn adjust(flight: &Flight<'_>, priors: &Priors, start: State) -> Option<Adjusted> {
+    let cost_of = |state: &State| {
+        let mut cost = Cost(0.0);
+        state.all(flight, priors, &mut cost);
+        cost.0
+    };
+    let (mut state, mut damping) = (start, FIRST_DAMPING);
+    let mut cost = cost_of(&state);
+    for _ in 0..MOST_STEPS {
+        let linear = linearised(flight, priors, &state);
+        let before = cost;
+        while damping < MOST_DAMPING {
+            let Solution { step, .. } = linear.clone().solve(damping)?;
+            let next = state.moved(step.as_slice());
+            let next_cost = cost_of(&next);
+            if next_cost < cost {
+                (state, cost) = (next, next_cost);
+                damping /= DAMPING_STEP;
+                break;
+            }
+            damping *= DAMPING_STEP;
+        }
+        if before - cost < SETTLED {
+            break;
+        }
+    }
+    let solution = linearised(flight, priors, &state).solve(0.0)?;
+    let way_covariance = solution.chain_covariance();
+    Some(Adjusted { state, information: solution.schur, way_covariance, cost })
+}
+
+/// A step is damped by this share of each diagonal element at first, ...
+const FIRST_DAMPING: f64 = 1e-6;
+/// ... by so many times more where it makes the fit worse, or less where better, ...
+const DAMPING_STEP: f64 = 10.0;
+/// ... and by this at most.
+const MOST_DAMPING: f64 = 1e3;
+
+fn linearised(flight: &Flight<'_>, priors: &Priors, state: &State) -> NormalEquations {
+    let mut linear = Linear(NormalEquations::new(state.chain(), BAND, state.others()));
+    state.all(flight, priors, &mut linear);
+    linear.0
+}
+
+/// Half the square of a residual: the mean of both axes, pixels^2.
+pub(super) fn square(residual: Vector2<f64>) -> f64 {
+    residual.norm_squared() / 2.0
+}

@@ -1,0 +1,564 @@
+//! Poses, clocks and lenses of cameras from the flight of one target with a log.
+//!
+//! All that is unknown is adjusted at once: each camera's pose, clock and lens, the target's way (a
+//! cubic spline with white jerk) and the log's drifting bias. The log is a measurement and not the
+//! truth: a camera that were held against it alone would take on its errors.
+
+mod adjustment;
+mod model;
+mod noise;
+mod normal;
+mod spline;
+mod start;
+
+use crossfix_geometry::{Camera, Intrinsics, Pose};
+use crossfix_message::CameraName;
+use nalgebra::{DMatrix, Matrix6, Vector2};
+use thiserror::Error;
+
+use crate::lens::{self, LensUncertainty};
+use adjustment::{Adjusted, CameraPriors, Flight, Priors, State};
+use model::{CLOCK, CameraState, Knots, POSE_AND_CLOCK};
+use normal::ChainCovariance;
+use spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
+
+pub use model::{CameraLabels, FlightLog, Label, LogErrors, LogSample};
+pub use noise::LabelNoise;
+
+/// Why a flight cannot be adjusted.
+#[derive(Debug, Error)]
+pub enum FlightError {
+    /// The log holds too little.
+    #[error("the log has {samples} samples: a flight needs at least {LEAST_SAMPLES}")]
+    ShortLog {
+        /// How many there are.
+        samples: usize,
+    },
+    /// No camera can be calibrated; why not of the first.
+    #[error("no camera can be calibrated: camera `{camera}` {why}")]
+    NoCamera {
+        /// The camera.
+        camera: CameraName,
+        /// Why not.
+        why: Refusal,
+    },
+    /// The equations have no solution.
+    #[error("the adjustment has no solution: its numbers are not finite")]
+    NoSolution,
+}
+
+/// Why one camera cannot be calibrated.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum Refusal {
+    /// It saw too little.
+    #[error("has {labels} labels: a calibration needs at least {LEAST_LABELS}")]
+    FewLabels {
+        /// How many there are.
+        labels: usize,
+    },
+    /// Its labels and the log have no time in common.
+    #[error("has too few labels in the time of the log, whatever its clock shows")]
+    NoTime,
+    /// No pose and offset makes its labels fit the log.
+    #[error(
+        "lies {misfit_mrad:.1} mrad beside the log wherever it stands{}",
+        mirror.map_or(String::new(), |mirror| format!(": {mirror}"))
+    )]
+    Misfit {
+        /// The median angle between labels and log, mrad.
+        misfit_mrad: f64,
+        /// What makes it fit.
+        mirror: Option<Mirror>,
+    },
+}
+
+/// A log whose axes are others than it says: only its mirror image fits what cameras see.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mirror {
+    /// East and north are exchanged, or the height's sign is: what cameras see does not tell which.
+    AxesOrHeight,
+}
+
+impl std::fmt::Display for Mirror {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(
+            "its mirror image fits, so east and north are exchanged in the log, or its height counts \
+             downwards",
+        )
+    }
+}
+
+/// Labels that lie farther than this beside the log, in the median, are not of it, rad: lens files
+/// and clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
+const MOST_MISFIT_RAD: f64 = 8e-3;
+/// ... and so many deviations of the log's own errors, as they are seen from where the camera
+/// stands.
+const LOG_DEVIATIONS: f64 = 3.0;
+/// The mirror image fits where it fits so many times better.
+const CLEARLY_BETTER: f64 = 3.0;
+
+/// A log with fewer samples is none.
+const LEAST_SAMPLES: usize = 20;
+/// A camera with fewer labels has seen nothing.
+const LEAST_LABELS: usize = 30;
+/// Beyond the labels the way goes on for so long, s: their times may still move.
+const MARGIN_S: f64 = 2.0;
+/// Rounds in which deviations and powers are found beside the unknowns.
+const ROUNDS: usize = 6;
+/// Knots of the log's bias lie so many to its time of forgetting.
+const BIAS_KNOTS: f64 = 8.0;
+/// What labels are taken to err by before anything is known, pixels: a hand's or a tracker's, and
+/// what a lens file leaves.
+const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
+/// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. From too little
+/// it would not be found.
+const FIRST_WANDER: f64 = 2e-6;
+/// What clocks are usually like, 0.03 ms after a second, is believed as two steps that were seen; the
+/// least is a crystal's.
+const USUAL_WANDER: f64 = 1e-9;
+const USUAL_STEPS: f64 = 2.0;
+const LEAST_WANDER: f64 = 1e-12;
+
+/// What a flight has shown of one camera.
+#[derive(Clone, Debug)]
+pub struct CameraResult {
+    /// Whose it is.
+    pub name: CameraName,
+    /// Lens and pose.
+    pub camera: Camera,
+    /// Covariance of the pose with the lens held at what it was found to be: rotation about the
+    /// camera's axes (rad), then position (m).
+    pub pose_covariance: Matrix6<f64>,
+    /// What is still unknown of the lens.
+    pub lens: LensUncertainty,
+    /// Its clock.
+    pub clock: ClockResult,
+    /// Its labels' error.
+    pub noise: LabelNoise,
+    /// Time between its frames, s.
+    pub frame_s: f64,
+    /// Range at which it saw the target, in the middle, m.
+    pub range_m: f64,
+    /// Labels.
+    pub labels: usize,
+    /// Those of them that lie within four deviations.
+    pub used: usize,
+    /// Root mean square of the labels' residuals per axis, of those within four deviations, pixels.
+    pub residual_px: f64,
+    /// The focal length against the lens file's.
+    pub focal_ratio: f64,
+    /// Its standard deviation.
+    pub focal_ratio_sd: f64,
+}
+
+/// What a flight has shown of a clock.
+#[derive(Clone, Debug)]
+pub struct ClockResult {
+    /// Knots, evenly spread over the labels' times.
+    pub knots: Vec<ClockKnot>,
+    /// How much more than a second passes in one of its own, and the standard deviation.
+    pub rate: f64,
+    /// Standard deviation of that.
+    pub rate_sd: f64,
+    /// Power of its random walk, s^2/s.
+    pub wander: f64,
+    /// Time between the first row's read-out and the last's, s.
+    pub readout_s: f64,
+    /// Standard deviation of that.
+    pub readout_sd_s: f64,
+}
+
+/// What a clock is to be corrected by at one of its times.
+#[derive(Clone, Copy, Debug)]
+pub struct ClockKnot {
+    /// Its own time, s.
+    pub time_s: f64,
+    /// The common time less its own, s.
+    pub ahead_s: f64,
+    /// Standard deviation of that.
+    pub sd_s: f64,
+}
+
+/// What a flight has shown.
+#[derive(Clone, Debug)]
+pub struct FlightResult {
+    /// Of each camera that could be calibrated, in the order that they were given in.
+    pub cameras: Vec<CameraResult>,
+    /// The others, and why not.
+    pub refused: Vec<(CameraName, Refusal)>,
+    /// Power of the target's jerk, m^2/s^5.
+    pub jerk: f64,
+    /// Root mean square of the log's residuals per axis, m.
+    pub log_residual_m: f64,
+}
+
+/// Adjusts a flight.
+///
+/// # Errors
+/// [`FlightError`] naming the camera, or what of the log is too little.
+pub fn calibrate_flight(
+    cameras: &[CameraLabels],
+    log: &FlightLog,
+) -> Result<FlightResult, FlightError> {
+    if log.samples.len() < LEAST_SAMPLES {
+        return Err(FlightError::ShortLog { samples: log.samples.len() });
+    }
+    let (of_log, jerk) = log_alone(log).ok_or(FlightError::NoSolution)?;
+    let (mut used, mut starts, mut refused) = (Vec::new(), Vec::new(), Vec::new());
+    for camera in cameras {
+        match start_of(camera, &of_log, &log.errors) {
+            Ok(start) => {
+                used.push(camera.clone());
+                starts.push(start);
+            }
+            Err(why) => refused.push((camera.name.clone(), why)),
+        }
+    }
+    if used.is_empty() {
+        let (camera, why) = refused.into_iter().next().ok_or(FlightError::NoSolution)?;
+        return Err(FlightError::NoCamera { camera, why });
+    }
+    let flight = Flight { cameras: &used, log };
+    let (state, priors) = begin(&flight, starts, &of_log, jerk);
+    let (adjusted, priors) = settle(&flight, priors, state).ok_or(FlightError::NoSolution)?;
+    let mut result = results(&flight, &adjusted, &priors).ok_or(FlightError::NoSolution)?;
+    result.refused = refused;
+    Ok(result)
+}
+
+/// A camera's start against the log's way.
+fn start_of(
+    camera: &CameraLabels,
+    of_log: &State,
+    errors: &LogErrors,
+) -> Result<CameraState, Refusal> {
+    let labels = camera.labels.len();
+    if labels < LEAST_LABELS {
+        return Err(Refusal::FewLabels { labels });
+    }
+    let frame_s = frame_time(camera);
+    let (state, misfit) = start::find(camera, &of_log.way, frame_s).ok_or(Refusal::NoTime)?;
+    tracing::debug!(
+        "camera `{}` starts at {:.2} with the clock {:.3} s behind, {:.2} mrad off",
+        camera.name,
+        state.centre,
+        state.clock.offset_s,
+        misfit * 1e3
+    );
+    let of_errors = LOG_DEVIATIONS * errors.sd_m.hypot(errors.drift_sd_m);
+    let range_m = middle_distance(&of_log.way, &state);
+    if misfit <= MOST_MISFIT_RAD + of_errors / range_m {
+        return Ok(state);
+    }
+    // Exchanging two axes or turning one round is the same but for where the camera stands.
+    let mut mirrored = of_log.way.clone();
+    mirrored.coefficients.iter_mut().for_each(|place| place.z = -place.z);
+    let of_mirror = start::find(camera, &mirrored, frame_s).map_or(f64::INFINITY, |found| found.1);
+    let mirror = (of_mirror * CLEARLY_BETTER < misfit).then_some(Mirror::AxesOrHeight);
+    Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, mirror })
+}
+
+/// The median distance of a way from a camera, m.
+fn middle_distance(way: &Spline, camera: &CameraState) -> f64 {
+    let distance = |place: &nalgebra::Vector3<f64>| (place - camera.centre.coords).norm();
+    let mut distances: Vec<f64> = way.coefficients.iter().map(distance).collect();
+    distances.sort_unstable_by(f64::total_cmp);
+    distances[distances.len() / 2].max(1.0)
+}
+
+/// All unknowns as they are begun with: each camera at its start, the way as the log shows it.
+fn begin(
+    flight: &Flight<'_>,
+    states: Vec<CameraState>,
+    of_log: &State,
+    jerk: f64,
+) -> (State, Priors) {
+    let prior = |camera: &CameraLabels| CameraPriors {
+        noise: FIRST_NOISE,
+        lens: camera.intrinsics,
+        frame_s: frame_time(camera),
+        wander: FIRST_WANDER,
+    };
+    let priors = flight.cameras.iter().map(prior).collect();
+    let times = flight
+        .cameras
+        .iter()
+        .zip(&states)
+        .flat_map(|(camera, state)| camera.labels.iter().map(|label| state.time_s(label)));
+    let (from, to) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), time_s| {
+        (from.min(time_s), to.max(time_s))
+    });
+    let mut way = Spline::over(from - MARGIN_S, to + MARGIN_S);
+    way.follow(&of_log.way);
+    let bias = bias_over(flight.log, from - MARGIN_S, to + MARGIN_S);
+    (State { way, cameras: states, bias }, Priors { jerk, cameras: priors })
+}
+
+fn bias_over(log: &FlightLog, from: f64, to: f64) -> [Knots; 3] {
+    let step_s = log.errors.drift_time_s / BIAS_KNOTS;
+    [0, 1, 2].map(|_| Knots::over(from, to, step_s))
+}
+
+/// The time between a camera's frames: the median between its labels, s.
+fn frame_time(camera: &CameraLabels) -> f64 {
+    let mut steps: Vec<f64> =
+        camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
+    steps.sort_unstable_by(f64::total_cmp);
+    steps[steps.len() / 2].max(1e-3)
+}
+
+/// The way that the log shows, and the power of its jerk.
+fn log_alone(log: &FlightLog) -> Option<(State, f64)> {
+    const ROUNDS: usize = 12;
+    const FIRST_JERK: f64 = 10.0;
+    let (from, to) = (log.samples.first()?.time_s, log.samples.last()?.time_s);
+    let flight = Flight { cameras: &[], log };
+    let bias = bias_over(log, from, to);
+    let mut state = State { way: Spline::over(from, to + KNOT_S), cameras: Vec::new(), bias };
+    let mut priors = Priors { jerk: FIRST_JERK, cameras: Vec::new() };
+    for _ in 0..ROUNDS {
+        let adjusted = adjustment::adjust(&flight, &priors, state)?;
+        priors.jerk = jerk(&adjusted.state.way, &adjusted.way_covariance);
+        state = adjusted.state;
+    }
+    Some((state, priors.jerk))
+}
+
+/// The power of the jerk that a way shows: what its third differences are, and what they may be
+/// beside (expectation and maximisation).
+fn jerk(way: &Spline, covariance: &ChainCovariance) -> f64 {
+    let mut sum = 0.0;
+    for first in 0..way.intervals() {
+        sum += way.third_difference(first).norm_squared();
+        for axis in 0..3 {
+            let terms = [0, 1, 2, 3].map(|k| (3 * (first + k) + axis, THIRD_DIFFERENCE[k]));
+            sum += covariance.variance(&terms);
+        }
+    }
+    (sum / (3.0 * way.intervals() as f64) / KNOT_S.powi(5)).max(1e-6)
+}
+
+/// Adjusts, finds the noise in what is left, and adjusts again.
+fn settle(flight: &Flight<'_>, mut priors: Priors, mut state: State) -> Option<(Adjusted, Priors)> {
+    let mut adjusted = None;
+    for round in 0..ROUNDS {
+        let next = adjustment::adjust(flight, &priors, state)?;
+        state = next.state.clone();
+        if round + 1 < ROUNDS {
+            priors = learnt(flight, &next, &priors)?;
+            tracing::debug!(
+                "round {round}: cost {:.1}, jerk {:.2} m^2/s^5",
+                next.cost,
+                priors.jerk
+            );
+        }
+        adjusted = Some(next);
+    }
+    Some((adjusted?, priors))
+}
+
+/// Noise, wander and jerk as an adjustment shows them.
+fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Option<Priors> {
+    let state = &adjusted.state;
+    let covariance = adjusted.information.clone().cholesky()?.inverse();
+    let starts = state.starts();
+    let mut cameras = Vec::new();
+    for (index, camera) in state.cameras.iter().enumerate() {
+        let residuals = residuals(flight, state, index);
+        let explained = explained(flight, adjusted, index);
+        let frame_s = priors.cameras[index].frame_s;
+        let noise = LabelNoise::of(&residuals, explained, frame_s);
+        let start = starts[index] - state.chain() + camera.own();
+        let wander = wander(&camera.clock.wander, &covariance, start, priors.cameras[index].wander);
+        tracing::debug!(
+            "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre {:.2}",
+            flight.cameras[index].name,
+            noise.white_px,
+            noise.lasting_px,
+            noise.lasting_s,
+            explained.sqrt(),
+            wander.sqrt() * 1e3,
+            camera.clock.rate,
+            camera.clock.readout_s * 1e3,
+            camera.intrinsics.fx / priors.cameras[index].lens.fx,
+            camera.centre
+        );
+        cameras.push(CameraPriors { noise, wander, ..priors.cameras[index].clone() });
+    }
+    let jerk = jerk(&state.way, &adjusted.way_covariance);
+    Some(Priors { jerk, cameras })
+}
+
+/// A camera's residuals with their own times.
+fn residuals(flight: &Flight<'_>, state: &State, index: usize) -> Vec<(f64, Vector2<f64>)> {
+    let labels = flight.cameras[index].labels.iter();
+    labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.2.residual))).collect()
+}
+
+/// What of a label's variance the way has taken, pixels^2 an axis, in the mean.
+fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize) -> f64 {
+    const STRIDE: usize = 10;
+    let (mut sum, mut count) = (0.0, 0);
+    for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
+        let Some((first, weights, seen)) = adjusted.state.see(index, label) else { continue };
+        for axis in 0..2 {
+            let term = |k: usize| {
+                let by = seen.by_place[(axis, k % 3)] * weights[k / 3];
+                (3 * first + k, by)
+            };
+            let terms: [_; 3 * SPAN] = std::array::from_fn(term);
+            sum += adjusted.way_covariance.variance(&terms);
+            count += 1;
+        }
+    }
+    if count == 0 { 0.0 } else { sum / f64::from(count) }
+}
+
+/// The power of a clock's random walk, s^2/s: of its steps' squares, by how many of them the labels
+/// have told (MacKay's fixed point), and of what clocks are like beforehand.
+fn wander(knots: &Knots, covariance: &DMatrix<f64>, start: usize, before: f64) -> f64 {
+    let (mut squares, mut told) = (0.0, 0.0);
+    for (k, pair) in knots.values.windows(2).enumerate() {
+        let (a, b) = (start + k, start + k + 1);
+        let spread = covariance[(a, a)] + covariance[(b, b)] - 2.0 * covariance[(a, b)];
+        squares += (pair[1] - pair[0]).powi(2) / knots.step_s;
+        told += (1.0 - spread / (before * knots.step_s)).clamp(0.0, 1.0);
+    }
+    ((squares + USUAL_STEPS * USUAL_WANDER) / (told + USUAL_STEPS)).max(LEAST_WANDER)
+}
+
+fn results(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Option<FlightResult> {
+    let state = &adjusted.state;
+    let covariance = adjusted.information.clone().cholesky()?.inverse();
+    let starts = state.starts();
+    let mut cameras = Vec::new();
+    for (index, camera) in state.cameras.iter().enumerate() {
+        let start = starts[index] - state.chain();
+        let at = Block { covariance: &covariance, start };
+        let prior = &priors.cameras[index];
+        let residuals = residuals(flight, state, index);
+        let within = |residual: &Vector2<f64>| residual.norm() < 4.0 * prior.noise.sd_px();
+        let squares: Vec<f64> = residuals
+            .iter()
+            .filter(|(_, residual)| within(residual))
+            .map(|(_, residual)| adjustment::square(*residual))
+            .collect();
+        let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
+        cameras.push(CameraResult {
+            name: flight.cameras[index].name.clone(),
+            camera: Camera::new(camera.intrinsics, pose).ok()?,
+            pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))?,
+            lens: at.lens(lens::numbers(&camera.intrinsics))?,
+            clock: clock_result(camera, &at, prior.wander),
+            noise: prior.noise,
+            frame_s: prior.frame_s,
+            range_m: middle_range(flight, state, index),
+            labels: flight.cameras[index].labels.len(),
+            used: squares.len(),
+            residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+            focal_ratio: camera.intrinsics.fx / prior.lens.fx,
+            focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
+        });
+    }
+    Some(FlightResult {
+        cameras,
+        refused: Vec::new(),
+        jerk: priors.jerk,
+        log_residual_m: log_residual(flight.log, state),
+    })
+}
+
+/// The median range at which a camera saw the target, m.
+fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
+    let camera = &state.cameras[index];
+    let range = |label: &Label| {
+        let weights = state.way.weights(camera.time_s(label))?;
+        Some((state.way.place(&weights) - camera.centre).norm())
+    };
+    let mut ranges: Vec<f64> = flight.cameras[index].labels.iter().filter_map(range).collect();
+    ranges.sort_unstable_by(f64::total_cmp);
+    ranges.get(ranges.len() / 2).copied().unwrap_or(1.0)
+}
+
+fn log_residual(log: &FlightLog, state: &State) -> f64 {
+    let squares: Vec<f64> = log
+        .samples
+        .iter()
+        .filter_map(|sample| {
+            let weights = state.way.weights(sample.time_s)?;
+            let bias = nalgebra::Vector3::from_fn(|axis, _| state.bias[axis].at(sample.time_s));
+            Some((state.way.place(&weights) + bias - sample.position).norm_squared() / 3.0)
+        })
+        .collect();
+    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+}
+
+/// One camera's part of the covariance of all but the way.
+struct Block<'a> {
+    covariance: &'a DMatrix<f64>,
+    start: usize,
+}
+
+impl Block<'_> {
+    fn covariance_of(&self, a: usize, b: usize) -> f64 {
+        self.covariance[(self.start + a, self.start + b)]
+    }
+
+    fn part(&self, rows: usize, n: usize, columns: usize, m: usize) -> DMatrix<f64> {
+        DMatrix::from_fn(n, m, |i, j| self.covariance_of(rows + i, columns + j))
+    }
+
+    /// What is unknown of the lens, and how the pose follows it.
+    fn lens(&self, lens: usize) -> Option<LensUncertainty> {
+        let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
+        let covariance = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        let pose_by_lens = covariance.clone().cholesky()?.solve(&tied.transpose()).transpose();
+        Some(LensUncertainty { covariance, pose_by_lens })
+    }
+
+    /// The pose's covariance where the camera's lens is as it was found: what pose and lens may
+    /// both be off by without a difference in the image is no error of a bearing.
+    fn pose_with_lens_held(&self, lens: usize) -> Option<Matrix6<f64>> {
+        let pose = self.part(0, 6, 0, 6);
+        let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
+        let of_lens = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        let held = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
+        let held = (&held + held.transpose()) * 0.5;
+        Some(Matrix6::from_column_slice(held.as_slice()))
+    }
+}
+
+fn clock_result(camera: &CameraState, at: &Block<'_>, wander: f64) -> ClockResult {
+    let clock = &camera.clock;
+    let own = camera.own();
+    let knot = |k: usize| {
+        let time_s = clock.wander.time_s(k);
+        let terms = [(CLOCK, 1.0), (CLOCK + 1, time_s - clock.reference_s), (own + k, 1.0)];
+        let variance: f64 = terms
+            .iter()
+            .flat_map(|a| terms.iter().map(move |b| (a, b)))
+            .map(|(a, b)| a.1 * b.1 * at.covariance_of(a.0, b.0))
+            .sum();
+        ClockKnot {
+            time_s,
+            ahead_s: clock.common_s(time_s) - time_s,
+            sd_s: variance.max(0.0).sqrt(),
+        }
+    };
+    ClockResult {
+        knots: (0..clock.wander.values.len()).map(knot).collect(),
+        rate: clock.rate,
+        rate_sd: at.covariance_of(CLOCK + 1, CLOCK + 1).sqrt(),
+        wander,
+        readout_s: clock.readout_s,
+        readout_sd_s: at.covariance_of(CLOCK + 2, CLOCK + 2).sqrt(),
+    }
+}
+
+/// The intrinsics of a result.
+impl CameraResult {
+    /// The lens as it was found.
+    pub fn intrinsics(&self) -> &Intrinsics {
+        self.camera.model().intrinsics()
+    }
+}

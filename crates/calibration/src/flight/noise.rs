@@ -1,0 +1,153 @@
+//! How labels err: most a little and alike for half a second, some by anything.
+
+use nalgebra::Vector2;
+
+/// Degrees of freedom of the heavy tails: at four, a residual of ten deviations counts a fifth of
+/// one, and clean labels lose a tenth of their weight.
+const FREEDOM: f64 = 4.0;
+
+/// How unlikely a large residual is.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Tails {
+    /// As a normal deviate's.
+    Normal,
+    /// As Student's t: what is measured may be of something else.
+    Heavy,
+}
+
+impl Tails {
+    /// What residuals with this sum of squares count.
+    pub(super) fn weight(self, squares: f64, count: usize) -> f64 {
+        match self {
+            Self::Normal => 1.0,
+            Self::Heavy => (FREEDOM + count as f64) / (FREEDOM + squares),
+        }
+    }
+
+    /// Twice their negative log likelihood.
+    pub(super) fn loss(self, squares: f64, count: usize) -> f64 {
+        match self {
+            Self::Normal => squares,
+            Self::Heavy => (FREEDOM + count as f64) * (squares / FREEDOM).ln_1p(),
+        }
+    }
+}
+
+/// The error of a camera's labels, per axis: a part that is new in every frame, and one that lasts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LabelNoise {
+    /// Standard deviation of what is new in every frame, pixels.
+    pub white_px: f64,
+    /// Of what lasts, pixels.
+    pub lasting_px: f64,
+    /// Time after which e^-1 of that is left, s.
+    pub lasting_s: f64,
+}
+
+/// No label is nearer to its target's middle than this, pixels: the noise of a camera that alone
+/// holds the track would be found to be nothing.
+const LEAST_SD_PX: f64 = 0.1;
+/// Errors that last longer than this are the lens's or the pose's, s.
+const LONGEST_S: f64 = 2.0;
+/// Labels over this time are averaged to see how long errors last, s.
+const BLOCK_S: f64 = 1.0;
+/// The median of the sum of two squared normal deviates.
+const MEDIAN_OF_TWO: f64 = 2.0 * std::f64::consts::LN_2;
+
+/// How labels are whitened: a label's error is this share of the one's before, ...
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Whitening {
+    pub(super) kept: f64,
+    /// ... and what is new has this deviation, pixels.
+    pub(super) sd_px: f64,
+}
+
+impl LabelNoise {
+    /// Standard deviation in all, pixels.
+    pub fn sd_px(&self) -> f64 {
+        self.white_px.hypot(self.lasting_px)
+    }
+
+    /// The deviation of white noise of labels `frame_s` apart that over seconds averages out as
+    /// slowly as this does, pixels: `w^2 + c^2 (1 + a) / (1 - a)` with `a = exp(-frame / T)`.
+    pub fn white_equivalent_px(&self, frame_s: f64) -> f64 {
+        let kept = (-frame_s / self.lasting_s).exp();
+        let slow = (1.0 + kept) / (1.0 - kept);
+        (self.white_px.powi(2) + self.lasting_px.powi(2) * slow).sqrt()
+    }
+
+    /// How a label is whitened after one so many seconds before, where frames are `frame_s` apart.
+    ///
+    /// The sum of a white part and a lasting one would need all labels before to be whitened. The
+    /// last one alone, weighed by its correlation, leaves the difference of two labels what it is;
+    /// its deviation is then made so much larger that the mean of many is not better known than it
+    /// is. Between the two it errs towards caution.
+    pub(super) fn after(&self, before_s: Option<f64>, frame_s: f64) -> Whitening {
+        let variance = self.sd_px().powi(2);
+        let correlation =
+            |after_s: f64| self.lasting_px.powi(2) / variance * (-after_s / self.lasting_s).exp();
+        let of_frame = correlation(frame_s);
+        let averaged = variance * (1.0 + of_frame) / (1.0 - of_frame);
+        let caution = (self.white_equivalent_px(frame_s).powi(2) / averaged).max(1.0);
+        let kept = before_s.map_or(0.0, correlation);
+        Whitening { kept, sd_px: (variance * (1.0 - kept * kept) * caution).sqrt() }
+    }
+
+    /// As residuals show it, in order of time; `explained` is the variance (pixels^2, an axis) that
+    /// the fitted way has taken from them.
+    pub(super) fn of(residuals: &[(f64, Vector2<f64>)], explained: f64, frame_s: f64) -> Self {
+        let variance = typical(residuals.iter().map(|(_, residual)| *residual)) + explained;
+        let variance = variance.max(LEAST_SD_PX.powi(2));
+        let steps = residuals.windows(2).filter(|pair| pair[1].0 - pair[0].0 < 1.5 * frame_s);
+        let of_steps = typical(steps.map(|pair| pair[1].1 - pair[0].1)) / 2.0;
+        let of_means = typical(block_means(residuals).into_iter()) + explained;
+        // Of all that could be, the time after which blocks' means vary as they do.
+        let lasting = |lasting_s: f64| {
+            let kept = (-frame_s / lasting_s).exp();
+            ((variance - of_steps).max(0.0) / kept).min(variance)
+        };
+        let means = |lasting_s: f64| {
+            let lasting = lasting(lasting_s);
+            lasting * share_of_means(lasting_s) + (variance - lasting) * frame_s / BLOCK_S
+        };
+        let (mut least, mut most) = (frame_s, LONGEST_S.max(2.0 * frame_s));
+        for _ in 0..40 {
+            let middle = f64::midpoint(least, most);
+            if means(middle) < of_means { least = middle } else { most = middle }
+        }
+        let lasting = lasting(least);
+        Self {
+            white_px: (variance - lasting).max(0.0).sqrt().max(LEAST_WHITE_PX),
+            lasting_px: lasting.sqrt(),
+            lasting_s: least,
+        }
+    }
+}
+
+/// Labels are not drawn finer than this, pixels.
+const LEAST_WHITE_PX: f64 = 0.03;
+
+/// The variance of an axis whose vectors' median square is theirs.
+fn typical(vectors: impl Iterator<Item = Vector2<f64>>) -> f64 {
+    let mut squares: Vec<f64> = vectors.map(|vector| vector.norm_squared()).collect();
+    squares.sort_unstable_by(f64::total_cmp);
+    squares.get(squares.len() / 2).map_or(0.0, |median| median / MEDIAN_OF_TWO)
+}
+
+fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
+    let block = |time_s: f64| (time_s / BLOCK_S).floor();
+    let same = |a: &(f64, Vector2<f64>), b: &(f64, Vector2<f64>)| block(a.0) == block(b.0);
+    let spans =
+        |chunk: &&[(f64, Vector2<f64>)]| chunk[chunk.len() - 1].0 - chunk[0].0 > 0.6 * BLOCK_S;
+    let mean = |chunk: &[(f64, Vector2<f64>)]| {
+        chunk.iter().map(|(_, residual)| residual).sum::<Vector2<f64>>() / chunk.len() as f64
+    };
+    residuals.chunk_by(same).filter(spans).map(mean).collect()
+}
+
+/// What of the variance of an error that lasts T is left in the mean over a block of length L: the
+/// mean of `exp(-t / T)` over the block's pairs, `2 T/L (1 - T/L (1 - exp(-L/T)))`.
+fn share_of_means(lasting_s: f64) -> f64 {
+    let ratio = lasting_s / BLOCK_S;
+    2.0 * ratio * (1.0 - ratio * (1.0 - (-ratio.recip()).exp()))
+}

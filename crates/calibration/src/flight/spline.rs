@@ -1,0 +1,131 @@
+//! The target's way: a uniform cubic B-spline in time, kept smooth by white jerk.
+
+use nalgebra::{Point3, Vector3};
+
+/// Time between knots, s. A small drone turns in a second or two; a knot each tenth of one would
+/// cost twice the time and gain nothing, at one each half second turns are cut.
+pub(super) const KNOT_S: f64 = 0.2;
+
+/// Coefficients that have a part in one place.
+pub(super) const SPAN: usize = 4;
+
+/// How the place at a time depends on four coefficients.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Weights {
+    /// The first of the four.
+    pub(super) first: usize,
+    pub(super) place: [f64; SPAN],
+    /// Of the velocity, 1/s.
+    pub(super) velocity: [f64; SPAN],
+}
+
+/// A way over a range of time.
+#[derive(Clone, Debug)]
+pub(super) struct Spline {
+    start_s: f64,
+    pub(super) coefficients: Vec<Vector3<f64>>,
+}
+
+impl Spline {
+    /// One that stays at the origin from one time to another.
+    pub(super) fn over(start_s: f64, end_s: f64) -> Self {
+        let intervals = ((end_s - start_s) / KNOT_S).ceil().max(1.0) as usize;
+        Self { start_s, coefficients: vec![Vector3::zeros(); intervals + SPAN - 1] }
+    }
+
+    /// The weights at a time; `None` outside of its range.
+    pub(super) fn weights(&self, time_s: f64) -> Option<Weights> {
+        let at = (time_s - self.start_s) / KNOT_S;
+        let intervals = self.coefficients.len() - (SPAN - 1);
+        if !(at >= 0.0 && at < intervals as f64) {
+            return None;
+        }
+        let first = at as usize;
+        let u = at - first as f64;
+        let v = 1.0 - u;
+        let place = [
+            v * v * v / 6.0,
+            (4.0 - 6.0 * u * u + 3.0 * u * u * u) / 6.0,
+            (4.0 - 6.0 * v * v + 3.0 * v * v * v) / 6.0,
+            u * u * u / 6.0,
+        ];
+        let velocity = [
+            -v * v / 2.0,
+            (3.0 * u * u - 4.0 * u) / 2.0,
+            (4.0 * v - 3.0 * v * v) / 2.0,
+            u * u / 2.0,
+        ]
+        .map(|weight| weight / KNOT_S);
+        Some(Weights { first, place, velocity })
+    }
+
+    /// The place at weights that it gave.
+    pub(super) fn place(&self, weights: &Weights) -> Point3<f64> {
+        Point3::from(self.sum(weights.first, &weights.place))
+    }
+
+    /// The velocity, m/s.
+    pub(super) fn velocity(&self, weights: &Weights) -> Vector3<f64> {
+        self.sum(weights.first, &weights.velocity)
+    }
+
+    /// Third difference of the coefficients from one on: the interval's jerk times the knots'
+    /// distance cubed.
+    pub(super) fn third_difference(&self, first: usize) -> Vector3<f64> {
+        self.sum(first, &THIRD_DIFFERENCE)
+    }
+
+    fn sum(&self, first: usize, weights: &[f64; SPAN]) -> Vector3<f64> {
+        let terms = self.coefficients[first..first + SPAN].iter().zip(weights);
+        terms.map(|(coefficient, weight)| coefficient * *weight).sum()
+    }
+
+    /// Takes another's way where both are, and stays where that one begins and ends.
+    pub(super) fn follow(&mut self, other: &Self) {
+        let (from, to) = other.range();
+        for (k, coefficient) in self.coefficients.iter_mut().enumerate() {
+            // A coefficient has its largest part a knot after its first.
+            let time_s = self.start_s + (k as f64 - 1.0) * KNOT_S;
+            let within = time_s.clamp(from, to - 1e-6);
+            if let Some(weights) = other.weights(within) {
+                *coefficient = other.place(&weights).coords;
+            }
+        }
+    }
+
+    /// From when to when, s.
+    pub(super) fn range(&self) -> (f64, f64) {
+        (self.start_s, self.start_s + KNOT_S * self.intervals() as f64)
+    }
+
+    /// How many intervals it has.
+    pub(super) fn intervals(&self) -> usize {
+        self.coefficients.len() - (SPAN - 1)
+    }
+}
+
+/// The third difference of four coefficients.
+pub(super) const THIRD_DIFFERENCE: [f64; SPAN] = [-1.0, 3.0, -3.0, 1.0];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_holds_a_cubic_exactly_with_its_velocity_and_jerk() {
+        let mut spline = Spline::over(10.0, 14.0);
+        // A cubic's coefficients by its blossom: the product of the knots about each coefficient.
+        for (k, coefficient) in spline.coefficients.iter_mut().enumerate() {
+            let knot = |offset: f64| (k as f64 + offset) * KNOT_S;
+            coefficient.x = knot(-2.0) * knot(-1.0) * knot(0.0);
+        }
+        for t in [0.0, 0.13, 1.0, 3.99] {
+            let weights = spline.weights(10.0 + t).unwrap();
+            assert!((spline.place(&weights).x - t.powi(3)).abs() < 1e-9, "{t}");
+            assert!((spline.velocity(&weights).x - 3.0 * t * t).abs() < 1e-9, "{t}");
+        }
+        assert!((spline.third_difference(5).x - 6.0 * KNOT_S.powi(3)).abs() < 1e-9);
+        assert!(spline.weights(9.99).is_none() && spline.weights(14.01).is_none());
+        assert!(spline.weights(f64::NAN).is_none());
+    }
+}

@@ -1,0 +1,232 @@
+//! Flights that were made up: what is found must be what was put in, to within what is said of it.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use crossfix_calibration::{
+    CameraLabels, FlightError, FlightLog, FlightResult, Label, LogErrors, LogSample, Mirror,
+    Refusal, SiteCalibration, calibrate_flight,
+};
+use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
+use nalgebra::{Point3, Rotation3, Vector3, Vector6};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+const LOG: LogErrors = LogErrors { sd_m: 0.02, drift_sd_m: 0.02, drift_time_s: 200.0 };
+const SECONDS: f64 = 120.0;
+const FRAME_S: f64 = 0.04;
+
+/// A way through the whole volume: up to 8 m/s, 20 to 45 m high.
+fn way(t: f64) -> Point3<f64> {
+    Point3::new(
+        30.0 * (0.11 * t).sin() + 8.0 * (0.53 * t).sin(),
+        25.0 * (0.17 * t).cos() + 6.0 * (0.71 * t).cos(),
+        32.0 + 12.0 * (0.23 * t).sin(),
+    )
+}
+
+/// A camera as it is, and as its file and its clock say that it is.
+struct Truth {
+    name: &'static str,
+    camera: Camera,
+    file: Intrinsics,
+    /// The common time less the camera's.
+    offset_s: f64,
+    rate: f64,
+}
+
+fn cameras() -> Vec<Truth> {
+    let places = [[60.0, 10.0, 1.5], [-50.0, 35.0, 2.0], [5.0, -65.0, 4.0]];
+    let names = ["north", "east", "south"];
+    let truth = |(k, place): (usize, [f64; 3])| {
+        let pose = Pose::looking_at(place.into(), Point3::new(0.0, 0.0, 30.0)).unwrap();
+        let file = Intrinsics {
+            size: ImageSize { width: 1920, height: 1080 },
+            fx: 1100.0,
+            fy: 1102.0,
+            cx: 958.0,
+            cy: 541.0,
+            distortion: Distortion::BrownConrady([-0.05, 0.02, 0.0, 0.0, 0.0]),
+        };
+        // The lens is shorter at a distance than near the checkerboard.
+        let shorter = 1.0 - 0.004 * (k as f64 + 1.0);
+        let real = Intrinsics { fx: file.fx * shorter, fy: file.fy * shorter, ..file };
+        let camera = Camera::new(real, pose).unwrap();
+        let offset_s = 7.3 * k as f64 - 4.0;
+        Truth { name: names[k], camera, file, offset_s, rate: 2e-5 * k as f64 }
+    };
+    places.into_iter().enumerate().map(truth).collect()
+}
+
+/// What it labels: errors of 0.1 pixels that are new in every frame, and of 0.4 that last for half
+/// a second.
+fn labels(truth: &Truth, random: &mut ChaCha8Rng) -> CameraLabels {
+    let mut normal = || -> f64 { StandardNormal.sample(random) };
+    let kept = (-FRAME_S / 0.5_f64).exp();
+    let mut lasting = [normal(), normal()].map(|n| 0.4 * n);
+    let mut labels = Vec::new();
+    let mut common_s = 1.0;
+    while common_s < SECONDS - 1.0 {
+        common_s += FRAME_S;
+        let own = (common_s - truth.offset_s + truth.rate * SECONDS / 2.0) / (1.0 + truth.rate);
+        lasting = lasting.map(|error| kept * error + 0.4 * (1.0 - kept * kept).sqrt() * normal());
+        let place = way(common_s);
+        if let Some(pixel) = truth.camera.project(place).filter(|_| truth.camera.sees(place)) {
+            let [x, y] = lasting.map(|error| error + 0.1 * normal());
+            labels.push(Label { time_s: own, pixel: Pixel::new(pixel.x() + x, pixel.y() + y) });
+        }
+    }
+    CameraLabels { name: truth.name.parse().unwrap(), intrinsics: truth.file, labels }
+}
+
+fn log(random: &mut ChaCha8Rng, axes: impl Fn(Point3<f64>) -> Point3<f64>) -> FlightLog {
+    let mut noisy = |place: Point3<f64>| {
+        place + Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(random) }) * LOG.sd_m
+    };
+    let sample = |k: u32| {
+        let time_s = 0.2 * f64::from(k);
+        LogSample { time_s, position: noisy(axes(way(time_s))) }
+    };
+    FlightLog { samples: (0..(SECONDS / 0.2) as u32).map(sample).collect(), errors: LOG }
+}
+
+fn flight(seed: u64) -> (Vec<Truth>, Vec<CameraLabels>, FlightLog) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let truths = cameras();
+    let labels = truths.iter().map(|truth| labels(truth, &mut random)).collect();
+    let log = log(&mut random, |place| place);
+    (truths, labels, log)
+}
+
+/// What pose and lens make of the middle of the image is compared, as both may be off together.
+fn pointing_error_mrad(truth: &Truth, result: &FlightResult, index: usize) -> f64 {
+    let found = &result.cameras[index].camera;
+    let seen = (0..40).map(|k| way(3.0 * f64::from(k))).filter(|place| truth.camera.sees(*place));
+    let errors: Vec<f64> = seen
+        .map(|place| {
+            let pixel = truth.camera.project(place).unwrap();
+            let there = found.project(place).unwrap();
+            (there.x() - pixel.x()).hypot(there.y() - pixel.y()) / truth.file.fx * 1e3
+        })
+        .collect();
+    (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt()
+}
+
+#[test]
+fn poses_clocks_and_lenses_are_found_from_nothing_but_labels_and_a_log() {
+    let (truths, labels, log) = flight(1);
+    let result = calibrate_flight(&labels, &log).unwrap();
+    assert!(result.refused.is_empty());
+    for (index, truth) in truths.iter().enumerate() {
+        let found = &result.cameras[index];
+        // One label errs by 0.37 mrad; the file's lens is off by up to 6 mrad at the image's border.
+        let error = pointing_error_mrad(truth, &result, index);
+        assert!(error < 0.25, "{}: {error} mrad", truth.name);
+        let ratio = truth.camera.model().intrinsics().fx / truth.file.fx;
+        let off = (found.focal_ratio - ratio) / found.focal_ratio_sd;
+        assert!(off.abs() < 4.0 && found.focal_ratio_sd < 2e-3, "{}: {off} SD", truth.name);
+        let middle = found.clock.knots[found.clock.knots.len() / 2];
+        let ahead = truth.offset_s + truth.rate * (middle.time_s + truth.offset_s - SECONDS / 2.0);
+        assert!((middle.ahead_s - ahead).abs() < 4.0 * middle.sd_s.max(1e-4), "{}", truth.name);
+        assert!((0.25..0.6).contains(&found.noise.lasting_px), "{:?}", found.noise);
+        assert!((0.2..1.2).contains(&found.noise.lasting_s), "{:?}", found.noise);
+    }
+}
+
+/// The covariance is that of the pose where the lens is as it was found: the part of the pose's
+/// error that follows from the lens's is taken off, and what is left has a squared distance of six.
+#[test]
+fn the_poses_covariance_is_honest() {
+    const FLIGHTS: u64 = 6;
+    let mut squares = Vec::new();
+    for seed in 0..FLIGHTS {
+        let (truths, mut labels, log) = flight(100 + seed);
+        for (truth, camera) in truths.iter().zip(&mut labels) {
+            camera.intrinsics = *truth.camera.model().intrinsics();
+        }
+        let result = calibrate_flight(&labels, &log).unwrap();
+        for (truth, found) in truths.iter().zip(&result.cameras) {
+            let (pose, real) = (found.camera.pose(), truth.camera.pose());
+            let turn = Rotation3::from_matrix_unchecked(
+                pose.rotation().matrix().transpose() * real.rotation().matrix(),
+            );
+            let lens = lens_error(truth, found.intrinsics());
+            let mut error = Vector6::zeros();
+            error.fixed_rows_mut::<3>(0).copy_from(&turn.scaled_axis());
+            error.fixed_rows_mut::<3>(3).copy_from(&(real.position() - pose.position()));
+            error -= &found.lens.pose_by_lens * lens;
+            let inverse = found.pose_covariance.try_inverse().unwrap();
+            squares.push(error.dot(&(inverse * error)));
+        }
+    }
+    let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+    // 18 draws of six: a standard error of 0.8. The whitening errs towards caution, and the common
+    // error of the log's drift ties the three cameras of a flight.
+    assert!((2.0..10.0).contains(&mean), "{mean}: {squares:?}");
+}
+
+fn lens_error(truth: &Truth, found: &Intrinsics) -> nalgebra::DVector<f64> {
+    let numbers = |lens: &Intrinsics| {
+        let Distortion::BrownConrady(k) = lens.distortion else { unreachable!() };
+        let first = [lens.fx.ln(), (lens.fy / lens.fx).ln(), lens.cx, lens.cy];
+        nalgebra::DVector::from_iterator(9, first.into_iter().chain(k))
+    };
+    numbers(truth.camera.model().intrinsics()) - numbers(found)
+}
+
+#[test]
+fn a_mirrored_log_is_refused_and_said_to_be_one() {
+    let (_, labels, _) = flight(2);
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let exchanged = log(&mut random, |place| Point3::new(place.y, place.x, place.z));
+    let error = calibrate_flight(&labels, &exchanged).unwrap_err();
+    let FlightError::NoCamera { why: Refusal::Misfit { mirror, .. }, .. } = &error else {
+        panic!("{error}");
+    };
+    assert_eq!(*mirror, Some(Mirror::AxesOrHeight));
+    assert!(error.to_string().contains("east and north are exchanged"), "{error}");
+}
+
+#[test]
+fn a_camera_that_saw_nothing_is_refused_and_the_others_are_calibrated() {
+    let (_, mut labels, log) = flight(3);
+    labels[1].labels.truncate(10);
+    let result = calibrate_flight(&labels, &log).unwrap();
+    assert_eq!(result.cameras.len(), 2);
+    assert_eq!(result.refused, [(labels[1].name.clone(), Refusal::FewLabels { labels: 10 })]);
+}
+
+#[test]
+fn jumps_of_the_log_and_birds_among_the_labels_do_not_move_the_cameras() {
+    let (truths, mut labels, mut log) = flight(4);
+    for sample in log.samples.iter_mut().skip(200).step_by(40).take(8) {
+        sample.position.x += 2.0;
+    }
+    for label in labels[0].labels.iter_mut().step_by(20) {
+        label.pixel = Pixel::new(300.0, 200.0);
+    }
+    let result = calibrate_flight(&labels, &log).unwrap();
+    for (index, truth) in truths.iter().enumerate() {
+        let error = pointing_error_mrad(truth, &result, index);
+        assert!(error < 0.2, "{}: {error} mrad", truth.name);
+    }
+    assert!(result.cameras[0].used < result.cameras[0].labels);
+}
+
+#[test]
+fn what_is_found_survives_its_file_and_a_torn_file_is_named() {
+    let (_, labels, log) = flight(5);
+    let result = calibrate_flight(&labels[..1], &log).unwrap();
+    let site = SiteCalibration::from(&result);
+    let text = site.to_toml();
+    let again = SiteCalibration::from_toml(&text).unwrap();
+    let (one, two) = (&site.cameras()[0], &again.cameras()[0]);
+    assert_eq!(one.clock, two.clock);
+    let pixel = Pixel::new(1000.0, 500.0);
+    let [one, two] = [one, two].map(|camera| camera.bearing(pixel).unwrap().direction());
+    assert!((one.into_inner() - two.into_inner()).norm() < 1e-12);
+    assert!(SiteCalibration::from_toml(&text.replace("form = 1", "form = 2")).is_err());
+    assert!(SiteCalibration::from_toml(&text[..text.len() / 2]).is_err());
+    let nan = text.replace("range_m = ", "range_m = -");
+    assert!(SiteCalibration::from_toml(&nan).unwrap_err().to_string().contains("range_m"));
+}

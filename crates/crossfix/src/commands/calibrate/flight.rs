@@ -1,0 +1,113 @@
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{CameraLabels, Label, SiteCalibration, calibrate_flight};
+use crossfix_geometry::{Intrinsics, Pixel};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
+};
+
+use super::log::{self, LogKind};
+use super::report;
+use crate::commands::numbers;
+use crate::output;
+use crate::recorded::{self, Lacks};
+
+/// From the flight of one target: with the log of its own receiver.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Example:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml"
+)]
+pub struct Args {
+    /// The recording (MCAP) of what the cameras saw.
+    recording: PathBuf,
+    /// Where the target was by its own receiver: a CSV with time_s, east_m, north_m, up_m.
+    #[arg(long, value_name = "FILE")]
+    log: PathBuf,
+    /// How good the log is.
+    #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
+    log_kind: LogKind,
+    /// Standard deviation of each place in the log, m per axis; the kind's without.
+    #[arg(long, value_name = "METRES", value_parser = numbers::positive)]
+    log_sd: Option<f64>,
+    /// By how much the log may lie beside as a whole, drifting over minutes, m per axis; the
+    /// kind's without.
+    #[arg(long, value_name = "METRES", value_parser = numbers::not_negative)]
+    log_drift: Option<f64>,
+    /// The calibration (TOML) to write.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let mut errors = args.log_kind.errors();
+    errors.sd_m = args.log_sd.unwrap_or(errors.sd_m);
+    errors.drift_sd_m = args.log_drift.unwrap_or(errors.drift_sd_m);
+    let log = log::read(&args.log, errors)?;
+    let cameras = labels(&args.recording)?;
+    let result = calibrate_flight(&cameras, &log)?;
+    for (camera, why) in &result.refused {
+        tracing::warn!("camera `{camera}` is not calibrated: it {why}");
+    }
+    let text = format!(
+        "# Written by crossfix calibrate flight from {} and {}.\n{}",
+        args.recording.display(),
+        args.log.display(),
+        SiteCalibration::from(&result).to_toml()
+    );
+    output::write_file(&args.output, &[&args.recording, &args.log], text.as_bytes())?;
+    if args.json {
+        return output::json(&report::figures(&result));
+    }
+    output::line(report::render(&result));
+    output::line(format!("\nwritten to {}", args.output.display()));
+    Ok(())
+}
+
+/// What a recording's cameras saw, by their own clocks.
+fn labels(recording: &Path) -> anyhow::Result<Vec<CameraLabels>> {
+    let mut lenses: BTreeMap<CameraName, Intrinsics> = BTreeMap::new();
+    let mut seen: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
+    let mut lacks = Lacks::default();
+    recorded::for_each(recording, &mut lacks, |lacks, entry| {
+        match &entry.key.channel {
+            Channel::Calibration(name) => {
+                if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
+                    lenses.insert(name.clone(), message.lens(name)?);
+                }
+            }
+            Channel::Bearings(name) => {
+                if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
+                    let time_s = Timestamp::from_nanos(frame.capture_time_ns).seconds();
+                    let measured = frame
+                        .tracks
+                        .iter()
+                        .filter(|track| track.state() == ImageTrackState::Tracking)
+                        .map(|track| Label {
+                            time_s,
+                            pixel: Pixel::new(track.pixel_x, track.pixel_y),
+                        });
+                    seen.entry(name.clone()).or_default().extend(measured);
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    })?;
+    lacks.say(recording);
+    lacks.ensure_found(!seen.is_empty(), "bearings", recording)?;
+    let mut cameras = Vec::new();
+    for (name, mut labels) in seen {
+        let intrinsics = lenses.remove(&name).with_context(|| {
+            format!("{} says nothing of the lens of camera `{name}`", recording.display())
+        })?;
+        labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+        cameras.push(CameraLabels { name, intrinsics, labels });
+    }
+    ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
+    Ok(cameras)
+}

@@ -1,0 +1,178 @@
+//! What a calibration has found, for people and for programs.
+
+use crossfix_calibration::{CameraResult, FlightResult};
+use serde::Serialize;
+
+use crate::output;
+
+/// A focal length that has moved by more than this share is remarked on.
+const REMARKED: f64 = 0.003;
+
+/// The figures of a calibration.
+#[derive(Debug, Serialize)]
+pub struct Figures {
+    cameras: Vec<CameraFigures>,
+    /// Cameras that could not be calibrated, and why not.
+    refused: Vec<(String, String)>,
+    /// Root mean square of the log's residuals per axis, m.
+    log_residual_m: f64,
+    /// Power of the target's jerk, m^2/s^5.
+    jerk: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct CameraFigures {
+    name: String,
+    labels: usize,
+    used: usize,
+    residual_px: f64,
+    residual_mrad: f64,
+    noise_white_px: f64,
+    noise_lasting_px: f64,
+    noise_lasting_s: f64,
+    position_m: [f64; 3],
+    position_sd_m: f64,
+    pointing_sd_mrad: f64,
+    focal_ratio: f64,
+    focal_ratio_sd: f64,
+    clock_ahead_s: f64,
+    clock_sd_s: f64,
+    clock_rate: f64,
+    clock_wander_ms: f64,
+    readout_ms: f64,
+    readout_sd_ms: f64,
+    verdict: &'static str,
+}
+
+/// A camera whose pointing is known worse than this is weak, mrad: at 100 m a target lies half a
+/// metre aside. With half of it a minute's flight would not do.
+const WEAK_POINTING_MRAD: f64 = 5.0;
+/// Nor may it stand this uncertainly, m.
+const WEAK_POSITION_M: f64 = 0.5;
+/// A camera of whose labels less than this share fits has seen something else as well.
+const WEAK_SHARE: f64 = 0.8;
+
+/// What to think of a camera, and what to do about it.
+fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'static str {
+    // The image's rows go down in the world where the camera is not held upside down.
+    let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
+    if is_upside_down {
+        "wrong: upside down, so the log's height may count downwards (north-east-down?)"
+    } else if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
+        "weak: many labels are not the target's"
+    } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
+        "weak: fly longer, near and far, high and low, through all of its image"
+    } else {
+        "good"
+    }
+}
+
+impl From<&CameraResult> for CameraFigures {
+    fn from(camera: &CameraResult) -> Self {
+        let focal_px = camera.intrinsics().fx;
+        let clock = &camera.clock;
+        let knots = clock.knots.iter();
+        let straight = |knot: &crossfix_calibration::ClockKnot| {
+            let middle = &clock.knots[clock.knots.len() / 2];
+            knot.ahead_s - middle.ahead_s - clock.rate * (knot.time_s - middle.time_s)
+        };
+        let (least, most) = knots.fold((0.0_f64, 0.0_f64), |(least, most), knot| {
+            (least.min(straight(knot)), most.max(straight(knot)))
+        });
+        let middle = &clock.knots[clock.knots.len() / 2];
+        let covariance = &camera.pose_covariance;
+        let position_sd_m = covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
+        let pointing_sd_mrad = covariance.fixed_view::<3, 3>(0, 0).trace().sqrt() * 1e3;
+        Self {
+            verdict: verdict(camera, [position_sd_m, pointing_sd_mrad]),
+            name: camera.name.to_string(),
+            labels: camera.labels,
+            used: camera.used,
+            residual_px: camera.residual_px,
+            residual_mrad: camera.residual_px / focal_px * 1e3,
+            noise_white_px: camera.noise.white_px,
+            noise_lasting_px: camera.noise.lasting_px,
+            noise_lasting_s: camera.noise.lasting_s,
+            position_m: camera.camera.pose().position().coords.into(),
+            position_sd_m,
+            pointing_sd_mrad,
+            focal_ratio: camera.focal_ratio,
+            focal_ratio_sd: camera.focal_ratio_sd,
+            clock_ahead_s: middle.ahead_s,
+            clock_sd_s: middle.sd_s,
+            clock_rate: clock.rate,
+            clock_wander_ms: (most - least) * 1e3,
+            readout_ms: clock.readout_s * 1e3,
+            readout_sd_ms: clock.readout_sd_s * 1e3,
+        }
+    }
+}
+
+/// The figures for a program.
+pub fn figures(result: &FlightResult) -> Figures {
+    Figures {
+        cameras: result.cameras.iter().map(CameraFigures::from).collect(),
+        refused: result
+            .refused
+            .iter()
+            .map(|(name, why)| (name.to_string(), why.to_string()))
+            .collect(),
+        log_residual_m: result.log_residual_m,
+        jerk: result.jerk,
+    }
+}
+
+/// The figures for people.
+pub fn render(result: &FlightResult) -> String {
+    let head = [
+        "camera",
+        "labels used",
+        "residual [px]",
+        "[mrad]",
+        "centre SD [m]",
+        "pointing SD [mrad]",
+        "clock [s]",
+        "SD [ms]",
+        "rate [1e-6]",
+        "wander [ms]",
+        "read-out [ms]",
+        "focal length",
+        "verdict",
+    ];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    let figures = figures(result);
+    for camera in &figures.cameras {
+        rows.push(vec![
+            camera.name.clone(),
+            format!("{} of {}", camera.used, camera.labels),
+            format!("{:.2}", camera.residual_px),
+            format!("{:.2}", camera.residual_mrad),
+            format!("{:.3}", camera.position_sd_m),
+            format!("{:.2}", camera.pointing_sd_mrad),
+            format!("{:.3}", camera.clock_ahead_s),
+            format!("{:.1}", camera.clock_sd_s * 1e3),
+            format!("{:.0}", camera.clock_rate * 1e6),
+            format!("{:.1}", camera.clock_wander_ms),
+            format!("{:.1} ± {:.1}", camera.readout_ms, camera.readout_sd_ms),
+            format!("{:+.2} %", 100.0 * (camera.focal_ratio - 1.0)),
+            camera.verdict.to_owned(),
+        ]);
+    }
+    let moved = figures.cameras.iter().any(|camera| (camera.focal_ratio - 1.0).abs() > REMARKED);
+    let remark = if moved {
+        "\n\nA lens's focal length is shorter or longer at a distance than near the checkerboard that \
+         its file was made with: that is usual up to 2 %."
+    } else {
+        ""
+    };
+    let refused: String = figures
+        .refused
+        .iter()
+        .map(|(name, why)| format!("\n\ncamera `{name}` is not calibrated: it {why}"))
+        .collect();
+    format!(
+        "{}{refused}\n\nthe log lies {:.3} m beside the way, root mean square per axis{remark}",
+        output::table(&rows),
+        figures.log_residual_m
+    )
+}

@@ -1,0 +1,185 @@
+//! A recording read with another calibration: times, lenses and poses as that has them.
+
+use std::cell::Cell;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap};
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{CalibratedCamera, SiteCalibration};
+use crossfix_geometry::Pixel;
+use crossfix_message::{
+    BearingFrame, Channel, ImageTrackState, Payload, Preview, Timestamp, decode,
+};
+use crossfix_recording::Entry;
+
+/// A calibration file to be put in the place of what was recorded.
+#[derive(Clone, Debug)]
+pub struct Recalibration {
+    site: SiteCalibration,
+    /// Bearings that the calibration has no direction for.
+    left_out: Cell<u64>,
+}
+
+impl Recalibration {
+    /// Reads the file.
+    pub fn load(path: &Path) -> anyhow::Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the calibration {}", path.display()))?;
+        let site = SiteCalibration::from_toml(&text)
+            .with_context(|| format!("the calibration {} has an error", path.display()))?;
+        ensure!(!site.cameras().is_empty(), "the calibration {} has no cameras", path.display());
+        Ok(Self { site, left_out: Cell::new(0) })
+    }
+
+    /// The entry as it would have been recorded with this calibration. What cannot be read stays
+    /// as it is; what is of no camera of the file, too.
+    pub fn applied(&self, entry: Entry) -> Entry {
+        self.changed(&entry).unwrap_or(entry)
+    }
+
+    fn changed(&self, entry: &Entry) -> Option<Entry> {
+        let (data_time, data) = match &entry.key.channel {
+            Channel::Calibration(name) => {
+                let camera = self.site.camera(name)?;
+                (Timestamp::EPOCH, camera.message(Timestamp::EPOCH).encode())
+            }
+            Channel::Bearings(name) => {
+                let mut frame: BearingFrame = decode(&entry.data).ok()?;
+                let left_out = recalibrate(&mut frame, self.site.camera(name)?);
+                self.left_out.set(self.left_out.get() + left_out);
+                (Timestamp::from_nanos(frame.capture_time_ns), frame.encode_unstamped())
+            }
+            Channel::Preview(name) => {
+                let mut preview: Preview = decode(&entry.data).ok()?;
+                let camera = self.site.camera(name)?;
+                let time = middle_time(camera, preview.capture_time_ns).0;
+                preview.capture_time_ns = time.nanos();
+                (time, preview.encode_unstamped())
+            }
+            _ => return None,
+        };
+        Some(Entry { key: entry.key.clone(), data_time, arrival: entry.arrival, data })
+    }
+
+    /// Says what was left out.
+    fn say(&self) {
+        if self.left_out.get() > 0 {
+            tracing::warn!(
+                "{} bearings are left out: nobody knows the lens where they are in the image \
+                 (calibrate with a flight through all of it)",
+                self.left_out.get()
+            );
+        }
+    }
+
+    /// By how much the cameras' times move apart at most, s.
+    fn spread_s(&self) -> f64 {
+        let ahead = |camera: &CalibratedCamera| {
+            camera.clock.knots_s.iter().map(|knot| knot[1]).collect::<Vec<_>>()
+        };
+        let all: Vec<f64> = self.site.cameras().iter().flat_map(ahead).chain([0.0]).collect();
+        let least = all.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        // Rates go on behind the last knot.
+        most - least + SPARE_S
+    }
+}
+
+/// What a clock may gain behind its calibration, s.
+const SPARE_S: f64 = 5.0;
+
+/// The common time of a frame's middle row, and its deviation.
+fn middle_time(camera: &CalibratedCamera, own_ns: i64) -> (Timestamp, f64) {
+    let height = f64::from(camera.camera.model().intrinsics().size.height);
+    camera.common_time(Timestamp::from_nanos(own_ns), height / 2.0)
+}
+
+/// Makes a frame's bearings anew from its pixels, and its time the common one: that at which the
+/// rows of its targets were read out, in the mean. Returns how many bearings had to be left out.
+fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
+    let height = f64::from(camera.camera.model().intrinsics().size.height);
+    let is_seen =
+        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
+    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
+    let row =
+        if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 };
+    let (time, sd_s) = camera.common_time(Timestamp::from_nanos(frame.capture_time_ns), row);
+    frame.capture_time_ns = time.nanos();
+    frame.capture_time_sd_s = frame.capture_time_sd_s.hypot(sd_s);
+    let before = frame.tracks.len();
+    frame.tracks.retain_mut(|track| {
+        let Ok(bearing) = camera.bearing(Pixel::new(track.pixel_x, track.pixel_y)) else {
+            return false;
+        };
+        track.bearing = Some(bearing.direction().into_inner().into());
+        track.covariance_xx = bearing.covariance().m11;
+        track.covariance_xy = bearing.covariance().m12;
+        track.covariance_yy = bearing.covariance().m22;
+        true
+    });
+    (before - frame.tracks.len()) as u64
+}
+
+/// Entries put into the order of their new times: each waits until nothing older can come.
+#[derive(Debug)]
+pub struct Reordered {
+    recalibration: Recalibration,
+    waiting: BinaryHeap<Reverse<(Timestamp, u64)>>,
+    entries: BTreeMap<u64, Entry>,
+    next: u64,
+    spread_s: f64,
+}
+
+impl Reordered {
+    /// None waits yet.
+    pub fn new(recalibration: Recalibration) -> Self {
+        let spread_s = recalibration.spread_s();
+        Self {
+            recalibration,
+            waiting: BinaryHeap::new(),
+            entries: BTreeMap::new(),
+            next: 0,
+            spread_s,
+        }
+    }
+
+    /// Takes an entry in, in the order of the recording; hands on what is not waited for any more.
+    pub fn take(
+        &mut self,
+        entry: Entry,
+        mut handle: impl FnMut(Entry) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        let own = entry.data_time;
+        let entry = self.recalibration.applied(entry);
+        self.waiting.push(Reverse((entry.data_time, self.next)));
+        self.entries.insert(self.next, entry);
+        self.next += 1;
+        self.release(own.plus_seconds(-self.spread_s), &mut handle)
+    }
+
+    /// Hands on what still waits.
+    pub fn finish(
+        &mut self,
+        mut handle: impl FnMut(Entry) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        self.recalibration.say();
+        self.release(Timestamp::MAX, &mut handle)
+    }
+
+    fn release(
+        &mut self,
+        until: Timestamp,
+        handle: &mut impl FnMut(Entry) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        while let Some(&Reverse((time, number))) = self.waiting.peek()
+            && time <= until
+        {
+            self.waiting.pop();
+            if let Some(entry) = self.entries.remove(&number) {
+                handle(entry)?;
+            }
+        }
+        Ok(())
+    }
+}
