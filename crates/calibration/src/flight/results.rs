@@ -1,0 +1,223 @@
+//! What an adjusted flight has shown, with how sure that is.
+
+use crossfix_geometry::{Camera, Intrinsics, Pose};
+use crossfix_message::CameraName;
+use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
+
+use super::adjustment::{self, Adjusted, Flight, Priors, State};
+use super::model::{CLOCK, CameraState, FlightLog, Label, POSE_AND_CLOCK};
+use super::noise::LabelNoise;
+use super::{Refusal, residuals};
+use crate::lens::{self, LensUncertainty};
+
+/// What a flight has shown of one camera.
+#[derive(Clone, Debug)]
+pub struct CameraResult {
+    /// Whose it is.
+    pub name: CameraName,
+    /// Lens and pose.
+    pub camera: Camera,
+    /// Covariance of the pose with the lens held at what it was found to be: rotation about the
+    /// camera's axes (rad), then position (m).
+    pub pose_covariance: Matrix6<f64>,
+    /// What is still unknown of the lens.
+    pub lens: LensUncertainty,
+    /// Its clock.
+    pub clock: ClockResult,
+    /// Its labels' error.
+    pub noise: LabelNoise,
+    /// Time between its frames, s.
+    pub frame_s: f64,
+    /// Range at which it saw the target, in the middle, m.
+    pub range_m: f64,
+    /// Labels.
+    pub labels: usize,
+    /// Those of them that lie within four deviations.
+    pub used: usize,
+    /// Root mean square of the labels' residuals per axis, of those within four deviations, pixels.
+    pub residual_px: f64,
+    /// The focal length against the lens file's.
+    pub focal_ratio: f64,
+    /// Its standard deviation.
+    pub focal_ratio_sd: f64,
+}
+
+/// What a flight has shown of a clock.
+#[derive(Clone, Debug)]
+pub struct ClockResult {
+    /// Knots, evenly spread over the labels' times.
+    pub knots: Vec<ClockKnot>,
+    /// How much more than a second passes in one of its own, and the standard deviation.
+    pub rate: f64,
+    /// Standard deviation of that.
+    pub rate_sd: f64,
+    /// Power of its random walk, s^2/s.
+    pub wander: f64,
+    /// Time between the first row's read-out and the last's, s.
+    pub readout_s: f64,
+    /// Standard deviation of that.
+    pub readout_sd_s: f64,
+}
+
+/// What a clock is to be corrected by at one of its times.
+#[derive(Clone, Copy, Debug)]
+pub struct ClockKnot {
+    /// Its own time, s.
+    pub time_s: f64,
+    /// The common time less its own, s.
+    pub ahead_s: f64,
+    /// Standard deviation of that.
+    pub sd_s: f64,
+}
+
+/// What a flight has shown.
+#[derive(Clone, Debug)]
+pub struct FlightResult {
+    /// Of each camera that could be calibrated, in the order that they were given in.
+    pub cameras: Vec<CameraResult>,
+    /// The others, and why not.
+    pub refused: Vec<(CameraName, Refusal)>,
+    /// Power of the target's jerk, m^2/s^5.
+    pub jerk: f64,
+    /// Root mean square of the log's residuals per axis, m.
+    pub log_residual_m: f64,
+}
+
+pub(super) fn results(
+    flight: &Flight<'_>,
+    adjusted: &Adjusted,
+    priors: &Priors,
+) -> Option<FlightResult> {
+    let state = &adjusted.state;
+    let covariance = adjusted.information.clone().cholesky()?.inverse();
+    let starts = state.starts();
+    let mut cameras = Vec::new();
+    for (index, camera) in state.cameras.iter().enumerate() {
+        let start = starts[index] - state.chain();
+        let at = Block { covariance: &covariance, start };
+        let prior = &priors.cameras[index];
+        let residuals = residuals(flight, state, index);
+        let within = |residual: &Vector2<f64>| residual.norm() < 4.0 * prior.noise.sd_px();
+        let squares: Vec<f64> = residuals
+            .iter()
+            .filter(|(_, residual)| within(residual))
+            .map(|(_, residual)| adjustment::square(*residual))
+            .collect();
+        let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
+        cameras.push(CameraResult {
+            name: flight.cameras[index].name.clone(),
+            camera: Camera::new(camera.intrinsics, pose).ok()?,
+            pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))?,
+            lens: at.lens(lens::numbers(&camera.intrinsics))?,
+            clock: clock_result(camera, &at, prior.wander),
+            noise: prior.noise,
+            frame_s: prior.frame_s,
+            range_m: middle_range(flight, state, index),
+            labels: flight.cameras[index].labels.len(),
+            used: squares.len(),
+            residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+            focal_ratio: camera.intrinsics.fx / prior.lens.fx,
+            focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
+        });
+    }
+    Some(FlightResult {
+        cameras,
+        refused: Vec::new(),
+        jerk: priors.jerk,
+        log_residual_m: log_residual(flight.log, state),
+    })
+}
+
+/// The median range at which a camera saw the target, m.
+fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
+    let camera = &state.cameras[index];
+    let range = |label: &Label| {
+        let weights = state.way.weights(camera.time_s(label))?;
+        Some((state.way.place(&weights) - camera.centre).norm())
+    };
+    let mut ranges: Vec<f64> = flight.cameras[index].labels.iter().filter_map(range).collect();
+    ranges.sort_unstable_by(f64::total_cmp);
+    ranges.get(ranges.len() / 2).copied().unwrap_or(1.0)
+}
+
+fn log_residual(log: &FlightLog, state: &State) -> f64 {
+    let squares: Vec<f64> = log
+        .samples
+        .iter()
+        .filter_map(|sample| {
+            let weights = state.way.weights(sample.time_s)?;
+            let bias = Vector3::from_fn(|axis, _| state.bias[axis].at(sample.time_s));
+            Some((state.way.place(&weights) + bias - sample.position).norm_squared() / 3.0)
+        })
+        .collect();
+    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+}
+
+/// One camera's part of the covariance of all but the way.
+struct Block<'a> {
+    covariance: &'a DMatrix<f64>,
+    start: usize,
+}
+
+impl Block<'_> {
+    fn covariance_of(&self, a: usize, b: usize) -> f64 {
+        self.covariance[(self.start + a, self.start + b)]
+    }
+
+    fn part(&self, rows: usize, n: usize, columns: usize, m: usize) -> DMatrix<f64> {
+        DMatrix::from_fn(n, m, |i, j| self.covariance_of(rows + i, columns + j))
+    }
+
+    /// What is unknown of the lens, and how the pose follows it.
+    fn lens(&self, lens: usize) -> Option<LensUncertainty> {
+        let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
+        let covariance = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        let pose_by_lens = covariance.clone().cholesky()?.solve(&tied.transpose()).transpose();
+        Some(LensUncertainty { covariance, pose_by_lens })
+    }
+
+    /// The pose's covariance where the camera's lens is as it was found: what pose and lens may
+    /// both be off by without a difference in the image is no error of a bearing.
+    fn pose_with_lens_held(&self, lens: usize) -> Option<Matrix6<f64>> {
+        let pose = self.part(0, 6, 0, 6);
+        let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
+        let of_lens = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        let held = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
+        let held = (&held + held.transpose()) * 0.5;
+        Some(Matrix6::from_column_slice(held.as_slice()))
+    }
+}
+
+fn clock_result(camera: &CameraState, at: &Block<'_>, wander: f64) -> ClockResult {
+    let clock = &camera.clock;
+    let own = camera.own();
+    let knot = |k: usize| {
+        let time_s = clock.wander.time_s(k);
+        let terms = [(CLOCK, 1.0), (CLOCK + 1, time_s - clock.reference_s), (own + k, 1.0)];
+        let variance: f64 = terms
+            .iter()
+            .flat_map(|a| terms.iter().map(move |b| (a, b)))
+            .map(|(a, b)| a.1 * b.1 * at.covariance_of(a.0, b.0))
+            .sum();
+        ClockKnot {
+            time_s,
+            ahead_s: clock.common_s(time_s) - time_s,
+            sd_s: variance.max(0.0).sqrt(),
+        }
+    };
+    ClockResult {
+        knots: (0..clock.wander.values.len()).map(knot).collect(),
+        rate: clock.rate,
+        rate_sd: at.covariance_of(CLOCK + 1, CLOCK + 1).sqrt(),
+        wander,
+        readout_s: clock.readout_s,
+        readout_sd_s: at.covariance_of(CLOCK + 2, CLOCK + 2).sqrt(),
+    }
+}
+
+impl CameraResult {
+    /// The lens as it was found.
+    pub fn intrinsics(&self) -> &Intrinsics {
+        self.camera.model().intrinsics()
+    }
+}
