@@ -44,7 +44,7 @@ pub enum FlightError {
         why: Refusal,
     },
     /// The equations have no solution.
-    #[error("the adjustment has no solution: its numbers are not finite")]
+    #[error("the adjustment has no solution: labels and log are hardly of one flight")]
     NoSolution,
 }
 

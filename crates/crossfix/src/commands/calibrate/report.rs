@@ -49,15 +49,20 @@ struct CameraFigures {
 const WEAK_POINTING_MRAD: f64 = 5.0;
 /// Nor may it stand this uncertainly, m.
 const WEAK_POSITION_M: f64 = 0.5;
+/// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
+const WRONG_MRAD: f64 = 8.0;
 /// A camera of whose labels less than this share fits has seen something else as well.
 const WEAK_SHARE: f64 = 0.8;
 
 /// What to think of a camera, and what to do about it.
 fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'static str {
+    let noise_mrad = camera.noise.sd_px() / camera.intrinsics().fx * 1e3;
     // The image's rows go down in the world where the camera is not held upside down.
     let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
     if is_upside_down {
         "wrong: upside down, so the log's height may count downwards (north-east-down?)"
+    } else if noise_mrad > WRONG_MRAD {
+        "wrong: its labels lie far beside the way (another target, lens file or log?)"
     } else if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
         "weak: many labels are not the target's"
     } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
