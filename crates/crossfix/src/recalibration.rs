@@ -59,7 +59,9 @@ impl Recalibration {
             }
             _ => return None,
         };
-        Some(Entry { key: entry.key.clone(), data_time, arrival: entry.arrival, data })
+        // It arrived as long after its capture as it did.
+        let arrival = entry.arrival.plus_seconds(data_time.seconds_since(entry.data_time));
+        Some(Entry { key: entry.key.clone(), data_time, arrival, data })
     }
 
     /// Says what was left out.
