@@ -51,7 +51,8 @@ impl Flight {
     }
 }
 
-/// The bounds are those that the project asks for; docs/results.md has what is reached.
+/// The bounds are those that the project asks for, but for the velocity of three cameras: 0.28 m/s is
+/// asked for and 0.285 is reached (docs/calibration.md).
 fn check(figures: &Value, most_position_m: f64, most_velocity_mps: f64) {
     let number = |name: &str| figures[name].as_f64().unwrap();
     assert!(number("position_rmse_m") <= most_position_m, "{figures:#}");
@@ -65,7 +66,7 @@ fn check(figures: &Value, most_position_m: f64, most_velocity_mps: f64) {
 fn three_cameras_that_nobody_has_surveyed_place_the_drone_to_five_centimetres() {
     let Some(data) = real_data() else { return };
     let figures = Flight::new(&data, "3", "gopro3,sony5100,sonyG").figures("3");
-    check(&figures, 0.055, 0.30);
+    check(&figures, 0.055, 0.29);
 }
 
 #[test]
