@@ -197,6 +197,28 @@ fn a_camera_that_saw_nothing_is_refused_and_the_others_are_calibrated() {
 }
 
 #[test]
+fn a_label_of_another_year_costs_its_camera_and_neither_memory_nor_time() {
+    let (_, mut labels, mut log) = flight(6);
+    labels[0].labels.last_mut().unwrap().time_s = 3e9;
+    let result = calibrate_flight(&labels[..2], &log).unwrap();
+    assert!(matches!(result.refused[..], [(_, Refusal::LongFlight { .. })]));
+    log.samples.last_mut().unwrap().time_s = 3e9;
+    let error = calibrate_flight(&labels, &log).unwrap_err();
+    assert!(matches!(error, FlightError::LongLog { .. }), "{error}");
+}
+
+#[test]
+fn labels_whose_rows_put_the_later_first_are_adjusted() {
+    let (_, mut labels, log) = flight(7);
+    // A frame counted twice with the target at the other end of the image.
+    for k in (50..labels[0].labels.len()).step_by(50) {
+        labels[0].labels[k].time_s = labels[0].labels[k - 1].time_s;
+        labels[0].labels[k].pixel = Pixel::new(900.0, -200_000.0);
+    }
+    assert_eq!(calibrate_flight(&labels[..1], &log).unwrap().cameras.len(), 1);
+}
+
+#[test]
 fn jumps_of_the_log_and_birds_among_the_labels_do_not_move_the_cameras() {
     let (truths, mut labels, mut log) = flight(4);
     for sample in log.samples.iter_mut().skip(200).step_by(40).take(8) {

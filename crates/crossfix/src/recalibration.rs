@@ -136,6 +136,8 @@ pub struct Reordered {
 impl Reordered {
     /// None waits yet.
     pub fn new(recalibration: Recalibration) -> Self {
+        // What was looked through for a range is not counted twice.
+        recalibration.left_out.set(0);
         let spread_s = recalibration.spread_s();
         Self {
             recalibration,

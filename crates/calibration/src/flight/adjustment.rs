@@ -235,7 +235,9 @@ impl State {
                 continue;
             };
             let earlier = before.filter(|(time_s, earlier)| {
-                label.time_s - time_s < LONGEST_PAIR_S && placed.first - earlier.first <= 1
+                // Rows and a clock that wanders may have put the later label first.
+                let ahead = placed.first.checked_sub(earlier.first);
+                label.time_s - time_s < LONGEST_PAIR_S && ahead.is_some_and(|ahead| ahead <= 1)
             });
             let whitening = priors
                 .noise

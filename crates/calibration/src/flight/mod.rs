@@ -35,6 +35,12 @@ pub enum FlightError {
         /// How many there are.
         samples: usize,
     },
+    /// The log is longer than any flight: a time of it is wrong, or it has to be cut.
+    #[error("the log lasts {hours:.1} h: cut it to the flight, at most {LONGEST_LOG_H} h")]
+    LongLog {
+        /// How long.
+        hours: f64,
+    },
     /// No camera can be calibrated; why not of the first.
     #[error("no camera can be calibrated: camera `{camera}` {why}")]
     NoCamera {
@@ -56,6 +62,15 @@ pub enum Refusal {
     FewLabels {
         /// How many there are.
         labels: usize,
+    },
+    /// Its labels last longer than any flight.
+    #[error(
+        "has labels over {hours:.1} h: take one flight, at most {LONGEST_FLIGHT_H} h (a time of them \
+         may be wrong)"
+    )]
+    LongFlight {
+        /// How long.
+        hours: f64,
     },
     /// Its labels and the log have no time in common.
     #[error("has too few labels in the time of the log, whatever its clock shows")]
@@ -98,6 +113,10 @@ const LOG_DEVIATIONS: f64 = 3.0;
 /// The mirror image fits where it fits so many times better.
 const CLEARLY_BETTER: f64 = 3.0;
 
+/// A flight's equations take memory by the square of its time: an hour of six cameras 2 GB.
+const LONGEST_FLIGHT_H: f64 = 1.0;
+/// All of a log's times are tried for each camera's clock: six hours take seconds a camera.
+const LONGEST_LOG_H: f64 = 6.0;
 /// A log with fewer samples is none.
 const LEAST_SAMPLES: usize = 20;
 /// A camera with fewer labels has seen nothing.
@@ -131,6 +150,10 @@ pub fn calibrate_flight(
     if log.samples.len() < LEAST_SAMPLES {
         return Err(FlightError::ShortLog { samples: log.samples.len() });
     }
+    let hours = hours(log.samples.iter().map(|sample| sample.time_s));
+    if hours > LONGEST_LOG_H {
+        return Err(FlightError::LongLog { hours });
+    }
     let (of_log, jerk) = log_alone(log).ok_or(FlightError::NoSolution)?;
     let (mut used, mut starts, mut refused) = (Vec::new(), Vec::new(), Vec::new());
     for camera in cameras {
@@ -154,6 +177,12 @@ pub fn calibrate_flight(
     Ok(result)
 }
 
+/// How long times last that are in order.
+fn hours(mut times_s: impl DoubleEndedIterator<Item = f64>) -> f64 {
+    let (first, last) = (times_s.next(), times_s.next_back());
+    first.zip(last).map_or(0.0, |(first, last)| (last - first) / 3600.0)
+}
+
 /// A camera's start against the log's way.
 fn start_of(
     camera: &CameraLabels,
@@ -163,6 +192,10 @@ fn start_of(
     let labels = camera.labels.len();
     if labels < LEAST_LABELS {
         return Err(Refusal::FewLabels { labels });
+    }
+    let hours = hours(camera.labels.iter().map(|label| label.time_s));
+    if hours > LONGEST_FLIGHT_H {
+        return Err(Refusal::LongFlight { hours });
     }
     let frame_s = frame_time(camera);
     let (state, misfit) = start::find(camera, &of_log.way, frame_s).ok_or(Refusal::NoTime)?;

@@ -49,10 +49,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     errors.drift_sd_m = args.log_drift.unwrap_or(errors.drift_sd_m);
     let log = log::read(&args.log, errors)?;
     let cameras = labels(&args.recording)?;
-    let result = calibrate_flight(&cameras, &log)?;
+    let mut result = calibrate_flight(&cameras, &log)?;
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
+    if args.json {
+        output::json(&report::figures(&result))?;
+    } else {
+        output::line(report::render(&result));
+    }
+    for wrong in report::take_out_wrong(&mut result) {
+        tracing::warn!("camera `{wrong}` is wrong and is not written");
+    }
+    ensure!(!result.cameras.is_empty(), "nothing is written: each camera is wrong");
     let text = format!(
         "# Written by crossfix calibrate flight from {} and {}.\n{}",
         args.recording.display(),
@@ -60,11 +69,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         SiteCalibration::from(&result).to_toml()
     );
     output::write_file(&args.output, &[&args.recording, &args.log], text.as_bytes())?;
-    if args.json {
-        return output::json(&report::figures(&result));
+    if !args.json {
+        output::line(format!("\nwritten to {}", args.output.display()));
     }
-    output::line(report::render(&result));
-    output::line(format!("\nwritten to {}", args.output.display()));
     Ok(())
 }
 
@@ -87,6 +94,7 @@ fn labels(recording: &Path) -> anyhow::Result<Vec<CameraLabels>> {
                         .tracks
                         .iter()
                         .filter(|track| track.state() == ImageTrackState::Tracking)
+                        .filter(|track| track.pixel_x.is_finite() && track.pixel_y.is_finite())
                         .map(|track| Label {
                             time_s,
                             pixel: Pixel::new(track.pixel_x, track.pixel_y),

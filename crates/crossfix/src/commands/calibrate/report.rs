@@ -1,6 +1,7 @@
 //! What a calibration has found, for people and for programs.
 
 use crossfix_calibration::{CameraResult, FlightResult};
+use crossfix_message::CameraName;
 use serde::Serialize;
 
 use crate::output;
@@ -71,6 +72,16 @@ fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'st
         "good"
     }
 }
+
+/// Takes the cameras out of a result that are wrong, and names them.
+pub fn take_out_wrong(result: &mut FlightResult) -> Vec<CameraName> {
+    let is_wrong =
+        |camera: &mut CameraResult| CameraFigures::from(&*camera).verdict.starts_with(WRONG);
+    result.cameras.extract_if(.., is_wrong).map(|camera| camera.name).collect()
+}
+
+/// How the verdict of a camera begins that must not be used.
+const WRONG: &str = "wrong";
 
 impl From<&CameraResult> for CameraFigures {
     fn from(camera: &CameraResult) -> Self {
