@@ -2,27 +2,33 @@
 //! log's bias, all at once.
 
 use crossfix_geometry::Intrinsics;
-use nalgebra::{DMatrix, Vector2, Vector3};
+use nalgebra::{Vector2, Vector3};
 
 use super::model::{CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen};
 use super::noise::{LabelNoise, Tails, Whitening};
-use super::normal::{ChainCovariance, NormalEquations, Solution, Term};
+use super::normal::{Covariance, NormalEquations, Solution, Term};
 use super::spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
+use super::unknowns::{Order, Touched};
 use crate::lens;
 
 /// Labels farther apart in time than this have errors of their own, s. No more than the distance of
-/// the spline's knots, or the equations' band is too narrow.
+/// the spline's knots: a row holds five coefficients.
 pub(super) const LONGEST_PAIR_S: f64 = KNOT_S;
 /// Unknowns of the target's way that two labels in a row touch: five coefficients.
-const BAND: usize = 3 * (SPAN + 1);
+const OF_A_PAIR: usize = 3 * (SPAN + 1);
 /// Prior of what is not known at all: wide against anything that a site has.
 const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
 /// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
 /// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
-/// one all clocks of a site may be off alike, as a log of metres does not tell.
-const RATE_SD: f64 = 2e-4;
+/// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by
+/// 50 ms five minutes later.
+pub(super) const RATE_SD: f64 = 1e-4;
+/// What it is known by where the flight does not tell: nobody knows which camera is a phone. With
+/// the deviation above a phone's clock is 80 ms beside what it is said to be to 9 ms, after a minute
+/// and a half.
+const RATE_KNOWN_BY: f64 = 1e-3;
 /// Beside cameras the jerk may have so many times the power that was found. The likeliest way is
 /// smoother than the way is, and a scene that is drawn together as a whole has less jerk and the
 /// same labels: with a log of metres it shrank by 4 % at once the power, by 0.4 % at ten times and by
@@ -39,6 +45,8 @@ const UNSEEN: f64 = 1e3;
 pub(super) struct Priors {
     /// Power of the target's jerk, m^2/s^5.
     pub(super) jerk: f64,
+    /// What a clock's rate may be off by.
+    pub(super) rate_sd: f64,
     /// Of each camera.
     pub(super) cameras: Vec<CameraPriors>,
 }
@@ -100,40 +108,44 @@ pub(super) struct Flight<'a> {
 }
 
 impl State {
-    /// Unknowns of the target's way.
-    pub(super) fn chain(&self) -> usize {
-        3 * self.way.coefficients.len()
+    /// In what order its unknowns stand.
+    pub(super) fn order(&self) -> Order {
+        Order::of(&self.way, self.cameras.len())
     }
 
-    /// Where each camera's unknowns begin, and at last the bias's.
+    /// Where each camera's own unknowns begin, and at last where they end.
     pub(super) fn starts(&self) -> Vec<usize> {
-        let mut next = self.chain();
+        let mut next = self.order().chain();
         let mut starts = vec![next];
         for camera in &self.cameras {
-            next += camera.unknowns();
+            next += camera.own();
             starts.push(next);
         }
         starts
     }
 
     fn others(&self) -> usize {
-        let cameras: usize = self.cameras.iter().map(CameraState::unknowns).sum();
-        cameras + 3 * self.bias[0].values.len()
+        self.cameras.iter().map(CameraState::own).sum()
     }
 
     fn moved(&self, step: &[f64]) -> Self {
         let mut next = self.clone();
-        let (way, mut rest) = step.split_at(self.chain());
-        for (coefficient, step) in next.way.coefficients.iter_mut().zip(way.chunks_exact(3)) {
-            *coefficient += Vector3::from_column_slice(step);
+        let order = self.order();
+        for (k, coefficient) in next.way.coefficients.iter_mut().enumerate() {
+            let first = order.way(k, 0);
+            *coefficient += Vector3::from_column_slice(&step[first..first + 3]);
         }
-        for camera in &mut next.cameras {
-            let (own, after) = rest.split_at(camera.unknowns());
+        let mut rest = &step[order.chain()..];
+        for (index, camera) in next.cameras.iter_mut().enumerate() {
+            let (own, after) = rest.split_at(camera.own());
             camera.step(own);
             rest = after;
+            let wander = camera.clock.wander.values.iter_mut().enumerate();
+            wander.for_each(|(knot, value)| *value += step[order.wander(knot, index)]);
         }
-        for (axis, step) in next.bias.iter_mut().zip(rest.chunks_exact(self.bias[0].values.len())) {
-            axis.values.iter_mut().zip(step).for_each(|(value, step)| *value += step);
+        for (axis, bias) in next.bias.iter_mut().enumerate() {
+            let values = bias.values.iter_mut().enumerate();
+            values.for_each(|(knot, value)| *value += step[order.bias(knot, axis)]);
         }
         next
     }
@@ -157,6 +169,7 @@ impl State {
         for (index, camera) in flight.cameras.iter().enumerate() {
             self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);
             self.prior_rows(index, starts[index], &priors.cameras[index], sink);
+            self.rate_row(index, starts[index], priors.rate_sd, sink);
         }
     }
 
@@ -165,53 +178,56 @@ impl State {
     fn way_rows(&self, priors: &Priors, sink: &mut impl Sink) {
         let width = if self.cameras.is_empty() { 1.0 } else { WIDER };
         let scale = (width * priors.jerk * KNOT_S.powi(5)).sqrt().recip();
+        let order = self.order();
         for first in 0..self.way.intervals() {
             let difference = self.way.third_difference(first);
             for axis in 0..3 {
-                let term = |k: usize| (3 * (first + k) + axis, THIRD_DIFFERENCE[k] * scale);
+                let term = |k: usize| (order.way(first + k, axis), THIRD_DIFFERENCE[k] * scale);
                 let terms = (0..SPAN).map(term).collect();
                 sink.take(&[(terms, difference[axis] * scale)], Tails::Normal);
             }
         }
         // Where nothing holds the way, the origin does, from very far.
-        for unknown in 0..self.chain() {
-            let value = self.way.coefficients[unknown / 3][unknown % 3] / WIDE_M;
-            sink.take(&[(vec![(unknown, 1.0 / WIDE_M)], value)], Tails::Normal);
+        for (k, coefficient) in self.way.coefficients.iter().enumerate() {
+            for axis in 0..3 {
+                let term = (order.way(k, axis), 1.0 / WIDE_M);
+                sink.take(&[(vec![term], coefficient[axis] / WIDE_M)], Tails::Normal);
+            }
         }
     }
 
     fn log_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
-        let bias_start = self.starts()[self.cameras.len()];
-        let knots = self.bias[0].values.len();
+        let order = self.order();
         let scale = log.errors.sd_m.recip();
         for sample in &log.samples {
             let Some(weights) = self.way.weights(sample.time_s) else { continue };
             let place = self.way.place(&weights);
             let rows = [0, 1, 2].map(|axis| {
                 let of_bias = self.bias[axis].weights(sample.time_s);
-                let chain =
-                    (0..SPAN).map(|k| (3 * (weights.first + k) + axis, weights.place[k] * scale));
-                let bias =
-                    of_bias.map(|(k, weight)| (bias_start + axis * knots + k, weight * scale));
+                let chain = (0..SPAN)
+                    .map(|k| (order.way(weights.first + k, axis), weights.place[k] * scale));
+                let bias = of_bias.map(|(k, weight)| (order.bias(k, axis), weight * scale));
                 let stated = place[axis] + self.bias[axis].at(sample.time_s);
                 (chain.chain(bias).collect(), (stated - sample.position[axis]) * scale)
             });
             sink.take(&rows, Tails::Heavy);
         }
-        self.bias_rows(log, bias_start, sink);
+        self.bias_rows(log, sink);
     }
 
     /// A bias that forgets itself: `b' = f b + noise`, of the same deviation at all times.
-    fn bias_rows(&self, log: &FlightLog, start: usize, sink: &mut impl Sink) {
+    fn bias_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
+        let order = self.order();
         let errors = &log.errors;
         let kept = (-self.bias[0].step_s / errors.drift_time_s).exp();
         let first = errors.drift_sd_m.max(1e-9).recip();
         let next = first / (1.0 - kept * kept).sqrt();
         for (axis, bias) in self.bias.iter().enumerate() {
-            let start = start + axis * bias.values.len();
-            sink.take(&[(vec![(start, first)], bias.values[0] * first)], Tails::Normal);
+            let begin = (vec![(order.bias(0, axis), first)], bias.values[0] * first);
+            sink.take(&[begin], Tails::Normal);
             for (k, pair) in bias.values.windows(2).enumerate() {
-                let terms = vec![(start + k, -kept * next), (start + k + 1, next)];
+                let terms =
+                    vec![(order.bias(k, axis), -kept * next), (order.bias(k + 1, axis), next)];
                 sink.take(&[(terms, (pair[1] - kept * pair[0]) * next)], Tails::Normal);
             }
         }
@@ -237,7 +253,9 @@ impl State {
             let earlier = before.filter(|(time_s, earlier)| {
                 // Rows and a clock that wanders may have put the later label first.
                 let ahead = placed.first.checked_sub(earlier.first);
-                label.time_s - time_s < LONGEST_PAIR_S && ahead.is_some_and(|ahead| ahead <= 1)
+                label.time_s - time_s < LONGEST_PAIR_S
+                    && ahead.is_some_and(|ahead| ahead <= 1)
+                    && placed.touched().and(earlier.touched()).fit()
             });
             let whitening = priors
                 .noise
@@ -250,8 +268,10 @@ impl State {
 
     fn placed(&self, index: usize, label: &super::Label) -> Option<Placed> {
         let (first, weights, seen) = self.see(index, label)?;
-        let wander = self.cameras[index].clock.wander.weights(label.time_s);
-        Some(Placed { first, weights, seen, wander })
+        let clock = &self.cameras[index].clock;
+        let wander = clock.wander.weights(clock.straight_s(label.time_s));
+        let placed = Placed { first, weights, seen, wander };
+        placed.touched().fit().then_some(placed)
     }
 
     /// A label's residual less what of it is the one's before, by the deviation of what is new.
@@ -263,11 +283,11 @@ impl State {
         before: Option<&Placed>,
         Whitening { kept, sd_px }: Whitening,
     ) -> [Row; 2] {
-        let own = self.cameras[index].own();
+        let (order, own) = (self.order(), self.cameras[index].own());
         let first = before.map_or(now.first, |before| before.first);
         [0, 1].map(|axis| {
-            let mut chain = [0.0; BAND];
-            let mut terms: Vec<Term> = Vec::with_capacity(BAND + own + 4);
+            let mut chain = [0.0; OF_A_PAIR];
+            let mut terms: Vec<Term> = Vec::with_capacity(OF_A_PAIR + own + 4);
             let mut own_terms = [0.0; super::model::MOST_OWN];
             let mut residual = 0.0;
             let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
@@ -284,15 +304,21 @@ impl State {
                     *term += by_own[axis] * share;
                 }
                 for (knot, weight) in part.wander {
-                    terms.push((start + own + knot, part.seen.by_time[axis] * weight * share));
+                    let by_knot = part.seen.by_time[axis] * weight * share;
+                    terms.push((order.wander(knot, index), by_knot));
                 }
             }
             let used = 3 * (now.first - first + SPAN);
-            terms
-                .extend(chain[..used].iter().enumerate().map(|(k, value)| (3 * first + k, *value)));
+            let of_way = chain[..used].iter().enumerate();
+            terms.extend(of_way.map(|(k, value)| (order.way(first + k / 3, k % 3), *value)));
             terms.extend(own_terms[..own].iter().enumerate().map(|(k, value)| (start + k, *value)));
             (terms, residual)
         })
+    }
+
+    fn rate_row(&self, index: usize, start: usize, rate_sd: f64, sink: &mut impl Sink) {
+        let rate = self.cameras[index].clock.rate;
+        sink.take(&[(vec![(start + CLOCK + 1, rate_sd.recip())], rate / rate_sd)], Tails::Heavy);
     }
 
     /// What is known of a camera before anything is seen.
@@ -317,17 +343,17 @@ impl State {
         }
         // The wander's mean and slope are the clock's: the wander itself is held to nought as wide
         // as it may go.
-        let own = camera.own();
+        let order = self.order();
         let wander = &clock.wander;
         let span = wander.step_s * (wander.values.len() - 1) as f64;
         for (k, value) in wander.values.iter().enumerate() {
-            hold(own + k, *value, (priors.wander * span).sqrt());
+            let scale = (priors.wander * span).sqrt().recip();
+            let term = (order.wander(k, index), scale);
+            sink.take(&[(vec![term], value * scale)], Tails::Normal);
         }
-        let rate = (vec![(start + CLOCK + 1, RATE_SD.recip())], clock.rate / RATE_SD);
-        sink.take(&[rate], Tails::Heavy);
         let step = (priors.wander * wander.step_s).sqrt().recip();
         for (k, pair) in wander.values.windows(2).enumerate() {
-            let terms = vec![(start + own + k, -step), (start + own + k + 1, step)];
+            let terms = vec![(order.wander(k, index), -step), (order.wander(k + 1, index), step)];
             sink.take(&[(terms, (pair[1] - pair[0]) * step)], Tails::Normal);
         }
     }
@@ -342,23 +368,35 @@ struct Placed {
     wander: [(usize, f64); 2],
 }
 
+impl Placed {
+    fn touched(&self) -> Touched {
+        Touched::by(self.first, self.wander[0].0)
+    }
+}
+
 /// Steps at most; from a start within a metre and a tenth of a second five to eight are enough.
 const MOST_STEPS: usize = 30;
-/// A step that changes the cost by less than this is the last: in units of log likelihood.
-const SETTLED: f64 = 0.01;
+/// A step that changes the cost by less than this is the last, in units of log likelihood; ...
+pub(super) const SETTLED: f64 = 0.01;
+/// ... and by this while the noise is still being found: with a hundred unknowns, a tenth of a
+/// deviation each.
+pub(super) const NEARLY_SETTLED: f64 = 1.0;
 
-/// A state that no step makes likelier, and the information on all but the way.
+/// A state that no step makes likelier, and how well it is known.
 pub(super) struct Adjusted {
     pub(super) state: State,
-    pub(super) information: DMatrix<f64>,
-    /// Of the way, all else held.
-    pub(super) way_covariance: ChainCovariance,
+    pub(super) covariance: Covariance,
     pub(super) cost: f64,
 }
 
 /// Levenberg and Marquardt's way down from a start. `None`: something is tied to nothing, or is not
 /// a number.
-pub(super) fn adjust(flight: &Flight<'_>, priors: &Priors, start: State) -> Option<Adjusted> {
+pub(super) fn adjust(
+    flight: &Flight<'_>,
+    priors: &Priors,
+    start: State,
+    settled: f64,
+) -> Option<Adjusted> {
     let cost_of = |state: &State| {
         let mut cost = Cost(0.0);
         state.all(flight, priors, &mut cost);
@@ -380,13 +418,14 @@ pub(super) fn adjust(flight: &Flight<'_>, priors: &Priors, start: State) -> Opti
             }
             damping *= DAMPING_STEP;
         }
-        if before - cost < SETTLED {
+        if before - cost < settled {
             break;
         }
     }
-    let solution = linearised(flight, priors, &state).solve(0.0)?;
-    let way_covariance = solution.chain_covariance();
-    Some(Adjusted { state, information: solution.schur, way_covariance, cost })
+    tracing::debug!("cost {cost:.2}");
+    let known = Priors { rate_sd: RATE_KNOWN_BY, ..priors.clone() };
+    let solution = linearised(flight, &known, &state).solve(0.0)?;
+    Some(Adjusted { state, covariance: solution.covariance()?, cost })
 }
 
 /// A step is damped by this share of each diagonal element at first, ...
@@ -397,7 +436,8 @@ const DAMPING_STEP: f64 = 10.0;
 const MOST_DAMPING: f64 = 1e3;
 
 fn linearised(flight: &Flight<'_>, priors: &Priors, state: &State) -> NormalEquations {
-    let mut linear = Linear(NormalEquations::new(state.chain(), BAND, state.others()));
+    let order = state.order();
+    let mut linear = Linear(NormalEquations::new(order.chain(), order.band(), state.others()));
     state.all(flight, priors, &mut linear);
     linear.0
 }

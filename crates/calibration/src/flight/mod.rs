@@ -5,23 +5,26 @@
 //! truth: a camera that were held against it alone would take on its errors.
 
 mod adjustment;
+mod datum;
+mod halves;
 mod model;
 mod noise;
 mod normal;
 mod results;
 mod spline;
 mod start;
+mod unknowns;
 
 use crossfix_message::CameraName;
-use nalgebra::{DMatrix, Vector2};
+use nalgebra::Vector2;
 use thiserror::Error;
 
-use adjustment::{Adjusted, CameraPriors, Flight, Priors, State};
-use model::{CameraState, Knots};
-use normal::ChainCovariance;
+use adjustment::{Adjusted, CameraPriors, Flight, NEARLY_SETTLED, Priors, RATE_SD, SETTLED, State};
+use model::CameraState;
 use results::results;
 use spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
 
+pub use datum::Datum;
 pub use model::{CameraLabels, FlightLog, Label, LogErrors, LogSample};
 pub use noise::LabelNoise;
 pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult};
@@ -113,7 +116,7 @@ const LOG_DEVIATIONS: f64 = 3.0;
 /// The mirror image fits where it fits so many times better.
 const CLEARLY_BETTER: f64 = 3.0;
 
-/// A flight's equations take memory by the square of its time: an hour of six cameras 2 GB.
+/// A flight's equations take memory by its time: an hour of six cameras 0.2 GB, and minutes.
 const LONGEST_FLIGHT_H: f64 = 1.0;
 /// All of a log's times are tried for each camera's clock: six hours take seconds a camera.
 const LONGEST_LOG_H: f64 = 6.0;
@@ -125,8 +128,6 @@ const LEAST_LABELS: usize = 30;
 const MARGIN_S: f64 = 2.0;
 /// Rounds in which deviations and powers are found beside the unknowns.
 const ROUNDS: usize = 6;
-/// Knots of the log's bias lie so many to its time of forgetting.
-const BIAS_KNOTS: f64 = 8.0;
 /// What labels are taken to err by before anything is known, pixels: a hand's or a tracker's, and
 /// what a lens file leaves.
 const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
@@ -172,7 +173,7 @@ pub fn calibrate_flight(
     let flight = Flight { cameras: &used, log };
     let (state, priors) = begin(&flight, starts, &of_log, jerk);
     let (adjusted, priors) = settle(&flight, priors, state).ok_or(FlightError::NoSolution)?;
-    let mut result = results(&flight, &adjusted, &priors).ok_or(FlightError::NoSolution)?;
+    let mut result = results(&flight, adjusted, &priors).ok_or(FlightError::NoSolution)?;
     result.refused = refused;
     Ok(result)
 }
@@ -251,13 +252,10 @@ fn begin(
     });
     let mut way = Spline::over(from - MARGIN_S, to + MARGIN_S);
     way.follow(&of_log.way);
-    let bias = bias_over(flight.log, from - MARGIN_S, to + MARGIN_S);
-    (State { way, cameras: states, bias }, Priors { jerk, cameras: priors })
-}
-
-fn bias_over(log: &FlightLog, from: f64, to: f64) -> [Knots; 3] {
-    let step_s = log.errors.drift_time_s / BIAS_KNOTS;
-    [0, 1, 2].map(|_| Knots::over(from, to, step_s))
+    let mut states = states;
+    states.iter_mut().for_each(|camera| camera.clock.wander = way.drift());
+    let bias = [0, 1, 2].map(|_| way.drift());
+    (State { way, cameras: states, bias }, Priors { jerk, rate_sd: RATE_SD, cameras: priors })
 }
 
 /// The time between a camera's frames: the median between its labels, s.
@@ -274,12 +272,13 @@ fn log_alone(log: &FlightLog) -> Option<(State, f64)> {
     const FIRST_JERK: f64 = 10.0;
     let (from, to) = (log.samples.first()?.time_s, log.samples.last()?.time_s);
     let flight = Flight { cameras: &[], log };
-    let bias = bias_over(log, from, to);
-    let mut state = State { way: Spline::over(from, to + KNOT_S), cameras: Vec::new(), bias };
-    let mut priors = Priors { jerk: FIRST_JERK, cameras: Vec::new() };
+    let way = Spline::over(from, to + KNOT_S);
+    let bias = [0, 1, 2].map(|_| way.drift());
+    let mut state = State { way, cameras: Vec::new(), bias };
+    let mut priors = Priors { jerk: FIRST_JERK, rate_sd: RATE_SD, cameras: Vec::new() };
     for _ in 0..ROUNDS {
-        let adjusted = adjustment::adjust(&flight, &priors, state)?;
-        priors.jerk = jerk(&adjusted.state.way, &adjusted.way_covariance);
+        let adjusted = adjustment::adjust(&flight, &priors, state, NEARLY_SETTLED)?;
+        priors.jerk = jerk(&adjusted);
         state = adjusted.state;
     }
     Some((state, priors.jerk))
@@ -287,13 +286,14 @@ fn log_alone(log: &FlightLog) -> Option<(State, f64)> {
 
 /// The power of the jerk that a way shows: what its third differences are, and what they may be
 /// beside (expectation and maximisation).
-fn jerk(way: &Spline, covariance: &ChainCovariance) -> f64 {
+fn jerk(adjusted: &Adjusted) -> f64 {
+    let (way, order) = (&adjusted.state.way, adjusted.state.order());
     let mut sum = 0.0;
     for first in 0..way.intervals() {
         sum += way.third_difference(first).norm_squared();
         for axis in 0..3 {
-            let terms = [0, 1, 2, 3].map(|k| (3 * (first + k) + axis, THIRD_DIFFERENCE[k]));
-            sum += covariance.variance(&terms);
+            let terms = [0, 1, 2, 3].map(|k| (order.way(first + k, axis), THIRD_DIFFERENCE[k]));
+            sum += adjusted.covariance.variance_held(&terms);
         }
     }
     (sum / (3.0 * way.intervals() as f64) / KNOT_S.powi(5)).max(1e-6)
@@ -303,10 +303,12 @@ fn jerk(way: &Spline, covariance: &ChainCovariance) -> f64 {
 fn settle(flight: &Flight<'_>, mut priors: Priors, mut state: State) -> Option<(Adjusted, Priors)> {
     let mut adjusted = None;
     for round in 0..ROUNDS {
-        let next = adjustment::adjust(flight, &priors, state)?;
+        let is_last = round + 1 == ROUNDS;
+        let settled = if is_last { SETTLED } else { NEARLY_SETTLED };
+        let next = adjustment::adjust(flight, &priors, state, settled)?;
         state = next.state.clone();
-        if round + 1 < ROUNDS {
-            priors = learnt(flight, &next, &priors)?;
+        if !is_last {
+            priors = learnt(flight, &next, &priors);
             tracing::debug!(
                 "round {round}: cost {:.1}, jerk {:.2} m^2/s^5",
                 next.cost,
@@ -319,18 +321,15 @@ fn settle(flight: &Flight<'_>, mut priors: Priors, mut state: State) -> Option<(
 }
 
 /// Noise, wander and jerk as an adjustment shows them.
-fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Option<Priors> {
+fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
     let state = &adjusted.state;
-    let covariance = adjusted.information.clone().cholesky()?.inverse();
-    let starts = state.starts();
     let mut cameras = Vec::new();
     for (index, camera) in state.cameras.iter().enumerate() {
         let residuals = residuals(flight, state, index);
         let explained = explained(flight, adjusted, index);
         let frame_s = priors.cameras[index].frame_s;
         let noise = LabelNoise::of(&residuals, explained, frame_s);
-        let start = starts[index] - state.chain() + camera.own();
-        let wander = wander(&camera.clock.wander, &covariance, start, priors.cameras[index].wander);
+        let wander = wander(adjusted, index, priors.cameras[index].wander);
         tracing::debug!(
             "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre {:.2}",
             flight.cameras[index].name,
@@ -346,8 +345,7 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Option<P
         );
         cameras.push(CameraPriors { noise, wander, ..priors.cameras[index].clone() });
     }
-    let jerk = jerk(&state.way, &adjusted.way_covariance);
-    Some(Priors { jerk, cameras })
+    Priors { jerk: jerk(adjusted), rate_sd: priors.rate_sd, cameras }
 }
 
 /// A camera's residuals with their own times.
@@ -359,16 +357,17 @@ fn residuals(flight: &Flight<'_>, state: &State, index: usize) -> Vec<(f64, Vect
 /// What of a label's variance the way has taken, pixels^2 an axis, in the mean.
 fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize) -> f64 {
     const STRIDE: usize = 10;
+    let order = adjusted.state.order();
     let (mut sum, mut count) = (0.0, 0);
     for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
         let Some((first, weights, seen)) = adjusted.state.see(index, label) else { continue };
         for axis in 0..2 {
             let term = |k: usize| {
                 let by = seen.by_place[(axis, k % 3)] * weights[k / 3];
-                (3 * first + k, by)
+                (order.way(first + k / 3, k % 3), by)
             };
             let terms: [_; 3 * SPAN] = std::array::from_fn(term);
-            sum += adjusted.way_covariance.variance(&terms);
+            sum += adjusted.covariance.variance_held(&terms);
             count += 1;
         }
     }
@@ -377,11 +376,13 @@ fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize) -> f64 {
 
 /// The power of a clock's random walk, s^2/s: of its steps' squares, by how many of them the labels
 /// have told (MacKay's fixed point), and of what clocks are like beforehand.
-fn wander(knots: &Knots, covariance: &DMatrix<f64>, start: usize, before: f64) -> f64 {
+fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
+    let order = adjusted.state.order();
+    let knots = &adjusted.state.cameras[camera].clock.wander;
     let (mut squares, mut told) = (0.0, 0.0);
     for (k, pair) in knots.values.windows(2).enumerate() {
-        let (a, b) = (start + k, start + k + 1);
-        let spread = covariance[(a, a)] + covariance[(b, b)] - 2.0 * covariance[(a, b)];
+        let step = [(order.wander(k, camera), -1.0), (order.wander(k + 1, camera), 1.0)];
+        let spread = adjusted.covariance.variance(&step);
         squares += (pair[1] - pair[0]).powi(2) / knots.step_s;
         told += (1.0 - spread / (before * knots.step_s)).clamp(0.0, 1.0);
     }

@@ -55,8 +55,9 @@ pub struct LogErrors {
     pub drift_time_s: f64,
 }
 
-/// A camera's clock: `common time = own + offset + rate (own - reference) + wander(own)`, and a row
-/// of the image is read out `read-out (row / height - 1/2)` after the frame's time.
+/// A camera's clock: `common time = straight + wander(straight)` with `straight = own + offset + rate
+/// (own - reference)`, and a row of the image is read out `read-out (row / height - 1/2)` after the
+/// frame's time.
 #[derive(Clone, Debug)]
 pub(crate) struct Clock {
     pub(super) reference_s: f64,
@@ -75,12 +76,6 @@ pub(crate) struct Knots {
 }
 
 impl Knots {
-    /// Nought from one time to another.
-    pub(super) fn over(start_s: f64, end_s: f64, step_s: f64) -> Self {
-        let steps = ((end_s - start_s) / step_s).ceil().max(1.0) as usize;
-        Self { start_s, step_s, values: vec![0.0; steps + 1] }
-    }
-
     /// The two knots about a time and their weights; before and behind the ends, the end's alone.
     pub(super) fn weights(&self, time_s: f64) -> [(usize, f64); 2] {
         let last = self.values.len() - 1;
@@ -95,9 +90,13 @@ impl Knots {
         self.weights(time_s).iter().map(|&(k, weight)| self.values[k] * weight).sum()
     }
 
-    /// The time of a knot, s.
-    pub(super) fn time_s(&self, knot: usize) -> f64 {
-        self.start_s + self.step_s * knot as f64
+    /// By how much the value grows per second about a time.
+    fn slope(&self, time_s: f64) -> f64 {
+        let at = (time_s - self.start_s) / self.step_s;
+        if !(0.0..(self.values.len() - 1) as f64).contains(&at) {
+            return 0.0;
+        }
+        (self.values[at as usize + 1] - self.values[at as usize]) / self.step_s
     }
 }
 
@@ -112,8 +111,7 @@ pub(crate) struct CameraState {
 }
 
 /// The unknowns of a camera's pose and clock, in their order: a small rotation about its own axes
-/// (rad), its centre (m), the clock's offset (s), rate and read-out (s). The lens and the clock's
-/// wander follow.
+/// (rad), its centre (m), the clock's offset (s), rate and read-out (s). The lens follows.
 pub(super) const POSE_AND_CLOCK: usize = 9;
 /// Where the clock begins among them.
 pub(super) const CLOCK: usize = 6;
@@ -121,14 +119,9 @@ pub(super) const CLOCK: usize = 6;
 pub(super) const MOST_OWN: usize = POSE_AND_CLOCK + lens::MOST_LENS_NUMBERS;
 
 impl CameraState {
-    /// Unknowns beside the wander.
+    /// Unknowns beside its clock's wander, which is of the time.
     pub(super) fn own(&self) -> usize {
         POSE_AND_CLOCK + lens::numbers(&self.intrinsics)
-    }
-
-    /// All unknowns.
-    pub(super) fn unknowns(&self) -> usize {
-        self.own() + self.clock.wander.values.len()
     }
 
     /// How far after its frame's time a pixel's row is read out, as a share of the read-out.
@@ -161,15 +154,18 @@ impl CameraState {
             by_own[axis] = by_rotation.column(axis).into_owned();
             by_own[axis + 3] = -by_place.column(axis);
         }
-        by_own[CLOCK] = by_time;
-        by_own[CLOCK + 1] = by_time * (label.time_s - self.clock.reference_s);
+        // The wander is one of the straight time.
+        let by_straight =
+            by_time * (1.0 + self.clock.wander.slope(self.clock.straight_s(label.time_s)));
+        by_own[CLOCK] = by_straight;
+        by_own[CLOCK + 1] = by_straight * (label.time_s - self.clock.reference_s);
         by_own[CLOCK + 2] = by_time * self.row_share(label.pixel);
         by_own[POSE_AND_CLOCK..].copy_from_slice(&seen.by_lens);
         let residual = seen.pixel - Vector2::new(label.pixel.x(), label.pixel.y());
         Some(Seen { residual, by_place, by_time, by_own })
     }
 
-    /// Moves it by a step in its unknowns, in their order.
+    /// Moves it by a step in its own unknowns, in their order.
     pub(super) fn step(&mut self, step: &[f64]) {
         let own = self.own();
         let vector = |from: usize| Vector3::from_column_slice(&step[from..from + 3]);
@@ -179,19 +175,19 @@ impl CameraState {
         self.clock.rate += step[CLOCK + 1];
         self.clock.readout_s += step[CLOCK + 2];
         self.intrinsics = lens::moved(&self.intrinsics, &step[POSE_AND_CLOCK..own]);
-        let wander = self.clock.wander.values.iter_mut();
-        wander.zip(&step[own..]).for_each(|(value, step)| *value += step);
     }
 }
 
 impl Clock {
     /// The common time of a time of its own, s.
     pub(super) fn common_s(&self, own_s: f64) -> f64 {
-        own_s + self.ahead_s(own_s)
+        let straight_s = self.straight_s(own_s);
+        straight_s + self.wander.at(straight_s)
     }
 
-    fn ahead_s(&self, own_s: f64) -> f64 {
-        self.offset_s + self.rate * (own_s - self.reference_s) + self.wander.at(own_s)
+    /// The common time if the clock did not wander, s.
+    pub(super) fn straight_s(&self, own_s: f64) -> f64 {
+        own_s + self.offset_s + self.rate * (own_s - self.reference_s)
     }
 }
 

@@ -16,20 +16,23 @@ pub(super) enum Tails {
 }
 
 impl Tails {
+    /// Degrees of freedom of Student's t; `None` is a normal deviate's.
+    fn freedom(self) -> Option<f64> {
+        match self {
+            Self::Normal => None,
+            Self::Heavy => Some(FREEDOM),
+        }
+    }
+
     /// What residuals with this sum of squares count.
     pub(super) fn weight(self, squares: f64, count: usize) -> f64 {
-        match self {
-            Self::Normal => 1.0,
-            Self::Heavy => (FREEDOM + count as f64) / (FREEDOM + squares),
-        }
+        self.freedom().map_or(1.0, |freedom| (freedom + count as f64) / (freedom + squares))
     }
 
     /// Twice their negative log likelihood.
     pub(super) fn loss(self, squares: f64, count: usize) -> f64 {
-        match self {
-            Self::Normal => squares,
-            Self::Heavy => (FREEDOM + count as f64) * (squares / FREEDOM).ln_1p(),
-        }
+        let heavy = |freedom: f64| (freedom + count as f64) * (squares / freedom).ln_1p();
+        self.freedom().map_or(squares, heavy)
     }
 }
 

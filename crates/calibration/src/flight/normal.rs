@@ -16,7 +16,7 @@ pub(super) struct NormalEquations {
     /// Its block: `band[k * width + d]` ties unknown k to unknown k - d.
     band: Vec<f64>,
     width: usize,
-    /// How the chain (rows) is tied to the others (columns).
+    /// How the others (rows) are tied to the chain (columns).
     cross: DMatrix<f64>,
     others: DMatrix<f64>,
     right: DVector<f64>,
@@ -27,24 +27,32 @@ pub(super) struct Solution {
     /// A step of all unknowns.
     pub(super) step: DVector<f64>,
     /// Information on the others alone.
-    pub(super) schur: DMatrix<f64>,
+    schur: DMatrix<f64>,
+    /// The chain's block's factor, and what it makes of the others' ties to the chain.
     factor: Vec<f64>,
+    cross: DMatrix<f64>,
     width: usize,
 }
 
-/// The covariance of the chain's unknowns with their neighbours, the others held.
-pub(super) struct ChainCovariance {
-    /// `band[k * width + d]` is of unknowns k and k + d.
+/// How well unknowns are known, as far as rows tie them.
+pub(super) struct Covariance {
+    /// Of the chain's unknowns with the others held: `band[k * width + d]` is of unknowns k and k + d.
     band: Vec<f64>,
     width: usize,
+    /// How the chain (columns) goes with the others (rows).
+    follows: DMatrix<f64>,
+    /// Of the others.
+    others: DMatrix<f64>,
+    /// The information on the others alone.
+    information: DMatrix<f64>,
 }
 
 impl Solution {
     /// By Takahashi's recursion: from `L' Z = L^-1`, whose upper triangle is diagonal, an element of
     /// `Z = A^-1` within the band hangs on others within it.
-    pub(super) fn chain_covariance(&self) -> ChainCovariance {
-        let Self { factor, width, .. } = self;
-        let (width, chain) = (*width, factor.len() / width);
+    pub(super) fn covariance(self) -> Option<Covariance> {
+        let Self { schur, factor, mut cross, width, .. } = self;
+        let chain = factor.len() / width;
         let mut band = vec![0.0; factor.len()];
         for row in (0..chain).rev() {
             let inverse_diagonal = factor[row * width];
@@ -60,17 +68,51 @@ impl Solution {
                 band[row * width + ahead] = value * inverse_diagonal;
             }
         }
-        ChainCovariance { band, width }
+        let others = cross.nrows();
+        backward(&factor, width, cross.as_mut_slice(), others);
+        cross.neg_mut();
+        let others = Cholesky::new(schur.clone())?.inverse();
+        Some(Covariance { band, width, follows: cross, others, information: schur })
     }
 }
 
-impl ChainCovariance {
-    /// The variance of a sum of the chain's unknowns, all within the band's width.
-    pub(super) fn variance(&self, terms: &[Term]) -> f64 {
+impl Covariance {
+    /// The variance of a sum of the chain's unknowns, all within the band's width, the others held.
+    pub(super) fn variance_held(&self, terms: &[Term]) -> f64 {
         let pairs = terms.iter().flat_map(|a| terms.iter().map(move |b| (a, b)));
         pairs
             .map(|(&(i, x), &(j, y))| x * y * self.band[i.min(j) * self.width + i.abs_diff(j)])
             .sum()
+    }
+
+    /// The variance of a sum of unknowns, those of the chain within the band's width.
+    pub(super) fn variance(&self, terms: &[Term]) -> f64 {
+        let chain = self.follows.ncols();
+        let (of_chain, of_others): (Vec<Term>, Vec<Term>) =
+            terms.iter().partition(|(unknown, _)| *unknown < chain);
+        let mut by_others = DVector::zeros(self.others.nrows());
+        for &(unknown, by) in &of_chain {
+            by_others.axpy(by, &self.follows.column(unknown), 1.0);
+        }
+        for (unknown, by) in of_others {
+            by_others[unknown - chain] += by;
+        }
+        self.variance_held(&of_chain) + by_others.dot(&(&self.others * &by_others))
+    }
+
+    /// Of all but the chain.
+    pub(super) fn others(&self) -> &DMatrix<f64> {
+        &self.others
+    }
+
+    /// The information on all but the chain.
+    pub(super) fn information(&self) -> &DMatrix<f64> {
+        &self.information
+    }
+
+    /// Takes a part of their covariance off that is told of elsewhere.
+    pub(super) fn take_off(&mut self, part: &DMatrix<f64>) {
+        self.others -= part;
     }
 }
 
@@ -81,7 +123,7 @@ impl NormalEquations {
             chain,
             band: vec![0.0; chain * width],
             width,
-            cross: DMatrix::zeros(chain, others),
+            cross: DMatrix::zeros(others, chain),
             others: DMatrix::zeros(others, others),
             right: DVector::zeros(chain + others),
         }
@@ -105,7 +147,7 @@ impl NormalEquations {
                         debug_assert!(row - column < self.width, "beyond the band");
                         self.band[row * self.width + row - column] += product;
                     }
-                    (false, true) => self.cross[(column, row - self.chain)] += product,
+                    (false, true) => self.cross[(row - self.chain, column)] += product,
                     (false, false) => {
                         self.others[(row - self.chain, column - self.chain)] += product;
                     }
@@ -126,22 +168,21 @@ impl NormalEquations {
         self.factor_band()?;
         let Self { chain, ref mut cross, ref mut others, ref right, .. } = self;
         let mut ahead = right.rows(0, chain).into_owned();
-        forward(&self.band, self.width, ahead.as_mut_slice());
-        for mut column in cross.column_iter_mut() {
-            forward(&self.band, self.width, column.as_mut_slice());
-        }
+        forward(&self.band, self.width, ahead.as_mut_slice(), 1);
+        let count = others.nrows();
+        forward(&self.band, self.width, cross.as_mut_slice(), count);
         others.fill_upper_triangle_with_lower_triangle();
         // S = D - B A^-1 B' with A = L L': the chain is gone.
-        others.gemm(-1.0, &cross.transpose(), cross, 1.0);
-        let reduced = right.rows(chain, others.nrows()) - cross.tr_mul(&ahead);
+        others.gemm(-1.0, cross, &cross.transpose(), 1.0);
+        let reduced = right.rows(chain, count) - &*cross * &ahead;
         let schur = others.clone();
         let other_step = Cholesky::new(schur.clone())?.solve(&reduced);
-        ahead -= &*cross * &other_step;
-        backward(&self.band, self.width, ahead.as_mut_slice());
+        ahead -= cross.tr_mul(&other_step);
+        backward(&self.band, self.width, ahead.as_mut_slice(), 1);
         let mut step = DVector::zeros(right.len());
         step.rows_mut(0, chain).copy_from(&ahead);
         step.rows_mut(chain, other_step.len()).copy_from(&other_step);
-        Some(Solution { step, schur, factor: self.band, width: self.width })
+        Some(Solution { step, schur, factor: self.band, cross: self.cross, width: self.width })
     }
 
     /// The chain's block becomes its lower triangular factor, whose diagonal is inverted.
@@ -174,28 +215,38 @@ impl NormalEquations {
     }
 }
 
-/// Solves `L x = b` in place.
-fn forward(band: &[f64], width: usize, values: &mut [f64]) {
-    let start = values.iter().position(|value| *value != 0.0).unwrap_or(values.len());
-    for row in start..values.len() {
-        let reach = (width - 1).min(row - start);
-        let factor = &band[row * width..][..=reach];
-        let known = &values[row - reach..row];
-        let sum: f64 = factor[1..].iter().zip(known.iter().rev()).map(|(l, x)| l * x).sum();
-        values[row] = (values[row] - sum) * factor[0];
+/// Solves `L x = b` in place, for so many right sides that lie beside one another.
+fn forward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
+    let rows = values.len() / sides.max(1);
+    for row in 0..rows {
+        let (known, rest) = values.split_at_mut(row * sides);
+        let own = &mut rest[..sides];
+        let factor = &band[row * width..][..width.min(row + 1)];
+        for (back, &l) in factor.iter().enumerate().skip(1) {
+            less(own, l, &known[(row - back) * sides..][..sides]);
+        }
+        own.iter_mut().for_each(|value| *value *= factor[0]);
     }
 }
 
-/// Solves `L' x = b` in place.
-fn backward(band: &[f64], width: usize, values: &mut [f64]) {
-    for row in (0..values.len()).rev() {
-        let reach = (width - 1).min(row);
-        let factor = &band[row * width..][..=reach];
-        let value = values[row] * factor[0];
-        values[row] = value;
-        for (back, l) in factor.iter().enumerate().skip(1) {
-            values[row - back] -= l * value;
+/// Solves `L' x = b` in place, likewise.
+fn backward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
+    let rows = values.len() / sides.max(1);
+    for row in (0..rows).rev() {
+        let (before, rest) = values.split_at_mut(row * sides);
+        let own = &mut rest[..sides];
+        let factor = &band[row * width..][..width.min(row + 1)];
+        own.iter_mut().for_each(|value| *value *= factor[0]);
+        for (back, &l) in factor.iter().enumerate().skip(1) {
+            less(&mut before[(row - back) * sides..][..sides], l, own);
         }
+    }
+}
+
+/// Takes a multiple of other values off.
+fn less(values: &mut [f64], times: f64, others: &[f64]) {
+    if times != 0.0 {
+        values.iter_mut().zip(others).for_each(|(value, other)| *value -= times * other);
     }
 }
 
@@ -235,13 +286,15 @@ mod tests {
         let covariance = dense.clone().try_inverse().unwrap();
         let marginal = covariance.view((CHAIN, CHAIN), (OTHERS, OTHERS));
         let held = dense.view((0, 0), (CHAIN, CHAIN)).into_owned().try_inverse().unwrap();
+        let found = solution.covariance().unwrap();
+        assert!((found.others() - marginal).amax() < 1e-9);
+        let sum = |terms: &[Term], of: &DMatrix<f64>| -> f64 {
+            terms.iter().flat_map(|a| terms.iter().map(|b| a.1 * b.1 * of[(a.0, b.0)])).sum()
+        };
         let terms = [(7, 0.5), (9, -2.0), (12, 1.0)];
-        let expected: f64 =
-            terms.iter().flat_map(|a| terms.iter().map(|b| a.1 * b.1 * held[(a.0, b.0)])).sum();
-        let found = solution.chain_covariance().variance(&terms);
-        assert!((found - expected).abs() < 1e-9, "{found} {expected}");
-        let product = solution.schur * marginal;
-        assert!((product - DMatrix::identity(OTHERS, OTHERS)).amax() < 1e-9);
+        assert!((found.variance_held(&terms) - sum(&terms, &held)).abs() < 1e-9);
+        let terms = [(7, 0.5), (CHAIN + 2, 0.7), (9, -2.0), (12, 1.0), (CHAIN, -0.3)];
+        assert!((found.variance(&terms) - sum(&terms, &covariance)).abs() < 1e-9);
     }
 
     #[test]

@@ -5,9 +5,10 @@ use crossfix_message::CameraName;
 use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
 
 use super::adjustment::{self, Adjusted, Flight, Priors, State};
-use super::model::{CLOCK, CameraState, FlightLog, Label, POSE_AND_CLOCK};
+use super::datum::Datum;
+use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::noise::LabelNoise;
-use super::{Refusal, residuals};
+use super::{Refusal, halves, residuals};
 use crate::lens::{self, LensUncertainty};
 
 /// What a flight has shown of one camera.
@@ -36,6 +37,9 @@ pub struct CameraResult {
     pub used: usize,
     /// Root mean square of the labels' residuals per axis, of those within four deviations, pixels.
     pub residual_px: f64,
+    /// How many times farther the flight's two halves lie apart than both say: above one, the
+    /// covariances here are made so much larger. `None`: one half saw too little.
+    pub halves_ratio: Option<f64>,
     /// The focal length against the lens file's.
     pub focal_ratio: f64,
     /// Its standard deviation.
@@ -75,6 +79,8 @@ pub struct ClockKnot {
 pub struct FlightResult {
     /// Of each camera that could be calibrated, in the order that they were given in.
     pub cameras: Vec<CameraResult>,
+    /// What they may be off by together: the rest here is beside that.
+    pub datum: Datum,
     /// The others, and why not.
     pub refused: Vec<(CameraName, Refusal)>,
     /// Power of the target's jerk, m^2/s^5.
@@ -85,16 +91,21 @@ pub struct FlightResult {
 
 pub(super) fn results(
     flight: &Flight<'_>,
-    adjusted: &Adjusted,
+    mut adjusted: Adjusted,
     priors: &Priors,
 ) -> Option<FlightResult> {
+    let ratios = halves::ratios(flight, priors, &adjusted);
+    let (datum, follows) = Datum::of(&adjusted.state, &adjusted.covariance);
+    adjusted.covariance.take_off(&datum.of_cameras(&follows));
+    tracing::debug!("ratios {ratios:?} datum {:?}", datum.sd());
+    let known: Vec<f64> = ratios.iter().copied().flatten().collect();
+    let typical = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let state = &adjusted.state;
-    let covariance = adjusted.information.clone().cholesky()?.inverse();
     let starts = state.starts();
     let mut cameras = Vec::new();
     for (index, camera) in state.cameras.iter().enumerate() {
-        let start = starts[index] - state.chain();
-        let at = Block { covariance: &covariance, start };
+        let start = starts[index] - state.order().chain();
+        let at = Block { covariance: adjusted.covariance.others(), start };
         let prior = &priors.cameras[index];
         let residuals = residuals(flight, state, index);
         let within = |residual: &Vector2<f64>| residual.norm() < 4.0 * prior.noise.sd_px();
@@ -103,25 +114,29 @@ pub(super) fn results(
             .filter(|(_, residual)| within(residual))
             .map(|(_, residual)| adjustment::square(*residual))
             .collect();
+        // Cameras that one half saw too little of are no better than the others.
+        let ratio = ratios[index].unwrap_or(typical).max(1.0).powi(2);
         let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
         cameras.push(CameraResult {
             name: flight.cameras[index].name.clone(),
             camera: Camera::new(camera.intrinsics, pose).ok()?,
-            pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))?,
-            lens: at.lens(lens::numbers(&camera.intrinsics))?,
-            clock: clock_result(camera, &at, prior.wander),
+            pose_covariance: at.pose_with_lens_held(lens::numbers(&camera.intrinsics))? * ratio,
+            lens: at.lens(lens::numbers(&camera.intrinsics), ratio)?,
+            clock: clock_result(flight, &adjusted, index, prior.wander),
             noise: prior.noise,
             frame_s: prior.frame_s,
             range_m: middle_range(flight, state, index),
             labels: flight.cameras[index].labels.len(),
             used: squares.len(),
             residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+            halves_ratio: ratios[index],
             focal_ratio: camera.intrinsics.fx / prior.lens.fx,
             focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
         });
     }
     Some(FlightResult {
         cameras,
+        datum,
         refused: Vec::new(),
         jerk: priors.jerk,
         log_residual_m: log_residual(flight.log, state),
@@ -169,11 +184,11 @@ impl Block<'_> {
     }
 
     /// What is unknown of the lens, and how the pose follows it.
-    fn lens(&self, lens: usize) -> Option<LensUncertainty> {
+    fn lens(&self, lens: usize, ratio: f64) -> Option<LensUncertainty> {
         let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
         let covariance = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
         let pose_by_lens = covariance.clone().cholesky()?.solve(&tied.transpose()).transpose();
-        Some(LensUncertainty { covariance, pose_by_lens })
+        Some(LensUncertainty { covariance: covariance * ratio, pose_by_lens })
     }
 
     /// The pose's covariance where the camera's lens is as it was found: what pose and lens may
@@ -188,30 +203,40 @@ impl Block<'_> {
     }
 }
 
-fn clock_result(camera: &CameraState, at: &Block<'_>, wander: f64) -> ClockResult {
-    let clock = &camera.clock;
-    let own = camera.own();
+/// What a clock is to be corrected by is written down each so many seconds: between them one that
+/// wanders by 5 ms in a second is 5 ms off, which its wander says.
+const CLOCK_STEP_S: f64 = 5.0;
+
+fn clock_result(
+    flight: &Flight<'_>,
+    adjusted: &Adjusted,
+    index: usize,
+    wander: f64,
+) -> ClockResult {
+    let state = &adjusted.state;
+    let (order, start) = (state.order(), state.starts()[index]);
+    let clock = &state.cameras[index].clock;
+    let labels = &flight.cameras[index].labels;
+    let times = labels.first().zip(labels.last());
+    let (from, to) = times.map_or((0.0, 0.0), |(first, last)| (first.time_s, last.time_s));
+    let steps = ((to - from) / CLOCK_STEP_S).ceil().max(1.0);
     let knot = |k: usize| {
-        let time_s = clock.wander.time_s(k);
-        let terms = [(CLOCK, 1.0), (CLOCK + 1, time_s - clock.reference_s), (own + k, 1.0)];
-        let variance: f64 = terms
-            .iter()
-            .flat_map(|a| terms.iter().map(move |b| (a, b)))
-            .map(|(a, b)| a.1 * b.1 * at.covariance_of(a.0, b.0))
-            .sum();
-        ClockKnot {
-            time_s,
-            ahead_s: clock.common_s(time_s) - time_s,
-            sd_s: variance.max(0.0).sqrt(),
-        }
+        let time_s = from + (to - from) * k as f64 / steps;
+        let of_wander = clock.wander.weights(clock.straight_s(time_s));
+        let [first, second] = of_wander.map(|(k, weight)| (order.wander(k, index), weight));
+        let rate = (start + CLOCK + 1, time_s - clock.reference_s);
+        let terms = [first, second, (start + CLOCK, 1.0), rate];
+        let sd_s = adjusted.covariance.variance(&terms).max(0.0).sqrt();
+        ClockKnot { time_s, ahead_s: clock.common_s(time_s) - time_s, sd_s }
     };
+    let sd = |unknown: usize| adjusted.covariance.variance(&[(start + unknown, 1.0)]).sqrt();
     ClockResult {
-        knots: (0..clock.wander.values.len()).map(knot).collect(),
+        knots: (0..=steps as usize).map(knot).collect(),
         rate: clock.rate,
-        rate_sd: at.covariance_of(CLOCK + 1, CLOCK + 1).sqrt(),
+        rate_sd: sd(CLOCK + 1),
         wander,
         readout_s: clock.readout_s,
-        readout_sd_s: at.covariance_of(CLOCK + 2, CLOCK + 2).sqrt(),
+        readout_sd_s: sd(CLOCK + 2),
     }
 }
 

@@ -2,9 +2,17 @@
 
 use nalgebra::{Point3, Vector3};
 
+use super::model::Knots;
+
 /// Time between knots, s. A small drone turns in a second or two; a knot each tenth of one would
 /// cost twice the time and gain nothing, at one each half second turns are cut.
 pub(super) const KNOT_S: f64 = 0.2;
+
+/// Clocks and a log's bias drift from knot to knot of their own, each at so many of the way's: one a
+/// second. Between them a consumer's receiver drifts by 0.1 m and a phone's clock by 2 ms, less than
+/// what is measured in a second; with a knot each 25 s a log of metres was believed where it was
+/// between two.
+pub(super) const IN_A_STEP: usize = 5;
 
 /// Coefficients that have a part in one place.
 pub(super) const SPAN: usize = 4;
@@ -27,10 +35,18 @@ pub(super) struct Spline {
 }
 
 impl Spline {
-    /// One that stays at the origin from one time to another.
+    /// One that stays at the origin from one time to another, and on to a whole number of
+    /// [`IN_A_STEP`] coefficients.
     pub(super) fn over(start_s: f64, end_s: f64) -> Self {
         let intervals = ((end_s - start_s) / KNOT_S).ceil().max(1.0) as usize;
-        Self { start_s, coefficients: vec![Vector3::zeros(); intervals + SPAN - 1] }
+        let coefficients = (intervals + SPAN - 1).next_multiple_of(IN_A_STEP).max(2 * IN_A_STEP);
+        Self { start_s, coefficients: vec![Vector3::zeros(); coefficients] }
+    }
+
+    /// Knots of what drifts beside the way: each stands at the start of [`IN_A_STEP`] intervals.
+    pub(super) fn drift(&self) -> Knots {
+        let values = vec![0.0; self.coefficients.len() / IN_A_STEP];
+        Knots { start_s: self.start_s, step_s: KNOT_S * IN_A_STEP as f64, values }
     }
 
     /// The weights at a time; `None` outside of its range.

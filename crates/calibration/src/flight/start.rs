@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, SVector, Vector3};
 
-use super::model::{CameraLabels, CameraState, Clock, Knots};
+use super::model::{CameraLabels, CameraState, Clock};
 use super::spline::Spline;
 use crate::lens;
 
@@ -17,8 +17,6 @@ const LEAST_TRIED: usize = 12;
 const LEAST_SHARE: f64 = 0.4;
 /// Of all offsets, so many are followed up.
 const FOLLOWED: usize = 12;
-/// Knots of a clock's wander, s. Those of phones that were seen wander over tens of seconds.
-const WANDER_STEP_S: f64 = 5.0;
 
 /// A pose, and by how much the camera's time is behind the common one.
 #[derive(Clone, Debug)]
@@ -68,7 +66,7 @@ pub(super) fn find(
         offset_s: best.offset_s,
         rate: 0.0,
         readout_s: frame_s / 2.0,
-        wander: Knots::over(start, end, WANDER_STEP_S),
+        wander: way.drift(),
     };
     let Candidate { rotation, centre, misfit, .. } = best;
     Some((CameraState { rotation, centre, clock, intrinsics: camera.intrinsics }, misfit))

@@ -1,0 +1,142 @@
+//! Whether the flight's two halves agree as well as both say that they do.
+//!
+//! A covariance is as good as the model that it comes from. Labels that err in ways which the noise
+//! model does not know, or a lens that bends otherwise than its formula, show where the same cameras
+//! are found from either half alone.
+
+use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Rotation3, Vector3};
+
+use super::LEAST_LABELS;
+use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
+use super::datum::Datum;
+use super::model::{CameraLabels, CameraState, Label, MOST_OWN, POSE_AND_CLOCK};
+use crate::lens;
+
+/// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.
+const STRIDE: usize = 20;
+
+/// For each camera how many times farther its halves lie apart, in the image, than both say; `None`
+/// where one half saw too little.
+pub(super) fn ratios(
+    flight: &Flight<'_>,
+    priors: &Priors,
+    adjusted: &Adjusted,
+) -> Vec<Option<f64>> {
+    let count = flight.cameras.len();
+    compared(flight, priors, &adjusted.state).unwrap_or_else(|| vec![None; count])
+}
+
+fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<Option<f64>>> {
+    let middle_s = middle(flight, state)?;
+    let half = |is_late: bool| -> Vec<CameraLabels> {
+        let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+            let is_in = |label: &&Label| (state.time_s(label) >= middle_s) == is_late;
+            let labels = camera.labels.iter().filter(is_in).copied().collect();
+            CameraLabels { labels, ..camera.clone() }
+        };
+        flight.cameras.iter().zip(&state.cameras).map(of_camera).collect()
+    };
+    let halves = [half(false), half(true)];
+    let [first, second] = [0, 1].map(|k| {
+        let flight = Flight { cameras: &halves[k], log: flight.log };
+        adjustment::adjust(&flight, priors, state.clone(), NEARLY_SETTLED)
+    });
+    let (first, second) = (first?, second?);
+    let saw_both =
+        |index: usize| halves.iter().all(|cameras| cameras[index].labels.len() >= LEAST_LABELS);
+    let shown: Vec<usize> = (0..state.cameras.len()).filter(|&index| saw_both(index)).collect();
+    let apart = Apart::of(state, [&first, &second], &shown)?;
+    let mut ratios = vec![None; state.cameras.len()];
+    for (start, &index) in apart.starts.iter().zip(&shown) {
+        ratios[index] = apart.ratio(flight, state, index, *start);
+    }
+    Some(ratios)
+}
+
+/// The time before which half of all labels are.
+fn middle(flight: &Flight<'_>, state: &State) -> Option<f64> {
+    let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+        camera.labels.iter().map(|label| state.time_s(label)).collect::<Vec<_>>()
+    };
+    let mut times: Vec<f64> =
+        flight.cameras.iter().zip(&state.cameras).flat_map(of_camera).collect();
+    times.sort_unstable_by(f64::total_cmp);
+    times.get(times.len() / 2).copied()
+}
+
+/// By what the cameras' own unknowns differ between the halves beside the datum, and what they
+/// should.
+struct Apart {
+    difference: DVector<f64>,
+    covariance: DMatrix<f64>,
+    /// Where each camera's begin.
+    starts: Vec<usize>,
+}
+
+impl Apart {
+    fn of(state: &State, halves: [&Adjusted; 2], shown: &[usize]) -> Option<Self> {
+        let (first, all) = (state.order().chain(), state.starts());
+        let own = |index: &usize| all[*index] - first..all[*index + 1] - first;
+        let rows: Vec<usize> = shown.iter().flat_map(own).collect();
+        let mut starts = Vec::new();
+        let mut next = 0;
+        for index in shown {
+            starts.push(next);
+            next += own(index).len();
+        }
+        let [a, b] =
+            halves.map(|half| half.covariance.others().select_rows(&rows).select_columns(&rows));
+        let covariance = a + b;
+        let pairs =
+            shown.iter().map(|&k| (&halves[0].state.cameras[k], &halves[1].state.cameras[k]));
+        let difference: Vec<f64> = pairs.flat_map(|(a, b)| step_between(a, b)).collect();
+        let difference = DVector::from_vec(difference);
+        // The log lies elsewhere in either half: what all cameras have in common is its.
+        let follows = Datum::followers(state).1.select_rows(&rows);
+        let weighed = covariance.clone().cholesky()?.solve(&follows);
+        let datum = super::datum::inverse_of_what_is_shown(&follows.tr_mul(&weighed));
+        let common = &datum * weighed.tr_mul(&difference);
+        Some(Self {
+            difference: difference - &follows * common,
+            covariance: covariance - &follows * datum * follows.transpose(),
+            starts,
+        })
+    }
+
+    fn ratio(&self, flight: &Flight<'_>, state: &State, index: usize, start: usize) -> Option<f64> {
+        let camera = &state.cameras[index];
+        let own = camera.own();
+        let difference = self.difference.rows(start, own);
+        let covariance = self.covariance.view((start, start), (own, own));
+        let (mut found, mut stated) = (0.0, 0.0);
+        for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
+            let weights = state.way.weights(camera.time_s(label));
+            let place = weights.map(|weights| state.way.place(&weights));
+            let Some(by_own) = place.and_then(|place| in_image(camera, label, place)) else {
+                continue;
+            };
+            found += (&by_own * difference).norm_squared();
+            stated += (&by_own * covariance * by_own.transpose()).trace();
+        }
+        (stated > 0.0).then(|| (found / stated).sqrt())
+    }
+}
+
+/// How a place at rest moves in the image with what is unknown of a camera.
+fn in_image(camera: &CameraState, label: &Label, place: Point3<f64>) -> Option<Matrix2xX<f64>> {
+    let by_own: [_; MOST_OWN] = camera.see(label, place, Vector3::zeros())?.by_own;
+    Some(Matrix2xX::from_columns(&by_own[..camera.own()]))
+}
+
+/// The step in a camera's own unknowns that leads from one state to another.
+fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
+    let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
+    let mut step: Vec<f64> = turn.scaled_axis().iter().copied().collect();
+    step.extend((to.centre - from.centre).iter());
+    let (a, b) = (&from.clock, &to.clock);
+    step.extend([b.offset_s - a.offset_s, b.rate - a.rate, b.readout_s - a.readout_s]);
+    debug_assert_eq!(step.len(), POSE_AND_CLOCK);
+    let lenses = lens::values(&from.intrinsics).into_iter().zip(lens::values(&to.intrinsics));
+    step.extend(lenses.map(|(from, to)| to - from));
+    step
+}
