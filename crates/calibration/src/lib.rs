@@ -22,8 +22,8 @@ mod lens;
 mod site_file;
 
 pub use flight::{
-    CameraLabels, CameraResult, ClockKnot, ClockResult, Datum, FlightError, FlightLog,
-    FlightResult, Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, calibrate_flight,
+    CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
+    Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, calibrate_flight,
 };
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
 pub use lens::LensUncertainty;

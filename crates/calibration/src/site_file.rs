@@ -3,8 +3,8 @@
 use crossfix_geometry::{
     Bearing, Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pixel, PixelCovariance, Pose,
 };
-use crossfix_message::{CameraCalibration, CameraName, LastingNoise, Timestamp};
-use nalgebra::{DMatrix, Matrix3, Matrix6, Point3};
+use crossfix_message::{CameraCalibration, CameraName, Datum, LastingNoise, Timestamp};
+use nalgebra::{DMatrix, Matrix3, Matrix6, Point3, SMatrix};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -53,6 +53,9 @@ pub enum SiteFileError {
         #[source]
         source: GeometryError,
     },
+    /// A datum that cannot be.
+    #[error("`datum` is impossible")]
+    Datum,
     /// A covariance, a clock or a deviation that cannot be.
     #[error("camera `{camera}`: `{key}` is impossible")]
     Number {
@@ -77,6 +80,7 @@ pub enum SiteFileError {
 #[derive(Clone, Debug)]
 pub struct SiteCalibration {
     cameras: Vec<CalibratedCamera>,
+    datum: Option<Datum>,
 }
 
 /// One camera of it.
@@ -122,8 +126,18 @@ pub struct ClockCorrection {
 #[serde(deny_unknown_fields)]
 struct File {
     form: u32,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    datum: Option<FileDatum>,
     #[serde(rename = "camera")]
     cameras: Vec<FileCamera>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileDatum {
+    middle_m: [f64; 3],
+    time_s: f64,
+    covariance: [[f64; Datum::WAYS]; Datum::WAYS],
 }
 
 #[derive(Serialize, Deserialize)]
@@ -180,18 +194,32 @@ impl SiteCalibration {
             return Err(SiteFileError::Form(file.form));
         }
         let cameras = file.cameras.into_iter().map(FileCamera::parse).collect::<Result<_, _>>()?;
-        Ok(Self { cameras })
+        let datum =
+            file.datum.map(|datum| datum.parse().ok_or(SiteFileError::Datum)).transpose()?;
+        Ok(Self { cameras, datum })
     }
 
     /// The file's text, without its first lines that say where it is from.
     pub fn to_toml(&self) -> String {
         let cameras = self.cameras.iter().map(FileCamera::of).collect();
-        toml::to_string(&File { form: FORM, cameras }).unwrap_or_default()
+        let datum = self.datum.as_ref().map(FileDatum::of);
+        toml::to_string(&File { form: FORM, datum, cameras }).unwrap_or_default()
     }
 
     /// The cameras, as the file has them.
     pub fn cameras(&self) -> &[CalibratedCamera] {
         &self.cameras
+    }
+
+    /// What the site may be off by as a whole, if the file says so.
+    pub fn datum(&self) -> Option<&Datum> {
+        self.datum.as_ref()
+    }
+
+    /// What the cameras' channel says of a camera of the file.
+    pub fn message(&self, camera: &CalibratedCamera, valid_from: Timestamp) -> CameraCalibration {
+        let message = camera.message(valid_from);
+        self.datum.iter().fold(message, CameraCalibration::with_datum)
     }
 
     /// The camera of this name.
@@ -202,7 +230,8 @@ impl SiteCalibration {
 
 impl From<&FlightResult> for SiteCalibration {
     fn from(result: &FlightResult) -> Self {
-        Self { cameras: result.cameras.iter().map(CalibratedCamera::from).collect() }
+        let cameras = result.cameras.iter().map(CalibratedCamera::from).collect();
+        Self { cameras, datum: Some(result.datum.clone()) }
     }
 }
 
@@ -231,8 +260,8 @@ impl From<&CameraResult> for CalibratedCamera {
 }
 
 impl CalibratedCamera {
-    /// What the cameras' channel says of it.
-    pub fn message(&self, valid_from: Timestamp) -> CameraCalibration {
+    /// What the cameras' channel says of it alone.
+    fn message(&self, valid_from: Timestamp) -> CameraCalibration {
         CameraCalibration::new(&self.name, &self.camera, valid_from)
             .with_pose_covariance(&self.pose_covariance)
             .with_lasting_errors(self.lasting_noise(), self.clock.wander_s)
@@ -305,6 +334,26 @@ impl ClockCorrection {
             && self.rate_sd >= 0.0
             && self.wander_s >= 0.0
             && self.readout_s.abs() < 1.0
+    }
+}
+
+impl FileDatum {
+    fn of(datum: &Datum) -> Self {
+        Self {
+            middle_m: datum.middle.coords.into(),
+            time_s: datum.time.seconds(),
+            covariance: datum.covariance.into(),
+        }
+    }
+
+    fn parse(self) -> Option<Datum> {
+        let is_time = self.time_s.abs() < 1e12;
+        let datum = Datum {
+            middle: Point3::from(self.middle_m),
+            time: Timestamp::EPOCH.plus_seconds(if is_time { self.time_s } else { 0.0 }),
+            covariance: SMatrix::from(self.covariance),
+        };
+        (is_time && datum.is_possible()).then_some(datum)
     }
 }
 

@@ -42,7 +42,7 @@ impl Recalibration {
         let (data_time, data) = match &entry.key.channel {
             Channel::Calibration(name) => {
                 let camera = self.site.camera(name)?;
-                (Timestamp::EPOCH, camera.message(Timestamp::EPOCH).encode())
+                (Timestamp::EPOCH, self.site.message(camera, Timestamp::EPOCH).encode())
             }
             Channel::Bearings(name) => {
                 let mut frame: BearingFrame = decode(&entry.data).ok()?;

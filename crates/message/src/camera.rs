@@ -5,7 +5,7 @@ use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::{
-    CameraCalibration, CameraName, DistortionModel, NameError, Payload, Timestamp, Vector3,
+    CameraCalibration, CameraName, Datum, DistortionModel, NameError, Payload, Timestamp, Vector3,
 };
 
 /// A [`CameraCalibration`] that has been read and found possible.
@@ -22,6 +22,8 @@ pub struct Calibration {
     pub lasting_noise: Option<LastingNoise>,
     /// What its clock wanders by, s after one second.
     pub clock_wander_s: f64,
+    /// What the whole site may be off by, beside the pose's covariance.
+    pub datum: Option<Datum>,
     /// It holds from this time on.
     pub valid_from: Timestamp,
 }
@@ -148,6 +150,8 @@ impl CameraCalibration {
         if !(0.0..1.0).contains(&self.clock_wander_s) {
             return Err(shape("clock_wander_s"));
         }
+        let datum = self.datum.as_ref().map(|datum| datum.parse().ok_or_else(|| shape("datum")));
+        let datum = datum.transpose()?;
         let lasts = noise.sd_rad > 0.0 && noise.time_s > 0.0;
         Ok(Calibration {
             name,
@@ -155,6 +159,7 @@ impl CameraCalibration {
             pose_covariance,
             lasting_noise: lasts.then_some(noise),
             clock_wander_s: self.clock_wander_s,
+            datum,
             valid_from,
         })
     }
@@ -199,6 +204,14 @@ impl CameraCalibration {
     pub fn with_lasting_errors(mut self, noise: LastingNoise, clock_wander_s: f64) -> Self {
         (self.lasting_noise_rad, self.lasting_noise_s) = (noise.sd_rad, noise.time_s);
         self.clock_wander_s = clock_wander_s;
+        self.hash = self.content_hash();
+        self
+    }
+
+    /// The same calibration of a site that may be off as a whole.
+    #[must_use]
+    pub fn with_datum(mut self, datum: &Datum) -> Self {
+        self.datum = Some(datum.into());
         self.hash = self.content_hash();
         self
     }

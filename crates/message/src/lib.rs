@@ -16,6 +16,7 @@
 //! ```
 
 mod camera;
+mod datum;
 mod glance;
 mod key;
 mod name;
@@ -25,6 +26,7 @@ mod time;
 mod track;
 
 pub use camera::{Calibration, CalibrationError, LastingNoise};
+pub use datum::Datum;
 pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};
 pub use name::{CameraName, NameError, SiteName};

@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Rotation3, Vector3};
 
 use super::LEAST_LABELS;
 use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
-use super::datum::Datum;
+use super::datum::Followers;
 use super::model::{CameraLabels, CameraState, Label, MOST_OWN, POSE_AND_CLOCK};
 use crate::lens;
 
@@ -92,13 +92,11 @@ impl Apart {
         let difference: Vec<f64> = pairs.flat_map(|(a, b)| step_between(a, b)).collect();
         let difference = DVector::from_vec(difference);
         // The log lies elsewhere in either half: what all cameras have in common is its.
-        let follows = Datum::followers(state).1.select_rows(&rows);
-        let weighed = covariance.clone().cholesky()?.solve(&follows);
-        let datum = super::datum::inverse_of_what_is_shown(&follows.tr_mul(&weighed));
-        let common = &datum * weighed.tr_mul(&difference);
+        let followers = Followers::of(state).rows(&rows);
+        let datum = followers.shown(&covariance.clone().cholesky()?.inverse());
         Some(Self {
-            difference: difference - &follows * common,
-            covariance: covariance - &follows * datum * follows.transpose(),
+            difference: followers.without_datum(&datum, &difference),
+            covariance: covariance - datum.of_cameras(),
             starts,
         })
     }

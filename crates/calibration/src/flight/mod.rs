@@ -24,7 +24,6 @@ use model::CameraState;
 use results::results;
 use spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
 
-pub use datum::Datum;
 pub use model::{CameraLabels, FlightLog, Label, LogErrors, LogSample};
 pub use noise::LabelNoise;
 pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult};

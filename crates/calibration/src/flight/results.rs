@@ -1,11 +1,11 @@
 //! What an adjusted flight has shown, with how sure that is.
 
 use crossfix_geometry::{Camera, Intrinsics, Pose};
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Datum};
 use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
 
 use super::adjustment::{self, Adjusted, Flight, Priors, State};
-use super::datum::Datum;
+use super::datum::Followers;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::noise::LabelNoise;
 use super::{Refusal, halves, residuals};
@@ -95,9 +95,9 @@ pub(super) fn results(
     priors: &Priors,
 ) -> Option<FlightResult> {
     let ratios = halves::ratios(flight, priors, &adjusted);
-    let (datum, follows) = Datum::of(&adjusted.state, &adjusted.covariance);
-    adjusted.covariance.take_off(&datum.of_cameras(&follows));
-    tracing::debug!("ratios {ratios:?} datum {:?}", datum.sd());
+    let followers = Followers::of(&adjusted.state);
+    let shown = followers.shown(adjusted.covariance.information());
+    adjusted.covariance.take_off(shown.of_cameras());
     let known: Vec<f64> = ratios.iter().copied().flatten().collect();
     let typical = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let state = &adjusted.state;
@@ -136,7 +136,7 @@ pub(super) fn results(
     }
     Some(FlightResult {
         cameras,
-        datum,
+        datum: followers.datum(&shown),
         refused: Vec::new(),
         jerk: priors.jerk,
         log_residual_m: log_residual(flight.log, state),

@@ -2,11 +2,15 @@ use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 use crossfix_evaluation::{
-    Delays, Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory, TrueTarget,
+    Delays, Estimate, Evaluator, Latency, LatencyRecorder, Report, Sightings, TrackHistory,
+    TrueTarget,
 };
-use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, TruthFrame};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, Datum, Timestamp, TrackFrame, TruthFrame,
+};
 use serde::Serialize;
 
+use super::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
 
@@ -36,6 +40,9 @@ pub struct Question {
     /// Leave out what lies less than this after the first truth, seconds.
     #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
     pub skip_s: f64,
+    /// Standard deviation of the truth's places, metres per axis: what it may be off by itself.
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::not_negative)]
+    pub truth_sd: f64,
     /// Only the instants at which so many cameras saw something: in the frame just before and in
     /// that just after.
     #[arg(long, default_value_t = 0, value_name = "N")]
@@ -44,7 +51,7 @@ pub struct Question {
 
 impl Default for Question {
     fn default() -> Self {
-        Self { truth: None, cutoff_m: 5.0, skip_s: 0.0, min_cameras: 0 }
+        Self { truth: None, cutoff_m: 5.0, skip_s: 0.0, truth_sd: 0.0, min_cameras: 0 }
     }
 }
 
@@ -68,13 +75,35 @@ struct Run {
     track_frames: u64,
     sightings: Sightings,
     latency: LatencyRecorder,
+    /// What the site may be off by as a whole.
+    datum: Option<Datum>,
 }
 
 impl Run {
+    /// The tracks at a time. The truth is from elsewhere: what it is off by, and what the site is off
+    /// by as a whole, is between the two.
+    fn estimates(&self, time: Timestamp, truth_sd_m: f64) -> Vec<Estimate> {
+        let mut estimates = self.tracks.at(time);
+        for Estimate { state, .. } in &mut estimates {
+            for axis in 0..3 {
+                state.covariance[(axis, axis)] += truth_sd_m * truth_sd_m;
+            }
+            if let Some(datum) = &self.datum {
+                state.covariance += datum.of_state(&state.position(), &state.velocity(), time);
+            }
+        }
+        estimates
+    }
+
     fn read(&mut self, path: &Path) -> anyhow::Result<Lacks> {
         let mut lacks = Lacks::default();
         recorded::for_each(path, &mut lacks, |lacks, entry| {
             match entry.key.channel {
+                Channel::Calibration(_) => {
+                    let message = lacks.read::<CameraCalibration>(&entry.data);
+                    let datum = message.and_then(|message| message.datum?.parse());
+                    self.datum = self.datum.take().or(datum);
+                }
                 Channel::Truth => self.truth.extend(lacks.read::<TruthFrame>(&entry.data)),
                 Channel::Tracks => {
                     if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
@@ -135,7 +164,7 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
         run.truth.iter().zip(&times).zip(run.sightings.cameras_at(&times))
     {
         if time >= start && cameras >= question.min_cameras {
-            evaluator.add(time, &targets(frame), &run.tracks.at(time));
+            evaluator.add(time, &targets(frame), &run.estimates(time, question.truth_sd));
         }
     }
     // Imported data arrive when they are made: there is no latency to speak of.

@@ -153,6 +153,26 @@ pub struct CameraCalibration {
     /// of the time. 0: an ordinary quartz.
     #[prost(double, tag = "18")]
     pub clock_wander_s: f64,
+    /// What the whole site may be off by, the same for all its cameras: the pose's covariance is beside it. Absent:
+    /// not known, or part of the pose's.
+    #[prost(message, optional, tag = "19")]
+    pub datum: ::core::option::Option<SiteDatum>,
+}
+/// What all that a site says of places and times may be off by, alike.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SiteDatum {
+    /// What the site turns and grows about, local ENU, metres.
+    #[prost(message, optional, tag = "1")]
+    pub middle: ::core::option::Option<Vector3>,
+    /// The time at which its clocks are late together and from which they go slow.
+    #[prost(sfixed64, tag = "2")]
+    pub time_ns: i64,
+    /// Covariance of shift (m, 3), turn (rad, 3), growth (a ratio), lateness (s) and slowness (a ratio), 9x9 row by row:
+    /// what is true less what is said.
+    #[prost(double, repeated, tag = "3")]
+    pub covariance: ::prost::alloc::vec::Vec<f64>,
 }
 /// What one camera contributed to a track's newest update, and how well it fitted.
 #[derive(serde::Serialize, serde::Deserialize)]

@@ -1,0 +1,102 @@
+use nalgebra::{Matrix3, Matrix6, Point3, SMatrix, Vector3 as Vector};
+
+use crate::{SiteDatum, Timestamp};
+
+/// What a whole site may be off by: all that it says of places and times, alike.
+///
+/// Tracks of one site do not feel it and do not hold it. Whoever compares them with places from
+/// elsewhere adds it.
+///
+/// ```
+/// use crossfix_message::{Datum, Timestamp};
+/// use nalgebra::{Point3, SMatrix, Vector3};
+///
+/// // The log that the site was calibrated by may lie 2 m beside, and is level to 10 mrad.
+/// let sd: [f64; 9] = [2.0, 2.0, 2.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.0];
+/// let covariance = SMatrix::from_diagonal(&sd.map(|sd| sd * sd).into());
+/// let datum = Datum { middle: Point3::origin(), time: Timestamp::EPOCH, covariance };
+/// let of_state = datum.of_state(&Point3::new(300.0, 0.0, 0.0), &Vector3::zeros(), Timestamp::EPOCH);
+/// assert!((of_state[(0, 0)].sqrt() - 2.0).abs() < 1e-9);
+/// assert!((of_state[(2, 2)].sqrt() - 2.0_f64.hypot(300.0 * 0.01)).abs() < 1e-9);
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Datum {
+    /// What the site turns and grows about, local ENU, m.
+    pub middle: Point3<f64>,
+    /// The time at which its clocks are late together and from which they go slow.
+    pub time: Timestamp,
+    /// Covariance of shift (m, 3), turn (rad, 3), growth (a ratio), lateness (s) and slowness (a
+    /// ratio): what is true less what is said.
+    pub covariance: SMatrix<f64, { Datum::WAYS }, { Datum::WAYS }>,
+}
+
+impl Datum {
+    /// Ways in which a site may be off as a whole.
+    pub const WAYS: usize = 9;
+    /// Where the turn begins among them, ...
+    pub const TURN: usize = 3;
+    /// ... and where growth, lateness and slowness are.
+    pub const GROWTH: usize = 6;
+    /// The clocks' common offset.
+    pub const LATE: usize = 7;
+    /// The clocks' common rate.
+    pub const SLOW: usize = 8;
+
+    /// Standard deviations, in the covariance's order.
+    pub fn sd(&self) -> [f64; Self::WAYS] {
+        std::array::from_fn(|way| self.covariance[(way, way)].max(0.0).sqrt())
+    }
+
+    /// Covariance of the position (m) and velocity (m/s) of a target that is at a place at a time.
+    pub fn of_state(
+        &self,
+        position: &Point3<f64>,
+        velocity: &Vector<f64>,
+        time: Timestamp,
+    ) -> Matrix6<f64> {
+        let arm = position - self.middle;
+        let mut by_datum = SMatrix::<f64, 6, { Self::WAYS }>::zeros();
+        by_datum.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+        by_datum.fixed_view_mut::<3, 3>(0, Self::TURN).copy_from(&-arm.cross_matrix());
+        by_datum.fixed_view_mut::<3, 1>(0, Self::GROWTH).copy_from(&arm);
+        by_datum.fixed_view_mut::<3, 1>(0, Self::LATE).copy_from(&-velocity);
+        let slow = -velocity * time.seconds_since(self.time);
+        by_datum.fixed_view_mut::<3, 1>(0, Self::SLOW).copy_from(&slow);
+        by_datum.fixed_view_mut::<3, 3>(3, Self::TURN).copy_from(&-velocity.cross_matrix());
+        by_datum.fixed_view_mut::<3, 1>(3, Self::GROWTH).copy_from(velocity);
+        by_datum.fixed_view_mut::<3, 1>(3, Self::SLOW).copy_from(&-velocity);
+        by_datum * self.covariance * by_datum.transpose()
+    }
+
+    /// Whether its numbers can be.
+    pub fn is_possible(&self) -> bool {
+        let size = self.covariance.amax();
+        self.middle.iter().chain(&self.covariance).all(|value| value.is_finite())
+            && (self.covariance - self.covariance.transpose()).amax() <= 1e-9 * size
+            && self.covariance.symmetric_eigenvalues().min() >= -1e-9 * size
+    }
+}
+
+impl From<&Datum> for SiteDatum {
+    fn from(datum: &Datum) -> Self {
+        Self {
+            middle: Some(datum.middle.into()),
+            time_ns: datum.time.nanos(),
+            // It is symmetric: rows are columns.
+            covariance: datum.covariance.as_slice().to_vec(),
+        }
+    }
+}
+
+impl SiteDatum {
+    /// Reads the message; `None` where it describes no datum.
+    pub fn parse(&self) -> Option<Datum> {
+        let is_whole = self.covariance.len() == Datum::WAYS * Datum::WAYS;
+        let datum = Datum {
+            middle: self.middle?.into(),
+            time: Timestamp::from_nanos(self.time_ns),
+            covariance: is_whole.then(|| SMatrix::from_row_slice(&self.covariance))?,
+        };
+        datum.is_possible().then_some(datum)
+    }
+}
