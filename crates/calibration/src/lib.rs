@@ -23,7 +23,8 @@ mod site_file;
 
 pub use flight::{
     CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
-    Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, calibrate_flight,
+    Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, Survey, SurveyedPlace, TapedDistance,
+    calibrate_flight,
 };
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
 pub use lens::LensUncertainty;

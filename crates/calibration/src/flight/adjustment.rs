@@ -4,7 +4,10 @@
 use crossfix_geometry::Intrinsics;
 use nalgebra::{Vector2, Vector3};
 
-use super::model::{CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen};
+use super::gauge::Gauge;
+use super::model::{
+    CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen, Survey,
+};
 use super::noise::{LabelNoise, Tails, Whitening};
 use super::normal::{Covariance, NormalEquations, Solution, Term};
 use super::spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
@@ -20,6 +23,9 @@ const OF_A_PAIR: usize = 3 * (SPAN + 1);
 const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
+/// A step of the adjustment moves the way by this where nothing else holds it, m: wide against what
+/// labels tell, and near enough for ten minutes without any.
+const REST_M: f64 = 1e3;
 /// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
 /// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
 /// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by
@@ -29,11 +35,6 @@ pub(super) const RATE_SD: f64 = 1e-4;
 /// the deviation above a phone's clock is 80 ms beside what it is said to be to 9 ms, after a minute
 /// and a half.
 const RATE_KNOWN_BY: f64 = 1e-3;
-/// Beside cameras the jerk may have so many times the power that was found. The likeliest way is
-/// smoother than the way is, and a scene that is drawn together as a whole has less jerk and the
-/// same labels: with a log of metres it shrank by 4 % at once the power, by 0.4 % at ten times and by
-/// 0.2 % at a hundred.
-const WIDER: f64 = 10.0;
 /// A sensor is read out in between nothing and a frame's time: so much of it, and give or take.
 const READOUT_SHARE: f64 = 0.5;
 
@@ -67,15 +68,15 @@ pub(super) struct CameraPriors {
 pub(super) struct State {
     pub(super) way: Spline,
     pub(super) cameras: Vec<CameraState>,
-    /// The log's bias, an axis each.
-    pub(super) bias: [Knots; 3],
+    /// The log's bias, an axis each; empty without a log.
+    pub(super) bias: Vec<Knots>,
 }
 
 /// A residual that is one by its deviation, and what it hangs on.
-type Row = (Vec<Term>, f64);
+pub(super) type Row = (Vec<Term>, f64);
 
 /// Takes rows in that have their tails in common.
-trait Sink {
+pub(super) trait Sink {
     fn take(&mut self, rows: &[Row], tails: Tails);
 }
 
@@ -104,13 +105,22 @@ impl Sink for Cost {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Flight<'a> {
     pub(super) cameras: &'a [CameraLabels],
-    pub(super) log: &'a FlightLog,
+    pub(super) log: Option<&'a FlightLog>,
+    pub(super) survey: &'a Survey,
+}
+
+/// All that the unknowns are held against.
+#[derive(Clone, Copy)]
+struct Model<'a> {
+    flight: Flight<'a>,
+    priors: &'a Priors,
+    gauge: Option<&'a Gauge>,
 }
 
 impl State {
     /// In what order its unknowns stand.
     pub(super) fn order(&self) -> Order {
-        Order::of(&self.way, self.cameras.len())
+        Order::of(&self.way, self.cameras.len(), self.bias.len())
     }
 
     /// Where each camera's own unknowns begin, and at last where they end.
@@ -162,22 +172,83 @@ impl State {
         Some((weights.first, weights.place, seen))
     }
 
-    fn all(&self, flight: &Flight<'_>, priors: &Priors, sink: &mut impl Sink) {
-        self.way_rows(priors, sink);
-        self.log_rows(flight.log, sink);
+    fn all(&self, model: &Model<'_>, sink: &mut impl Sink) {
+        let Model { flight, priors, gauge } = model;
+        self.jerk_rows(priors, sink);
+        self.rest_rows(sink);
+        match flight.log {
+            Some(log) => self.log_rows(log, sink),
+            None => self.level_rows(flight, sink),
+        }
+        if let Some(gauge) = gauge {
+            gauge.rows(self, sink);
+        }
+        self.distance_rows(flight, sink);
         let starts = self.starts();
         for (index, camera) in flight.cameras.iter().enumerate() {
             self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);
             self.prior_rows(index, starts[index], &priors.cameras[index], sink);
+            self.place_rows(starts[index], index, flight, sink);
             self.rate_row(index, starts[index], priors.rate_sd, sink);
+        }
+    }
+
+    /// The pull of the jerk's prior on the way's size: by how much its cost falls as the way is drawn
+    /// together by one e-th.
+    ///
+    /// A scene that is drawn together as a whole has the same labels and less jerk, and so has one that
+    /// goes slower: the likeliest way and site are smaller and later than they are, by percents where
+    /// little else tells. The power of the jerk is found from the way, which is as large as the site is
+    /// and as quick as its clocks: it says nothing of either, and its pull on both is taken off.
+    fn pull(&self, priors: &Priors) -> f64 {
+        // One camera alone shows no size.
+        if self.cameras.len() < 2 {
+            return 0.0;
+        }
+        let mut cost = Cost(0.0);
+        self.jerk_rows(priors, &mut cost);
+        cost.0
+    }
+
+    /// The square of the site's size: of its cameras about their middle, m^2.
+    fn size2(&self) -> f64 {
+        let middle = self.middle();
+        self.cameras.iter().map(|camera| (camera.centre.coords - middle).norm_squared()).sum()
+    }
+
+    fn middle(&self) -> Vector3<f64> {
+        let centres = self.cameras.iter().map(|camera| camera.centre.coords);
+        centres.sum::<Vector3<f64>>() / self.cameras.len() as f64
+    }
+
+    /// What takes a pull off. The jerk's cost goes with the square of the size and with the fifth power
+    /// of the pace.
+    fn lean(&self, pull: f64) -> f64 {
+        if pull <= 0.0 {
+            return 0.0;
+        }
+        let rates = self.cameras.iter().map(|camera| camera.clock.rate).sum::<f64>();
+        pull * (5.0 * rates / self.cameras.len() as f64 - self.size2().ln())
+    }
+
+    /// Its gradient.
+    fn lean_against(&self, pull: f64, linear: &mut NormalEquations) {
+        if pull <= 0.0 {
+            return;
+        }
+        let middle = self.middle();
+        let by_size2 = pull / self.size2();
+        for (camera, start) in self.cameras.iter().zip(self.starts()) {
+            let arm = camera.centre.coords - middle;
+            (0..3).for_each(|axis| linear.push(start + 3 + axis, by_size2 * arm[axis]));
+            linear.push(start + CLOCK + 1, -2.5 * pull / self.cameras.len() as f64);
         }
     }
 
     /// White jerk: over an interval its mean has the variance power / interval, so that the third
     /// difference has power x interval^5.
-    fn way_rows(&self, priors: &Priors, sink: &mut impl Sink) {
-        let width = if self.cameras.is_empty() { 1.0 } else { WIDER };
-        let scale = (width * priors.jerk * KNOT_S.powi(5)).sqrt().recip();
+    fn jerk_rows(&self, priors: &Priors, sink: &mut impl Sink) {
+        let scale = (priors.jerk * KNOT_S.powi(5)).sqrt().recip();
         let order = self.order();
         for first in 0..self.way.intervals() {
             let difference = self.way.third_difference(first);
@@ -187,11 +258,15 @@ impl State {
                 sink.take(&[(terms, difference[axis] * scale)], Tails::Normal);
             }
         }
-        // Where nothing holds the way, the origin does, from very far.
-        for (k, coefficient) in self.way.coefficients.iter().enumerate() {
+    }
+
+    /// Where nothing holds the way it stays about where it is: in a gap of minutes white jerk alone
+    /// leaves it to rounding.
+    fn rest_rows(&self, sink: &mut impl Sink) {
+        let order = self.order();
+        for k in 0..self.way.coefficients.len() {
             for axis in 0..3 {
-                let term = (order.way(k, axis), 1.0 / WIDE_M);
-                sink.take(&[(vec![term], coefficient[axis] / WIDE_M)], Tails::Normal);
+                sink.take(&[(vec![(order.way(k, axis), 1.0 / REST_M)], 0.0)], Tails::Normal);
             }
         }
     }
@@ -397,20 +472,26 @@ pub(super) fn adjust(
     start: State,
     settled: f64,
 ) -> Option<Adjusted> {
-    let cost_of = |state: &State| {
+    let gauge = flight.log.is_none().then(|| Gauge::of(&start));
+    let model = Model { flight: *flight, priors, gauge: gauge.as_ref() };
+    let cost_of = |state: &State, pull: f64| {
         let mut cost = Cost(0.0);
-        state.all(flight, priors, &mut cost);
-        cost.0
+        state.all(&model, &mut cost);
+        cost.0 + state.lean(pull)
     };
     let (mut state, mut damping) = (start, FIRST_DAMPING);
-    let mut cost = cost_of(&state);
+    let mut cost = 0.0;
     for _ in 0..MOST_STEPS {
-        let linear = linearised(flight, priors, &state);
+        // A rough start pulls more than what it becomes.
+        let pull = state.pull(priors);
+        cost = cost_of(&state, pull);
+        let mut linear = linearised(&model, &state);
+        state.lean_against(pull, &mut linear);
         let before = cost;
         while damping < MOST_DAMPING {
             let Solution { step, .. } = linear.clone().solve(damping)?;
             let next = state.moved(step.as_slice());
-            let next_cost = cost_of(&next);
+            let next_cost = cost_of(&next, pull);
             if next_cost < cost {
                 (state, cost) = (next, next_cost);
                 damping /= DAMPING_STEP;
@@ -424,7 +505,7 @@ pub(super) fn adjust(
     }
     tracing::debug!("cost {cost:.2}");
     let known = Priors { rate_sd: RATE_KNOWN_BY, ..priors.clone() };
-    let solution = linearised(flight, &known, &state).solve(0.0)?;
+    let solution = linearised(&Model { priors: &known, ..model }, &state).solve(0.0)?;
     Some(Adjusted { state, covariance: solution.covariance()?, cost })
 }
 
@@ -435,10 +516,10 @@ const DAMPING_STEP: f64 = 10.0;
 /// ... and by this at most.
 const MOST_DAMPING: f64 = 1e3;
 
-fn linearised(flight: &Flight<'_>, priors: &Priors, state: &State) -> NormalEquations {
+fn linearised(model: &Model<'_>, state: &State) -> NormalEquations {
     let order = state.order();
     let mut linear = Linear(NormalEquations::new(order.chain(), order.band(), state.others()));
-    state.all(flight, priors, &mut linear);
+    state.all(model, &mut linear);
     linear.0
 }
 

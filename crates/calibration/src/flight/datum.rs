@@ -9,6 +9,9 @@ use nalgebra::{DMatrix, DVector, Point3, SMatrix, Vector3};
 use super::adjustment::State;
 use super::model::{CLOCK, CameraState};
 
+/// Without a log the common time is a camera's, whose clock may show anything, s.
+const UNKNOWN_S: f64 = 1e3;
+
 /// How the cameras of a site follow its datum.
 pub(super) struct Followers {
     middle: Point3<f64>,
@@ -21,9 +24,9 @@ pub(super) struct Followers {
 pub(super) struct Shown {
     /// The ways in which they are off alike, from what they are off by.
     gain: DMatrix<f64>,
-    /// Covariance of the datum, ...
-    covariance: DMatrix<f64>,
-    /// ... and the part of the cameras' own that is the datum's.
+    /// Information on the datum, ...
+    information: DMatrix<f64>,
+    /// ... and the part of the covariance of the cameras' own unknowns that is the datum's.
     of_cameras: DMatrix<f64>,
 }
 
@@ -65,10 +68,11 @@ impl Followers {
     /// information. Good cameras count for more in it than poor ones.
     pub(super) fn shown(&self, information: &DMatrix<f64>) -> Shown {
         let weighed = information * &self.by_datum;
-        let covariance = inverse_of_what_is_shown(&self.by_datum.tr_mul(&weighed));
+        let on_datum = self.by_datum.tr_mul(&weighed);
+        let covariance = inverse_of_what_is_shown(&on_datum);
         let gain = &covariance * weighed.transpose();
         let of_cameras = &self.by_datum * &covariance * self.by_datum.transpose();
-        Shown { gain, covariance, of_cameras }
+        Shown { gain, information: on_datum, of_cameras }
     }
 
     /// What is left of the cameras' differences when the datum's part is off.
@@ -76,17 +80,34 @@ impl Followers {
         differences - &self.by_datum * (&shown.gain * differences)
     }
 
-    /// The datum as the site has it.
-    pub(super) fn datum(&self, shown: &Shown) -> Datum {
+    /// The datum as the site has it, where so much of the information on it is nobody's.
+    pub(super) fn datum(&self, shown: &Shown, of_nobody: Option<DMatrix<f64>>) -> Datum {
+        let is_timeless = of_nobody.is_some();
+        let of_nobody = of_nobody.unwrap_or_else(|| DMatrix::zeros(Datum::WAYS, Datum::WAYS));
+        let mut covariance = inverse_of_what_is_shown(&(&shown.information - of_nobody));
+        if is_timeless {
+            // The way's knots stand at times of their own, which tells a little of nothing.
+            covariance[(Datum::LATE, Datum::LATE)] += UNKNOWN_S * UNKNOWN_S;
+        }
         Datum {
             middle: self.middle,
             time: Timestamp::EPOCH.plus_seconds(self.time_s),
-            covariance: SMatrix::from_fn(|i, j| shown.covariance[(i, j)]),
+            covariance: SMatrix::from_fn(|i, j| covariance[(i, j)]),
         }
+    }
+
+    /// Of how many unknowns.
+    pub(super) fn unknowns(&self) -> usize {
+        self.by_datum.nrows()
     }
 }
 
 impl Shown {
+    /// The ways in which cameras are off alike, from what they are off by.
+    pub(super) fn into_gain(self) -> DMatrix<f64> {
+        self.gain
+    }
+
     /// The part of the covariance of the cameras' own unknowns that is the datum's.
     pub(super) fn of_cameras(&self) -> &DMatrix<f64> {
         &self.of_cameras

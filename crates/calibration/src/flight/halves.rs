@@ -4,13 +4,12 @@
 //! model does not know, or a lens that bends otherwise than its formula, show where the same cameras
 //! are found from either half alone.
 
-use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Rotation3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Vector3};
 
 use super::LEAST_LABELS;
 use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
 use super::datum::Followers;
-use super::model::{CameraLabels, CameraState, Label, MOST_OWN, POSE_AND_CLOCK};
-use crate::lens;
+use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
 
 /// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.
 const STRIDE: usize = 20;
@@ -38,7 +37,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<O
     };
     let halves = [half(false), half(true)];
     let [first, second] = [0, 1].map(|k| {
-        let flight = Flight { cameras: &halves[k], log: flight.log };
+        let flight = Flight { cameras: &halves[k], ..*flight };
         adjustment::adjust(&flight, priors, state.clone(), NEARLY_SETTLED)
     });
     let (first, second) = (first?, second?);
@@ -124,17 +123,4 @@ impl Apart {
 fn in_image(camera: &CameraState, label: &Label, place: Point3<f64>) -> Option<Matrix2xX<f64>> {
     let by_own: [_; MOST_OWN] = camera.see(label, place, Vector3::zeros())?.by_own;
     Some(Matrix2xX::from_columns(&by_own[..camera.own()]))
-}
-
-/// The step in a camera's own unknowns that leads from one state to another.
-fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
-    let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
-    let mut step: Vec<f64> = turn.scaled_axis().iter().copied().collect();
-    step.extend((to.centre - from.centre).iter());
-    let (a, b) = (&from.clock, &to.clock);
-    step.extend([b.offset_s - a.offset_s, b.rate - a.rate, b.readout_s - a.readout_s]);
-    debug_assert_eq!(step.len(), POSE_AND_CLOCK);
-    let lenses = lens::values(&from.intrinsics).into_iter().zip(lens::values(&to.intrinsics));
-    step.extend(lenses.map(|(from, to)| to - from));
-    step
 }

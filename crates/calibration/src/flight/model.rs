@@ -55,6 +55,44 @@ pub struct LogErrors {
     pub drift_time_s: f64,
 }
 
+/// Where cameras stand, by others than their own pictures.
+#[derive(Clone, Debug, Default)]
+pub struct Survey {
+    /// Places of cameras.
+    pub places: Vec<SurveyedPlace>,
+    /// Distances between cameras.
+    pub distances: Vec<TapedDistance>,
+}
+
+/// Where a camera stands.
+#[derive(Clone, Debug)]
+pub struct SurveyedPlace {
+    /// The camera.
+    pub camera: CameraName,
+    /// Local ENU, m.
+    pub position: Point3<f64>,
+    /// Standard deviation per axis, m.
+    pub sd_m: Vector3<f64>,
+}
+
+/// How far two cameras are apart.
+#[derive(Clone, Debug)]
+pub struct TapedDistance {
+    /// The cameras.
+    pub between: [CameraName; 2],
+    /// m.
+    pub metres: f64,
+    /// Standard deviation, m.
+    pub sd_m: f64,
+}
+
+impl Survey {
+    /// The place of a camera.
+    pub fn place(&self, camera: &CameraName) -> Option<&SurveyedPlace> {
+        self.places.iter().find(|place| place.camera == *camera)
+    }
+}
+
 /// A camera's clock: `common time = straight + wander(straight)` with `straight = own + offset + rate
 /// (own - reference)`, and a row of the image is read out `read-out (row / height - 1/2)` after the
 /// frame's time.
@@ -201,4 +239,17 @@ pub(super) struct Seen {
     pub(super) by_time: Vector2<f64>,
     /// By each unknown of the camera but its wander.
     pub(super) by_own: [Vector2<f64>; MOST_OWN],
+}
+
+/// The step in a camera's own unknowns that leads from one state to another.
+pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
+    let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
+    let mut step: Vec<f64> = turn.scaled_axis().iter().copied().collect();
+    step.extend((to.centre - from.centre).iter());
+    let (a, b) = (&from.clock, &to.clock);
+    step.extend([b.offset_s - a.offset_s, b.rate - a.rate, b.readout_s - a.readout_s]);
+    debug_assert_eq!(step.len(), POSE_AND_CLOCK);
+    let lenses = lens::values(&from.intrinsics).into_iter().zip(lens::values(&to.intrinsics));
+    step.extend(lenses.map(|(from, to)| to - from));
+    step
 }

@@ -156,6 +156,11 @@ impl NormalEquations {
         }
     }
 
+    /// Pushes an unknown: a term of the cost whose derivative by it is minus twice this.
+    pub(super) fn push(&mut self, unknown: usize, by: f64) {
+        self.right[unknown] += by;
+    }
+
     /// Solves them, each diagonal element made larger by a share of itself. `None`: they have no
     /// solution, as some unknown is tied to nothing.
     pub(super) fn solve(mut self, damping: f64) -> Option<Solution> {

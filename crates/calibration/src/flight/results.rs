@@ -6,9 +6,11 @@ use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
 
 use super::adjustment::{self, Adjusted, Flight, Priors, State};
 use super::datum::Followers;
+use super::gauge::Gauge;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::noise::LabelNoise;
-use super::{Refusal, halves, residuals};
+use super::settle::residuals;
+use super::{Refusal, halves};
 use crate::lens::{self, LensUncertainty};
 
 /// What a flight has shown of one camera.
@@ -86,7 +88,7 @@ pub struct FlightResult {
     /// Power of the target's jerk, m^2/s^5.
     pub jerk: f64,
     /// Root mean square of the log's residuals per axis, m.
-    pub log_residual_m: f64,
+    pub log_residual_m: Option<f64>,
 }
 
 pub(super) fn results(
@@ -136,10 +138,10 @@ pub(super) fn results(
     }
     Some(FlightResult {
         cameras,
-        datum: followers.datum(&shown),
+        datum: followers.datum(&shown, flight.log.is_none().then(Gauge::information)),
         refused: Vec::new(),
         jerk: priors.jerk,
-        log_residual_m: log_residual(flight.log, state),
+        log_residual_m: flight.log.map(|log| log_residual(log, state)),
     })
 }
 

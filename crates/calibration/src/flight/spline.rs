@@ -96,16 +96,12 @@ impl Spline {
         terms.map(|(coefficient, weight)| coefficient * *weight).sum()
     }
 
-    /// Takes another's way where both are, and stays where that one begins and ends.
-    pub(super) fn follow(&mut self, other: &Self) {
-        let (from, to) = other.range();
+    /// Takes these places for its coefficients, where there are any.
+    pub(super) fn lead(&mut self, place: impl Fn(f64) -> Option<Vector3<f64>>) {
         for (k, coefficient) in self.coefficients.iter_mut().enumerate() {
             // A coefficient has its largest part a knot after its first.
             let time_s = self.start_s + (k as f64 - 1.0) * KNOT_S;
-            let within = time_s.clamp(from, to - 1e-6);
-            if let Some(weights) = other.weights(within) {
-                *coefficient = other.place(&weights).coords;
-            }
+            *coefficient = place(time_s).unwrap_or(*coefficient);
         }
     }
 

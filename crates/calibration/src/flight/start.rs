@@ -2,8 +2,9 @@
 
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, SVector, Vector3};
 
+use super::begin::frame_time;
+use super::course::Course;
 use super::model::{CameraLabels, CameraState, Clock};
-use super::spline::Spline;
 use crate::lens;
 
 /// The clock's offset is tried in steps of this, s: at 10 m/s and 40 m the target is then 0.03 rad
@@ -41,35 +42,56 @@ struct Ray {
 /// enough of its labels fall into the log.
 pub(super) fn find(
     camera: &CameraLabels,
-    way: &Spline,
+    course: &Course,
     frame_s: f64,
 ) -> Option<(CameraState, f64)> {
     let rays = rays(camera);
     let (first, last) = (rays.first()?.time_s, rays.last()?.time_s);
-    let (from, to) = way.range();
+    let (from, to) = course.range();
     let offsets = ((to - from + last - first) / STEP_S) as usize;
     let offset = |k: usize| from - last + k as f64 * STEP_S;
     let mut found: Vec<Candidate> =
-        (0..=offsets).flat_map(|k| candidates(&rays, way, offset(k))).collect();
+        (0..=offsets).flat_map(|k| candidates(&rays, course, offset(k))).collect();
     found.sort_by(|a, b| a.misfit.total_cmp(&b.misfit));
     let mut best: Option<Candidate> = None;
     for candidate in found.into_iter().take(FOLLOWED) {
-        let refined = refined(candidate, &rays, way, frame_s);
+        let refined = refined(candidate, &rays, course, frame_s);
         if best.as_ref().is_none_or(|best| refined.misfit < best.misfit) {
             best = Some(refined);
         }
     }
-    let best = best?;
-    let (start, end) = (camera.labels.first()?.time_s, camera.labels.last()?.time_s);
+    let Candidate { rotation, centre, offset_s, misfit } = best?;
+    Some((state(camera, course, (rotation, centre, offset_s)), misfit))
+}
+
+/// A camera that stands so, its clock behind by an offset (s).
+pub(super) fn state(
+    camera: &CameraLabels,
+    course: &Course,
+    (rotation, centre, offset_s): (Rotation3<f64>, Point3<f64>, f64),
+) -> CameraState {
+    let times = camera.labels.iter().map(|label| label.time_s);
+    let (start, end) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(start, end), time_s| {
+        (start.min(time_s), end.max(time_s))
+    });
     let clock = Clock {
         reference_s: f64::midpoint(start, end),
-        offset_s: best.offset_s,
+        offset_s,
         rate: 0.0,
-        readout_s: frame_s / 2.0,
-        wander: way.drift(),
+        readout_s: frame_time(camera) / 2.0,
+        wander: course.way.drift(),
     };
-    let Candidate { rotation, centre, misfit, .. } = best;
-    Some((CameraState { rotation, centre, clock, intrinsics: camera.intrinsics }, misfit))
+    CameraState { rotation, centre, clock, intrinsics: camera.intrinsics }
+}
+
+/// The median angle between a camera's labels and a course, rad.
+pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraState, course: &Course) -> f64 {
+    let at = |ray: &Ray| {
+        let weights = course.weights(state.clock.common_s(ray.time_s))?;
+        Some((ray.direction, course.way.place(&weights)))
+    };
+    let pairs: Vec<_> = rays(camera).iter().filter_map(at).collect();
+    if pairs.is_empty() { f64::INFINITY } else { misfit(&pairs, &state.rotation, state.centre) }
 }
 
 /// Labels evenly spread over all.
@@ -84,10 +106,10 @@ fn rays(camera: &CameraLabels) -> Vec<Ray> {
 }
 
 /// The linear solutions at an offset.
-fn candidates(rays: &[Ray], way: &Spline, offset_s: f64) -> Vec<Candidate> {
+fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<Candidate> {
     let at = |ray: &Ray| {
-        let weights = way.weights(ray.time_s + offset_s)?;
-        Some((ray.direction, way.place(&weights)))
+        let weights = course.weights(ray.time_s + offset_s)?;
+        Some((ray.direction, course.way.place(&weights)))
     };
     let pairs: Vec<(Vector3<f64>, Point3<f64>)> = rays.iter().filter_map(at).collect();
     let enough = LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize);
@@ -230,7 +252,7 @@ fn in_plane(pairs: &[(Vector3<f64>, Point3<f64>)]) -> Option<(Rotation3<f64>, Po
 
 /// Gauss and Newton's steps of pose, offset and read-out against the log's way, with weights
 /// against outliers.
-fn refined(start: Candidate, rays: &[Ray], way: &Spline, frame_s: f64) -> Candidate {
+fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Candidate {
     const STEPS: usize = 25;
     let mut best = start;
     let mut now = best.clone();
@@ -241,8 +263,8 @@ fn refined(start: Candidate, rays: &[Ray], way: &Spline, frame_s: f64) -> Candid
         let mut seen = Vec::new();
         for ray in rays {
             let time_s = ray.time_s + now.offset_s + 0.5 * frame_s * ray.row_share;
-            let Some(weights) = way.weights(time_s) else { continue };
-            let (place, velocity) = (way.place(&weights), way.velocity(&weights));
+            let Some(weights) = course.weights(time_s) else { continue };
+            let (place, velocity) = (course.way.place(&weights), course.way.velocity(&weights));
             seen.push((ray.direction, place));
             let offset = now.rotation.inverse_transform_vector(&(place - now.centre));
             let range = offset.norm();

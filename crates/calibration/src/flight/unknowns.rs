@@ -9,24 +9,25 @@ use super::spline::{IN_A_STEP, SPAN, Spline};
 /// Steps that one row may touch: beyond the one that it is in, the way and the knots reach into the
 /// next one, and a clock's wander puts its knots in another step than the way's.
 const STEPS_IN_A_ROW: usize = 3;
-const BIAS_AXES: usize = 3;
 
 /// The order, for so many cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Order {
     pub(super) cameras: usize,
+    /// Axes of the log's bias: three, or none without a log.
+    axes: usize,
     pub(super) steps: usize,
 }
 
 impl Order {
-    /// Of a flight of this way.
-    pub(super) fn of(way: &Spline, cameras: usize) -> Self {
-        Self { cameras, steps: way.coefficients.len() / IN_A_STEP }
+    /// Of a flight of this way with so many axes of a log's bias.
+    pub(super) fn of(way: &Spline, cameras: usize, axes: usize) -> Self {
+        Self { cameras, axes, steps: way.coefficients.len() / IN_A_STEP }
     }
 
     /// Unknowns of one step.
     fn step(self) -> usize {
-        self.cameras + BIAS_AXES + 3 * IN_A_STEP
+        self.cameras + self.axes + 3 * IN_A_STEP
     }
 
     /// Unknowns of the chain.
@@ -42,7 +43,7 @@ impl Order {
     /// An axis of a coefficient of the way.
     pub(super) fn way(self, coefficient: usize, axis: usize) -> usize {
         let (step, within) = (coefficient / IN_A_STEP, coefficient % IN_A_STEP);
-        step * self.step() + self.cameras + BIAS_AXES + 3 * within + axis
+        step * self.step() + self.cameras + self.axes + 3 * within + axis
     }
 
     /// A knot of a camera's clock.

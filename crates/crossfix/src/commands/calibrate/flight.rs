@@ -10,21 +10,29 @@ use crossfix_message::{
 
 use super::log::{self, LogKind};
 use super::report;
+use super::survey::{self, Distance};
 use crate::commands::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
 
-/// From the flight of one target: with the log of its own receiver.
+/// From the flight of one target: with the log of its own receiver, or with where cameras stand.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml"
+    after_help = "Examples:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml"
 )]
 pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s, east_m, north_m, up_m.
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance"])]
+    log: Option<PathBuf>,
+    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two say how large the
+    /// site is, three where it is; without a log the flight may be anybody's.
     #[arg(long, value_name = "FILE")]
-    log: PathBuf,
+    positions: Option<PathBuf>,
+    /// How far two cameras are apart, as in north,east,79.3 (m, to 5 cm). May be given again.
+    #[arg(long, value_name = "A,B,METRES")]
+    distance: Vec<Distance>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
@@ -47,9 +55,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut errors = args.log_kind.errors();
     errors.sd_m = args.log_sd.unwrap_or(errors.sd_m);
     errors.drift_sd_m = args.log_drift.unwrap_or(errors.drift_sd_m);
-    let log = log::read(&args.log, errors)?;
+    let log = args.log.as_deref().map(|path| log::read(path, errors)).transpose()?;
     let cameras = labels(&args.recording)?;
-    let mut result = calibrate_flight(&cameras, &log)?;
+    let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
+    let survey = survey::read(args.positions.as_deref(), &args.distance, &names)?;
+    let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
@@ -62,13 +72,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         tracing::warn!("camera `{wrong}` is wrong and is not written");
     }
     ensure!(!result.cameras.is_empty(), "nothing is written: each camera is wrong");
+    let inputs: Vec<&Path> = [Some(&args.recording), args.log.as_ref(), args.positions.as_ref()]
+        .into_iter()
+        .flatten()
+        .map(PathBuf::as_path)
+        .collect();
+    let from: Vec<String> = inputs.iter().map(|path| path.display().to_string()).collect();
     let text = format!(
-        "# Written by crossfix calibrate flight from {} and {}.\n{}",
-        args.recording.display(),
-        args.log.display(),
+        "# Written by crossfix calibrate flight from {}.\n{}",
+        from.join(" and "),
         SiteCalibration::from(&result).to_toml()
     );
-    output::write_file(&args.output, &[&args.recording, &args.log], text.as_bytes())?;
+    output::write_file(&args.output, &inputs, text.as_bytes())?;
     if !args.json {
         output::line(format!("\nwritten to {}", args.output.display()));
     }

@@ -1,6 +1,7 @@
 mod flight;
 mod log;
 mod report;
+mod survey;
 
 /// Find where cameras stand, what their lenses are and how their clocks run.
 #[derive(Debug, clap::Args)]

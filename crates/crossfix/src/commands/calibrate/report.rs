@@ -1,7 +1,7 @@
 //! What a calibration has found, for people and for programs.
 
 use crossfix_calibration::{CameraResult, FlightResult};
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
 use crate::output;
@@ -15,10 +15,50 @@ pub struct Figures {
     cameras: Vec<CameraFigures>,
     /// Cameras that could not be calibrated, and why not.
     refused: Vec<(String, String)>,
-    /// Root mean square of the log's residuals per axis, m.
-    log_residual_m: f64,
+    /// Root mean square of the log's residuals per axis, m; absent without a log.
+    log_residual_m: Option<f64>,
+    datum: DatumFigures,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
+}
+
+/// What the site may be off by as a whole: standard deviations.
+#[derive(Debug, Serialize)]
+struct DatumFigures {
+    position_sd_m: [f64; 3],
+    turn_sd_mrad: [f64; 3],
+    scale_sd: f64,
+    time_sd_s: f64,
+}
+
+/// Beyond this nothing has said where the site is, which way round or when, m, mrad, s.
+const UNKNOWN: [f64; 3] = [100.0, 1e3, 10.0];
+
+impl std::fmt::Display for DatumFigures {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let largest = |values: [f64; 3]| values.into_iter().fold(0.0, f64::max);
+        let known = |value: f64, unknown: f64, text: String| {
+            if value < unknown { text } else { "not known".to_owned() }
+        };
+        let (position_m, turn_mrad) = (largest(self.position_sd_m), largest(self.turn_sd_mrad));
+        write!(
+            f,
+            "the site as a whole: position {}, turn {}, size {}, time {}",
+            known(position_m, UNKNOWN[0], format!("± {position_m:.3} m")),
+            known(turn_mrad, UNKNOWN[1], format!("± {turn_mrad:.2} mrad")),
+            known(self.scale_sd, 1.0, format!("± {:.3} %", self.scale_sd * 100.0)),
+            known(self.time_sd_s, UNKNOWN[2], format!("± {:.1} ms", self.time_sd_s * 1e3)),
+        )
+    }
+}
+
+impl From<&Datum> for DatumFigures {
+    fn from(datum: &Datum) -> Self {
+        let [east, north, up, about_east, about_north, about_up, scale_sd, time_sd_s, _] =
+            datum.sd();
+        let turn_sd_mrad = [about_east, about_north, about_up].map(|sd| sd * 1e3);
+        Self { position_sd_m: [east, north, up], turn_sd_mrad, scale_sd, time_sd_s }
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -40,6 +80,7 @@ struct CameraFigures {
     clock_sd_s: f64,
     clock_rate: f64,
     clock_wander_ms: f64,
+    halves_ratio: Option<f64>,
     readout_ms: f64,
     readout_sd_ms: f64,
     verdict: &'static str,
@@ -118,6 +159,7 @@ impl From<&CameraResult> for CameraFigures {
             clock_sd_s: middle.sd_s,
             clock_rate: clock.rate,
             clock_wander_ms: (most - least) * 1e3,
+            halves_ratio: camera.halves_ratio,
             readout_ms: clock.readout_s * 1e3,
             readout_sd_ms: clock.readout_sd_s * 1e3,
         }
@@ -134,6 +176,7 @@ pub fn figures(result: &FlightResult) -> Figures {
             .map(|(name, why)| (name.to_string(), why.to_string()))
             .collect(),
         log_residual_m: result.log_residual_m,
+        datum: DatumFigures::from(&result.datum),
         jerk: result.jerk,
     }
 }
@@ -153,6 +196,7 @@ pub fn render(result: &FlightResult) -> String {
         "wander [ms]",
         "read-out [ms]",
         "focal length",
+        "halves",
         "verdict",
     ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
@@ -171,6 +215,7 @@ pub fn render(result: &FlightResult) -> String {
             format!("{:.1}", camera.clock_wander_ms),
             format!("{:.1} ± {:.1}", camera.readout_ms, camera.readout_sd_ms),
             format!("{:+.2} %", 100.0 * (camera.focal_ratio - 1.0)),
+            output::number(camera.halves_ratio, 1),
             camera.verdict.to_owned(),
         ]);
     }
@@ -186,9 +231,8 @@ pub fn render(result: &FlightResult) -> String {
         .iter()
         .map(|(name, why)| format!("\n\ncamera `{name}` is not calibrated: it {why}"))
         .collect();
-    format!(
-        "{}{refused}\n\nthe log lies {:.3} m beside the way, root mean square per axis{remark}",
-        output::table(&rows),
-        figures.log_residual_m
-    )
+    let log = figures.log_residual_m.map_or_else(String::new, |metres| {
+        format!("\n\nthe log lies {metres:.3} m beside the way, root mean square per axis")
+    });
+    format!("{}{refused}{log}\n\n{}{remark}", output::table(&rows), figures.datum)
 }

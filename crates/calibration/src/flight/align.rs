@@ -1,0 +1,119 @@
+//! A site that was put together from what cameras saw is brought to where it stands.
+
+use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
+
+use super::adjustment::State;
+use super::model::{CameraLabels, CameraState, Survey};
+use super::survey::ENOUGH_FOR_UP;
+
+/// A turn, a size and a shift.
+struct Similarity {
+    rotation: Rotation3<f64>,
+    scale: f64,
+    from: Point3<f64>,
+    to: Point3<f64>,
+}
+
+/// Brings cameras and way to where the survey has them, as near as it says. `None`: it says nothing
+/// of the size.
+pub(super) fn to_survey(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<State> {
+    let places: Vec<(Point3<f64>, Point3<f64>)> = labels
+        .iter()
+        .zip(&state.cameras)
+        .filter_map(|(labels, camera)| Some((camera.centre, survey.place(&labels.name)?.position)))
+        .collect();
+    let scale = size(&places).or_else(|| taped(state, labels, survey))?;
+    let centroid = |of: fn(&(Point3<f64>, Point3<f64>)) -> Point3<f64>| {
+        let sum: Vector3<f64> = places.iter().map(|pair| of(pair).coords).sum();
+        Point3::from(sum / places.len() as f64)
+    };
+    let (from, to) = if places.is_empty() {
+        (state.cameras.first()?.centre, Point3::origin())
+    } else {
+        (centroid(|pair| pair.0), centroid(|pair| pair.1))
+    };
+    let arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
+    let rotation = turn(&arms).filter(|_| places.len() >= ENOUGH_FOR_UP);
+    let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
+    Some(Similarity { rotation, scale, from, to }.moved(state))
+}
+
+/// How many times larger the survey is, by at least two places.
+fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
+    let pairs = places.iter().enumerate().flat_map(|(k, a)| {
+        places[..k].iter().map(move |b| ((a.0 - b.0).norm(), (a.1 - b.1).norm()))
+    });
+    let (here, there) = pairs.fold((0.0, 0.0), |sum, pair| (sum.0 + pair.0, sum.1 + pair.1));
+    (here > 0.0 && there > 0.0).then(|| there / here)
+}
+
+/// The same by a taped distance.
+fn taped(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<f64> {
+    survey.distances.iter().find_map(|distance| {
+        let [a, b] = distance.between.each_ref().map(|name| {
+            let index = labels.iter().position(|camera| camera.name == *name);
+            index.map(|index| state.cameras[index].centre)
+        });
+        Some(distance.metres / (b? - a?).norm())
+    })
+}
+
+/// The turn that brings arms over one another best (Kabsch); `None` where they lie on a line.
+fn turn(arms: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Rotation3<f64>> {
+    /// Of the widest spread, this is none.
+    const FLAT: f64 = 1e-3;
+    let sum: Matrix3<f64> = arms.iter().map(|(here, there)| there * here.transpose()).sum();
+    let factors = sum.svd(true, true);
+    let (u, v_t) = (factors.u?, factors.v_t?);
+    if factors.singular_values[1] < FLAT * factors.singular_values[0] {
+        return None;
+    }
+    let sign = (u * v_t).determinant().signum();
+    let last = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign));
+    Some(Rotation3::from_matrix_unchecked(u * last * v_t))
+}
+
+/// The turn that makes cameras stand upright whose images' rows are level.
+fn upright(cameras: &[CameraState]) -> Rotation3<f64> {
+    let rows = cameras.iter().map(|camera| camera.rotation * Vector3::x());
+    let sum: Matrix3<f64> = rows.map(|row| row * row.transpose()).sum();
+    let eigen = sum.symmetric_eigen();
+    let across = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    // Rows go down in the image.
+    let up: Vector3<f64> = cameras.iter().map(|camera| camera.rotation * -Vector3::y()).sum();
+    let up = if across.dot(&up) < 0.0 { -across } else { across };
+    Rotation3::rotation_between(&up, &Vector3::z())
+        .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
+}
+
+/// The same, turned about the vertical to where arms point, and tipped by what is left.
+fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rotation3<f64> {
+    let level = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
+        let here = upright * here;
+        (here.x * there.y - here.y * there.x, here.x * there.x + here.y * there.y)
+    };
+    let (sine, cosine) =
+        arms.iter().map(level).fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
+    let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)) * upright;
+    let tip = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
+        let axis = Unit::try_new((turned * here).cross(there), 1e-9)?;
+        Some(Rotation3::from_axis_angle(&axis, (turned * here).angle(there)))
+    };
+    // Two places lie on one line: both arms tell the same.
+    arms.first().and_then(tip).map_or(turned, |tip| tip * turned)
+}
+
+impl Similarity {
+    fn moved(&self, state: &State) -> State {
+        let place = |place: Point3<f64>| self.to + self.rotation * (place - self.from) * self.scale;
+        let mut moved = state.clone();
+        for camera in &mut moved.cameras {
+            camera.centre = place(camera.centre);
+            camera.rotation = self.rotation * camera.rotation;
+        }
+        for coefficient in &mut moved.way.coefficients {
+            *coefficient = place(Point3::from(*coefficient)).coords;
+        }
+        moved
+    }
+}

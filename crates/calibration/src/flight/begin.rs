@@ -1,0 +1,271 @@
+//! Where the adjustment begins: each camera's pose and clock, and the target's way.
+
+use super::adjustment::{CameraPriors, Priors, RATE_SD, State};
+use super::align;
+use super::course::Course;
+use super::model::{CameraLabels, CameraState, FlightLog, Survey};
+use super::noise::LabelNoise;
+use super::pairs::{self, Pair, Sights};
+use super::spline::Spline;
+use super::{
+    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Mirror, Refusal, hours, start, triangulation,
+};
+use crossfix_message::CameraName;
+use nalgebra::{Point3, Rotation3};
+
+/// Labels that lie farther than this beside the log, in the median, are not of it, rad: lens files
+/// and clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
+const MOST_MISFIT_RAD: f64 = 8e-3;
+/// ... and so many deviations of the log's own errors, as they are seen from where the camera
+/// stands.
+const LOG_DEVIATIONS: f64 = 3.0;
+/// The mirror image fits where it fits so many times better.
+const CLEARLY_BETTER: f64 = 3.0;
+/// Beyond the labels the way goes on for so long, s: their times may still move.
+const MARGIN_S: f64 = 2.0;
+/// Two cameras see the target together where they do within this, s: at a knot of the way.
+const TOGETHER_S: f64 = 0.2;
+/// Without a log so many pairs of cameras are begun with, the best by their looks: one that saw a
+/// short or a flat piece of the way leads astray.
+const PAIRS_TRIED: usize = 3;
+/// What labels are taken to err by before anything is known, pixels: a hand's or a tracker's, and
+/// what a lens file leaves.
+const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
+/// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. From too little
+/// it would not be found.
+const FIRST_WANDER: f64 = 2e-6;
+
+/// The cameras that take part, and where they are begun with.
+pub(super) struct Begun {
+    pub(super) cameras: Vec<CameraLabels>,
+    states: Vec<CameraState>,
+    course: Course,
+    /// The others.
+    pub(super) refused: Vec<(CameraName, Refusal)>,
+}
+
+impl Begun {
+    fn new(course: Course) -> Self {
+        Self { cameras: Vec::new(), states: Vec::new(), course, refused: Vec::new() }
+    }
+
+    /// Each camera against a log.
+    pub(super) fn by_log(cameras: &[CameraLabels], log: &FlightLog) -> Result<Self, FlightError> {
+        let mut begun = Self::new(Course::of(log).ok_or(FlightError::NoSolution)?);
+        for camera in cameras {
+            let start = usable(camera)
+                .and_then(|()| placed_against(camera, &begun.course))
+                .map_err(|why| named_mirror(camera, &begun.course, why));
+            begun.take(camera, start);
+        }
+        if begun.cameras.is_empty() {
+            let (camera, why) = begun.refused.into_iter().next().ok_or(FlightError::NoSolution)?;
+            return Err(FlightError::NoCamera { camera, why });
+        }
+        begun.leave_lonely_out(true);
+        Ok(begun)
+    }
+
+    /// From two cameras that saw the target together, and the others against what these make of it.
+    pub(super) fn by_pairs(
+        cameras: &[CameraLabels],
+        survey: &Survey,
+    ) -> Result<(Self, State), FlightError> {
+        let (usable, unusable): (Vec<_>, Vec<_>) =
+            cameras.iter().map(|camera| (camera, usable(camera))).partition(|(_, is)| is.is_ok());
+        let usable: Vec<&CameraLabels> = usable.into_iter().map(|(camera, _)| camera).collect();
+        let mut begun = best_of_pairs(&usable).ok_or(FlightError::NoPair)?;
+        for (camera, why) in unusable {
+            begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
+        }
+        begun.leave_lonely_out(false);
+        let state = begun.unknowns(false);
+        let state = align::to_survey(&state, &begun.cameras, survey).ok_or(FlightError::NoSize)?;
+        Ok((begun, state))
+    }
+
+    fn take(&mut self, camera: &CameraLabels, start: Result<CameraState, Refusal>) {
+        match start {
+            Ok(state) => {
+                self.cameras.push(camera.clone());
+                self.states.push(state);
+            }
+            Err(why) => self.refused.push((camera.name.clone(), why)),
+        }
+    }
+
+    /// Leaves labels out that were made where no log and no other camera tells how far off the target
+    /// was: the jerk's prior would draw it up to the camera.
+    fn leave_lonely_out(&mut self, has_log: bool) {
+        let times: Vec<Vec<f64>> = self
+            .cameras
+            .iter()
+            .zip(&self.states)
+            .map(|(camera, state)| camera.labels.iter().map(|label| state.time_s(label)).collect())
+            .collect();
+        let is_near = |times: &Vec<f64>, time_s: f64| {
+            let next = times.partition_point(|other| *other < time_s - TOGETHER_S);
+            times.get(next).is_some_and(|other| *other < time_s + TOGETHER_S)
+        };
+        for (index, camera) in self.cameras.iter_mut().enumerate() {
+            let mut own = times[index].iter();
+            camera.labels.retain(|_| {
+                own.next().is_some_and(|&time_s| {
+                    let mut others = times.iter().enumerate().filter(|(other, _)| *other != index);
+                    (has_log && self.course.weights(time_s).is_some())
+                        || others.any(|(_, times)| is_near(times, time_s))
+                })
+            });
+        }
+    }
+
+    /// All unknowns as they are begun with: each camera at its start, the way as the course shows it.
+    pub(super) fn unknowns(&self, has_log: bool) -> State {
+        let labels = self.cameras.iter().zip(&self.states);
+        let times = labels
+            .flat_map(|(camera, state)| camera.labels.iter().map(|label| state.time_s(label)));
+        let (from, to) = times.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), time_s| {
+            (from.min(time_s), to.max(time_s))
+        });
+        let mut way = Spline::over(from - MARGIN_S, to + MARGIN_S);
+        self.course.lead(&mut way);
+        let mut states = self.states.clone();
+        states.iter_mut().for_each(|camera| camera.clock.wander = way.drift());
+        let bias = vec![way.drift(); if has_log { 3 } else { 0 }];
+        State { way, cameras: states, bias }
+    }
+
+    /// What all is held against at first.
+    pub(super) fn priors(&self) -> Priors {
+        let prior = |camera: &CameraLabels| CameraPriors {
+            noise: FIRST_NOISE,
+            lens: camera.intrinsics,
+            frame_s: frame_time(camera),
+            wander: FIRST_WANDER,
+        };
+        let cameras = self.cameras.iter().map(prior).collect();
+        Priors { jerk: self.course.jerk, rate_sd: RATE_SD, cameras }
+    }
+
+    /// Places the cameras that are not placed yet against what those that are make of the way, until
+    /// no more fit.
+    fn place_the_rest(&mut self, cameras: &[&CameraLabels], sights: &[Sights]) -> Option<()> {
+        loop {
+            let of = |camera: &CameraLabels| {
+                let index = cameras.iter().position(|other| other.name == camera.name)?;
+                sights.get(index)
+            };
+            let placed: Vec<_> = self
+                .cameras
+                .iter()
+                .zip(&self.states)
+                .filter_map(|(c, s)| Some((of(c)?, s)))
+                .collect();
+            self.course = Course::of(&triangulation::log(&placed))?;
+            let before = self.cameras.len();
+            self.refused.clear();
+            for camera in cameras {
+                if self.cameras.iter().all(|placed| placed.name != camera.name) {
+                    let start = placed_against(camera, &self.course);
+                    self.take(camera, start);
+                }
+            }
+            if self.cameras.len() == before {
+                return Some(());
+            }
+        }
+    }
+
+    /// The sum of what all cameras' labels lie beside the course.
+    fn misfit(&self) -> f64 {
+        let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
+            start::misfit_of(camera, state, &self.course)
+        };
+        self.cameras.iter().zip(&self.states).map(of_camera).sum()
+    }
+}
+
+/// Whether a camera has labels of a flight.
+fn usable(camera: &CameraLabels) -> Result<(), Refusal> {
+    let labels = camera.labels.len();
+    if labels < LEAST_LABELS {
+        return Err(Refusal::FewLabels { labels });
+    }
+    let hours = hours(camera.labels.iter().map(|label| label.time_s));
+    if hours > LONGEST_FLIGHT_H {
+        return Err(Refusal::LongFlight { hours });
+    }
+    Ok(())
+}
+
+/// A camera's start against a course.
+fn placed_against(camera: &CameraLabels, course: &Course) -> Result<CameraState, Refusal> {
+    let (state, misfit) = start::find(camera, course, frame_time(camera)).ok_or(Refusal::NoTime)?;
+    tracing::debug!(
+        "camera `{}` starts at {:.2} with the clock {:.3} s behind, {:.2} mrad off",
+        camera.name,
+        state.centre,
+        state.clock.offset_s,
+        misfit * 1e3
+    );
+    let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
+    let range_m = course.middle_distance(state.centre);
+    if misfit <= MOST_MISFIT_RAD + of_errors / range_m {
+        return Ok(state);
+    }
+    Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, mirror: None })
+}
+
+/// Exchanging two of a log's axes or turning one round is the same but for where the camera stands.
+fn named_mirror(camera: &CameraLabels, course: &Course, why: Refusal) -> Refusal {
+    let Refusal::Misfit { misfit_mrad, .. } = why else { return why };
+    let found = start::find(camera, &course.mirrored(), frame_time(camera));
+    let of_mirror = found.map_or(f64::INFINITY, |found| found.1);
+    let fits = of_mirror * 1e3 * CLEARLY_BETTER < misfit_mrad;
+    Refusal::Misfit { misfit_mrad, mirror: fits.then_some(Mirror::AxesOrHeight) }
+}
+
+/// Of the best pairs the one that most cameras fit, and fit best.
+fn best_of_pairs(cameras: &[&CameraLabels]) -> Option<Begun> {
+    let sights: Vec<Sights> = cameras.iter().map(|camera| Sights::of(camera)).collect();
+    let mut found: Vec<(usize, usize, Pair)> = Vec::new();
+    for first in 0..cameras.len() {
+        for second in first + 1..cameras.len() {
+            let pair = pairs::find(&sights[first], &sights[second]);
+            found.extend(pair.map(|pair| (first, second, pair)));
+        }
+    }
+    found.sort_by(|a, b| a.2.doubt.total_cmp(&b.2.doubt));
+    let begun = found.iter().take(PAIRS_TRIED).filter_map(|(first, second, pair)| {
+        tracing::debug!(
+            "`{}` and `{}` are {:.3} s apart (doubt {:.1e})",
+            cameras[*first].name,
+            cameras[*second].name,
+            pair.ahead_s,
+            pair.doubt
+        );
+        // Their way is not known yet: the clocks' knots are found with it.
+        let mut begun = Begun::new(Course::nowhere());
+        let (a, b) = (cameras[*first], cameras[*second]);
+        let second_pose = (pair.first_from_second, pair.centre, pair.ahead_s);
+        let poses = [(a, (Rotation3::identity(), Point3::origin(), 0.0)), (b, second_pose)];
+        for (camera, pose) in poses {
+            let state = start::state(camera, &begun.course, pose);
+            begun.take(camera, Ok(state));
+        }
+        begun.place_the_rest(cameras, &sights)?;
+        Some(begun)
+    });
+    begun.min_by(|a, b| {
+        let fewer = b.cameras.len().cmp(&a.cameras.len());
+        fewer.then_with(|| a.misfit().total_cmp(&b.misfit()))
+    })
+}
+
+/// The time between a camera's frames: the median between its labels, s.
+pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
+    let mut steps: Vec<f64> =
+        camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
+    steps.sort_unstable_by(f64::total_cmp);
+    steps[steps.len() / 2].max(1e-3)
+}

@@ -1,0 +1,115 @@
+//! Where the target was before any camera is known: as a log says, or two cameras.
+
+use nalgebra::Point3;
+
+use super::adjustment::{self, Flight, NEARLY_SETTLED, Priors, RATE_SD, State};
+use super::model::{FlightLog, LogErrors, Survey};
+use super::settle::jerk;
+use super::spline::{KNOT_S, Spline, Weights};
+
+/// Between samples farther apart than this nobody knows where the target was, s: or so many of the
+/// usual steps between them.
+const GAP_S: f64 = 1.0;
+const GAP_STEPS: f64 = 2.5;
+
+/// A way, where it is known.
+#[derive(Clone, Debug)]
+pub(super) struct Course {
+    pub(super) way: Spline,
+    /// Power of its jerk, m^2/s^5.
+    pub(super) jerk: f64,
+    pub(super) errors: LogErrors,
+    times_s: Vec<f64>,
+    gap_s: f64,
+}
+
+impl Course {
+    /// By a log alone. `None`: it has no solution.
+    pub(super) fn of(log: &FlightLog) -> Option<Self> {
+        const ROUNDS: usize = 12;
+        const FIRST_JERK: f64 = 10.0;
+        let (from, to) = (log.samples.first()?.time_s, log.samples.last()?.time_s);
+        let flight = Flight { cameras: &[], log: Some(log), survey: &Survey::default() };
+        let way = Spline::over(from, to + KNOT_S);
+        let bias = vec![way.drift(); 3];
+        let mut state = State { way, cameras: Vec::new(), bias };
+        let mut priors = Priors { jerk: FIRST_JERK, rate_sd: RATE_SD, cameras: Vec::new() };
+        for _ in 0..ROUNDS {
+            let adjusted = adjustment::adjust(&flight, &priors, state, NEARLY_SETTLED)?;
+            priors.jerk = jerk(&adjusted);
+            state = adjusted.state;
+        }
+        let times_s: Vec<f64> = log.samples.iter().map(|sample| sample.time_s).collect();
+        Some(Self::along(state.way, priors.jerk, log.errors, times_s))
+    }
+
+    /// Along a way that is known at these times, in order.
+    pub(super) fn along(way: Spline, jerk: f64, errors: LogErrors, times_s: Vec<f64>) -> Self {
+        let mut steps: Vec<f64> = times_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        steps.sort_unstable_by(f64::total_cmp);
+        let usual = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
+        Self { way, jerk, errors, times_s, gap_s: GAP_S.max(GAP_STEPS * usual) }
+    }
+
+    /// The way's weights at a time; `None` where it is not known.
+    pub(super) fn weights(&self, time_s: f64) -> Option<Weights> {
+        let next = self.times_s.partition_point(|known| *known < time_s);
+        let (before, after) = (self.times_s.get(next.wrapping_sub(1)), self.times_s.get(next));
+        let is_known = match (before, after) {
+            (Some(before), Some(after)) => after - before <= self.gap_s,
+            (_, Some(after)) => *after - time_s < KNOT_S,
+            (Some(before), _) => time_s - before < KNOT_S,
+            (None, None) => false,
+        };
+        is_known.then(|| self.way.weights(time_s))?
+    }
+
+    /// None.
+    pub(super) fn nowhere() -> Self {
+        let errors = LogErrors { sd_m: 1.0, drift_sd_m: 0.0, drift_time_s: 1.0 };
+        Self::along(Spline::over(0.0, 1.0), 1.0, errors, Vec::new())
+    }
+
+    /// Makes a way go along it: where it is known as it is, straight on from one known place to the
+    /// next, and before and behind staying where it begins and ends. A smooth way through what is not
+    /// known swings far out, and labels there would be left beside it.
+    pub(super) fn lead(&self, way: &mut Spline) {
+        let known = |time_s: f64| Some(self.way.place(&self.way.weights(time_s)?).coords);
+        let at = |time_s: f64| {
+            if self.weights(time_s).is_some() {
+                return known(time_s);
+            }
+            let next = self.times_s.partition_point(|known| *known < time_s);
+            let before = next.checked_sub(1).map(|before| self.times_s[before]);
+            match (before, self.times_s.get(next).copied()) {
+                (Some(before), Some(after)) => {
+                    let share = (time_s - before) / (after - before);
+                    Some(known(before)?.lerp(&known(after)?, share))
+                }
+                (end, None) | (None, end) => known(end?),
+            }
+        };
+        way.lead(at);
+    }
+
+    /// From when to when, s.
+    pub(super) fn range(&self) -> (f64, f64) {
+        self.way.range()
+    }
+
+    /// As it looks in a mirror that lies level.
+    pub(super) fn mirrored(&self) -> Self {
+        let mut mirrored = self.clone();
+        mirrored.way.coefficients.iter_mut().for_each(|place| place.z = -place.z);
+        mirrored
+    }
+
+    /// The median distance from a place, m.
+    pub(super) fn middle_distance(&self, place: Point3<f64>) -> f64 {
+        let known = self.times_s.iter().filter_map(|time_s| self.way.weights(*time_s));
+        let mut distances: Vec<f64> =
+            known.map(|weights| (self.way.place(&weights) - place).norm()).collect();
+        distances.sort_unstable_by(f64::total_cmp);
+        distances.get(distances.len() / 2).map_or(1.0, |distance| distance.max(1.0))
+    }
+}

@@ -1,0 +1,193 @@
+//! Where to begin without a log: two cameras from what both saw, up to size and place.
+//!
+//! For every offset of their clocks that leaves them enough in common, the essential matrix by eight
+//! points; the offset that fits best tells how the two stand to each other and where the target was.
+
+use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
+
+use super::model::CameraLabels;
+use crate::lens;
+
+/// Offsets of the clocks are tried in steps of this, s, and then ever finer ones about the best.
+const STEP_S: f64 = 0.25;
+const FINER: [f64; 3] = [0.05, 0.01, 0.002];
+/// Labels that one try takes.
+const TRIED: usize = 150;
+/// Of these so many must be seen by both cameras, ...
+const LEAST_COMMON: usize = 40;
+/// ... and so large a share of the smaller one's labels: eight numbers fit any short piece of a way.
+const LEAST_SHARE: f64 = 0.3;
+/// A direction between two labels farther apart than this is not known, s.
+const GAP_S: f64 = 0.2;
+/// Sight lines that meet more sharply than this tell no range, rad.
+pub(super) const LEAST_PARALLAX_RAD: f64 = 0.05;
+/// Cameras are taken to stand so far apart until something says how far, m.
+const BASE_M: f64 = 50.0;
+
+/// Directions that a camera saw the target in, by its own clock.
+pub(super) struct Sights {
+    times_s: Vec<f64>,
+    directions: Vec<Vector3<f64>>,
+}
+
+impl Sights {
+    pub(super) fn of(camera: &CameraLabels) -> Self {
+        let seen = |label: &super::Label| {
+            Some((label.time_s, lens::direction(&camera.intrinsics, label.pixel)?.normalize()))
+        };
+        let (times_s, directions) = camera.labels.iter().filter_map(seen).unzip();
+        Self { times_s, directions }
+    }
+
+    /// The direction at a time; `None` where it was not seen.
+    pub(super) fn at(&self, time_s: f64) -> Option<Vector3<f64>> {
+        let next = self.times_s.partition_point(|seen| *seen < time_s);
+        let before = next.checked_sub(1)?;
+        let (from, to) = (self.times_s[before], *self.times_s.get(next)?);
+        let share = (time_s - from) / (to - from);
+        let between = self.directions[before].lerp(&self.directions[next], share);
+        (to - from <= GAP_S).then(|| between.normalize())
+    }
+
+    pub(super) fn span(&self) -> Option<(f64, f64)> {
+        Some((*self.times_s.first()?, *self.times_s.last()?))
+    }
+
+    /// Times of labels, evenly spread, at most so many.
+    fn times(&self, most: usize) -> impl Iterator<Item = (f64, Vector3<f64>)> {
+        let stride = self.times_s.len().div_ceil(most).max(1);
+        let seen = self.times_s.iter().copied().zip(self.directions.iter().copied());
+        seen.step_by(stride)
+    }
+}
+
+/// How a second camera stands to a first.
+#[derive(Clone, Debug)]
+pub(super) struct Pair {
+    /// The time by the first's clock less that by the second's, s.
+    pub(super) ahead_s: f64,
+    pub(super) first_from_second: Rotation3<f64>,
+    /// The second's centre in the first's frame, m if the two stand [`BASE_M`] apart.
+    pub(super) centre: Point3<f64>,
+    /// Median angle by which sight lines miss each other over that by which they meet: what ranges
+    /// are known by. Less is better.
+    pub(super) doubt: f64,
+}
+
+/// What both see at an offset: directions in the first's frame and in the second's.
+fn common(first: &Sights, second: &Sights, ahead_s: f64) -> Vec<[Vector3<f64>; 2]> {
+    let both =
+        |(time_s, direction): (f64, Vector3<f64>)| Some([direction, second.at(time_s - ahead_s)?]);
+    first.times(TRIED).filter_map(both).collect()
+}
+
+/// The essential matrix by eight points, `b' E a = 0`, and the median angle that it leaves.
+fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
+    let mut sum = SMatrix::<f64, 9, 9>::zeros();
+    for [a, b] in seen {
+        let outer = b * a.transpose();
+        let row = SMatrix::<f64, 9, 1>::from_column_slice(outer.as_slice());
+        sum.syger(1.0, &row, &row, 1.0);
+    }
+    sum.fill_upper_triangle_with_lower_triangle();
+    let eigen = sum.symmetric_eigen();
+    let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let matrix = Matrix3::from_column_slice(least.as_slice());
+    let angle = |[a, b]: &[Vector3<f64>; 2]| {
+        let (of_a, of_b) = (matrix * a, matrix.tr_mul(b));
+        let size2 = f64::midpoint(of_a.norm_squared(), of_b.norm_squared());
+        b.dot(&of_a).abs() / size2.sqrt().max(1e-12)
+    };
+    (matrix, median(seen.iter().map(angle)))
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::INFINITY)
+}
+
+/// How two cameras stand to each other; `None` where they saw too little in common.
+pub(super) fn find(first: &Sights, second: &Sights) -> Option<Pair> {
+    let ((from, to), (other_from, other_to)) = (first.span()?, second.span()?);
+    let fewer = first.times_s.len().min(second.times_s.len());
+    // Of the first's labels that are tried, as many as that share of the fewer.
+    let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
+    let tried = first.times(TRIED).count();
+    let enough = LEAST_COMMON.max((share * tried as f64) as usize);
+    let misfit = |ahead_s: f64| {
+        let seen = common(first, second, ahead_s);
+        if seen.len() < enough { f64::INFINITY } else { essential(&seen).1 }
+    };
+    let (least, most) = (from - other_to, to - other_from);
+    let steps = ((most - least) / STEP_S) as usize;
+    let mut best = (f64::INFINITY, 0.0);
+    let mut attempt = |ahead_s: f64| {
+        let misfit = misfit(ahead_s);
+        if misfit < best.0 {
+            best = (misfit, ahead_s);
+        }
+        best.1
+    };
+    (0..=steps).for_each(|k| {
+        attempt(least + k as f64 * STEP_S);
+    });
+    let mut coarser = STEP_S;
+    for step in FINER {
+        let about = attempt(f64::NAN);
+        let reach = (coarser / step) as i32;
+        (-reach..=reach).for_each(|k| {
+            attempt(about + f64::from(k) * step);
+        });
+        coarser = step;
+    }
+    let (misfit_rad, ahead_s) = best;
+    misfit_rad
+        .is_finite()
+        .then(|| decomposed(&common(first, second, ahead_s), ahead_s, misfit_rad))?
+}
+
+/// The pose of the four that an essential matrix allows, which has most of the target ahead of both.
+fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Option<Pair> {
+    let factors = essential(seen).0.svd(true, true);
+    let (mut u, mut v_t) = (factors.u?, factors.v_t?);
+    // nalgebra orders them by size.
+    if u.determinant() < 0.0 {
+        u.neg_mut();
+    }
+    if v_t.determinant() < 0.0 {
+        v_t.neg_mut();
+    }
+    let quarter = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
+    let along: Vector3<f64> = u.column(2).into_owned();
+    let poses = [quarter, quarter.transpose()].into_iter().flat_map(|quarter| {
+        let second_from_first = u * quarter * v_t;
+        [along, -along].map(|shift| (second_from_first, shift))
+    });
+    let pair = |(second_from_first, shift): (Matrix3<f64>, Vector3<f64>)| {
+        let centre = Point3::from(-second_from_first.tr_mul(&shift) * BASE_M);
+        let rotation = Rotation3::from_matrix_unchecked(second_from_first.transpose());
+        let pair = Pair { ahead_s, first_from_second: rotation, centre, doubt: 0.0 };
+        let parallaxes: Vec<f64> = seen.iter().filter_map(|seen| pair.parallax(seen)).collect();
+        (parallaxes, pair)
+    };
+    let (parallaxes, mut pair) = poses.map(pair).max_by_key(|(ahead, _)| ahead.len())?;
+    if 2 * parallaxes.len() < seen.len() {
+        return None;
+    }
+    let count = parallaxes.len() as f64;
+    pair.doubt = misfit_rad / median(parallaxes.into_iter()) / count.sqrt();
+    Some(pair)
+}
+
+impl Pair {
+    /// The angle at which the sight lines of a place meet that lies ahead of both; `None` where they
+    /// meet too sharply to tell.
+    fn parallax(&self, [a, b]: &[Vector3<f64>; 2]) -> Option<f64> {
+        let b = self.first_from_second * b;
+        let (base, cosine) = (self.centre.coords, a.dot(&b));
+        let sine2 = 1.0 - cosine * cosine;
+        let is_ahead = base.dot(a) > base.dot(&b) * cosine && base.dot(a) * cosine > base.dot(&b);
+        (is_ahead && sine2 > LEAST_PARALLAX_RAD * LEAST_PARALLAX_RAD).then(|| sine2.sqrt())
+    }
+}

@@ -1,0 +1,130 @@
+//! Noise, clocks' wander and the target's jerk are found beside the unknowns, round by round.
+
+use nalgebra::Vector2;
+
+use super::adjustment::{
+    self, Adjusted, CameraPriors, Flight, NEARLY_SETTLED, Priors, SETTLED, State,
+};
+use super::noise::LabelNoise;
+use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
+
+/// Rounds in which deviations and powers are found beside the unknowns.
+const ROUNDS: usize = 6;
+/// What clocks are usually like, 0.03 ms after a second, is believed as two steps that were seen; the
+/// least is a crystal's.
+const USUAL_WANDER: f64 = 1e-9;
+const USUAL_STEPS: f64 = 2.0;
+const LEAST_WANDER: f64 = 1e-12;
+
+/// Adjusts, finds the noise in what is left, and adjusts again.
+pub(super) fn settle(
+    flight: &Flight<'_>,
+    mut priors: Priors,
+    mut state: State,
+) -> Option<(Adjusted, Priors)> {
+    let mut adjusted = None;
+    for round in 0..ROUNDS {
+        let is_last = round + 1 == ROUNDS;
+        let settled = if is_last { SETTLED } else { NEARLY_SETTLED };
+        let next = adjustment::adjust(flight, &priors, state, settled)?;
+        state = next.state.clone();
+        if !is_last {
+            priors = learnt(flight, &next, &priors);
+            tracing::debug!(
+                "round {round}: cost {:.1}, jerk {:.2} m^2/s^5",
+                next.cost,
+                priors.jerk
+            );
+        }
+        adjusted = Some(next);
+    }
+    Some((adjusted?, priors))
+}
+
+/// Noise, wander and jerk as an adjustment shows them.
+fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
+    let state = &adjusted.state;
+    let mut cameras = Vec::new();
+    for (index, camera) in state.cameras.iter().enumerate() {
+        let residuals = residuals(flight, state, index);
+        let explained = explained(flight, adjusted, index);
+        let frame_s = priors.cameras[index].frame_s;
+        let noise = LabelNoise::of(&residuals, explained, frame_s);
+        let wander = wander(adjusted, index, priors.cameras[index].wander);
+        tracing::debug!(
+            "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre {:.2}",
+            flight.cameras[index].name,
+            noise.white_px,
+            noise.lasting_px,
+            noise.lasting_s,
+            explained.sqrt(),
+            wander.sqrt() * 1e3,
+            camera.clock.rate,
+            camera.clock.readout_s * 1e3,
+            camera.intrinsics.fx / priors.cameras[index].lens.fx,
+            camera.centre
+        );
+        cameras.push(CameraPriors { noise, wander, ..priors.cameras[index].clone() });
+    }
+    Priors { jerk: jerk(adjusted), rate_sd: priors.rate_sd, cameras }
+}
+
+/// A camera's residuals with their own times.
+pub(super) fn residuals(
+    flight: &Flight<'_>,
+    state: &State,
+    index: usize,
+) -> Vec<(f64, Vector2<f64>)> {
+    let labels = flight.cameras[index].labels.iter();
+    labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.2.residual))).collect()
+}
+
+/// What of a label's variance the way has taken, pixels^2 an axis, in the mean.
+fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize) -> f64 {
+    const STRIDE: usize = 10;
+    let order = adjusted.state.order();
+    let (mut sum, mut count) = (0.0, 0);
+    for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
+        let Some((first, weights, seen)) = adjusted.state.see(index, label) else { continue };
+        for axis in 0..2 {
+            let term = |k: usize| {
+                let by = seen.by_place[(axis, k % 3)] * weights[k / 3];
+                (order.way(first + k / 3, k % 3), by)
+            };
+            let terms: [_; 3 * SPAN] = std::array::from_fn(term);
+            sum += adjusted.covariance.variance_held(&terms);
+            count += 1;
+        }
+    }
+    if count == 0 { 0.0 } else { sum / f64::from(count) }
+}
+
+/// The power of a clock's random walk, s^2/s: of its steps' squares, by how many of them the labels
+/// have told (MacKay's fixed point), and of what clocks are like beforehand.
+fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
+    let order = adjusted.state.order();
+    let knots = &adjusted.state.cameras[camera].clock.wander;
+    let (mut squares, mut told) = (0.0, 0.0);
+    for (k, pair) in knots.values.windows(2).enumerate() {
+        let step = [(order.wander(k, camera), -1.0), (order.wander(k + 1, camera), 1.0)];
+        let spread = adjusted.covariance.variance(&step);
+        squares += (pair[1] - pair[0]).powi(2) / knots.step_s;
+        told += (1.0 - spread / (before * knots.step_s)).clamp(0.0, 1.0);
+    }
+    ((squares + USUAL_STEPS * USUAL_WANDER) / (told + USUAL_STEPS)).max(LEAST_WANDER)
+}
+
+/// The power of the jerk that a way shows: what its third differences are, and what they may be
+/// beside (expectation and maximisation).
+pub(super) fn jerk(adjusted: &Adjusted) -> f64 {
+    let (way, order) = (&adjusted.state.way, adjusted.state.order());
+    let mut sum = 0.0;
+    for first in 0..way.intervals() {
+        sum += way.third_difference(first).norm_squared();
+        for axis in 0..3 {
+            let terms = [0, 1, 2, 3].map(|k| (order.way(first + k, axis), THIRD_DIFFERENCE[k]));
+            sum += adjusted.covariance.variance_held(&terms);
+        }
+    }
+    (sum / (3.0 * way.intervals() as f64) / KNOT_S.powi(5)).max(1e-6)
+}

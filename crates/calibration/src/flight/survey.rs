@@ -1,0 +1,73 @@
+//! What is known of cameras beside what they saw: where they stand, how far apart, that they are level.
+
+use nalgebra::{Rotation3, Vector3};
+
+use super::adjustment::{Flight, Row, Sink, State};
+use super::noise::Tails;
+
+/// Whoever sets a camera up holds its picture level to this, rad. It turns a site upright that three
+/// surveyed places do not; with half of it a tripod on a slope would be believed.
+const LEVEL_RAD: f64 = 0.1;
+
+impl State {
+    /// A camera's surveyed place.
+    pub(super) fn place_rows(
+        &self,
+        start: usize,
+        index: usize,
+        flight: &Flight<'_>,
+        sink: &mut impl Sink,
+    ) {
+        let Some(place) = flight.survey.place(&flight.cameras[index].name) else { return };
+        let rows = [0, 1, 2].map(|axis| -> Row {
+            let scale = place.sd_m[axis].recip();
+            let aside = self.cameras[index].centre[axis] - place.position[axis];
+            (vec![(start + 3 + axis, scale)], aside * scale)
+        });
+        // A place may have been written down for another camera.
+        sink.take(&rows, Tails::Heavy);
+    }
+
+    /// Taped distances.
+    pub(super) fn distance_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
+        let starts = self.starts();
+        for distance in &flight.survey.distances {
+            let found = distance
+                .between
+                .each_ref()
+                .map(|name| flight.cameras.iter().position(|camera| camera.name == *name));
+            let [Some(a), Some(b)] = found else { continue };
+            let apart = self.cameras[b].centre - self.cameras[a].centre;
+            let scale = distance.sd_m.recip();
+            let along = apart.normalize() * scale;
+            let ends = [(starts[a], -1.0), (starts[b], 1.0)];
+            let of_end = |(start, sign): (usize, f64)| {
+                [0, 1, 2].map(|axis| (start + 3 + axis, sign * along[axis]))
+            };
+            let terms = ends.into_iter().flat_map(of_end).collect();
+            sink.take(&[(terms, (apart.norm() - distance.metres) * scale)], Tails::Heavy);
+        }
+    }
+
+    /// Cameras are held level, where no log says which way is up.
+    pub(super) fn level_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
+        if flight.survey.places.len() >= ENOUGH_FOR_UP {
+            return;
+        }
+        for (camera, start) in self.cameras.iter().zip(self.starts()) {
+            let (tilt, by_rotation) = tilt(&camera.rotation);
+            let terms = (0..3).map(|axis| (start + axis, by_rotation[axis] / LEVEL_RAD)).collect();
+            sink.take(&[(terms, tilt / LEVEL_RAD)], Tails::Heavy);
+        }
+    }
+}
+
+/// So many places say which way is up.
+pub(super) const ENOUGH_FOR_UP: usize = 3;
+
+/// How far an image's rows are from level (the sine), and its derivative by a small rotation about
+/// the camera's axes.
+fn tilt(world_from_camera: &Rotation3<f64>) -> (f64, Vector3<f64>) {
+    let up = world_from_camera.inverse_transform_vector(&Vector3::z());
+    (up.x, Vector3::x().cross(&up))
+}

@@ -1,0 +1,63 @@
+//! Where the target was, from what cameras saw whose poses are known roughly.
+
+use nalgebra::{Matrix3, Point3, Vector3};
+
+use super::model::{CameraState, FlightLog, LogErrors, LogSample};
+use super::pairs::{LEAST_PARALLAX_RAD, Sights};
+
+/// The target is placed so often, s.
+const STEP_S: f64 = 0.1;
+/// Sight lines that pass their common place by more than this are not of one target, rad.
+const MOST_ASIDE_RAD: f64 = 0.02;
+/// Before lenses and clocks are known none passes nearer than this, rad.
+const LEAST_ASIDE_RAD: f64 = 1e-3;
+
+/// The target's places as a log, by the cameras' common time.
+pub(super) fn log(cameras: &[(&Sights, &CameraState)]) -> FlightLog {
+    let spans = cameras.iter().filter_map(|(sights, state)| {
+        let (from, to) = sights.span()?;
+        Some((state.clock.common_s(from), state.clock.common_s(to)))
+    });
+    let (from, to) = spans.fold((f64::INFINITY, f64::NEG_INFINITY), |range, span| {
+        (range.0.min(span.0), range.1.max(span.1))
+    });
+    let steps = ((to - from) / STEP_S).max(0.0) as usize;
+    let placed = (0..steps).filter_map(|k| {
+        let time_s = from + k as f64 * STEP_S;
+        let seen = |(sights, state): &(&Sights, &CameraState)| {
+            // As yet no clock runs fast or wanders.
+            let direction = sights.at(time_s - state.clock.offset_s)?;
+            Some((state.centre, state.rotation * direction))
+        };
+        let lines: Vec<_> = cameras.iter().filter_map(seen).collect();
+        let (position, doubt_m) = place(&lines)?;
+        Some((LogSample { time_s, position }, doubt_m))
+    });
+    let (samples, mut doubts): (Vec<LogSample>, Vec<f64>) = placed.unzip();
+    doubts.sort_unstable_by(f64::total_cmp);
+    let sd_m = doubts.get(doubts.len() / 2).copied().unwrap_or(1.0);
+    FlightLog { samples, errors: LogErrors { sd_m, drift_sd_m: 0.0, drift_time_s: 1.0 } }
+}
+
+/// The place that lines (a point and a direction each) pass nearest by, and how far it may be off, m.
+/// `None` where they do not meet, meet behind a camera or too sharply to tell.
+pub(super) fn place(lines: &[(Point3<f64>, Vector3<f64>)]) -> Option<(Point3<f64>, f64)> {
+    let across = |direction: &Vector3<f64>| Matrix3::identity() - direction * direction.transpose();
+    let sum: Matrix3<f64> = lines.iter().map(|(_, direction)| across(direction)).sum();
+    let right: Vector3<f64> =
+        lines.iter().map(|(centre, direction)| across(direction) * centre.coords).sum();
+    // Two lines that meet at an angle have 1 - cos(angle) as the least of the sum's values.
+    let least = sum.symmetric_eigenvalues().min();
+    if lines.len() < 2 || least < LEAST_PARALLAX_RAD * LEAST_PARALLAX_RAD / 2.0 {
+        return None;
+    }
+    let place = Point3::from(sum.cholesky()?.solve(&right));
+    let mut worst = LEAST_ASIDE_RAD;
+    let mut range_m = 0.0_f64;
+    for (centre, direction) in lines {
+        let aside = (place - centre).angle(direction);
+        worst = worst.max(aside);
+        range_m = range_m.max((place - centre).norm());
+    }
+    (worst < MOST_ASIDE_RAD).then(|| (place, worst * range_m / least.sqrt()))
+}

@@ -1,0 +1,111 @@
+//! Where cameras stand by a survey, and how far apart by a tape.
+
+use std::path::Path;
+use std::str::FromStr;
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{Survey, SurveyedPlace, TapedDistance};
+use crossfix_message::CameraName;
+use nalgebra::{Point3, Vector3};
+use serde::Deserialize;
+
+/// A taped distance, as `north,east,79.3`.
+#[derive(Clone, Debug)]
+pub struct Distance(TapedDistance);
+
+/// Two marks on tripods are apart by the tape to this, m.
+const TAPE_SD_M: f64 = 0.05;
+
+impl FromStr for Distance {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || "two cameras and metres are wanted, as in north,east,79.3".to_owned();
+        let parts: Vec<&str> = text.split(',').map(str::trim).collect();
+        let [first, second, metres] = parts.as_slice() else { return Err(wrong()) };
+        let name = |name: &str| name.parse::<CameraName>().map_err(|error| error.to_string());
+        let metres = metres.parse::<f64>().map_err(|_| wrong())?;
+        if !(metres.is_finite() && metres > 0.0) {
+            return Err("a distance is more than nothing".to_owned());
+        }
+        let between = [name(first)?, name(second)?];
+        Ok(Self(TapedDistance { between, metres, sd_m: TAPE_SD_M }))
+    }
+}
+
+/// A row of the survey.
+#[derive(Debug, Deserialize)]
+struct Row {
+    camera: CameraName,
+    east_m: f64,
+    north_m: f64,
+    up_m: f64,
+    /// Of each axis, ...
+    sd_m: Option<f64>,
+    /// ... or of each its own.
+    sd_east_m: Option<f64>,
+    sd_north_m: Option<f64>,
+    sd_up_m: Option<f64>,
+}
+
+impl Row {
+    fn place(&self) -> Option<SurveyedPlace> {
+        let sd = [self.sd_east_m, self.sd_north_m, self.sd_up_m].map(|sd| sd.or(self.sd_m));
+        let [Some(east), Some(north), Some(up)] = sd else { return None };
+        let place = SurveyedPlace {
+            camera: self.camera.clone(),
+            position: Point3::new(self.east_m, self.north_m, self.up_m),
+            sd_m: Vector3::new(east, north, up),
+        };
+        let is_place = place.position.iter().all(|metres| metres.abs() < 1e6);
+        let is_sd = place.sd_m.iter().all(|sd| (1e-4..1e4).contains(sd));
+        (is_place && is_sd).then_some(place)
+    }
+}
+
+/// What a survey says; the cameras that it names must be of the recording.
+pub fn read(
+    positions: Option<&Path>,
+    distances: &[Distance],
+    cameras: &[CameraName],
+) -> anyhow::Result<Survey> {
+    let places = positions.map(read_places).transpose()?.unwrap_or_default();
+    let distances: Vec<TapedDistance> =
+        distances.iter().map(|distance| distance.0.clone()).collect();
+    let named = places.iter().map(|place| &place.camera);
+    for name in named.chain(distances.iter().flat_map(|distance| &distance.between)) {
+        let known: Vec<&str> = cameras.iter().map(CameraName::as_str).collect();
+        ensure!(
+            cameras.contains(name),
+            "the survey names camera `{name}`, which the recording has not: it has {}",
+            known.join(", ")
+        );
+    }
+    Ok(Survey { places, distances })
+}
+
+fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {
+    let wrong = || format!("cannot read the survey {}", path.display());
+    let mut reader =
+        csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path).with_context(wrong)?;
+    let mut places: Vec<SurveyedPlace> = Vec::new();
+    for (row, record) in reader.deserialize::<Row>().enumerate() {
+        let place = record.with_context(wrong)?.place().with_context(|| {
+            format!(
+                "the survey {}, row {}: camera, east_m, north_m, up_m and sd_m (or sd_east_m, \
+                 sd_north_m and sd_up_m) are wanted, in metres",
+                path.display(),
+                row + 2
+            )
+        })?;
+        ensure!(
+            places.iter().all(|known| known.camera != place.camera),
+            "the survey {} has camera `{}` twice",
+            path.display(),
+            place.camera
+        );
+        places.push(place);
+    }
+    ensure!(!places.is_empty(), "the survey {} has no rows", path.display());
+    Ok(places)
+}
