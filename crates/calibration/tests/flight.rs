@@ -4,10 +4,10 @@
 
 use crossfix_calibration::{
     CameraLabels, FlightError, FlightLog, FlightResult, Label, LogErrors, LogSample, Mirror,
-    Refusal, SiteCalibration, calibrate_flight,
+    Refusal, SiteCalibration, Survey, SurveyedPlace, TapedDistance, calibrate_flight,
 };
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
-use nalgebra::{Point3, Rotation3, Vector3, Vector6};
+use nalgebra::{Matrix6, Point3, Rotation3, Vector3, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -115,7 +115,7 @@ fn pointing_error_mrad(truth: &Truth, result: &FlightResult, index: usize) -> f6
 #[test]
 fn poses_clocks_and_lenses_are_found_from_nothing_but_labels_and_a_log() {
     let (truths, labels, log) = flight(1);
-    let result = calibrate_flight(&labels, &log).unwrap();
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
     assert!(result.refused.is_empty());
     for (index, truth) in truths.iter().enumerate() {
         let found = &result.cameras[index];
@@ -140,11 +140,15 @@ fn the_poses_covariance_is_honest() {
     const FLIGHTS: u64 = 6;
     let mut squares = Vec::new();
     for seed in 0..FLIGHTS {
-        let (truths, mut labels, log) = flight(100 + seed);
+        let (truths, mut labels, mut log) = flight(100 + seed);
+        // Over two minutes of the 200 s that it lasts the drift is as good as a shift.
+        let mut random = ChaCha8Rng::seed_from_u64(200 + seed);
+        let drift = Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut random) });
+        log.samples.iter_mut().for_each(|sample| sample.position += drift * LOG.drift_sd_m);
         for (truth, camera) in truths.iter().zip(&mut labels) {
             camera.intrinsics = *truth.camera.model().intrinsics();
         }
-        let result = calibrate_flight(&labels, &log).unwrap();
+        let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
         for (truth, found) in truths.iter().zip(&result.cameras) {
             let (pose, real) = (found.camera.pose(), truth.camera.pose());
             let turn = Rotation3::from_matrix_unchecked(
@@ -155,14 +159,28 @@ fn the_poses_covariance_is_honest() {
             error.fixed_rows_mut::<3>(0).copy_from(&turn.scaled_axis());
             error.fixed_rows_mut::<3>(3).copy_from(&(real.position() - pose.position()));
             error -= &found.lens.pose_by_lens * lens;
-            let inverse = found.pose_covariance.try_inverse().unwrap();
+            let of_site = of_site(&result, &found.camera);
+            let inverse = (found.pose_covariance + of_site).try_inverse().unwrap();
             squares.push(error.dot(&(inverse * error)));
         }
     }
     let mean = squares.iter().sum::<f64>() / squares.len() as f64;
-    // 18 draws of six: a standard error of 0.8. The whitening errs towards caution, and the common
-    // error of the log's drift ties the three cameras of a flight.
-    assert!((2.0..10.0).contains(&mean), "{mean}: {squares:?}");
+    // 18 draws of six: a standard error of 0.8, and more as the log's drift is common to the three
+    // cameras of a flight. The whitening errs towards caution.
+    assert!((2.0..9.0).contains(&mean), "{mean}: {squares:?}");
+}
+
+/// The part of a camera's pose that is off with the whole site: turned by w about its middle, it turns
+/// by R'w about its own axes.
+fn of_site(result: &FlightResult, camera: &Camera) -> Matrix6<f64> {
+    let arm = camera.pose().position() - result.datum.middle;
+    let mut by_datum = nalgebra::SMatrix::<f64, 6, 9>::zeros();
+    let turn = camera.pose().rotation().matrix().transpose();
+    by_datum.fixed_view_mut::<3, 3>(0, 3).copy_from(&turn);
+    by_datum.fixed_view_mut::<3, 3>(3, 0).fill_with_identity();
+    by_datum.fixed_view_mut::<3, 3>(3, 3).copy_from(&-arm.cross_matrix());
+    by_datum.fixed_view_mut::<3, 1>(3, 6).copy_from(&arm);
+    by_datum * result.datum.covariance * by_datum.transpose()
 }
 
 fn lens_error(truth: &Truth, found: &Intrinsics) -> nalgebra::DVector<f64> {
@@ -179,7 +197,7 @@ fn a_mirrored_log_is_refused_and_said_to_be_one() {
     let (_, labels, _) = flight(2);
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let exchanged = log(&mut random, |place| Point3::new(place.y, place.x, place.z));
-    let error = calibrate_flight(&labels, &exchanged).unwrap_err();
+    let error = calibrate_flight(&labels, Some(&exchanged), &Survey::default()).unwrap_err();
     let FlightError::NoCamera { why: Refusal::Misfit { mirror, .. }, .. } = &error else {
         panic!("{error}");
     };
@@ -191,7 +209,7 @@ fn a_mirrored_log_is_refused_and_said_to_be_one() {
 fn a_camera_that_saw_nothing_is_refused_and_the_others_are_calibrated() {
     let (_, mut labels, log) = flight(3);
     labels[1].labels.truncate(10);
-    let result = calibrate_flight(&labels, &log).unwrap();
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
     assert_eq!(result.cameras.len(), 2);
     assert_eq!(result.refused, [(labels[1].name.clone(), Refusal::FewLabels { labels: 10 })]);
 }
@@ -200,10 +218,10 @@ fn a_camera_that_saw_nothing_is_refused_and_the_others_are_calibrated() {
 fn a_label_of_another_year_costs_its_camera_and_neither_memory_nor_time() {
     let (_, mut labels, mut log) = flight(6);
     labels[0].labels.last_mut().unwrap().time_s = 3e9;
-    let result = calibrate_flight(&labels[..2], &log).unwrap();
+    let result = calibrate_flight(&labels[..2], Some(&log), &Survey::default()).unwrap();
     assert!(matches!(result.refused[..], [(_, Refusal::LongFlight { .. })]));
     log.samples.last_mut().unwrap().time_s = 3e9;
-    let error = calibrate_flight(&labels, &log).unwrap_err();
+    let error = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap_err();
     assert!(matches!(error, FlightError::LongLog { .. }), "{error}");
 }
 
@@ -215,7 +233,10 @@ fn labels_whose_rows_put_the_later_first_are_adjusted() {
         labels[0].labels[k].time_s = labels[0].labels[k - 1].time_s;
         labels[0].labels[k].pixel = Pixel::new(900.0, -200_000.0);
     }
-    assert_eq!(calibrate_flight(&labels[..1], &log).unwrap().cameras.len(), 1);
+    assert_eq!(
+        calibrate_flight(&labels[..1], Some(&log), &Survey::default()).unwrap().cameras.len(),
+        1
+    );
 }
 
 #[test]
@@ -227,7 +248,7 @@ fn jumps_of_the_log_and_birds_among_the_labels_do_not_move_the_cameras() {
     for label in labels[0].labels.iter_mut().step_by(20) {
         label.pixel = Pixel::new(300.0, 200.0);
     }
-    let result = calibrate_flight(&labels, &log).unwrap();
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
     for (index, truth) in truths.iter().enumerate() {
         let error = pointing_error_mrad(truth, &result, index);
         assert!(error < 0.2, "{}: {error} mrad", truth.name);
@@ -238,7 +259,7 @@ fn jumps_of_the_log_and_birds_among_the_labels_do_not_move_the_cameras() {
 #[test]
 fn what_is_found_survives_its_file_and_a_torn_file_is_named() {
     let (_, labels, log) = flight(5);
-    let result = calibrate_flight(&labels[..1], &log).unwrap();
+    let result = calibrate_flight(&labels[..1], Some(&log), &Survey::default()).unwrap();
     let site = SiteCalibration::from(&result);
     let text = site.to_toml();
     let again = SiteCalibration::from_toml(&text).unwrap();
@@ -251,4 +272,96 @@ fn what_is_found_survives_its_file_and_a_torn_file_is_named() {
     assert!(SiteCalibration::from_toml(&text[..text.len() / 2]).is_err());
     let nan = text.replace("range_m = ", "range_m = -");
     assert!(SiteCalibration::from_toml(&nan).unwrap_err().to_string().contains("range_m"));
+}
+
+/// Where the cameras stand, as a survey to 5 cm has it.
+fn survey(truths: &[Truth], random: &mut ChaCha8Rng) -> Survey {
+    const SD_M: f64 = 0.05;
+    let mut aside = || Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(random) }) * SD_M;
+    let place = |truth: &Truth| SurveyedPlace {
+        camera: truth.name.parse().unwrap(),
+        position: truth.camera.pose().position() + aside(),
+        sd_m: Vector3::repeat(SD_M),
+    };
+    Survey { places: truths.iter().map(place).collect(), distances: Vec::new() }
+}
+
+/// With nothing but where the cameras stand: their clocks differ by seconds, nobody knows where they
+/// look or where the target was.
+#[test]
+fn an_unknown_flight_and_three_surveyed_places_give_poses_clocks_and_lenses() {
+    let (truths, labels, _) = flight(8);
+    let survey = survey(&truths, &mut ChaCha8Rng::seed_from_u64(80));
+    let result = calibrate_flight(&labels, None, &survey).unwrap();
+    assert!(result.refused.is_empty());
+    let clock = |index: usize| &result.cameras[index].clock.knots[0];
+    let ahead = |index: usize| clock(index).ahead_s - clock(0).ahead_s;
+    for (index, truth) in truths.iter().enumerate() {
+        let error = pointing_error_mrad(truth, &result, index);
+        // 5 cm at 60 m are 0.8 mrad, and three places 60 to 120 m apart turn the site by as much.
+        assert!(error < 1.6, "{}: {error} mrad", truth.name);
+        let found = result.cameras[index].camera.pose().position();
+        let off = found - truth.camera.pose().position();
+        assert!(off.norm() < 0.25, "{}: {off}", truth.name);
+        // Rates of 2e-5 and 4e-5 count from the middle of the flight.
+        let between = truth.offset_s - truths[0].offset_s;
+        assert!((ahead(index) - between).abs() < 0.01, "{}: {}", truth.name, ahead(index));
+    }
+    let sd = result.datum.sd();
+    assert!((0.01..0.1).contains(&sd[0]) && sd[6] < 2e-3 && sd[7] > 100.0, "{sd:?}");
+}
+
+#[test]
+fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
+    let (truths, labels, _) = flight(9);
+    let place = |index: usize| truths[index].camera.pose().position();
+    let distance = TapedDistance {
+        between: [labels[0].name.clone(), labels[2].name.clone()],
+        metres: (place(0) - place(2)).norm(),
+        sd_m: 0.05,
+    };
+    let survey = Survey { places: Vec::new(), distances: vec![distance] };
+    let result = calibrate_flight(&labels, None, &survey).unwrap();
+    let found = |index: usize| result.cameras[index].camera.pose().position();
+    let ratio = (found(0) - found(1)).norm() / (place(0) - place(1)).norm();
+    assert!((ratio - 1.0).abs() < 2e-3, "{ratio}");
+    for camera in &result.cameras {
+        let across = camera.camera.pose().rotation() * Vector3::x();
+        assert!(across.z.abs() < 0.02, "{across}");
+    }
+    let error = calibrate_flight(&labels, None, &Survey::default()).unwrap_err();
+    assert!(matches!(error, FlightError::NoSize), "{error}");
+    let error = calibrate_flight(&labels[..1], None, &survey).unwrap_err();
+    assert!(matches!(error, FlightError::NoPair), "{error}");
+}
+
+/// A log that lies metres beside puts the whole site beside and leaves the cameras where they are to
+/// one another; the datum says so, the cameras' covariances do not.
+#[test]
+fn a_log_beside_itself_moves_the_datum_and_not_the_cameras_to_one_another() {
+    const BESIDE: [f64; 3] = [1.6, -2.3, 1.1];
+    let errors = LogErrors { sd_m: 1.5, drift_sd_m: 2.0, drift_time_s: 200.0 };
+    let (truths, labels, mut log) = flight(10);
+    let mut random = ChaCha8Rng::seed_from_u64(100);
+    for sample in &mut log.samples {
+        let noise = Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut random) });
+        sample.position += Vector3::from(BESIDE) + noise * errors.sd_m;
+    }
+    log.errors = errors;
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
+    let off = |index: usize| {
+        result.cameras[index].camera.pose().position() - truths[index].camera.pose().position()
+    };
+    let sd = result.datum.sd();
+    for (axis, beside) in BESIDE.into_iter().enumerate() {
+        let mean = (0..3).map(|index| off(index)[axis]).sum::<f64>() / 3.0;
+        assert!((1.0..3.0).contains(&sd[axis]) && mean.abs() < 2.5 * sd[axis], "{mean} {sd:?}");
+        assert!((mean - beside).abs() < 1.0, "{mean} for {beside}");
+    }
+    for (index, camera) in result.cameras.iter().enumerate() {
+        let beside_the_others = off(index) - off((index + 1) % 3);
+        assert!(beside_the_others.norm() < 1.0, "{beside_the_others}");
+        let stated = camera.pose_covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
+        assert!(stated < 0.3, "{}: {stated} m", camera.name);
+    }
 }

@@ -8,6 +8,7 @@
     )
 )]
 
+mod calibrated;
 #[cfg(feature = "centre")]
 mod centre;
 mod commands;

@@ -5,13 +5,11 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 use std::path::Path;
 
-use anyhow::{Context, ensure};
 use crossfix_calibration::{CalibratedCamera, SiteCalibration};
-use crossfix_geometry::Pixel;
-use crossfix_message::{
-    BearingFrame, Channel, ImageTrackState, Payload, Preview, Timestamp, decode,
-};
+use crossfix_message::{BearingFrame, Channel, Payload, Preview, Timestamp, decode};
 use crossfix_recording::Entry;
+
+use crate::calibrated::{self, middle_time, recalibrate};
 
 /// A calibration file to be put in the place of what was recorded.
 #[derive(Clone, Debug)]
@@ -24,11 +22,7 @@ pub struct Recalibration {
 impl Recalibration {
     /// Reads the file.
     pub fn load(path: &Path) -> anyhow::Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("cannot read the calibration {}", path.display()))?;
-        let site = SiteCalibration::from_toml(&text)
-            .with_context(|| format!("the calibration {} has an error", path.display()))?;
-        ensure!(!site.cameras().is_empty(), "the calibration {} has no cameras", path.display());
+        let site = calibrated::load(path)?;
         Ok(Self { site, left_out: Cell::new(0) })
     }
 
@@ -90,38 +84,6 @@ impl Recalibration {
 
 /// What a clock may gain behind its calibration, s.
 const SPARE_S: f64 = 5.0;
-
-/// The common time of a frame's middle row, and its deviation.
-fn middle_time(camera: &CalibratedCamera, own_ns: i64) -> (Timestamp, f64) {
-    let height = f64::from(camera.camera.model().intrinsics().size.height);
-    camera.common_time(Timestamp::from_nanos(own_ns), height / 2.0)
-}
-
-/// Makes a frame's bearings anew from its pixels, and its time the common one: that at which the
-/// rows of its targets were read out, in the mean. Returns how many bearings had to be left out.
-fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
-    let height = f64::from(camera.camera.model().intrinsics().size.height);
-    let is_seen =
-        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
-    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
-    let row =
-        if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 };
-    let (time, sd_s) = camera.common_time(Timestamp::from_nanos(frame.capture_time_ns), row);
-    frame.capture_time_ns = time.nanos();
-    frame.capture_time_sd_s = frame.capture_time_sd_s.hypot(sd_s);
-    let before = frame.tracks.len();
-    frame.tracks.retain_mut(|track| {
-        let Ok(bearing) = camera.bearing(Pixel::new(track.pixel_x, track.pixel_y)) else {
-            return false;
-        };
-        track.bearing = Some(bearing.direction().into_inner().into());
-        track.covariance_xx = bearing.covariance().m11;
-        track.covariance_xy = bearing.covariance().m12;
-        track.covariance_yy = bearing.covariance().m22;
-        true
-    });
-    (before - frame.tracks.len()) as u64
-}
 
 /// Entries put into the order of their new times: each waits until nothing older can come.
 #[derive(Debug)]

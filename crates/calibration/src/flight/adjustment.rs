@@ -207,7 +207,9 @@ impl State {
         }
         let mut cost = Cost(0.0);
         self.jerk_rows(priors, &mut cost);
-        cost.0
+        // By the power that is found from the way each counts one; a rough start's count more, and
+        // would drive the site asunder.
+        cost.0.min(3.0 * self.way.intervals() as f64)
     }
 
     /// The square of the site's size: of its cameras about their middle, m^2.
@@ -503,7 +505,7 @@ pub(super) fn adjust(
             break;
         }
     }
-    tracing::debug!("cost {cost:.2}");
+
     let known = Priors { rate_sd: RATE_KNOWN_BY, ..priors.clone() };
     let solution = linearised(&Model { priors: &known, ..model }, &state).solve(0.0)?;
     Some(Adjusted { state, covariance: solution.covariance()?, cost })

@@ -14,9 +14,13 @@ struct Similarity {
     to: Point3<f64>,
 }
 
-/// Brings cameras and way to where the survey has them, as near as it says. `None`: it says nothing
-/// of the size.
-pub(super) fn to_survey(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<State> {
+/// Brings cameras and way to where the survey has them, as near as it says, and says how many times
+/// larger they are there. `None`: it says nothing of the size.
+pub(super) fn to_survey(
+    state: &State,
+    labels: &[CameraLabels],
+    survey: &Survey,
+) -> Option<(State, f64)> {
     let places: Vec<(Point3<f64>, Point3<f64>)> = labels
         .iter()
         .zip(&state.cameras)
@@ -35,7 +39,7 @@ pub(super) fn to_survey(state: &State, labels: &[CameraLabels], survey: &Survey)
     let arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
     let rotation = turn(&arms).filter(|_| places.len() >= ENOUGH_FOR_UP);
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
-    Some(Similarity { rotation, scale, from, to }.moved(state))
+    Some((Similarity { rotation, scale, from, to }.moved(state), scale))
 }
 
 /// How many times larger the survey is, by at least two places.

@@ -78,9 +78,12 @@ impl Begun {
         for (camera, why) in unusable {
             begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
         }
+        begun.order_as(cameras);
         begun.leave_lonely_out(false);
         let state = begun.unknowns(false);
-        let state = align::to_survey(&state, &begun.cameras, survey).ok_or(FlightError::NoSize)?;
+        let aligned = align::to_survey(&state, &begun.cameras, survey);
+        let (state, growth) = aligned.ok_or(FlightError::NoSize)?;
+        begun.course.jerk *= growth * growth;
         Ok((begun, state))
     }
 
@@ -92,6 +95,14 @@ impl Begun {
             }
             Err(why) => self.refused.push((camera.name.clone(), why)),
         }
+    }
+
+    /// Puts the cameras into the order that they were given in.
+    fn order_as(&mut self, cameras: &[CameraLabels]) {
+        let (names, states) = (self.cameras.drain(..), self.states.drain(..));
+        let mut both: Vec<(CameraLabels, CameraState)> = names.zip(states).collect();
+        both.sort_by_key(|(own, _)| cameras.iter().position(|camera| camera.name == own.name));
+        (self.cameras, self.states) = both.into_iter().unzip();
     }
 
     /// Leaves labels out that were made where no log and no other camera tells how far off the target

@@ -353,6 +353,7 @@ fn write_files(
         let file = CameraFile {
             name: name.clone(),
             network: "network.toml".into(),
+            calibration: None,
             intrinsics: Some(format!("{name}.yaml").into()),
             pose: Some(PoseConfig::of(camera.camera().pose())),
             source: SourceConfig::Simulation {

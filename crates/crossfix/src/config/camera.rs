@@ -12,6 +12,7 @@ use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
 use super::Kind;
+use crate::calibrated::Calibrated;
 use crate::recorded;
 
 /// The last second of this century: what begins later begins in error.
@@ -26,6 +27,10 @@ pub struct CameraFile {
     pub name: CameraName,
     /// The network's file (TOML).
     pub network: PathBuf,
+    /// The site's calibration (TOML, by crossfix calibrate): lens, pose and clock as it found them,
+    /// in the place of `intrinsics`, `pose` and what the clock is worth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<PathBuf>,
     /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if
     /// both this and `pose` are there, they replace the recorded calibration.
     pub intrinsics: Option<PathBuf>,
@@ -180,6 +185,7 @@ impl CameraFile {
         let folder = path.parent().unwrap_or(Path::new("."));
         file.network = folder.join(&file.network);
         file.intrinsics = file.intrinsics.map(|intrinsics| folder.join(intrinsics));
+        file.calibration = file.calibration.map(|calibration| folder.join(calibration));
         match &mut file.source {
             SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
                 *path = folder.join(&*path);
@@ -200,6 +206,10 @@ impl CameraFile {
     pub fn described(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         self.check().with_context(wrong)?;
+        if let Some(calibrated) = self.calibrated().with_context(wrong)? {
+            self.check_boxes(calibrated.camera()).with_context(wrong)?;
+            return Ok(calibrated.camera().clone());
+        }
         match (&self.intrinsics, &self.pose, &self.source) {
             (Some(intrinsics), Some(pose), _) => {
                 let text = std::fs::read_to_string(intrinsics)
@@ -219,8 +229,15 @@ impl CameraFile {
                 let calibration = recorded_calibration(path, &self.name).with_context(wrong)?;
                 Ok(calibration.parse()?.camera)
             }
-            _ => Err(anyhow!("give both `intrinsics` and [pose]")).with_context(wrong),
+            _ => Err(anyhow!("give both `intrinsics` and [pose], or `calibration`"))
+                .with_context(wrong),
         }
+    }
+
+    /// The camera as the site's calibration has it, where the file names one.
+    pub fn calibrated(&self) -> anyhow::Result<Option<Calibrated>> {
+        let load = |path: &PathBuf| Calibrated::load(path, &self.name).context("key `calibration`");
+        self.calibration.as_ref().map(load).transpose()
     }
 
     fn check(&self) -> anyhow::Result<()> {
@@ -297,6 +314,12 @@ impl CameraFile {
                 format!("the lens shows no direction at pixel ({x}, {y}): are the distortion coefficients in their order?")
             })?;
         }
+        self.check_boxes(camera)
+    }
+
+    /// Checks that boxes are in the camera's image.
+    fn check_boxes(&self, camera: &Camera) -> anyhow::Result<()> {
+        let ImageSize { width, height } = camera.model().intrinsics().size;
         for &[x, y, w, h] in &self.boxes {
             ensure!(
                 x + w > 0.0 && y + h > 0.0 && x < f64::from(width) && y < f64::from(height),
@@ -346,6 +369,9 @@ impl CameraFile {
         camera: &Camera,
         valid_from: Timestamp,
     ) -> anyhow::Result<CameraCalibration> {
+        if let Some(calibrated) = self.calibrated()? {
+            return Ok(calibrated.message(valid_from));
+        }
         match &self.source {
             SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
                 recorded_calibration(path, &self.name)

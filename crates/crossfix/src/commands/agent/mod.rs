@@ -12,6 +12,7 @@ use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
 
 use self::start::Start;
+use crate::calibrated::Calibrated;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
@@ -63,6 +64,8 @@ pub struct Args {
 /// What an agent has open.
 struct Agent {
     identity: CameraIdentity,
+    /// Lens, pose and clock by the site's calibration, where there is one.
+    calibrated: Option<Calibrated>,
     calibration: Vec<u8>,
     link: Link,
     /// That it hears what is said to it; from the moment on at which it does.
@@ -95,6 +98,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         return Ok(());
     };
     let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
+    agent.calibrated = file.calibrated()?;
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
         return agent.finish(Ok(()));
     };
@@ -135,6 +139,7 @@ impl Agent {
             health: link.publisher(Channel::CameraHealth(name.clone()), delivery)?,
             previews: link.publisher(Channel::Preview(name), Delivery::Picture)?,
             identity,
+            calibrated: None,
             calibration: Vec::new(),
             alive: None,
             link,
@@ -267,7 +272,10 @@ impl Agent {
         }
     }
 
-    fn publish(&mut self, frame: &BearingFrame) -> anyhow::Result<()> {
+    fn publish(&mut self, mut frame: BearingFrame) -> anyhow::Result<()> {
+        if let Some(calibrated) = &self.calibrated {
+            self.unseen_bearings += calibrated.apply(&mut frame);
+        }
         self.now = Timestamp::from_nanos(frame.capture_time_ns);
         self.keep_up()?;
         self.frames += 1;
@@ -321,13 +329,16 @@ impl Agent {
             self.note_behind(pace.behind(since_s));
             let (message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
             self.unseen_bearings += unseen;
-            self.publish(&message)?;
+            self.publish(message)?;
             let rate = file.preview.rate_hz;
             let due = shown.is_none_or(|last| capture.time.seconds_since(last) * rate >= 1.0);
             if rate > 0.0 && due {
                 shown = Some(capture.time);
                 let preview = self.identity.preview(&image, capture, file.preview.divisor as usize);
-                if let Some(preview) = preview {
+                if let Some(mut preview) = preview {
+                    if let Some(calibrated) = &self.calibrated {
+                        calibrated.apply_to_preview(&mut preview);
+                    }
                     self.previews.put(preview.encode())?;
                 }
             }
@@ -372,7 +383,7 @@ impl Agent {
             }
             self.note_behind(pace.behind(since_s));
             match lacks.read::<BearingFrame>(&entry.data) {
-                Some(frame) => self.publish(&frame),
+                Some(frame) => self.publish(frame),
                 None => {
                     self.bad_frames += 1;
                     Ok(())

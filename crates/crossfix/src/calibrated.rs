@@ -1,0 +1,103 @@
+//! What a camera saw, as its site's calibration file has it: lens, pose and clock.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{CalibratedCamera, SiteCalibration};
+use crossfix_geometry::{Camera, Pixel};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, CameraName, ImageTrackState, Preview, Timestamp,
+};
+
+/// Reads a site's calibration file.
+pub fn load(path: &Path) -> anyhow::Result<SiteCalibration> {
+    let text = std::fs::read_to_string(path)
+        .with_context(|| format!("cannot read the calibration {}", path.display()))?;
+    let site = SiteCalibration::from_toml(&text)
+        .with_context(|| format!("the calibration {} has an error", path.display()))?;
+    ensure!(!site.cameras().is_empty(), "the calibration {} has no cameras", path.display());
+    Ok(site)
+}
+
+/// One camera of a site's calibration.
+#[derive(Clone, Debug)]
+pub struct Calibrated {
+    site: SiteCalibration,
+    camera: CalibratedCamera,
+}
+
+impl Calibrated {
+    /// The camera of this name.
+    pub fn load(path: &Path, name: &CameraName) -> anyhow::Result<Self> {
+        let site = load(path)?;
+        let camera = site.camera(name).cloned().with_context(|| {
+            let known: Vec<&str> = site.cameras().iter().map(|c| c.name.as_str()).collect();
+            format!(
+                "the calibration {} has no camera `{name}`: it has {}",
+                path.display(),
+                known.join(", ")
+            )
+        })?;
+        Ok(Self { site, camera })
+    }
+
+    /// Lens and pose.
+    pub fn camera(&self) -> &Camera {
+        &self.camera.camera
+    }
+
+    /// The message that describes the camera from a time of its own on.
+    pub fn message(&self, from: Timestamp) -> CameraCalibration {
+        /// Rows and deviations of the clock may put a frame before its time, s.
+        const EARLIER_S: f64 = 1.0;
+        let from = self.common(from).plus_seconds(-EARLIER_S);
+        self.site.message(&self.camera, from)
+    }
+
+    /// The common time of one of the camera's.
+    pub fn common(&self, own: Timestamp) -> Timestamp {
+        middle_time(&self.camera, own.nanos()).0
+    }
+
+    /// As [`recalibrate`].
+    pub fn apply(&self, frame: &mut BearingFrame) -> u64 {
+        recalibrate(frame, &self.camera)
+    }
+
+    /// Gives a picture the common time.
+    pub fn apply_to_preview(&self, preview: &mut Preview) {
+        preview.capture_time_ns = middle_time(&self.camera, preview.capture_time_ns).0.nanos();
+    }
+}
+
+/// The common time of a frame's middle row, and its deviation.
+pub fn middle_time(camera: &CalibratedCamera, own_ns: i64) -> (Timestamp, f64) {
+    let height = f64::from(camera.camera.model().intrinsics().size.height);
+    camera.common_time(Timestamp::from_nanos(own_ns), height / 2.0)
+}
+
+/// Makes a frame's bearings anew from its pixels, and its time the common one: that at which the
+/// rows of its targets were read out, in the mean. Returns how many bearings had to be left out.
+pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
+    let height = f64::from(camera.camera.model().intrinsics().size.height);
+    let is_seen =
+        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
+    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
+    let row =
+        if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 };
+    let (time, sd_s) = camera.common_time(Timestamp::from_nanos(frame.capture_time_ns), row);
+    frame.capture_time_ns = time.nanos();
+    frame.capture_time_sd_s = frame.capture_time_sd_s.hypot(sd_s);
+    let before = frame.tracks.len();
+    frame.tracks.retain_mut(|track| {
+        let Ok(bearing) = camera.bearing(Pixel::new(track.pixel_x, track.pixel_y)) else {
+            return false;
+        };
+        track.bearing = Some(bearing.direction().into_inner().into());
+        track.covariance_xx = bearing.covariance().m11;
+        track.covariance_xy = bearing.covariance().m12;
+        track.covariance_yy = bearing.covariance().m22;
+        true
+    });
+    (before - frame.tracks.len()) as u64
+}
