@@ -46,12 +46,16 @@ impl Calibrated {
         &self.camera.camera
     }
 
-    /// The message that describes the camera from a time of its own on.
+    /// The message that describes the camera from a common time on.
     pub fn message(&self, from: Timestamp) -> CameraCalibration {
-        /// Rows and deviations of the clock may put a frame before its time, s.
+        /// A row may be read out before its frame's time, s.
         const EARLIER_S: f64 = 1.0;
-        let from = self.common(from).plus_seconds(-EARLIER_S);
-        self.site.message(&self.camera, from)
+        self.site.message(&self.camera, from.plus_seconds(-EARLIER_S))
+    }
+
+    /// The common time of one of another camera's of the site; its own, if the site has it not.
+    pub fn common_of(&self, camera: &CameraName, own: Timestamp) -> Timestamp {
+        self.site.camera(camera).map_or(own, |camera| middle_time(camera, own.nanos()).0)
     }
 
     /// The common time of one of the camera's.

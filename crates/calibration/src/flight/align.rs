@@ -27,19 +27,20 @@ pub(super) fn to_survey(
         .filter_map(|(labels, camera)| Some((camera.centre, survey.place(&labels.name)?.position)))
         .collect();
     let scale = size(&places).or_else(|| taped(state, labels, survey))?;
-    let centroid = |of: fn(&(Point3<f64>, Point3<f64>)) -> Point3<f64>| {
-        let sum: Vector3<f64> = places.iter().map(|pair| of(pair).coords).sum();
-        Point3::from(sum / places.len() as f64)
-    };
     let (from, to) = if places.is_empty() {
         (state.cameras.first()?.centre, Point3::origin())
     } else {
-        (centroid(|pair| pair.0), centroid(|pair| pair.1))
+        (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
     };
     let arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
     let rotation = turn(&arms).filter(|_| places.len() >= ENOUGH_FOR_UP);
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
     Some((Similarity { rotation, scale, from, to }.moved(state), scale))
+}
+
+fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {
+    let count = places.len() as f64;
+    Point3::from(places.map(|place| place.coords).sum::<Vector3<f64>>() / count)
 }
 
 /// How many times larger the survey is, by at least two places.

@@ -93,12 +93,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let network = config::load_network(&file.network)?;
     let identity =
         CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
-    let begins = source_begins(&file)?;
+    let calibrated = file.calibrated()?;
+    let begins = source_begins(&file, calibrated.as_ref())?;
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
     };
     let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
-    agent.calibrated = file.calibrated()?;
+    agent.calibrated = calibrated;
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
         return agent.finish(Ok(()));
     };
@@ -106,10 +107,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     agent.finish(seen)
 }
 
-/// The data time at which a source begins; that of a scene is when it is started.
-fn source_begins(file: &CameraFile) -> anyhow::Result<Timestamp> {
+/// The time at which a source begins: of a recording the common one of all its cameras, of a video the
+/// camera's own; that of a scene is when it is started.
+fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::Result<Timestamp> {
     match &file.source {
-        SourceConfig::Recording { path, .. } => first_bearing(path),
+        SourceConfig::Recording { path, .. } => first_bearing(path, calibrated),
         SourceConfig::Video { start_s, .. } => Ok(Timestamp::from_seconds(*start_s)),
         SourceConfig::Simulation { .. } => Ok(Timestamp::EPOCH),
     }
@@ -173,7 +175,11 @@ impl Agent {
         let start = start.map(|start| args.start_at.map_or(start, Start::at_wall_time));
         if let Some(start) = &start {
             let is_scene = matches!(file.source, SourceConfig::Simulation { .. });
-            let valid_from = if is_scene { Timestamp::from_seconds(start.wall_s) } else { begins };
+            let valid_from = if is_scene {
+                Timestamp::from_seconds(start.wall_s)
+            } else {
+                self.common_begin(file, begins)
+            };
             if is_scene {
                 self.scene_begins = valid_from;
             }
@@ -181,6 +187,13 @@ impl Agent {
             self.now = valid_from;
         }
         Ok(start)
+    }
+
+    /// The common time at which a source begins.
+    fn common_begin(&self, file: &CameraFile, begins: Timestamp) -> Timestamp {
+        let is_common = matches!(file.source, SourceConfig::Recording { .. });
+        let calibrated = self.calibrated.as_ref().filter(|_| !is_common);
+        calibrated.map_or(begins, |camera| camera.common(begins))
     }
 
     /// Says that it is there.
@@ -374,7 +387,9 @@ impl Agent {
         let mut lacks = Lacks::default();
         let shutdown = self.shutdown.clone();
         recorded::for_each_until(path, &mut lacks, &shutdown, |lacks, entry| {
-            let since_s = entry.data_time.seconds_since(begins);
+            let own = entry.data_time;
+            let time = self.calibrated.as_ref().map_or(own, |camera| camera.common(own));
+            let since_s = time.seconds_since(begins);
             if entry.key.channel != key
                 || !start.is_caught_up(since_s, pace.behind(since_s))
                 || !pace.wait(since_s, &self.shutdown)
@@ -415,12 +430,14 @@ impl Agent {
     }
 }
 
-/// Data time of the first bearing of any camera of a recording.
-fn first_bearing(path: &Path) -> anyhow::Result<Timestamp> {
+/// Time of the first bearing of any camera of a recording.
+fn first_bearing(path: &Path, calibrated: Option<&Calibrated>) -> anyhow::Result<Timestamp> {
     let mut first: Option<Timestamp> = None;
     recorded::for_each(path, &mut Lacks::default(), |_, entry| {
-        if matches!(entry.key.channel, Channel::Bearings(_)) {
-            first = Some(first.map_or(entry.data_time, |f| f.min(entry.data_time)));
+        if let Channel::Bearings(name) = &entry.key.channel {
+            let own = entry.data_time;
+            let time = calibrated.map_or(own, |camera| camera.common_of(name, own));
+            first = Some(first.map_or(time, |first| first.min(time)));
         }
         Ok(())
     })?;

@@ -179,7 +179,7 @@ impl Agent {
     ) -> Start {
         let name = &self.identity.name;
         let is_scene = matches!(file.source, SourceConfig::Simulation { .. });
-        let begins = self.calibrated.as_ref().map_or(begins, |camera| camera.common(begins));
+        let begins = self.common_begin(file, begins);
         let joined_s = now.seconds_since(if is_scene { scene_begins } else { begins });
         if !(0.0..FARTHEST_S).contains(&joined_s) {
             tracing::warn!(
