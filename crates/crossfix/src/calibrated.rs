@@ -105,3 +105,81 @@ pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
     });
     (before - frame.tracks.len()) as u64
 }
+
+#[cfg(test)]
+mod tests {
+    use crossfix_message::BearingTrack;
+
+    use super::*;
+
+    /// A camera that looks along its z axis, whose clock is half a minute behind, with a read-out of
+    /// 20 ms.
+    const SITE: &str = r#"
+        form = 1
+        [[camera]]
+        name = "north"
+        position_m = [10.0, 20.0, 2.0]
+        rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        pose_covariance = [[0.0, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0],
+                           [0.0, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0]]
+        range_m = 50.0
+        [camera.lens]
+        model = "pinhole"
+        size = [1000, 500]
+        focal_px = [1000.0, 1000.0]
+        centre_px = [500.0, 250.0]
+        distortion = []
+        covariance = [[0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 0, 0]]
+        pose_by_lens = [[0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 0, 0],
+                        [0.0, 0, 0, 0], [0.0, 0, 0, 0], [0.0, 0, 0, 0]]
+        [camera.clock]
+        knots_s = [[0.0, 30.0, 0.001], [100.0, 30.0, 0.001]]
+        rate = 0.0
+        rate_sd = 0.0
+        wander_s = 0.0
+        readout_s = 0.02
+        [camera.noise]
+        white_px = 0.5
+        lasting_px = 0.0
+        lasting_s = 1.0
+        frame_s = 0.04
+    "#;
+
+    fn calibrated(name: &str) -> anyhow::Result<Calibrated> {
+        let file = tempfile::NamedTempFile::new()?;
+        std::fs::write(file.path(), SITE)?;
+        Calibrated::load(file.path(), &name.parse()?)
+    }
+
+    #[test]
+    fn a_frame_gets_the_common_time_of_its_row_and_the_lens_s_direction() {
+        let camera = calibrated("north").unwrap();
+        let track = BearingTrack {
+            pixel_x: 600.0,
+            pixel_y: 500.0,
+            state: ImageTrackState::Tracking.into(),
+            ..Default::default()
+        };
+        let mut frame = BearingFrame {
+            capture_time_ns: Timestamp::from_seconds(7.0).nanos(),
+            tracks: vec![track],
+            ..Default::default()
+        };
+        assert_eq!(camera.apply(&mut frame), 0);
+        let time_s = Timestamp::from_nanos(frame.capture_time_ns).seconds();
+        // The last row is read out half the read-out after the frame's time.
+        assert!((time_s - 37.01).abs() < 1e-6, "{time_s}");
+        assert!((frame.capture_time_sd_s - 1e-3).abs() < 1e-9);
+        let bearing = frame.tracks[0].bearing.unwrap();
+        assert!((bearing.x / bearing.z - 0.1).abs() < 1e-12);
+        assert!((bearing.y / bearing.z - 0.25).abs() < 1e-12);
+        let message = camera.message(Timestamp::from_seconds(30.0)).parse().unwrap();
+        assert_eq!(message.camera.pose().position().x, 10.0);
+    }
+
+    #[test]
+    fn a_camera_that_the_file_has_not_is_told_which_it_has() {
+        let error = calibrated("south").unwrap_err().to_string();
+        assert!(error.contains("no camera `south`: it has north"), "{error}");
+    }
+}
