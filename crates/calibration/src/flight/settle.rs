@@ -15,6 +15,8 @@ const ROUNDS: usize = 6;
 const USUAL_WANDER: f64 = 1e-9;
 const USUAL_STEPS: f64 = 2.0;
 const LEAST_WANDER: f64 = 1e-12;
+/// A round goes on by as much again as it was led, and by this at most.
+const MOST_AHEAD: f64 = 3.0;
 
 /// Adjusts, finds the noise in what is left, and adjusts again.
 pub(super) fn settle(
@@ -111,7 +113,10 @@ fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
         squares += (pair[1] - pair[0]).powi(2) / knots.step_s;
         told += (1.0 - spread / (before * knots.step_s)).clamp(0.0, 1.0);
     }
-    ((squares + USUAL_STEPS * USUAL_WANDER) / (told + USUAL_STEPS)).max(LEAST_WANDER)
+    let found = (squares + USUAL_STEPS * USUAL_WANDER) / (told + USUAL_STEPS);
+    // By itself it takes a dozen rounds and more: half of the way is left in each.
+    let ahead = (found / before).clamp(MOST_AHEAD.recip(), MOST_AHEAD);
+    (found * ahead).max(LEAST_WANDER)
 }
 
 /// The power of the jerk that a way shows: what its third differences are, and what they may be

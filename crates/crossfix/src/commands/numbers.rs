@@ -44,6 +44,22 @@ pub fn rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 10_000.0, " frames a second")
 }
 
+#[cfg(feature = "centre")]
+pub fn triple(text: &str) -> Result<[f64; 3], String> {
+    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
+    numbers.try_into().map_err(|_| {
+        "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned()
+    })
+}
+
+/// A place on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
+#[cfg(feature = "centre")]
+pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
+    let [latitude, longitude, height] = triple(text)?;
+    crossfix_geometry::Geodetic::from_degrees(latitude, longitude, height)
+        .map_err(|error| error.to_string())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

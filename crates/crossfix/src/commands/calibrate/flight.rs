@@ -3,12 +3,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_calibration::{CameraLabels, Label, SiteCalibration, calibrate_flight};
-use crossfix_geometry::{Intrinsics, Pixel};
+use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
-use super::log::{self, LogKind};
+use super::log::{self, LogKind, LogTime, Reading};
 use super::report;
 use super::survey::{self, Distance};
 use crate::commands::numbers;
@@ -23,9 +23,20 @@ use crate::recorded::{self, Lacks};
 pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
-    /// Where the target was by its own receiver: a CSV with time_s, east_m, north_m, up_m.
+    /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
+    /// latitude_deg, longitude_deg, height_m; or GPX.
     #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance"])]
     log: Option<PathBuf>,
+    /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log in
+    /// degrees; its first place without.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
+    #[arg(long, default_value = "file", value_enum, value_name = "TIME")]
+    time: LogTime,
+    /// How far the receiver is above what cameras see as the target's middle, m.
+    #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::number, allow_hyphen_values = true)]
+    antenna: f64,
     /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two say how large the
     /// site is, three where it is; without a log the flight may be anybody's.
     #[arg(long, value_name = "FILE")]
@@ -55,7 +66,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut errors = args.log_kind.errors();
     errors.sd_m = args.log_sd.unwrap_or(errors.sd_m);
     errors.drift_sd_m = args.log_drift.unwrap_or(errors.drift_sd_m);
-    let log = args.log.as_deref().map(|path| log::read(path, errors)).transpose()?;
+    let reading = Reading {
+        errors,
+        anchor: args.anchor,
+        is_gps_time: args.time == LogTime::Gps,
+        antenna_m: args.antenna,
+    };
+    let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
     let cameras = labels(&args.recording)?;
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let survey = survey::read(args.positions.as_deref(), &args.distance, &names)?;

@@ -11,7 +11,7 @@ use crossfix_geometry::{Camera, Geodetic};
 use nalgebra::Point3;
 
 use self::report::Report;
-use crate::commands::numbers::{not_negative, number, positive};
+use crate::commands::numbers::{self, not_negative, positive, triple};
 use crate::config;
 use crate::output::{self, Draft};
 
@@ -81,7 +81,7 @@ pub struct Args {
     geojson: Option<PathBuf>,
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
     /// ellipsoid.
-    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = anchor, allow_hyphen_values = true)]
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
     anchor: Option<Geodetic>,
     /// Write the coloured volume as a picture for Rerun (.rrd).
     #[arg(long, value_name = "FILE")]
@@ -91,18 +91,6 @@ pub struct Args {
 fn window(text: &str) -> Result<f64, String> {
     positive(text)
         .and_then(|n| if n <= 60.0 { Ok(n) } else { Err("it must be at most 60 s".to_owned()) })
-}
-
-fn triple(text: &str) -> Result<[f64; 3], String> {
-    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
-    numbers.try_into().map_err(|_| {
-        "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned()
-    })
-}
-
-fn anchor(text: &str) -> Result<Geodetic, String> {
-    let [latitude, longitude, height] = triple(text)?;
-    Geodetic::from_degrees(latitude, longitude, height).map_err(|error| error.to_string())
 }
 
 impl Args {
