@@ -231,7 +231,7 @@ impl SiteCalibration {
 impl From<&FlightResult> for SiteCalibration {
     fn from(result: &FlightResult) -> Self {
         let cameras = result.cameras.iter().map(CalibratedCamera::from).collect();
-        Self { cameras, datum: Some(result.datum.clone()) }
+        Self { cameras, datum: result.datum.clone() }
     }
 }
 

@@ -173,14 +173,15 @@ fn the_poses_covariance_is_honest() {
 /// The part of a camera's pose that is off with the whole site: turned by w about its middle, it turns
 /// by R'w about its own axes.
 fn of_site(result: &FlightResult, camera: &Camera) -> Matrix6<f64> {
-    let arm = camera.pose().position() - result.datum.middle;
+    let datum = result.datum.as_ref().unwrap();
+    let arm = camera.pose().position() - datum.middle;
     let mut by_datum = nalgebra::SMatrix::<f64, 6, 9>::zeros();
     let turn = camera.pose().rotation().matrix().transpose();
     by_datum.fixed_view_mut::<3, 3>(0, 3).copy_from(&turn);
     by_datum.fixed_view_mut::<3, 3>(3, 0).fill_with_identity();
     by_datum.fixed_view_mut::<3, 3>(3, 3).copy_from(&-arm.cross_matrix());
     by_datum.fixed_view_mut::<3, 1>(3, 6).copy_from(&arm);
-    by_datum * result.datum.covariance * by_datum.transpose()
+    by_datum * datum.covariance * by_datum.transpose()
 }
 
 fn lens_error(truth: &Truth, found: &Intrinsics) -> nalgebra::DVector<f64> {
@@ -270,8 +271,15 @@ fn what_is_found_survives_its_file_and_a_torn_file_is_named() {
     assert!((one.into_inner() - two.into_inner()).norm() < 1e-12);
     assert!(SiteCalibration::from_toml(&text.replace("form = 1", "form = 2")).is_err());
     assert!(SiteCalibration::from_toml(&text[..text.len() / 2]).is_err());
+    // One camera alone is off by all that the site is.
+    assert!(again.datum().is_none() && one_sd(&again) > 0.01);
     let nan = text.replace("range_m = ", "range_m = -");
     assert!(SiteCalibration::from_toml(&nan).unwrap_err().to_string().contains("range_m"));
+}
+
+/// How sure the first camera's place is, m.
+fn one_sd(site: &SiteCalibration) -> f64 {
+    site.cameras()[0].pose_covariance.fixed_view::<3, 3>(3, 3).trace().sqrt()
 }
 
 /// Where the cameras stand, as a survey to 5 cm has it.
@@ -307,7 +315,7 @@ fn an_unknown_flight_and_three_surveyed_places_give_poses_clocks_and_lenses() {
         let between = truth.offset_s - truths[0].offset_s;
         assert!((ahead(index) - between).abs() < 0.01, "{}: {}", truth.name, ahead(index));
     }
-    let sd = result.datum.sd();
+    let sd = result.datum.as_ref().unwrap().sd();
     assert!((0.01..0.1).contains(&sd[0]) && sd[6] < 2e-3 && sd[7] > 100.0, "{sd:?}");
 }
 
@@ -325,6 +333,8 @@ fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
     let found = |index: usize| result.cameras[index].camera.pose().position();
     let ratio = (found(0) - found(1)).norm() / (place(0) - place(1)).norm();
     assert!((ratio - 1.0).abs() < 2e-3, "{ratio}");
+    // A gauge of tens of metres is nobody's knowledge.
+    assert!(result.datum.as_ref().unwrap().sd()[0] > 100.0, "{:?}", result.datum);
     for camera in &result.cameras {
         let across = camera.camera.pose().rotation() * Vector3::x();
         assert!(across.z.abs() < 0.02, "{across}");
@@ -352,7 +362,7 @@ fn a_log_beside_itself_moves_the_datum_and_not_the_cameras_to_one_another() {
     let off = |index: usize| {
         result.cameras[index].camera.pose().position() - truths[index].camera.pose().position()
     };
-    let sd = result.datum.sd();
+    let sd = result.datum.as_ref().unwrap().sd();
     for (axis, beside) in BESIDE.into_iter().enumerate() {
         let mean = (0..3).map(|index| off(index)[axis]).sum::<f64>() / 3.0;
         assert!((1.0..3.0).contains(&sd[axis]) && mean.abs() < 2.5 * sd[axis], "{mean} {sd:?}");

@@ -70,10 +70,15 @@ impl Datum {
 
     /// Whether its numbers can be.
     pub fn is_possible(&self) -> bool {
-        let size = self.covariance.amax();
-        self.middle.iter().chain(&self.covariance).all(|value| value.is_finite())
-            && (self.covariance - self.covariance.transpose()).amax() <= 1e-9 * size
-            && self.covariance.symmetric_eigenvalues().min() >= -1e-9 * size
+        // Its ways have units of their own: each by its own deviation.
+        let by = self.sd().map(|sd| if sd > 0.0 { sd.recip() } else { 0.0 });
+        let scale = SMatrix::from_diagonal(&by.into());
+        let correlation = scale * self.covariance * scale;
+        let is_variance = (0..Self::WAYS).all(|way| self.covariance[(way, way)] >= 0.0);
+        is_variance
+            && self.middle.iter().chain(&self.covariance).all(|value| value.is_finite())
+            && (correlation - correlation.transpose()).amax() <= 1e-9
+            && correlation.symmetric_eigenvalues().min() >= -1e-9
     }
 }
 

@@ -23,9 +23,10 @@ const OF_A_PAIR: usize = 3 * (SPAN + 1);
 const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
-/// A step of the adjustment moves the way by this where nothing else holds it, m: wide against what
-/// labels tell, and near enough for ten minutes without any.
-const REST_M: f64 = 1e3;
+/// A step of the adjustment moves the way by this where nothing else holds it, m: near enough for ten
+/// minutes without a label, and so wide that an hour of it says less of where the site is than the
+/// gauge does.
+const REST_M: f64 = 1e4;
 /// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
 /// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
 /// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by
@@ -38,6 +39,8 @@ const RATE_KNOWN_BY: f64 = 1e-3;
 /// A sensor is read out in between nothing and a frame's time: so much of it, and give or take.
 const READOUT_SHARE: f64 = 0.5;
 
+/// A way that hovers in a point has no size to be pulled on, m^2.
+const LEAST_SIZE2: f64 = 1.0;
 /// What a label counts, in deviations, that the way does not reach or that lies behind its camera.
 const UNSEEN: f64 = 1e3;
 
@@ -201,8 +204,7 @@ impl State {
     /// little else tells. The power of the jerk is found from the way, which is as large as the site is
     /// and as quick as its clocks: it says nothing of either, and its pull on both is taken off.
     fn pull(&self, priors: &Priors) -> f64 {
-        // One camera alone shows no size.
-        if self.cameras.len() < 2 {
+        if self.cameras.is_empty() {
             return 0.0;
         }
         let mut cost = Cost(0.0);
@@ -212,37 +214,53 @@ impl State {
         cost.0.min(3.0 * self.way.intervals() as f64)
     }
 
-    /// The square of the site's size: of its cameras about their middle, m^2.
-    fn size2(&self) -> f64 {
-        let middle = self.middle();
-        self.cameras.iter().map(|camera| (camera.centre.coords - middle).norm_squared()).sum()
+    /// The coefficients of the way that some label hangs on.
+    fn seen_coefficients(&self, flight: &Flight<'_>) -> Vec<usize> {
+        let mut is_seen = vec![false; self.way.coefficients.len()];
+        for (camera, labels) in self.cameras.iter().zip(flight.cameras) {
+            for label in &labels.labels {
+                if let Some(weights) = self.way.weights(camera.time_s(label)) {
+                    is_seen[weights.first..weights.first + SPAN].fill(true);
+                }
+            }
+        }
+        (0..is_seen.len()).filter(|k| is_seen[*k]).collect()
     }
 
-    fn middle(&self) -> Vector3<f64> {
-        let centres = self.cameras.iter().map(|camera| camera.centre.coords);
-        centres.sum::<Vector3<f64>>() / self.cameras.len() as f64
+    fn middle(&self, coefficients: &[usize]) -> Vector3<f64> {
+        let places = coefficients.iter().map(|k| self.way.coefficients[*k]);
+        places.sum::<Vector3<f64>>() / coefficients.len().max(1) as f64
+    }
+
+    /// The square of the size of these coefficients about their middle, m^2.
+    fn size2(&self, coefficients: &[usize]) -> f64 {
+        let middle = self.middle(coefficients);
+        let arms = coefficients.iter().map(|k| self.way.coefficients[*k] - middle);
+        arms.map(|arm| arm.norm_squared()).sum::<f64>().max(LEAST_SIZE2)
     }
 
     /// What takes a pull off. The jerk's cost goes with the square of the size and with the fifth power
     /// of the pace.
-    fn lean(&self, pull: f64) -> f64 {
+    fn lean(&self, pull: f64, seen: &[usize]) -> f64 {
         if pull <= 0.0 {
             return 0.0;
         }
         let rates = self.cameras.iter().map(|camera| camera.clock.rate).sum::<f64>();
-        pull * (5.0 * rates / self.cameras.len() as f64 - self.size2().ln())
+        pull * (5.0 * rates / self.cameras.len() as f64 - self.size2(seen).ln())
     }
 
     /// Its gradient.
-    fn lean_against(&self, pull: f64, linear: &mut NormalEquations) {
+    fn lean_against(&self, pull: f64, seen: &[usize], linear: &mut NormalEquations) {
         if pull <= 0.0 {
             return;
         }
-        let middle = self.middle();
-        let by_size2 = pull / self.size2();
-        for (camera, start) in self.cameras.iter().zip(self.starts()) {
-            let arm = camera.centre.coords - middle;
-            (0..3).for_each(|axis| linear.push(start + 3 + axis, by_size2 * arm[axis]));
+        let (order, middle) = (self.order(), self.middle(seen));
+        let by_size2 = pull / self.size2(seen);
+        for &k in seen {
+            let arm = self.way.coefficients[k] - middle;
+            (0..3).for_each(|axis| linear.push(order.way(k, axis), by_size2 * arm[axis]));
+        }
+        for start in &self.starts()[..self.cameras.len()] {
             linear.push(start + CLOCK + 1, -2.5 * pull / self.cameras.len() as f64);
         }
     }
@@ -474,12 +492,13 @@ pub(super) fn adjust(
     start: State,
     settled: f64,
 ) -> Option<Adjusted> {
-    let gauge = flight.log.is_none().then(|| Gauge::of(&start));
+    let gauge = if flight.log.is_none() { Some(Gauge::of(&start)?) } else { None };
     let model = Model { flight: *flight, priors, gauge: gauge.as_ref() };
+    let seen = start.seen_coefficients(flight);
     let cost_of = |state: &State, pull: f64| {
         let mut cost = Cost(0.0);
         state.all(&model, &mut cost);
-        cost.0 + state.lean(pull)
+        cost.0 + state.lean(pull, &seen)
     };
     let (mut state, mut damping) = (start, FIRST_DAMPING);
     let mut cost = 0.0;
@@ -488,7 +507,7 @@ pub(super) fn adjust(
         let pull = state.pull(priors);
         cost = cost_of(&state, pull);
         let mut linear = linearised(&model, &state);
-        state.lean_against(pull, &mut linear);
+        state.lean_against(pull, &seen, &mut linear);
         let before = cost;
         while damping < MOST_DAMPING {
             let Solution { step, .. } = linear.clone().solve(damping)?;

@@ -104,8 +104,9 @@ fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rota
         let axis = Unit::try_new((turned * here).cross(there), 1e-9)?;
         Some(Rotation3::from_axis_angle(&axis, (turned * here).angle(there)))
     };
-    // Two places lie on one line: both arms tell the same.
-    arms.first().and_then(tip).map_or(turned, |tip| tip * turned)
+    // Places on one line: the longest arm tells it best.
+    let longest = arms.iter().max_by(|a, b| a.0.norm_squared().total_cmp(&b.0.norm_squared()));
+    longest.and_then(tip).map_or(turned, |tip| tip * turned)
 }
 
 impl Similarity {

@@ -33,7 +33,7 @@ const PAIRS_TRIED: usize = 3;
 const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
 /// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. From too little
 /// it would not be found.
-const FIRST_WANDER: f64 = 2e-6;
+const FIRST_WANDER: f64 = 2e-5;
 
 /// The cameras that take part, and where they are begun with.
 pub(super) struct Begun {
@@ -58,11 +58,11 @@ impl Begun {
                 .map_err(|why| named_mirror(camera, &begun.course, why));
             begun.take(camera, start);
         }
+        begun.leave_lonely_out(true);
         if begun.cameras.is_empty() {
             let (camera, why) = begun.refused.into_iter().next().ok_or(FlightError::NoSolution)?;
             return Err(FlightError::NoCamera { camera, why });
         }
-        begun.leave_lonely_out(true);
         Ok(begun)
     }
 
@@ -74,6 +74,11 @@ impl Begun {
         let (usable, unusable): (Vec<_>, Vec<_>) =
             cameras.iter().map(|camera| (camera, usable(camera))).partition(|(_, is)| is.is_ok());
         let usable: Vec<&CameraLabels> = usable.into_iter().map(|(camera, _)| camera).collect();
+        if usable.len() < 2
+            && let Some((camera, Err(why))) = unusable.first()
+        {
+            return Err(FlightError::NoCamera { camera: camera.name.clone(), why: why.clone() });
+        }
         let mut begun = best_of_pairs(&usable).ok_or(FlightError::NoPair)?;
         for (camera, why) in unusable {
             begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
@@ -112,21 +117,31 @@ impl Begun {
             .cameras
             .iter()
             .zip(&self.states)
-            .map(|(camera, state)| camera.labels.iter().map(|label| state.time_s(label)).collect())
+            .map(|(camera, state)| {
+                let mut times: Vec<f64> =
+                    camera.labels.iter().map(|label| state.time_s(label)).collect();
+                times.sort_unstable_by(f64::total_cmp);
+                times
+            })
             .collect();
         let is_near = |times: &Vec<f64>, time_s: f64| {
             let next = times.partition_point(|other| *other < time_s - TOGETHER_S);
             times.get(next).is_some_and(|other| *other < time_s + TOGETHER_S)
         };
         for (index, camera) in self.cameras.iter_mut().enumerate() {
-            let mut own = times[index].iter();
-            camera.labels.retain(|_| {
-                own.next().is_some_and(|&time_s| {
-                    let mut others = times.iter().enumerate().filter(|(other, _)| *other != index);
-                    (has_log && self.course.weights(time_s).is_some())
-                        || others.any(|(_, times)| is_near(times, time_s))
-                })
+            let state = &self.states[index];
+            camera.labels.retain(|label| {
+                let time_s = state.time_s(label);
+                let mut others = times.iter().enumerate().filter(|(other, _)| *other != index);
+                (has_log && self.course.weights(time_s).is_some())
+                    || others.any(|(_, times)| is_near(times, time_s))
             });
+        }
+        let (cameras, states) =
+            (std::mem::take(&mut self.cameras), std::mem::take(&mut self.states));
+        for (camera, state) in cameras.into_iter().zip(states) {
+            let start = usable(&camera).map(|()| state);
+            self.take(&camera, start);
         }
     }
 
@@ -278,5 +293,5 @@ pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
     let mut steps: Vec<f64> =
         camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
     steps.sort_unstable_by(f64::total_cmp);
-    steps[steps.len() / 2].max(1e-3)
+    steps.get(steps.len() / 2).copied().unwrap_or_default().max(1e-3)
 }

@@ -64,7 +64,7 @@ impl Course {
         is_known.then(|| self.way.weights(time_s))?
     }
 
-    /// None.
+    /// One that is known at no time.
     pub(super) fn nowhere() -> Self {
         let errors = LogErrors { sd_m: 1.0, drift_sd_m: 0.0, drift_time_s: 1.0 };
         Self::along(Spline::over(0.0, 1.0), 1.0, errors, Vec::new())

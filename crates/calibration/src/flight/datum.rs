@@ -66,13 +66,14 @@ impl Followers {
     /// Of all splits into a common part and a rest that is each camera's, this is the one in which the
     /// two are uncorrelated: `D = (H' N H)^-1` where the cameras follow the datum by H and N is the
     /// information. Good cameras count for more in it than poor ones.
-    pub(super) fn shown(&self, information: &DMatrix<f64>) -> Shown {
+    /// `None`: the information is none.
+    pub(super) fn shown(&self, information: &DMatrix<f64>) -> Option<Shown> {
         let weighed = information * &self.by_datum;
         let on_datum = self.by_datum.tr_mul(&weighed);
-        let covariance = inverse_of_what_is_shown(&on_datum);
+        let covariance = inverse_of_what_is_shown(&on_datum)?;
         let gain = &covariance * weighed.transpose();
         let of_cameras = &self.by_datum * &covariance * self.by_datum.transpose();
-        Shown { gain, information: on_datum, of_cameras }
+        Some(Shown { gain, information: on_datum, of_cameras })
     }
 
     /// What is left of the cameras' differences when the datum's part is off.
@@ -81,19 +82,19 @@ impl Followers {
     }
 
     /// The datum as the site has it, where so much of the information on it is nobody's.
-    pub(super) fn datum(&self, shown: &Shown, of_nobody: Option<DMatrix<f64>>) -> Datum {
+    pub(super) fn datum(&self, shown: &Shown, of_nobody: Option<DMatrix<f64>>) -> Option<Datum> {
         let is_timeless = of_nobody.is_some();
         let of_nobody = of_nobody.unwrap_or_else(|| DMatrix::zeros(Datum::WAYS, Datum::WAYS));
-        let mut covariance = inverse_of_what_is_shown(&(&shown.information - of_nobody));
+        let mut covariance = inverse_of_what_is_shown(&(&shown.information - of_nobody))?;
         if is_timeless {
             // The way's knots stand at times of their own, which tells a little of nothing.
             covariance[(Datum::LATE, Datum::LATE)] += UNKNOWN_S * UNKNOWN_S;
         }
-        Datum {
+        Some(Datum {
             middle: self.middle,
             time: Timestamp::EPOCH.plus_seconds(self.time_s),
             covariance: SMatrix::from_fn(|i, j| covariance[(i, j)]),
-        }
+        })
     }
 
     /// Of how many unknowns.
@@ -116,19 +117,17 @@ impl Shown {
 
 /// The inverse where there is information, and nought where there is none: one camera alone has no
 /// size that could be wrong.
-fn inverse_of_what_is_shown(information: &DMatrix<f64>) -> DMatrix<f64> {
+fn inverse_of_what_is_shown(information: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let mut inverse = DMatrix::zeros(information.nrows(), information.ncols());
     let shown: Vec<usize> =
-        (0..information.nrows()).filter(|&way| information[(way, way)] > 0.0).collect();
+        (0..information.nrows()).filter(|&way| information[(way, way)] != 0.0).collect();
     let part = information.select_rows(&shown).select_columns(&shown);
-    if let Some(factor) = part.cholesky() {
-        let part = factor.inverse();
-        for (i, &row) in shown.iter().enumerate() {
-            for (j, &column) in shown.iter().enumerate() {
-                // From rounding alone it is not quite symmetric.
-                inverse[(row, column)] = f64::midpoint(part[(i, j)], part[(j, i)]);
-            }
+    let part = part.cholesky()?.inverse();
+    for (i, &row) in shown.iter().enumerate() {
+        for (j, &column) in shown.iter().enumerate() {
+            // From rounding alone it is not quite symmetric.
+            inverse[(row, column)] = f64::midpoint(part[(i, j)], part[(j, i)]);
         }
     }
-    inverse
+    Some(inverse)
 }

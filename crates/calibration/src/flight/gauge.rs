@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::adjustment::{Row, Sink, State};
 use super::datum::Followers;
-use super::model::step_between;
+use super::model::{CLOCK, step_between};
 use super::noise::Tails;
 
 /// The site as a whole is held by these: shift (m), turn (rad), growth, lateness (s). Rounding is at
@@ -30,7 +30,7 @@ pub(super) struct Gauge {
 
 impl Gauge {
     /// To a state.
-    pub(super) fn of(from: &State) -> Self {
+    pub(super) fn of(from: &State) -> Option<Self> {
         // A turn counts by what it moves some way off.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
@@ -40,9 +40,9 @@ impl Gauge {
         for start in &order_starts[..from.cameras.len()] {
             let own = start - first;
             (0..3).for_each(|k| weight[(own + k, own + k)] = RANGE_M * RANGE_M);
-            (3..8).for_each(|k| weight[(own + k, own + k)] = 1.0);
+            (3..CLOCK + 2).for_each(|k| weight[(own + k, own + k)] = 1.0);
         }
-        Self { from: from.clone(), gain: followers.shown(&weight).into_gain() }
+        Some(Self { from: from.clone(), gain: followers.shown(&weight)?.into_gain() })
     }
 
     pub(super) fn rows(&self, state: &State, sink: &mut impl Sink) {

@@ -92,7 +92,7 @@ impl Apart {
         let difference = DVector::from_vec(difference);
         // The log lies elsewhere in either half: what all cameras have in common is its.
         let followers = Followers::of(state).rows(&rows);
-        let datum = followers.shown(&covariance.clone().cholesky()?.inverse());
+        let datum = followers.shown(&covariance.clone().cholesky()?.inverse())?;
         Some(Self {
             difference: followers.without_datum(&datum, &difference),
             covariance: covariance - datum.of_cameras(),

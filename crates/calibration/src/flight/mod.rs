@@ -1,4 +1,4 @@
-//! Poses, clocks and lenses of cameras from the flight of one target with a log.
+//! Poses, clocks and lenses of cameras from the flight of one target, with a log of it or a survey.
 //!
 //! All that is unknown is adjusted at once: each camera's pose, clock and lens, the target's way (a
 //! cubic spline with white jerk) and the log's drifting bias. The log is a measurement and not the
@@ -68,11 +68,12 @@ pub enum FlightError {
     NoPair,
     /// Nothing says how large the site is.
     #[error(
-        "nothing says how large the site is: give a log, the places of two cameras or a distance"
+        "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \
+         or --distance between two"
     )]
     NoSize,
     /// The equations have no solution.
-    #[error("the adjustment has no solution: labels and log are hardly of one flight")]
+    #[error("the adjustment has no solution: labels, log and survey are hardly of one flight")]
     NoSolution,
 }
 
@@ -95,11 +96,13 @@ pub enum Refusal {
         hours: f64,
     },
     /// Its labels and the log have no time in common.
-    #[error("has too few labels in the time of the log, whatever its clock shows")]
+    #[error(
+        "has too few labels in the time that the target's way is known, whatever its clock shows"
+    )]
     NoTime,
     /// No pose and offset makes its labels fit the log.
     #[error(
-        "lies {misfit_mrad:.1} mrad beside the log wherever it stands{}",
+        "lies {misfit_mrad:.1} mrad beside the target's way wherever it stands{}",
         mirror.map_or(String::new(), |mirror| format!(": {mirror}"))
     )]
     Misfit {
@@ -134,6 +137,7 @@ const LONGEST_LOG_H: f64 = 6.0;
 const LEAST_SAMPLES: usize = 20;
 /// A camera with fewer labels has seen nothing.
 const LEAST_LABELS: usize = 30;
+
 /// Adjusts a flight, with a log of it or with what a survey says.
 ///
 /// # Errors

@@ -5,6 +5,7 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
+use super::begin::frame_time;
 use super::model::CameraLabels;
 use crate::lens;
 
@@ -17,8 +18,10 @@ const TRIED: usize = 150;
 const LEAST_COMMON: usize = 40;
 /// ... and so large a share of the smaller one's labels: eight numbers fit any short piece of a way.
 const LEAST_SHARE: f64 = 0.3;
-/// A direction between two labels farther apart than this is not known, s.
+/// A direction between two labels farther apart than this is not known, s: or than so many of its
+/// frames.
 const GAP_S: f64 = 0.2;
+const GAP_FRAMES: f64 = 1.5;
 /// Sight lines that meet more sharply than this tell no range, rad.
 pub(super) const LEAST_PARALLAX_RAD: f64 = 0.05;
 /// Cameras are taken to stand so far apart until something says how far, m.
@@ -28,6 +31,7 @@ const BASE_M: f64 = 50.0;
 pub(super) struct Sights {
     times_s: Vec<f64>,
     directions: Vec<Vector3<f64>>,
+    gap_s: f64,
 }
 
 impl Sights {
@@ -36,7 +40,8 @@ impl Sights {
             Some((label.time_s, lens::direction(&camera.intrinsics, label.pixel)?.normalize()))
         };
         let (times_s, directions) = camera.labels.iter().filter_map(seen).unzip();
-        Self { times_s, directions }
+        let gap_s = GAP_S.max(GAP_FRAMES * frame_time(camera));
+        Self { times_s, directions, gap_s }
     }
 
     /// The direction at a time; `None` where it was not seen.
@@ -46,7 +51,7 @@ impl Sights {
         let (from, to) = (self.times_s[before], *self.times_s.get(next)?);
         let share = (time_s - from) / (to - from);
         let between = self.directions[before].lerp(&self.directions[next], share);
-        (to - from <= GAP_S).then(|| between.normalize())
+        (to - from <= self.gap_s).then(|| between.normalize())
     }
 
     pub(super) fn span(&self) -> Option<(f64, f64)> {

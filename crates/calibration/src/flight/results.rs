@@ -39,8 +39,10 @@ pub struct CameraResult {
     pub used: usize,
     /// Root mean square of the labels' residuals per axis, of those within four deviations, pixels.
     pub residual_px: f64,
-    /// How many times farther the flight's two halves lie apart than both say: above one, the
-    /// covariances here are made so much larger. `None`: one half saw too little.
+    /// How many times farther the flight's two halves lie apart in the image than both say: above
+    /// one, the deviations of pose and lens here are made so much larger. Both halves know the same
+    /// lens file and survey, so what is wrong with those does not show. `None`: one half saw too
+    /// little.
     pub halves_ratio: Option<f64>,
     /// The focal length against the lens file's.
     pub focal_ratio: f64,
@@ -81,8 +83,9 @@ pub struct ClockKnot {
 pub struct FlightResult {
     /// Of each camera that could be calibrated, in the order that they were given in.
     pub cameras: Vec<CameraResult>,
-    /// What they may be off by together: the rest here is beside that.
-    pub datum: Datum,
+    /// What they may be off by together: the rest here is beside that. `None`: of one camera alone
+    /// nothing is beside it.
+    pub datum: Option<Datum>,
     /// The others, and why not.
     pub refused: Vec<(CameraName, Refusal)>,
     /// Power of the target's jerk, m^2/s^5.
@@ -98,8 +101,14 @@ pub(super) fn results(
 ) -> Option<FlightResult> {
     let ratios = halves::ratios(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
-    let shown = followers.shown(adjusted.covariance.information());
-    adjusted.covariance.take_off(shown.of_cameras());
+    let shown = followers.shown(adjusted.covariance.information())?;
+    let of_nobody = flight.log.is_none().then(Gauge::information);
+    let datum = followers.datum(&shown, of_nobody)?;
+    // One camera has nothing beside the site: all that it is off by is its own.
+    let datum = (flight.cameras.len() > 1).then_some(datum);
+    if datum.is_some() {
+        adjusted.covariance.take_off(shown.of_cameras());
+    }
     let known: Vec<f64> = ratios.iter().copied().flatten().collect();
     let typical = known.iter().sum::<f64>() / known.len().max(1) as f64;
     let state = &adjusted.state;
@@ -138,7 +147,7 @@ pub(super) fn results(
     }
     Some(FlightResult {
         cameras,
-        datum: followers.datum(&shown, flight.log.is_none().then(Gauge::information)),
+        datum,
         refused: Vec::new(),
         jerk: priors.jerk,
         log_residual_m: flight.log.map(|log| log_residual(log, state)),
@@ -231,7 +240,8 @@ fn clock_result(
         let sd_s = adjusted.covariance.variance(&terms).max(0.0).sqrt();
         ClockKnot { time_s, ahead_s: clock.common_s(time_s) - time_s, sd_s }
     };
-    let sd = |unknown: usize| adjusted.covariance.variance(&[(start + unknown, 1.0)]).sqrt();
+    let variance = |unknown: usize| adjusted.covariance.variance(&[(start + unknown, 1.0)]);
+    let sd = |unknown: usize| variance(unknown).max(0.0).sqrt();
     ClockResult {
         knots: (0..=steps as usize).map(knot).collect(),
         rate: clock.rate,

@@ -3,6 +3,7 @@
 use nalgebra::{Rotation3, Vector3};
 
 use super::adjustment::{Flight, Row, Sink, State};
+use super::model::CameraLabels;
 use super::noise::Tails;
 
 /// Whoever sets a camera up holds its picture level to this, rad. It turns a site upright that three
@@ -51,7 +52,8 @@ impl State {
 
     /// Cameras are held level, where no log says which way is up.
     pub(super) fn level_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
-        if flight.survey.places.len() >= ENOUGH_FOR_UP {
+        let named = |camera: &&CameraLabels| flight.survey.place(&camera.name).is_some();
+        if flight.cameras.iter().filter(named).count() >= ENOUGH_FOR_UP {
             return;
         }
         for (camera, start) in self.cameras.iter().zip(self.starts()) {

@@ -27,8 +27,8 @@ pub struct CameraFile {
     pub name: CameraName,
     /// The network's file (TOML).
     pub network: PathBuf,
-    /// The site's calibration (TOML, by crossfix calibrate): lens, pose and clock as it found them,
-    /// in the place of `intrinsics`, `pose` and what the clock is worth.
+    /// The site's calibration (TOML, by crossfix calibrate): lens and pose as it found them stand in the
+    /// place of `intrinsics` and `pose`, and times are corrected by its clock after [clock].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<PathBuf>,
     /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if
@@ -369,9 +369,6 @@ impl CameraFile {
         camera: &Camera,
         valid_from: Timestamp,
     ) -> anyhow::Result<CameraCalibration> {
-        if let Some(calibrated) = self.calibrated()? {
-            return Ok(calibrated.message(valid_from));
-        }
         match &self.source {
             SourceConfig::Recording { path, .. } if self.intrinsics.is_none() => {
                 recorded_calibration(path, &self.name)

@@ -183,7 +183,11 @@ impl Agent {
             if is_scene {
                 self.scene_begins = valid_from;
             }
-            self.calibration = file.calibration(&self.identity.camera, valid_from)?.encode();
+            let message = match &self.calibrated {
+                Some(calibrated) => calibrated.message(valid_from),
+                None => file.calibration(&self.identity.camera, valid_from)?,
+            };
+            self.calibration = message.encode();
             self.now = valid_from;
         }
         Ok(start)

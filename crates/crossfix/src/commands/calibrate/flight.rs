@@ -145,6 +145,11 @@ fn labels(recording: &Path) -> anyhow::Result<Vec<CameraLabels>> {
         let intrinsics = lenses.remove(&name).with_context(|| {
             format!("{} says nothing of the lens of camera `{name}`", recording.display())
         })?;
+        let size = intrinsics.size;
+        labels.retain(|label| {
+            (0.0..=f64::from(size.width)).contains(&label.pixel.x())
+                && (0.0..=f64::from(size.height)).contains(&label.pixel.y())
+        });
         labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
         cameras.push(CameraLabels { name, intrinsics, labels });
     }

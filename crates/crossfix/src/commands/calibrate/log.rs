@@ -37,10 +37,9 @@ impl LogKind {
 /// What a log's times are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum LogTime {
-    /// As they are in the file.
+    /// As they are in the file, UTC where that matters.
+    #[value(alias = "utc")]
     File,
-    /// UTC, as they are in the file.
-    Utc,
     /// GPS's.
     Gps,
 }

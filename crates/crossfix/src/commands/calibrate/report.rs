@@ -17,7 +17,8 @@ pub struct Figures {
     refused: Vec<(String, String)>,
     /// Root mean square of the log's residuals per axis, m; absent without a log.
     log_residual_m: Option<f64>,
-    datum: DatumFigures,
+    /// Absent of one camera alone.
+    datum: Option<DatumFigures>,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
 }
@@ -102,9 +103,9 @@ fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'st
     // The image's rows go down in the world where the camera is not held upside down.
     let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
     if is_upside_down {
-        "wrong: upside down, so the log's height may count downwards (north-east-down?)"
+        "wrong: upside down, so heights may count downwards in the log or survey (north-east-down?)"
     } else if noise_mrad > WRONG_MRAD {
-        "wrong: its labels lie far beside the way (another target, lens file or log?)"
+        "wrong: its labels lie far beside the target's way (another target or lens file?)"
     } else if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
         "weak: many labels are not the target's"
     } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
@@ -176,7 +177,7 @@ pub fn figures(result: &FlightResult) -> Figures {
             .map(|(name, why)| (name.to_string(), why.to_string()))
             .collect(),
         log_residual_m: result.log_residual_m,
-        datum: DatumFigures::from(&result.datum),
+        datum: result.datum.as_ref().map(DatumFigures::from),
         jerk: result.jerk,
     }
 }
@@ -234,5 +235,6 @@ pub fn render(result: &FlightResult) -> String {
     let log = figures.log_residual_m.map_or_else(String::new, |metres| {
         format!("\n\nthe log lies {metres:.3} m beside the way, root mean square per axis")
     });
-    format!("{}{refused}{log}\n\n{}{remark}", output::table(&rows), figures.datum)
+    let datum = figures.datum.map_or_else(String::new, |datum| format!("\n\n{datum}"));
+    format!("{}{refused}{log}{datum}{remark}", output::table(&rows))
 }

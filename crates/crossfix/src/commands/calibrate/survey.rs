@@ -29,6 +29,9 @@ impl FromStr for Distance {
             return Err("a distance is more than nothing".to_owned());
         }
         let between = [name(first)?, name(second)?];
+        if between[0] == between[1] {
+            return Err("a distance is between two cameras".to_owned());
+        }
         Ok(Self(TapedDistance { between, metres, sd_m: TAPE_SD_M }))
     }
 }
@@ -93,7 +96,7 @@ fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {
         let place = record.with_context(wrong)?.place().with_context(|| {
             format!(
                 "the survey {}, row {}: camera, east_m, north_m, up_m and sd_m (or sd_east_m, \
-                 sd_north_m and sd_up_m) are wanted, in metres",
+                 sd_north_m and sd_up_m, from 0.0001) are wanted, in metres",
                 path.display(),
                 row + 2
             )
