@@ -172,6 +172,6 @@ mod tests {
         assert_eq!(triple("-80, -80,10"), Ok([-80.0, -80.0, 10.0]));
         assert!(triple("1,2").is_err() && triple("1,2,x").is_err() && triple("1,2,NaN").is_err());
         assert!(window("61").is_err());
-        assert!(anchor("95,0,0").unwrap_err().contains("latitude"));
+        assert!(numbers::place("95,0,0").unwrap_err().contains("latitude"));
     }
 }
