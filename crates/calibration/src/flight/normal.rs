@@ -20,6 +20,9 @@ pub(super) struct NormalEquations {
     cross: DMatrix<f64>,
     others: DMatrix<f64>,
     right: DVector<f64>,
+    /// Room for one row's terms.
+    of_chain: Vec<Term>,
+    of_others: Vec<Term>,
 }
 
 /// The solution, and what is left of the others' block when the chain is eliminated.
@@ -126,34 +129,44 @@ impl NormalEquations {
             cross: DMatrix::zeros(others, chain),
             others: DMatrix::zeros(others, others),
             right: DVector::zeros(chain + others),
+            of_chain: Vec::new(),
+            of_others: Vec::new(),
         }
     }
 
     /// Takes a residual in with its weight. Terms may name an unknown more than once.
     pub(super) fn add(&mut self, terms: &[Term], residual: f64, weight: f64) {
-        for &(row, by_row) in terms {
-            let weighed = weight * by_row;
-            if weighed == 0.0 {
-                continue;
-            }
-            self.right[row] -= weighed * residual;
-            for &(column, by_column) in terms {
-                if column > row {
-                    continue;
-                }
-                let product = weighed * by_column;
-                match (row < self.chain, column < self.chain) {
-                    (true, _) => {
-                        debug_assert!(row - column < self.width, "beyond the band");
-                        self.band[row * self.width + row - column] += product;
-                    }
-                    (false, true) => self.cross[(row - self.chain, column)] += product,
-                    (false, false) => {
-                        self.others[(row - self.chain, column - self.chain)] += product;
-                    }
-                }
+        let (mut of_chain, mut of_others) =
+            (std::mem::take(&mut self.of_chain), std::mem::take(&mut self.of_others));
+        for &(unknown, by) in terms.iter().filter(|(_, by)| *by != 0.0) {
+            self.right[unknown] -= weight * by * residual;
+            if unknown < self.chain {
+                of_chain.push((unknown, by));
+            } else {
+                of_others.push((unknown - self.chain, by));
             }
         }
+        for &(row, by_row) in &of_chain {
+            let weighed = weight * by_row;
+            for &(column, by_column) in of_chain.iter().filter(|(column, _)| *column <= row) {
+                debug_assert!(row - column < self.width, "beyond the band");
+                self.band[row * self.width + row - column] += weighed * by_column;
+            }
+            let mut ties = self.cross.column_mut(row);
+            let ties = ties.as_mut_slice();
+            of_others.iter().for_each(|&(other, by)| ties[other] += weighed * by);
+        }
+        for &(column, by_column) in &of_others {
+            let weighed = weight * by_column;
+            let mut ties = self.others.column_mut(column);
+            let ties = ties.as_mut_slice();
+            // The lower triangle.
+            let below = of_others.iter().filter(|(row, _)| *row >= column);
+            below.for_each(|&(row, by)| ties[row] += weighed * by);
+        }
+        of_chain.clear();
+        of_others.clear();
+        (self.of_chain, self.of_others) = (of_chain, of_others);
     }
 
     /// Pushes an unknown: a term of the cost whose derivative by it is minus twice this.
@@ -201,11 +214,7 @@ impl NormalEquations {
                 let shared = (width - 1 - back).min(column);
                 let own = row * width + back + 1;
                 let their = column * width + 1;
-                let product: f64 = self.band[own..own + shared]
-                    .iter()
-                    .zip(&self.band[their..their + shared])
-                    .map(|(a, b)| a * b)
-                    .sum();
+                let product = dot(&self.band[own..own + shared], &self.band[their..their + shared]);
                 let left = self.band[row * width + back] - product;
                 self.band[row * width + back] = if back > 0 {
                     left * self.band[column * width]
@@ -246,6 +255,17 @@ fn backward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
             less(&mut before[(row - back) * sides..][..sides], l, own);
         }
     }
+}
+
+/// The sum of products, in four sums that a processor can work at side by side.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let (a, b) = (a.chunks_exact(4), b.chunks_exact(4));
+    let rest = a.remainder().iter().zip(b.remainder()).map(|(a, b)| a * b).sum::<f64>();
+    let mut sums = [0.0; 4];
+    for (a, b) in a.zip(b) {
+        (0..4).for_each(|k| sums[k] += a[k] * b[k]);
+    }
+    sums.iter().sum::<f64>() + rest
 }
 
 /// Takes a multiple of other values off.

@@ -28,7 +28,7 @@ pub struct CameraFile {
     /// The network's file (TOML).
     pub network: PathBuf,
     /// The site's calibration (TOML, by crossfix calibrate): lens and pose as it found them stand in the
-    /// place of `intrinsics` and `pose`, and times are corrected by its clock after [clock].
+    /// place of `intrinsics` and `pose`, and times are corrected by its clock after `clock`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<PathBuf>,
     /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if
