@@ -10,9 +10,13 @@ use super::LEAST_LABELS;
 use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
 use super::datum::Followers;
 use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
+use super::noise::LabelNoise;
 
 /// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.
 const STRIDE: usize = 20;
+/// A half that itself says that it knows a camera's picture worse than so many of its labels' errors
+/// has seen too little to be compared: of a drone that stands on the ground it makes anything.
+const MOST_STATED: f64 = 10.0;
 
 /// For each camera how many times farther its halves lie apart, in the image, than both say; `None`
 /// where one half saw too little.
@@ -47,7 +51,8 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<O
     let apart = Apart::of(state, [&first, &second], &shown)?;
     let mut ratios = vec![None; state.cameras.len()];
     for (start, &index) in apart.starts.iter().zip(&shown) {
-        ratios[index] = apart.ratio(flight, state, index, *start);
+        let noise = &priors.cameras[index].noise;
+        ratios[index] = apart.ratio(flight, state, (index, *start), noise);
     }
     Some(ratios)
 }
@@ -100,12 +105,18 @@ impl Apart {
         })
     }
 
-    fn ratio(&self, flight: &Flight<'_>, state: &State, index: usize, start: usize) -> Option<f64> {
+    fn ratio(
+        &self,
+        flight: &Flight<'_>,
+        state: &State,
+        (index, start): (usize, usize),
+        noise: &LabelNoise,
+    ) -> Option<f64> {
         let camera = &state.cameras[index];
         let own = camera.own();
         let difference = self.difference.rows(start, own);
         let covariance = self.covariance.view((start, start), (own, own));
-        let (mut found, mut stated) = (0.0, 0.0);
+        let (mut found, mut stated, mut count) = (0.0, 0.0, 0.0);
         for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
             let weights = state.way.weights(camera.time_s(label));
             let place = weights.map(|weights| state.way.place(&weights));
@@ -114,8 +125,11 @@ impl Apart {
             };
             found += (&by_own * difference).norm_squared();
             stated += (&by_own * covariance * by_own.transpose()).trace();
+            count += 1.0;
         }
-        (stated > 0.0).then(|| (found / stated).sqrt())
+        let most_px = MOST_STATED * noise.sd_px();
+        let is_told = stated > 0.0 && stated < 2.0 * count * most_px * most_px;
+        is_told.then(|| (found / stated).sqrt())
     }
 }
 
