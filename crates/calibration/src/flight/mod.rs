@@ -15,6 +15,7 @@ mod model;
 mod noise;
 mod normal;
 mod pairs;
+mod pull;
 mod results;
 mod settle;
 mod spline;
