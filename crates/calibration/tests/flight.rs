@@ -334,7 +334,8 @@ fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
     let ratio = (found(0) - found(1)).norm() / (place(0) - place(1)).norm();
     assert!((ratio - 1.0).abs() < 2e-3, "{ratio}");
     // A gauge of tens of metres is nobody's knowledge.
-    assert!(result.datum.as_ref().unwrap().sd()[0] > 100.0, "{:?}", result.datum);
+    let sd = result.datum.as_ref().unwrap().sd();
+    assert!(sd[0] > 100.0 && sd[5] > 0.5, "{sd:?}");
     for camera in &result.cameras {
         let across = camera.camera.pose().rotation() * Vector3::x();
         assert!(across.z.abs() < 0.02, "{across}");

@@ -24,9 +24,9 @@ const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
 /// A step of the adjustment moves the way by this where nothing else holds it, m: near enough for ten
-/// minutes without a label, and so wide that an hour of it says less of where the site is than the
-/// gauge does.
-const REST_M: f64 = 1e4;
+/// minutes without a label. With a tenth of it a way that swings out by kilometres in a gap would say
+/// which way round the site is, to 30 mrad.
+const REST_M: f64 = 1e5;
 /// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
 /// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
 /// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by

@@ -88,6 +88,7 @@ impl Begun {
         let state = begun.unknowns(false);
         let aligned = align::to_survey(&state, &begun.cameras, survey);
         let (state, growth) = aligned.ok_or(FlightError::NoSize)?;
+        // From here on the aligned state counts; of what it was begun with only the jerk does.
         begun.course.jerk *= growth * growth;
         Ok((begun, state))
     }

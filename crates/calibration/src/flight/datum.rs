@@ -82,19 +82,22 @@ impl Followers {
     }
 
     /// The datum as the site has it, where so much of the information on it is nobody's.
-    pub(super) fn datum(&self, shown: &Shown, of_nobody: Option<DMatrix<f64>>) -> Option<Datum> {
-        let is_timeless = of_nobody.is_some();
-        let of_nobody = of_nobody.unwrap_or_else(|| DMatrix::zeros(Datum::WAYS, Datum::WAYS));
-        let mut covariance = inverse_of_what_is_shown(&(&shown.information - of_nobody))?;
+    pub(super) fn datum(
+        &self,
+        shown: &Shown,
+        of_nobody: &DMatrix<f64>,
+        is_timeless: bool,
+    ) -> Datum {
+        let mut covariance = bounded_inverse(&(&shown.information - of_nobody));
         if is_timeless {
             // The way's knots stand at times of their own, which tells a little of nothing.
             covariance[(Datum::LATE, Datum::LATE)] += UNKNOWN_S * UNKNOWN_S;
         }
-        Some(Datum {
+        Datum {
             middle: self.middle,
             time: Timestamp::EPOCH.plus_seconds(self.time_s),
             covariance: SMatrix::from_fn(|i, j| covariance[(i, j)]),
-        })
+        }
     }
 
     /// Of how many unknowns.
@@ -113,6 +116,20 @@ impl Shown {
     pub(super) fn of_cameras(&self) -> &DMatrix<f64> {
         &self.of_cameras
     }
+}
+
+/// What nothing shows has this deviation, and not an infinite one: shift (m), turn (rad), growth,
+/// lateness (s), slowness.
+const UNKNOWN: [f64; Datum::WAYS] = [300.0, 300.0, 300.0, 3.0, 3.0, 3.0, 3.0, 30.0, 0.1];
+
+/// The inverse of information on a datum, no deviation larger than what is unknown.
+fn bounded_inverse(information: &DMatrix<f64>) -> DMatrix<f64> {
+    let scale = DMatrix::from_diagonal(&DVector::from_row_slice(&UNKNOWN));
+    let scaled = &scale * information * &scale;
+    let eigen = ((&scaled + scaled.transpose()) * 0.5).symmetric_eigen();
+    let inverse = eigen.eigenvalues.map(|value| value.max(1.0).recip());
+    let axes = &scale * &eigen.eigenvectors;
+    &axes * DMatrix::from_diagonal(&inverse) * axes.transpose()
 }
 
 /// The inverse where there is information, and nought where there is none: one camera alone has no

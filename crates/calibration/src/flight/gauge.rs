@@ -16,9 +16,6 @@ use super::noise::Tails;
 /// ten digits below them, far under what cameras are known by beside the datum. The clocks' common
 /// rate has a prior of its own.
 const HELD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0];
-/// What of the hold is taken off again from what is said: all but so much, that something which
-/// nothing shows has a deviation (thirty times the hold's) and not an infinite one.
-const TAKEN_OFF: f64 = 0.999;
 
 /// The hold.
 #[derive(Clone, Debug)]
@@ -61,7 +58,7 @@ impl Gauge {
 
     /// The information on the datum that is the hold's.
     pub(super) fn information() -> DMatrix<f64> {
-        let held = |way: usize| HELD.get(way).map_or(0.0, |sd| TAKEN_OFF / (sd * sd));
+        let held = |way: usize| HELD.get(way).map_or(0.0, |sd| 1.0 / (sd * sd));
         DMatrix::from_diagonal(&DVector::from_fn(Datum::WAYS, |way, _| held(way)))
     }
 }

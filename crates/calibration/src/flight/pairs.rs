@@ -74,8 +74,8 @@ pub(super) struct Pair {
     pub(super) first_from_second: Rotation3<f64>,
     /// The second's centre in the first's frame, m if the two stand [`BASE_M`] apart.
     pub(super) centre: Point3<f64>,
-    /// Median angle by which sight lines miss each other over that by which they meet: what ranges
-    /// are known by. Less is better.
+    /// Median angle by which sight lines miss each other over that by which they meet, and over the
+    /// root of how many there are: what ranges are known by. Less is better.
     pub(super) doubt: f64,
 }
 

@@ -1,11 +1,12 @@
 //! The prior of the target's way is kept from pulling on the site's size and its clocks' pace.
 
-use nalgebra::Vector3;
+use crossfix_message::Datum;
+use nalgebra::{DMatrix, Matrix3, Vector3};
 
 use super::adjustment::{Cost, Flight, Priors, State};
 use super::model::CLOCK;
 use super::normal::NormalEquations;
-use super::spline::SPAN;
+use super::spline::{KNOT_S, SPAN};
 
 /// A way that hovers in a point has no size to be pulled on, m^2.
 const LEAST_SIZE2: f64 = 1.0;
@@ -27,6 +28,19 @@ impl State {
         // By the power that is found from the way each counts one; a rough start's count more, and
         // would drive the site asunder.
         cost.0.min(3.0 * self.way.intervals() as f64)
+    }
+
+    /// The information on the datum that is only the linear equations': jerk has no direction, but
+    /// turned or grown by a step each of its rows changes.
+    pub(super) fn of_linear_jerk(&self, priors: &Priors) -> DMatrix<f64> {
+        let scale2 = (priors.jerk * KNOT_S.powi(5)).recip();
+        let differences = (0..self.way.intervals()).map(|first| self.way.third_difference(first));
+        let sum: Matrix3<f64> = differences.map(|d| d * d.transpose() * scale2).sum();
+        let mut information = DMatrix::zeros(Datum::WAYS, Datum::WAYS);
+        let turn = Matrix3::identity() * sum.trace() - sum;
+        information.view_mut((Datum::TURN, Datum::TURN), (3, 3)).copy_from(&turn);
+        information[(Datum::GROWTH, Datum::GROWTH)] = sum.trace();
+        information
     }
 
     /// The coefficients of the way that some label hangs on.

@@ -102,8 +102,11 @@ pub(super) fn results(
     let ratios = halves::ratios(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
     let shown = followers.shown(adjusted.covariance.information())?;
-    let of_nobody = flight.log.is_none().then(Gauge::information);
-    let datum = followers.datum(&shown, of_nobody)?;
+    let mut of_nobody = adjusted.state.of_linear_jerk(priors);
+    if flight.log.is_none() {
+        of_nobody += Gauge::information();
+    }
+    let datum = followers.datum(&shown, &of_nobody, flight.log.is_none());
     // One camera has nothing beside the site: all that it is off by is its own.
     let datum = (flight.cameras.len() > 1).then_some(datum);
     if datum.is_some() {
