@@ -31,10 +31,10 @@ impl Gauge {
         // A turn counts by what it moves some way off.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
-        let order_starts = from.starts();
+        let starts = from.starts();
         let first = from.order().chain();
         let mut weight = DMatrix::zeros(followers.unknowns(), followers.unknowns());
-        for start in &order_starts[..from.cameras.len()] {
+        for start in &starts[..from.cameras.len()] {
             let own = start - first;
             (0..3).for_each(|k| weight[(own + k, own + k)] = RANGE_M * RANGE_M);
             (3..CLOCK + 2).for_each(|k| weight[(own + k, own + k)] = 1.0);

@@ -16,7 +16,7 @@ impl State {
     /// together by one e-th.
     ///
     /// A scene that is drawn together as a whole has the same labels and less jerk, and so has one that
-    /// goes slower: the likeliest way and site are smaller and later than they are, by percents where
+    /// goes slower: the likeliest way and site are smaller and slower than they are, by percents where
     /// little else tells. The power of the jerk is found from the way, which is as large as the site is
     /// and as quick as its clocks: it says nothing of either, and its pull on both is taken off.
     pub(super) fn pull(&self, priors: &Priors) -> f64 {

@@ -94,6 +94,9 @@ const WEAK_POINTING_MRAD: f64 = 5.0;
 const WEAK_POSITION_M: f64 = 0.5;
 /// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
 const WRONG_MRAD: f64 = 8.0;
+/// A focal length that has moved by more than this share is not the file's lens, or nothing told how
+/// far off the target was: lenses move by 2 %.
+const WEAK_FOCAL: f64 = 0.025;
 /// A camera of whose labels less than this share fits has seen something else as well.
 const WEAK_SHARE: f64 = 0.8;
 
@@ -108,6 +111,8 @@ fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'st
         "wrong: its labels lie far beside the target's way (another target or lens file?)"
     } else if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
         "weak: many labels are not the target's"
+    } else if (camera.focal_ratio - 1.0).abs() > WEAK_FOCAL {
+        "weak: its focal length is far from its file's (another lens file, or fly nearer and farther)"
     } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
         "weak: fly longer, near and far, high and low, through all of its image"
     } else {
