@@ -54,8 +54,8 @@ const LEAST_SD_PX: f64 = 0.1;
 const LONGEST_S: f64 = 2.0;
 /// Labels over this time are averaged to see how long errors last, s.
 const BLOCK_S: f64 = 1.0;
-/// The median of the sum of two squared normal deviates.
-const MEDIAN_OF_TWO: f64 = 2.0 * std::f64::consts::LN_2;
+/// One label in so many may be of anything: as much of the largest is left out.
+const ANYTHING: usize = 20;
 
 /// How labels are whitened: a label's error is this share of the one's before, ...
 #[derive(Clone, Copy, Debug)]
@@ -130,11 +130,22 @@ impl LabelNoise {
 /// Labels are not drawn finer than this, pixels.
 const LEAST_WHITE_PX: f64 = 0.03;
 
-/// The variance of an axis whose vectors' median square is theirs.
+/// The variance of an axis without the largest vectors, for the share that normal deviates have in
+/// those. The median would not do: labels are drawn to half a pixel, and most that lie beside one
+/// another differ by next to nothing.
 fn typical(vectors: impl Iterator<Item = Vector2<f64>>) -> f64 {
     let mut squares: Vec<f64> = vectors.map(|vector| vector.norm_squared()).collect();
     squares.sort_unstable_by(f64::total_cmp);
-    squares.get(squares.len() / 2).map_or(0.0, |median| median / MEDIAN_OF_TWO)
+    let count = squares.len();
+    if count == 0 {
+        return 0.0;
+    }
+    // Half of the square is an exponential deviate: above its quantile of 1 - s lie s (1 - ln s) of
+    // its mean.
+    let share = 1.0 / ANYTHING as f64;
+    let left = 1.0 - share * (1.0 - share.ln());
+    let sum: f64 = squares[..count - count / ANYTHING].iter().sum();
+    sum / (2.0 * count as f64 * left)
 }
 
 fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
