@@ -7,13 +7,28 @@ use crossfix_filter::{Gate, Imm, KinematicState, MAX_MODELS, ModelWeights, Motio
 use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix3x2, Point3, Vector2};
 
-use crate::uncertainty::{CameraUncertainty, SharedTies};
+use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
 /// Where a camera should see a target, and how surely.
 #[derive(Clone, Debug)]
 pub(crate) struct BearingPrediction {
     model: BearingModel,
     factor: f64,
+    /// By what is known of the camera's errors.
+    known: Spread,
+    /// The same where those that last have been drawn anew, and the probability of that.
+    renewed: Option<(Spread, f64)>,
+    /// What each model's process noise adds along both tangents, rad^2, and its probability.
+    added: ModelWeights,
+    weights: ModelWeights,
+    widest: f64,
+}
+
+/// How far a bearing may lie from the direction that is expected, along the tangents.
+#[derive(Clone, Copy, Debug)]
+struct Spread {
+    /// What the camera's errors are thought to shift the bearing by, rad.
+    shifted: Vector2<f64>,
     /// Covariance of the direction without the process noise of this step, with what pose and clock
     /// of the camera add, rad^2.
     steady: Matrix2<f64>,
@@ -21,10 +36,6 @@ pub(crate) struct BearingPrediction {
     /// the track's error.
     shift: Matrix2<f64>,
     cross: Matrix2<f64>,
-    /// What each model's process noise adds along both tangents, rad^2, and its probability.
-    added: ModelWeights,
-    weights: ModelWeights,
-    widest: f64,
 }
 
 /// A line of which a track has been made, along the tangents.
@@ -69,7 +80,7 @@ impl BearingPrediction {
         models: &MotionModels,
         origin: Point3<f64>,
         uncertainty: &CameraUncertainty,
-        ties: &SharedTies,
+        errors: &SharedErrors,
     ) -> Option<Self> {
         // Process noise is the same along all axes: what it adds to a direction is a multiple of
         // the identity, and only what the models share has to be projected.
@@ -77,27 +88,27 @@ impl BearingPrediction {
         let model = BearingModel::new(origin, state.position())?;
         let by = model.by_position();
         let shifts = uncertainty.shifts(&model, state.velocity());
-        let common = shifts * shifts.transpose()
-            + uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
-        let cross = by * ties.fixed_rows::<3>(0) * shifts.transpose();
-        let shift = shifts * shifts.transpose();
-        let steady =
-            by * state.position_covariance() * by.transpose() + cross + cross.transpose() + common;
-        let range = model.range;
-        let spread = interval.abs().powi(3) / 3.0 / range.powi(2);
+        let noise = uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
+        let placed = by * state.position_covariance() * by.transpose();
+        let spread = |errors: &SharedErrors| {
+            let shift = errors.spread(&shifts);
+            let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
+            let steady = placed + cross + cross.transpose() + shift + noise;
+            Spread { shifted: shifts * errors.mean, steady, shift, cross }
+        };
+        let moved = interval.abs().powi(3) / 3.0 / model.range.powi(2);
         let mut added = [0.0; MAX_MODELS];
         for (variance, model) in added.iter_mut().zip(models.models()) {
-            *variance = model.density * spread;
+            *variance = model.density * moved;
         }
         Some(Self {
             model,
             factor: uncertainty.factor,
-            steady,
-            shift,
-            cross,
+            known: spread(errors),
+            renewed: errors.renewed().map(|(anew, probability)| (spread(&anew), probability)),
             added,
             weights: imm.predicted_probabilities(interval, models),
-            widest: models.widest() * spread,
+            widest: models.widest() * moved,
         })
     }
 
@@ -115,8 +126,10 @@ impl BearingPrediction {
             + Matrix2::identity() * (moved / model.range).powi(2);
         let mut weights = [0.0; MAX_MODELS];
         weights[0] = 1.0;
-        let (shift, cross, added) = (Matrix2::zeros(), Matrix2::zeros(), [0.0; MAX_MODELS]);
-        Some(Self { model, factor: 1.0, steady, shift, cross, added, weights, widest: 0.0 })
+        let none = Matrix2::zeros();
+        let known = Spread { shifted: Vector2::zeros(), steady, shift: none, cross: none };
+        let added = [0.0; MAX_MODELS];
+        Some(Self { model, factor: 1.0, known, renewed: None, added, weights, widest: 0.0 })
     }
 
     /// Range of the target, m.
@@ -137,30 +150,54 @@ impl BearingPrediction {
         let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
         // Of the shift s the track has taken C V^-1 s in, with C the covariance of the two and V
         // the shift's.
-        let taken =
-            self.shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| self.cross * inverse);
+        let Spread { steady, shift, cross, .. } = self.known;
+        let taken = shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| cross * inverse);
         let left = Matrix2::identity() + taken;
-        let spread = self.steady - left * self.shift * left.transpose();
-        GivenShift { shift: self.shift, left, spread: spread + noise + Matrix2::identity() * added }
+        let spread = steady - left * shift * left.transpose();
+        GivenShift { shift, left, spread: spread + noise + Matrix2::identity() * added }
     }
 
     /// What is left of a line of which the track has been made.
     pub(crate) fn beginning(&self, line: &SightLine) -> Option<Beginning> {
         let noise = self.model.covariance_of(line) * self.factor;
-        let placed = self.steady - self.cross - self.cross.transpose() - self.shift;
-        Some(Beginning { left: self.model.offset(line)?, shift: self.shift, noise, placed })
+        let Spread { steady, shift, cross, .. } = self.known;
+        let placed = steady - cross - cross.transpose() - shift;
+        Some(Beginning { left: self.model.offset(line)?, shift, noise, placed })
     }
 
-    /// How a bearing fits; `None` if it lies outside the gate.
+    /// How a bearing fits; `None` if it lies outside the gate. What is likelier of the camera's
+    /// errors that last, that they went on or were drawn anew, is taken for true.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
-        let innovation = self.model.offset(line)?;
+        let offset = self.model.offset(line)?;
+        let known = self.fit_by(&self.known, offset, line, gate);
+        let Some((renewed, probability)) = &self.renewed else { return known };
+        let weighed = |fit: Fit, probability: f64| Fit {
+            log_density: fit.log_density + probability.ln(),
+            ..fit
+        };
+        let known = known.map(|fit| weighed(fit, 1.0 - probability));
+        let renewed =
+            self.fit_by(renewed, offset, line, gate).map(|fit| weighed(fit, *probability));
+        [known, renewed]
+            .into_iter()
+            .flatten()
+            .max_by(|a, b| a.log_density.total_cmp(&b.log_density))
+    }
+
+    fn fit_by(
+        &self,
+        by: &Spread,
+        offset: Vector2<f64>,
+        line: &SightLine,
+        gate: Gate,
+    ) -> Option<Fit> {
+        let innovation = offset - by.shifted;
         // No axis of the covariance is longer than its trace: most bearings need no more than this.
-        let longest =
-            self.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
+        let longest = by.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
         if innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
-        let spread = self.steady + self.model.covariance_of(line) * self.factor;
+        let spread = by.steady + self.model.covariance_of(line) * self.factor;
         let gate_distance = distance(&spread, self.widest, innovation)?.0;
         if !gate.holds(gate_distance) {
             return None;
@@ -218,7 +255,7 @@ mod tests {
             &models,
             camera,
             &CameraUncertainty::of_time(0.0),
-            &SharedTies::zeros(),
+            &SharedErrors::unknown(),
         )
         .unwrap();
         let gate = Gate::with_probability(0.9999);

@@ -1,4 +1,6 @@
 mod expectation;
+mod innovation;
+mod learnt;
 mod ties;
 
 use std::collections::BTreeMap;
@@ -7,7 +9,7 @@ use std::fmt;
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine};
 use crossfix_message::{CameraName, Solver, Timestamp, TrackNumber};
-use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3};
 
 use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
@@ -16,6 +18,8 @@ use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 use crate::visibility::Visibility;
 
 pub(crate) use expectation::Expectation;
+use innovation::Innovation;
+use learnt::Learnt;
 use ties::Ties;
 
 /// Two cameras alone must place a target at least this well (root of the sum over the axes, as a
@@ -93,6 +97,8 @@ pub struct Track {
     pub observability: Observability,
     observed: Timestamp,
     held: bool,
+    /// Whether two cameras see it now, so that of how it moves nothing is unseen.
+    ranged: bool,
     /// When it began.
     pub(crate) born: Timestamp,
     /// Whether a detector has been found to report two ends of the target.
@@ -108,15 +114,11 @@ pub struct Track {
     imm: Imm,
     /// What ties it to the shared errors of each camera that has seen it.
     ties: BTreeMap<CameraName, Ties>,
+    /// Whose errors that last it learns.
+    learnt: Learnt,
     /// Fisher information of the bearings of late, for position and velocity.
     information: Matrix6<f64>,
     detector: Option<Detector>,
-}
-
-/// A bearing against what is expected of it.
-struct Innovation {
-    offset: Vector2<f64>,
-    model: BearingModel,
 }
 
 impl Track {
@@ -137,6 +139,7 @@ impl Track {
             observability: fix.observability,
             observed: fix.time,
             held: true,
+            ranged: true,
             born: fix.time,
             has_ends: false,
             comparisons: 0,
@@ -145,6 +148,7 @@ impl Track {
             published: None,
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             ties: BTreeMap::new(),
+            learnt: Learnt::default(),
             information: Matrix6::zeros(),
             detector: motion.detector(),
         };
@@ -163,7 +167,7 @@ impl Track {
         motion: &Motion,
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
-        (track.held, track.follower) = (false, Some(line.line.origin));
+        (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));
         // A pose that is off turns no direction faster.
         track.ties.values_mut().for_each(Ties::forget_velocity);
         track
@@ -227,7 +231,7 @@ impl Track {
 
     /// Position and velocity expected at another time.
     pub(crate) fn predicted(&self, time: Timestamp, motion: &Motion) -> KinematicState {
-        self.imm.predicted(time.seconds_since(self.updated), motion.models(self.held))
+        self.imm.predicted(time.seconds_since(self.updated), motion.models(self.ranged))
     }
 
     /// Where the target is expected at another time: the mean alone.
@@ -269,37 +273,6 @@ impl Track {
         !self.held && self.follower.is_some_and(vague)
     }
 
-    /// A bearing against what is expected at its time.
-    fn innovation(&self, time: Timestamp, line: &SightLine) -> Option<Innovation> {
-        let model = BearingModel::new(line.origin, self.position_at(time))?;
-        Some(Innovation { offset: model.offset(line)?, model })
-    }
-
-    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as
-    /// they are found to.
-    fn nis(
-        &self,
-        innovation: &Innovation,
-        interval: f64,
-        (camera, line): (&CameraName, &SightLine),
-        uncertainty: &CameraUncertainty,
-        motion: &Motion,
-    ) -> Option<f64> {
-        let Innovation { offset, model } = innovation;
-        let before = self.imm.predicted(interval, motion.models(self.held));
-        let by = model.by_position();
-        let shifts = uncertainty.shifts(model, before.velocity());
-        // S = H P H' + H C s' + s C' H' + s s' + f R: the camera's errors s are in the bearing and,
-        // by the bearings that it has given before (C), in the track.
-        let cross = by * self.ties_of(camera, interval).fixed_rows::<3>(0) * shifts.transpose();
-        let spread = by * before.position_covariance() * by.transpose()
-            + cross
-            + cross.transpose()
-            + shifts * shifts.transpose()
-            + model.covariance_of(line) * uncertainty.factor;
-        Some(offset.dot(&spread.cholesky()?.solve(offset)))
-    }
-
     /// Probability that a camera can see the target at a time, by what it has seen so far.
     pub(crate) fn visible_to(&self, camera: &CameraName, time: Timestamp, motion: &Motion) -> f64 {
         let visibility = |ties: &Ties| ties.visibility.at(time, motion.holding_s);
@@ -321,9 +294,7 @@ impl Track {
         detection: f64,
         motion: &Motion,
     ) {
-        if !self.ties.contains_key(camera) {
-            self.ties.insert(camera.clone(), Ties::new(time));
-        }
+        self.note(camera, time);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.visibility.look(time, seen, detection, motion.holding_s);
         }
@@ -354,16 +325,21 @@ impl Track {
             self.keep_ties_possible();
         }
         let seen_from = self.follower.filter(|_| !self.held);
-        let ties = self.ties_of(camera, interval);
-        let measured = Measured { line, camera: uncertainty, ties: &ties };
+        let mut errors = self.errors_of(camera, interval);
+        let bearing = (line, &errors);
+        if let Some(anew) = self.renewed(&innovation, interval, bearing, uncertainty, motion) {
+            errors = anew;
+            self.renew(camera);
+        }
+        let measured = Measured { line, camera: uncertainty, errors: &errors };
         let mut results: Vec<Option<Updated>> = Vec::with_capacity(crossfix_filter::MAX_MODELS);
-        self.imm.update(interval, motion.models(self.held), |state| {
+        self.imm.update(interval, motion.models(self.ranged), |state| {
             let result = updated(state, seen_from, &measured);
             let likely = result.as_ref().map(|after| (after.state.clone(), after.log_likelihood));
             results.push(result);
             likely
         })?;
-        let nis = self.carry((camera, uncertainty.lasting), interval, &results);
+        let nis = self.carry((camera, uncertainty.lasting), (time, interval), &results);
         self.gather_information(interval, line, uncertainty);
         self.updated = time;
         self.follower = Some(line.origin);
@@ -376,44 +352,27 @@ impl Track {
             self.residuals.insert(camera.clone(), residual);
         }
         let lately = |ties: &&Ties| ties.has_seen_lately(time, motion.holding_s);
-        let is_held = self.ties.values().filter(lately).count() >= 2;
-        let was_held = std::mem::replace(&mut self.held, is_held);
-        if was_held && !is_held {
-            // By now it shows that one camera alone has seen it for so long.
-            let others = self.ties.iter().filter(|(name, _)| *name != camera);
-            let silent_s =
-                others.filter_map(|(_, ties)| ties.silent_s(time)).fold(f64::INFINITY, f64::min);
-            if silent_s.is_finite() {
-                self.imm.relive(
-                    silent_s.max(0.0),
-                    &line.direction,
-                    (motion.models(true), motion.models(false)),
-                );
-            }
-        }
+        self.held = self.ties.values().filter(lately).count() >= 2;
+        self.range_again(line, motion);
         self.gather(camera, &innovation, line, uncertainty);
         let third_difference = self.third_difference(camera, line, motion);
         Some(Taken { manoeuvre, third_difference })
     }
 
-    /// Whether a detector sees in a bearing that the target has begun to manoeuvre.
-    fn sees_manoeuvre(
-        &mut self,
-        innovation: &Innovation,
-        interval: f64,
-        (camera, line): (&CameraName, &SightLine),
-        uncertainty: &CameraUncertainty,
-        motion: &Motion,
-    ) -> bool {
-        let nis = matches!(self.detector, Some(Detector::Innovation(_)))
-            .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))
-            .flatten();
-        self.detector.as_mut().is_some_and(|detector| match detector {
-            Detector::Residual(detector) => {
-                detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
+    /// Looks whether two cameras still see the target. If not, one alone has for a while, as shows
+    /// by now, and it may have moved along that one's sight line meanwhile.
+    fn range_again(&mut self, line: &SightLine, motion: &Motion) {
+        let sees = |ties: &&Ties| ties.sees(self.updated, motion.holding_s);
+        let is_ranged = self.ties.values().filter(sees).count() >= 2;
+        if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {
+            let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated));
+            // The camera of this bearing is the one that is not silent.
+            let silent_s = silent.filter(|silent_s| *silent_s > 0.0).fold(f64::INFINITY, f64::min);
+            if silent_s.is_finite() {
+                let models = (motion.models(true), motion.models(false));
+                self.imm.relive(silent_s, &line.direction, models);
             }
-            Detector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
-        })
+        }
     }
 
     /// Adds what a bearing says of position and velocity to what those of the last second have

@@ -1,7 +1,7 @@
 //! What is uncertain of a camera as a whole, beside the noise of each bearing.
 
 use crossfix_geometry::{BearingModel, tangent_basis};
-use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, Unit, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
 /// Variances that differ by less than this share of them are one: what turning them leaves is far
 /// less.
@@ -12,14 +12,65 @@ const ROUNDING: f64 = 1e-9;
 pub(crate) const SHARED: usize = 5;
 /// Where the clock's is among them.
 pub(crate) const OF_CLOCK: usize = 2;
-/// Where those are that last.
+/// Where those are that last, ...
 pub(crate) const LASTING: usize = 3;
+/// ... after so many that one target's bearings tell nothing of: they are considered.
+pub(crate) const CONSIDERED: usize = LASTING;
 
 /// What a deviation of each shared error does to a bearing, rad.
 pub(crate) type Shifts = SMatrix<f64, 2, SHARED>;
 
 /// Covariance of position and velocity with the shared errors, each in its own deviations.
 pub(crate) type SharedTies = SMatrix<f64, 6, SHARED>;
+
+/// Covariance of shared errors, each in its own deviations.
+pub(crate) type SharedCovariance = SMatrix<f64, SHARED, SHARED>;
+
+/// What a track knows of the errors that all bearings of a camera share, each in its own deviations.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SharedErrors {
+    /// Covariance of the state with them.
+    pub(crate) ties: SharedTies,
+    /// What they are thought to be: not zero for those that last alone.
+    pub(crate) mean: SVector<f64, SHARED>,
+    /// Their own covariance.
+    pub(crate) covariance: SharedCovariance,
+    /// Where something is known of those that last, the probability that they have been drawn anew
+    /// since the camera's last bearing. Somebody's hand or a tracker moves on from where it was at
+    /// once as well as slowly.
+    pub(crate) renewal: Option<f64>,
+}
+
+impl SharedErrors {
+    /// Nothing but their deviations.
+    pub(crate) fn unknown() -> Self {
+        Self {
+            ties: SharedTies::zeros(),
+            mean: SVector::zeros(),
+            covariance: SharedCovariance::identity(),
+            renewal: None,
+        }
+    }
+
+    /// Covariance of what they shift a bearing by, rad^2.
+    pub(crate) fn spread(&self, shifts: &Shifts) -> Matrix2<f64> {
+        // Most often each is as wide as it says and goes with no other.
+        if self.renewal.is_some() {
+            shifts * self.covariance * shifts.transpose()
+        } else {
+            shifts * shifts.transpose()
+        }
+    }
+
+    /// The same where those that last have been drawn anew, and the probability of that; `None` if
+    /// nothing was known of them.
+    pub(crate) fn renewed(&self) -> Option<(Self, f64)> {
+        let probability = self.renewal?;
+        let mut ties = self.ties;
+        ties.fixed_columns_mut::<2>(LASTING).fill(0.0);
+        Some((Self { ties, ..Self::unknown() }, probability))
+    }
+}
 
 /// The part of a bearing's noise that the next bearing of the same target has, too: a tracker that
 /// sits beside the target's middle does so for a while.

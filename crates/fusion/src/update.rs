@@ -1,5 +1,5 @@
 //! One bearing into one state: an iterated extended Kalman update in the coordinates of
-//! [`RangeChart`], with the camera's shared errors considered (Schmidt) and not estimated.
+//! [`RangeChart`], with the camera's shared errors considered (Schmidt); what they are is told of apart.
 
 use std::f64::consts::PI;
 
@@ -8,7 +8,7 @@ use crossfix_geometry::{BearingModel, SightLine};
 use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
 use crate::range_chart::Chart;
-use crate::uncertainty::{CameraUncertainty, SharedTies};
+use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
 /// Rounds of the iterated update: from a range known to a factor of three it takes four or five.
 const MAX_ROUNDS: usize = 10;
@@ -24,9 +24,8 @@ pub(crate) const VAGUE_LOG_RANGE_SD: f64 = 0.1;
 pub(crate) struct Measured<'a> {
     pub(crate) line: &'a SightLine,
     pub(crate) camera: &'a CameraUncertainty,
-    /// Covariance of the state with the camera's shared errors, each of these in its own
-    /// deviations.
-    pub(crate) ties: &'a SharedTies,
+    /// What is known of the camera's shared errors.
+    pub(crate) errors: &'a SharedErrors,
 }
 
 /// A state after a bearing.
@@ -37,10 +36,61 @@ pub(crate) struct Updated {
     pub(crate) nis: f64,
     /// Logarithm of the bearing's likelihood, 1/sr.
     pub(crate) log_likelihood: f64,
+    pub(crate) told: Told,
+}
+
+/// What a bearing tells of all that goes with it, or what it tells in the mean over the models.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Told {
     /// What the update does to the state's covariance with any error: `carried * ties`, ...
     pub(crate) carried: Matrix6<f64>,
-    /// ... less, of the camera's own errors, `gain * shifts`.
+    /// ... less `gained` times the camera's own errors' covariance with it.
     pub(crate) gained: SharedTies,
+    /// How the bearing follows the place, ...
+    pub(crate) by: Matrix2x3<f64>,
+    /// ... and the camera's errors.
+    pub(crate) shifts: Shifts,
+    /// The inverse S^-1 of the innovation's covariance, ...
+    pub(crate) weight: Matrix2<f64>,
+    /// ... and its product with the innovation, S^-1 z: an error of which C is the covariance with
+    /// the bearing is thought to be C S^-1 z larger, ...
+    pub(crate) pull: Vector2<f64>,
+    /// ... with the covariance of that over the models, ...
+    pub(crate) pull_spread: Matrix2<f64>,
+    /// ... and how the state goes with it.
+    pub(crate) moved: Matrix6x2<f64>,
+}
+
+impl Told {
+    /// In the mean over models of such probabilities.
+    pub(crate) fn over<'a>(models: impl Iterator<Item = (&'a Updated, f64)> + Clone) -> Self {
+        let mut mean = Self {
+            carried: Matrix6::zeros(),
+            gained: SharedTies::zeros(),
+            by: Matrix2x3::zeros(),
+            shifts: Shifts::zeros(),
+            weight: Matrix2::zeros(),
+            pull: Vector2::zeros(),
+            pull_spread: Matrix2::zeros(),
+            moved: Matrix6x2::zeros(),
+        };
+        let mut state = Vector6::zeros();
+        for (Updated { state: after, told, .. }, probability) in models.clone() {
+            mean.carried += told.carried * probability;
+            mean.gained += told.gained * probability;
+            mean.by += told.by * probability;
+            mean.shifts += told.shifts * probability;
+            mean.weight += told.weight * probability;
+            mean.pull += told.pull * probability;
+            state += after.mean * probability;
+        }
+        for (Updated { state: after, told, .. }, probability) in models {
+            let pull = told.pull - mean.pull;
+            mean.pull_spread += pull * pull.transpose() * probability;
+            mean.moved += (after.mean - state) * pull.transpose() * probability;
+        }
+        mean
+    }
 }
 
 /// The state after a bearing of its time; `seen_from` is where the camera stands that follows the
@@ -50,12 +100,12 @@ pub(crate) fn updated(
     seen_from: Option<Point3<f64>>,
     measured: &Measured<'_>,
 ) -> Option<Updated> {
-    let Measured { line, camera, ties } = *measured;
+    let Measured { line, camera, errors } = *measured;
     let chart = match seen_from {
         Some(origin) => Chart::by_range(origin, prior)?,
         None => Chart::cartesian(prior),
     };
-    let (covariance, ties) = chart.expressed(&prior.covariance, ties);
+    let (covariance, ties) = chart.expressed(&prior.covariance, &errors.ties);
     let is_own = seen_from == Some(line.origin);
     let mut coordinates = Vector6::zeros();
     if !is_own && seen_from.is_some() && covariance.m33 > VAGUE_LOG_RANGE_SD.powi(2) {
@@ -73,14 +123,15 @@ pub(crate) fn updated(
         let across = seen + tied;
         let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
         let noise = camera.noise(&model, point.velocity, &model.covariance_of(line))
-            + shifts * shifts.transpose();
+            + errors.spread(&shifts);
         let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
         let determinant = spread.determinant();
         let inverse = spread.try_inverse()?;
         if !(determinant > 0.0 && spread.m11 > 0.0) {
             return None;
         }
-        let innovation: Vector2<f64> = offset + by * coordinates.fixed_rows::<3>(0);
+        let innovation: Vector2<f64> =
+            offset + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
         let gain = across * inverse;
         let next = gain * innovation;
         let moved = (point.place_by * (next - coordinates).fixed_rows::<3>(0)).norm() / model.range;
@@ -104,8 +155,16 @@ pub(crate) fn updated(
             state,
             nis,
             log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
-            carried,
-            gained: gain * shifts,
+            told: Told {
+                carried,
+                gained: gain * shifts,
+                by: model.by_position(),
+                shifts,
+                weight: inverse,
+                pull: inverse * innovation,
+                pull_spread: Matrix2::zeros(),
+                moved: Matrix6x2::zeros(),
+            },
         });
     }
     None

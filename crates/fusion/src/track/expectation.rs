@@ -8,7 +8,7 @@ use nalgebra::Point3;
 use super::{Track, log_range_sd};
 use crate::motion::Motion;
 use crate::prediction::{BearingPrediction, Fit};
-use crate::uncertainty::{CameraUncertainty, SharedTies};
+use crate::uncertainty::{CameraUncertainty, SharedErrors};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 
 /// What a camera should see of a track.
@@ -26,8 +26,8 @@ pub(crate) enum Expectation {
         seen_from: Point3<f64>,
         /// The camera that looks now, ...
         camera: CameraUncertainty,
-        /// ... and what ties the track to its errors.
-        ties: SharedTies,
+        /// ... and what the track knows of its errors.
+        errors: SharedErrors,
     },
 }
 
@@ -36,10 +36,14 @@ impl Expectation {
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
         match self {
             Self::Near(prediction) => prediction.fit(line, gate),
-            Self::Along { state, seen_from, camera, ties } => {
-                let Updated { nis, log_likelihood, .. } =
-                    updated(state, Some(*seen_from), &Measured { line, camera, ties })?;
-                gate.holds(nis).then_some(Fit { gate_distance: nis, log_density: log_likelihood })
+            Self::Along { state, seen_from, camera, errors } => {
+                let fit = |errors: &SharedErrors| {
+                    let Updated { nis, log_likelihood, .. } =
+                        updated(state, Some(*seen_from), &Measured { line, camera, errors })?;
+                    let fit = Fit { gate_distance: nis, log_density: log_likelihood };
+                    gate.holds(nis).then_some(fit)
+                };
+                fit(errors).or_else(|| fit(&errors.renewed()?.0))
             }
         }
     }
@@ -55,16 +59,16 @@ impl Track {
         motion: &Motion,
     ) -> Option<Expectation> {
         let interval = time.seconds_since(self.updated);
-        let ties = self.ties_of(camera, interval);
+        let errors = self.errors_of(camera, interval);
         let follower = self.follower.filter(|follower| !self.held && *follower != origin);
         if let Some(seen_from) = follower {
             let state = self.predicted(time, motion);
             if log_range_sd(&state, seen_from) > VAGUE_LOG_RANGE_SD {
-                return Some(Expectation::Along { state, seen_from, camera: *uncertainty, ties });
+                return Some(Expectation::Along { state, seen_from, camera: *uncertainty, errors });
             }
         }
-        let models = motion.models(self.held);
-        BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &ties)
+        let models = motion.models(self.ranged);
+        BearingPrediction::new(&self.imm, interval, models, origin, uncertainty, &errors)
             .map(Expectation::Near)
     }
 }

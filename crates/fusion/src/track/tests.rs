@@ -1,11 +1,13 @@
-use nalgebra::{Point3, Vector3, Vector6};
+use crossfix_geometry::tangent_basis;
+use nalgebra::{Point3, Unit, Vector2, Vector3, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::*;
-use crate::spatial::tests_support::{noisy_line_at, orthogonal_cameras};
+use crate::spatial::tests_support::{line_at, noisy_line_at, orthogonal_cameras};
 use crate::spatial::{VelocityKnowledge, map};
+use crate::uncertainty::LastingNoise;
 use crate::{Manoeuvres, Tracking};
 
 /// Mean NEES after `periods` of the papers' geometry, started from the MAP fix of the first.
@@ -65,4 +67,149 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
     // 1's last time; held to the last bearing's time, as here, it is a little wider.
     let rmse = (square / f64::from(RUNS)).sqrt();
     assert!((0.088..0.105).contains(&rmse), "{rmse}");
+}
+
+/// What bearings of three cameras, thirty a second each, are off by: for a while by the same.
+struct LastingErrors {
+    noise: LastingNoise,
+    errors: [Vector2<f64>; 3],
+}
+
+impl LastingErrors {
+    fn new(noise: LastingNoise, normal: &mut impl FnMut() -> f64) -> Self {
+        let errors = std::array::from_fn(|_| Vector2::new(normal(), normal()) * noise.sd_rad);
+        Self { noise, errors }
+    }
+
+    /// The next bearing of a camera, `interval_s` after its last.
+    fn line(
+        &mut self,
+        camera: usize,
+        target: Point3<f64>,
+        (time_s, interval_s): (f64, f64),
+        normal: &mut impl FnMut() -> f64,
+    ) -> TimedLine {
+        let kept = (-interval_s / self.noise.time_s).exp();
+        let new = (1.0 - kept * kept).sqrt() * self.noise.sd_rad;
+        let error = &mut self.errors[camera];
+        *error = *error * kept + Vector2::new(normal(), normal()) * new;
+        let mut timed = line_at(orthogonal_cameras()[camera], target, time_s);
+        let white = Vector2::new(normal(), normal()) * WHITE_RAD;
+        let off = timed.line.basis * (*error + white);
+        timed.line.direction = Unit::new_normalize(timed.line.direction.into_inner() + off);
+        timed.line.basis = tangent_basis(&timed.line.direction);
+        timed.line.covariance = Matrix2::identity() * WHITE_RAD.powi(2);
+        timed
+    }
+}
+
+const WHITE_RAD: f64 = 2e-5;
+
+/// Errors of position and velocity with their squares by the covariance, of a target that is driven
+/// by white acceleration for six seconds; a tentative track considers what lasts, a confirmed one
+/// learns it. `hand` shifts the bearings of a camera from a time on, rad.
+fn flown(
+    status: TrackStatus,
+    (hand_from_s, hand): (f64, Vector2<f64>),
+    normal: &mut impl FnMut() -> f64,
+) -> (Vector6<f64>, f64) {
+    const DENSITY: f64 = 0.5;
+    const FRAME_S: f64 = 1.0 / 30.0;
+    let tracking = Tracking {
+        manoeuvres: Manoeuvres::None,
+        acceleration_density: DENSITY,
+        ..Tracking::default()
+    };
+    let motion = Motion::new(&tracking).unwrap();
+    let noise = LastingNoise { sd_rad: 3e-4, time_s: 1.0 };
+    let uncertainty = CameraUncertainty { lasting: noise, ..CameraUncertainty::of_time(0.0) };
+    let mut errors = LastingErrors::new(noise, normal);
+    let names: [CameraName; 3] = ["a", "b", "c"].map(|name| name.parse().unwrap());
+    let spread = Vector6::new(0.2, 0.2, 0.2, 1.0, 1.0, 1.0);
+    let mean = Vector6::new(0.0, 0.0, 0.0, 5.0, 0.0, 0.0);
+    let mut truth = mean + spread.map(|sd| sd * normal());
+    let start = Timestamp::from_seconds(100.0);
+    let state =
+        KinematicState { mean, covariance: Matrix6::from_diagonal(&spread.map(|sd| sd * sd)) };
+    let fix = Fix {
+        time: start,
+        state,
+        velocity: VelocityKnowledge::Solved,
+        solver: Solver::Map,
+        observability: Observability::of_information(&Matrix6::identity(), 1.0, 1.0),
+    };
+    let mut track = Track::start(&fix, [], &motion);
+    track.status = status;
+    let step = FRAME_S / 3.0;
+    for k in 0..540 {
+        // Exact moments of white acceleration over a step.
+        for axis in 0..3 {
+            let [first, second] = [normal(), normal()];
+            let velocity = (DENSITY * step).sqrt() * first;
+            truth[axis] += truth[axis + 3] * step
+                + velocity * step / 2.0
+                + (DENSITY * step.powi(3) / 12.0).sqrt() * second;
+            truth[axis + 3] += velocity;
+        }
+        let (camera, time_s) = (k % 3, f64::from(u32::try_from(k + 1).unwrap()) * step);
+        let place = Point3::from(truth.fixed_rows::<3>(0).into_owned());
+        let mut timed = errors.line(camera, place, (100.0 + time_s, FRAME_S), normal);
+        if camera == 0 && time_s > hand_from_s {
+            let off = timed.line.basis * hand;
+            timed.line.direction = Unit::new_normalize(timed.line.direction.into_inner() + off);
+            timed.line.basis = tangent_basis(&timed.line.direction);
+        }
+        let bearing = (timed.time, &uncertainty);
+        track.measurement_update(&names[camera], &timed.line, bearing, &motion).unwrap();
+    }
+    let error = track.state().mean - truth;
+    (error, (error.transpose() * track.state().covariance.try_inverse().unwrap() * error).x)
+}
+
+/// An error that lasts is in the next bearing too: where it is learnt, velocities are better known
+/// than where it is only considered, and both are as good as they say.
+#[test]
+fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
+    const RUNS: u32 = 300;
+    let figures = |status: TrackStatus| {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+        let (mut nees, mut square) = (0.0, 0.0);
+        for _ in 0..RUNS {
+            let (error, squared) = flown(status, (f64::INFINITY, Vector2::zeros()), &mut normal);
+            nees += squared / f64::from(RUNS);
+            square += error.fixed_rows::<3>(3).norm_squared() / f64::from(RUNS);
+        }
+        (nees, square.sqrt())
+    };
+    let (considered, learnt) = (figures(TrackStatus::Tentative), figures(TrackStatus::Confirmed));
+    // A mean of n squares of six deviates is known to sqrt(12 / n).
+    let tolerance = 3.0 * (12.0 / f64::from(RUNS)).sqrt();
+    for (nees, _) in [considered, learnt] {
+        assert!((nees - 6.0).abs() < tolerance, "{considered:?} {learnt:?}");
+    }
+    // The Riccati equations of one axis and the two of the cameras that look across it, iterated for
+    // a filter that considers the errors and for one that estimates them, m/s.
+    for ((_, found), expected) in [(considered, 0.219), (learnt, 0.189)] {
+        let axis = found / 3.0f64.sqrt();
+        let tolerance = 3.0 * expected / f64::from(2 * 3 * RUNS).sqrt();
+        assert!((axis - expected).abs() < tolerance, "{considered:?} {learnt:?}");
+    }
+}
+
+/// A hand that draws labels, or a tracker that finds its target again, moves on at once.
+#[test]
+fn an_error_that_is_drawn_anew_is_no_motion() {
+    const RUNS: u32 = 100;
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+    let mut velocity = |hand: (f64, Vector2<f64>)| {
+        let runs = (0..RUNS).map(|_| flown(TrackStatus::Confirmed, hand, &mut normal).0);
+        let square: f64 = runs.map(|error| error.fixed_rows::<3>(3).norm_squared()).sum();
+        (square / f64::from(RUNS)).sqrt()
+    };
+    let calm = velocity((f64::INFINITY, Vector2::zeros()));
+    // In the last bearing of a camera, by three deviations: taken for motion, it doubles the error.
+    let moved = velocity((5.97, Vector2::new(9e-4, 0.0)));
+    assert!(moved < 1.3 * calm, "{moved} {calm}");
 }

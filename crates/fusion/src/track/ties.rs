@@ -3,13 +3,14 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2, Matrix2x3, Matrix6, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Unit, Vector2};
 
+use super::learnt::LearntTies;
 use super::{Innovation, Track};
 use crate::cameras::{ClockChange, LastThree, Sample};
 use crate::motion::Motion;
 use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, SharedTies};
-use crate::update::Updated;
+use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
 /// Bearings further apart than this share of the time for which one holds a track tell no noise
@@ -25,6 +26,12 @@ const HOLDING_PERIODS: f64 = 1.5;
 /// ... where these lay no further apart than so many times what a bearing holds a track for.
 const LONGEST_PERIOD: f64 = 2.0;
 
+/// A camera that sees a target misses it without having lost it for this share of the time for which
+/// one bearing holds a track: 0.3 s by default. In that time a small drone's speed changes by a metre
+/// a second or two, unseen along the sight line of the other camera; with half of it a detector's
+/// misses are taken for that.
+const MISSED: f64 = 0.2;
+
 /// Something beside a target is steady if it moves by less than this share of how far away it is
 /// from draw to draw, ...
 const STEADY: f64 = 0.2;
@@ -36,12 +43,14 @@ const STEADY_DRAWS: u32 = 5;
 const LEAST_BESIDE: usize = 2;
 
 /// What ties a track to the shared errors of a camera that has seen it.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Ties {
     /// Covariance of position and velocity with the errors, each in its own deviations.
     pub(super) covariance: SharedTies,
-    /// How long that of the errors lasts that pass, s.
-    lasting_s: f64,
+    /// Covariance of what the track learns of errors that last with them.
+    pub(super) learnt: LearntTies,
+    /// How long those last that pass, s.
+    pub(super) lasting_s: f64,
     /// Whether the camera can see the target, when it was exposed last.
     pub(super) visibility: Visibility,
     /// When it gave the track its last bearing, ...
@@ -120,6 +129,7 @@ impl Ties {
     pub(super) fn new(time: Timestamp) -> Self {
         Self {
             covariance: SharedTies::zeros(),
+            learnt: LearntTies::zeros(0),
             lasting_s: LastingNoise::NONE.time_s,
             visibility: Visibility::new(time),
             seen: None,
@@ -176,6 +186,14 @@ impl Ties {
         })
     }
 
+    /// Whether the camera sees the target now: it has not missed it for longer than a detector may,
+    /// or than its bearings lie apart.
+    pub(super) fn sees(&self, now: Timestamp, holding_s: f64) -> bool {
+        let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
+        let missed_s = (MISSED * holding_s).max(HOLDING_PERIODS * period_s);
+        self.seen.is_some_and(|seen| now.seconds_since(seen) <= missed_s)
+    }
+
     /// The same `interval` seconds on: the position goes on with the velocity, and what lasts is
     /// partly gone.
     pub(super) fn predicted(&self, interval: f64) -> SharedTies {
@@ -183,18 +201,18 @@ impl Ties {
         let velocity = covariance.fixed_rows::<3>(3).into_owned();
         let mut position = covariance.fixed_rows_mut::<3>(0);
         position += velocity * interval;
-        let kept = (-interval.abs() / self.lasting_s).exp();
         let mut lasting = covariance.fixed_columns_mut::<2>(LASTING);
-        lasting *= kept;
+        lasting *= self.kept(interval);
         covariance
+    }
+
+    /// How much of what lasts is left after an interval, s.
+    pub(super) fn kept(&self, interval: f64) -> f64 {
+        (-interval.abs() / self.lasting_s).exp()
     }
 }
 
 impl Track {
-    pub(super) fn ties_of(&self, camera: &CameraName, interval: f64) -> SharedTies {
-        self.ties.get(camera).map_or_else(SharedTies::zeros, |ties| ties.predicted(interval))
-    }
-
     /// Keeps a bearing for the next draw.
     pub(super) fn gather(
         &mut self,
@@ -250,13 +268,9 @@ impl Track {
     /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances):
     /// what they have done to the track is as well.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
-        let Some(ties) = self.ties.get_mut(camera) else {
-            return;
-        };
-        let mut shared = ties.covariance.fixed_columns_mut::<2>(0);
-        let change = shared.clone_owned() * shared.transpose() * (ratio - 1.0);
-        shared *= ratio.sqrt();
-        self.imm.add_covariance(&change);
+        if let Some(change) = self.rescale::<OF_CLOCK>(camera, 0, (ratio, ratio.sqrt())) {
+            self.imm.add_covariance(&change);
+        }
     }
 
     /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was
@@ -269,15 +283,16 @@ impl Track {
         camera: &CameraName,
         ClockChange { ahead, ratio }: ClockChange,
     ) {
-        let Some(ties) = self.ties.get_mut(camera) else {
+        let Some(ties) = self.ties.get(camera) else {
             return;
         };
-        let mut shared = ties.covariance.fixed_columns_mut::<1>(OF_CLOCK);
-        let moved = shared.clone_owned() * ahead;
-        let change = shared.clone_owned() * shared.transpose() * (ratio.min(1.0) - 1.0);
-        shared *= ratio.min(ratio.recip()).sqrt();
+        let moved = ties.covariance.column(OF_CLOCK) * ahead;
         self.imm.shift(&moved);
-        self.imm.add_covariance(&change);
+        self.shift_learnt(camera, OF_CLOCK, ahead);
+        let scale = ratio.min(ratio.recip()).sqrt();
+        if let Some(change) = self.rescale::<1>(camera, OF_CLOCK, (ratio.min(1.0), scale)) {
+            self.imm.add_covariance(&change);
+        }
     }
 
     pub(super) fn third_difference(
@@ -295,44 +310,41 @@ impl Track {
         last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
     }
 
-    /// Carries the ties to all cameras' errors through an update, by the mean over the models;
+    /// Carries what is known of all cameras' errors through an update, by the mean over the models;
     /// returns the mean squared distance of the bearing.
     pub(super) fn carry(
         &mut self,
         (camera, lasting): (&CameraName, LastingNoise),
-        interval: f64,
+        (time, interval): (Timestamp, f64),
         results: &[Option<Updated>],
     ) -> f64 {
-        let (mut nis, mut carried, mut gained) = (0.0, Matrix6::zeros(), SharedTies::zeros());
-        for (result, weight) in results.iter().zip(self.imm.probabilities()) {
-            if let Some(after) = result {
-                nis += after.nis * weight;
-                carried += after.carried * *weight;
-                gained += after.gained * *weight;
-            }
-        }
-        if !self.ties.contains_key(camera) {
-            self.ties.insert(camera.clone(), Ties::new(self.updated));
-        }
-        for (name, ties) in &mut self.ties {
-            ties.covariance = carried * ties.predicted(interval);
-            if name == camera {
-                ties.covariance -= gained;
-                ties.lasting_s = lasting.time_s;
-            }
+        let models = results.iter().zip(self.imm.probabilities().iter().copied());
+        let models = models.filter_map(|(result, weight)| Some((result.as_ref()?, weight)));
+        let nis = models.clone().map(|(after, weight)| after.nis * weight).sum();
+        let told = Told::over(models);
+        self.note(camera, self.updated);
+        self.pass(interval);
+        self.begin_to_learn(camera, lasting, time);
+        self.learn(camera, &told);
+        if let Some(ties) = self.ties.get_mut(camera) {
+            ties.lasting_s = lasting.time_s;
         }
         self.keep_ties_possible();
         nis
     }
 
+    /// Has ties to a camera's errors from now on.
+    pub(super) fn note(&mut self, camera: &CameraName, time: Timestamp) {
+        if !self.ties.contains_key(camera) {
+            let learnt = self.untied();
+            self.ties.insert(camera.clone(), Ties { learnt, ..Ties::new(time) });
+        }
+    }
+
     /// The ties are carried by the mean over the models: where one model alone is surer than they
     /// allow, it is not believed.
     pub(super) fn keep_ties_possible(&mut self) {
-        let squares = self.ties.values().map(|ties| ties.covariance * ties.covariance.transpose());
-        // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
-        let mut squares: Vec<Matrix6<f64>> = squares.collect();
-        squares.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
-        let shared: Matrix6<f64> = squares.iter().sum();
+        let shared = self.shared_part();
         if shared.amax() > 0.0 {
             self.imm.exceed(&shared);
         }

@@ -1,0 +1,109 @@
+//! A bearing against what is expected of it.
+
+use crossfix_filter::KinematicState;
+use crossfix_geometry::{BearingModel, SightLine};
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::Vector2;
+
+use super::Track;
+use crate::motion::{Detector, Motion};
+use crate::uncertainty::{CameraUncertainty, SharedErrors};
+
+/// A bearing against what is expected of it.
+pub(super) struct Innovation {
+    pub(super) offset: Vector2<f64>,
+    pub(super) model: BearingModel,
+}
+
+/// A bearing and the state that is expected at its time.
+struct Against<'a> {
+    before: &'a KinematicState,
+    line: &'a SightLine,
+    uncertainty: &'a CameraUncertainty,
+}
+
+impl Against<'_> {
+    /// The squared Mahalanobis distance of an innovation, and the determinant of its covariance,
+    /// rad^4, by what is known of the camera's errors.
+    fn distance(&self, innovation: &Innovation, errors: &SharedErrors) -> Option<(f64, f64)> {
+        let Innovation { offset, model } = innovation;
+        let by = model.by_position();
+        let shifts = self.uncertainty.shifts(model, self.before.velocity());
+        // S = H P H' + H C s' + s C' H' + s W s' + f R: the camera's errors s are in the bearing and,
+        // by the bearings that it has given before (C), in the track.
+        let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
+        let spread = by * self.before.position_covariance() * by.transpose()
+            + cross
+            + cross.transpose()
+            + errors.spread(&shifts)
+            + model.covariance_of(self.line) * self.uncertainty.factor;
+        let offset = offset - shifts * errors.mean;
+        let factor = spread.cholesky()?;
+        Some((offset.dot(&factor.solve(&offset)), factor.determinant()))
+    }
+}
+
+impl Track {
+    /// A bearing against what is expected at its time.
+    pub(super) fn innovation(&self, time: Timestamp, line: &SightLine) -> Option<Innovation> {
+        let model = BearingModel::new(line.origin, self.position_at(time))?;
+        Some(Innovation { offset: model.offset(line)?, model })
+    }
+
+    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as
+    /// they are found to.
+    fn nis(
+        &self,
+        innovation: &Innovation,
+        interval: f64,
+        (camera, line): (&CameraName, &SightLine),
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> Option<f64> {
+        let before = self.imm.predicted(interval, motion.models(self.ranged));
+        let errors = self.errors_of(camera, interval);
+        let against = Against { before: &before, line, uncertainty };
+        Some(against.distance(innovation, &errors)?.0)
+    }
+
+    /// What is known of a camera's errors where a bearing tells that those that last have been drawn
+    /// anew.
+    pub(super) fn renewed(
+        &self,
+        innovation: &Innovation,
+        interval: f64,
+        (line, errors): (&SightLine, &SharedErrors),
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> Option<SharedErrors> {
+        let (anew, probability) = errors.renewed()?;
+        let before = self.imm.predicted(interval, motion.models(self.ranged));
+        let against = Against { before: &before, line, uncertainty };
+        let log_likelihood = |errors: &SharedErrors, probability: f64| {
+            let (squared, determinant) = against.distance(innovation, errors)?;
+            Some(probability.ln() - (squared + determinant.ln()) / 2.0)
+        };
+        let went_on = log_likelihood(errors, 1.0 - probability);
+        (log_likelihood(&anew, probability) > went_on).then_some(anew)
+    }
+
+    /// Whether a detector sees in a bearing that the target has begun to manoeuvre.
+    pub(super) fn sees_manoeuvre(
+        &mut self,
+        innovation: &Innovation,
+        interval: f64,
+        (camera, line): (&CameraName, &SightLine),
+        uncertainty: &CameraUncertainty,
+        motion: &Motion,
+    ) -> bool {
+        let nis = matches!(self.detector, Some(Detector::Innovation(_)))
+            .then(|| self.nis(innovation, interval, (camera, line), uncertainty, motion))
+            .flatten();
+        self.detector.as_mut().is_some_and(|detector| match detector {
+            Detector::Residual(detector) => {
+                detector.see(innovation.model.basis * innovation.offset / line.standard_deviation())
+            }
+            Detector::Innovation(detector) => nis.is_some_and(|nis| detector.see(nis, 2)),
+        })
+    }
+}
