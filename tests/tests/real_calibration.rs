@@ -54,22 +54,21 @@ impl Flight {
     }
 }
 
-/// The bounds are those that the project asks for, but for the velocity of three cameras: 0.28 m/s is
-/// asked for and 0.295 is reached (docs/calibration.md). Six is honest for the NEES; less is caution.
+/// The bounds are those that the project asks for. Six is honest for the NEES; less is caution.
 fn check(figures: &Value, most_position_m: f64, most_velocity_mps: f64) {
     let number = |name: &str| figures[name].as_f64().unwrap();
     assert!(number("position_rmse_m") <= most_position_m, "{figures:#}");
     assert!(number("velocity_rmse_mps") <= most_velocity_mps, "{figures:#}");
     assert!(number("completeness") >= 0.995, "{figures:#}");
     let nees = figures["nees"]["mean"].as_f64().unwrap();
-    assert!((1.5..12.0).contains(&nees), "{figures:#}");
+    assert!((3.0..12.0).contains(&nees), "{figures:#}");
 }
 
 #[test]
 fn three_cameras_that_nobody_has_surveyed_place_the_drone_to_five_centimetres() {
     let Some(data) = real_data() else { return };
     let figures = Flight::new(&data, "3", "gopro3,sony5100,sonyG").figures("3");
-    check(&figures, 0.055, 0.30);
+    check(&figures, 0.055, 0.28);
 }
 
 #[test]
