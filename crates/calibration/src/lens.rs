@@ -45,13 +45,34 @@ pub(crate) fn values(intrinsics: &Intrinsics) -> Vec<f64> {
     values
 }
 
-/// How well a lens file knows each number.
-pub(crate) fn prior_sd(intrinsics: &Intrinsics) -> Vec<f64> {
-    let centre = CENTRE_SD * f64::from(intrinsics.size.width);
-    let mut deviations = vec![LOG_FOCAL_SD, LOG_ASPECT_SD, centre, centre];
-    let distortion = coefficients(&intrinsics.distortion);
-    deviations.extend(distortion.iter().map(|k| (k.abs() * DISTORTION_SD).max(HELD_SD)));
-    deviations
+/// What of a lens may be otherwise than its file says.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LensFreedom {
+    /// Nothing: it was calibrated as it is used, at a distance.
+    Keep,
+    /// The focal length (1 %).
+    Focal,
+    /// All: the focal length (1 %), the pixels' aspect (0.1 %), the principal point (3 of 1920
+    /// pixels), each coefficient of distortion (a third of itself).
+    #[default]
+    All,
+}
+
+impl LensFreedom {
+    /// How well a lens file knows each number.
+    pub(crate) fn prior_sd(self, intrinsics: &Intrinsics) -> Vec<f64> {
+        let centre = CENTRE_SD * f64::from(intrinsics.size.width);
+        let mut deviations = vec![LOG_FOCAL_SD, LOG_ASPECT_SD, centre, centre];
+        let distortion = coefficients(&intrinsics.distortion);
+        deviations.extend(distortion.iter().map(|k| (k.abs() * DISTORTION_SD).max(HELD_SD)));
+        let free = match self {
+            Self::Keep => 0,
+            Self::Focal => 1,
+            Self::All => deviations.len(),
+        };
+        deviations[free..].fill(HELD_SD);
+        deviations
+    }
 }
 
 /// A lens moved by a step in its numbers.
@@ -121,19 +142,39 @@ impl LensUncertainty {
         &self,
         intrinsics: &Intrinsics,
         direction: &Vector3<f64>,
-        (range_m, world_from_camera): (f64, &nalgebra::Rotation3<f64>),
+        place: (f64, &nalgebra::Rotation3<f64>),
     ) -> Option<f64> {
-        let point = direction * range_m;
-        let seen = project(intrinsics, &point)?;
+        let seen = project(intrinsics, &(direction * place.0))?;
         let count = self.covariance.nrows();
-        let mut by_pose = nalgebra::Matrix2x6::zeros();
-        by_pose.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * point.cross_matrix()));
-        let by_centre = -seen.by_point * world_from_camera.matrix().transpose();
-        by_pose.fixed_columns_mut::<3>(3).copy_from(&by_centre);
         let by_lens = DMatrix::from_fn(2, count, |axis, number| seen.by_lens[number][axis]);
-        let by = by_lens + by_pose * &self.pose_by_lens;
+        let by = by_lens + by_pose(&seen, direction, place) * &self.pose_by_lens;
         Some((&by * &self.covariance * by.transpose()).trace() / 2.0)
     }
+}
+
+/// The variance that a pose's covariance leaves a pixel in the mean of both axes, likewise.
+pub(crate) fn pose_variance_px2(
+    intrinsics: &Intrinsics,
+    direction: &Vector3<f64>,
+    place: (f64, &nalgebra::Rotation3<f64>),
+    covariance: &nalgebra::Matrix6<f64>,
+) -> Option<f64> {
+    let by = by_pose(&project(intrinsics, &(direction * place.0))?, direction, place);
+    Some((by * covariance * by.transpose()).trace() / 2.0)
+}
+
+/// How a pixel follows the camera's rotation about its axes and its centre.
+fn by_pose(
+    seen: &Projection,
+    direction: &Vector3<f64>,
+    (range_m, world_from_camera): (f64, &nalgebra::Rotation3<f64>),
+) -> nalgebra::Matrix2x6<f64> {
+    let mut by_pose = nalgebra::Matrix2x6::zeros();
+    let turn = seen.by_point * (direction * range_m).cross_matrix();
+    by_pose.fixed_columns_mut::<3>(0).copy_from(&turn);
+    let by_centre = -seen.by_point * world_from_camera.matrix().transpose();
+    by_pose.fixed_columns_mut::<3>(3).copy_from(&by_centre);
+    by_pose
 }
 
 /// The direction in which a pixel is seen: by the geometry crate's model.

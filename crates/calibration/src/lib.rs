@@ -1,4 +1,6 @@
-//! Intrinsics from the calibration files that OpenCV and ROS write.
+//! What cameras are: poses, clocks and lenses with their covariance, from the flight of one target
+//! ([`calibrate_flight`]) or from landmarks in a picture ([`calibrate_landmarks`]); the file of a site
+//! that holds them ([`SiteCalibration`]); and intrinsics as OpenCV and ROS write them:
 //!
 //! ```
 //! use crossfix_calibration::intrinsics_from_yaml;
@@ -18,6 +20,7 @@
 
 mod flight;
 mod intrinsics;
+mod landmarks;
 mod lens;
 mod site_file;
 
@@ -27,7 +30,11 @@ pub use flight::{
     calibrate_flight,
 };
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
-pub use lens::LensUncertainty;
+pub use landmarks::{
+    Landmark, LandmarkError, LandmarkFit, LandmarkPicture, LandmarkPlace, LandmarkResult,
+    calibrate_landmarks,
+};
+pub use lens::{LensFreedom, LensUncertainty};
 pub use site_file::{
     BearingError, CalibratedCamera, ClockCorrection, SiteCalibration, SiteFileError,
 };

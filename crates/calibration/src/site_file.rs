@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::flight::{CameraResult, FlightResult, LabelNoise};
+use crate::landmarks::LandmarkResult;
 use crate::lens::{self, LensUncertainty};
 
 /// Where the lens may be off by so many times what labels err by, a pixel shows no direction: in
@@ -206,6 +207,19 @@ impl SiteCalibration {
         toml::to_string(&File { form: FORM, datum, cameras }).unwrap_or_default()
     }
 
+    /// A site of these cameras, of which nobody knows what they are off by together.
+    pub fn of(cameras: Vec<CalibratedCamera>) -> Self {
+        Self { cameras, datum: None }
+    }
+
+    /// Takes a camera in, in the place of the one of its name.
+    pub fn put(&mut self, camera: CalibratedCamera) {
+        match self.cameras.iter_mut().find(|known| known.name == camera.name) {
+            Some(known) => *known = camera,
+            None => self.cameras.push(camera),
+        }
+    }
+
     /// The cameras, as the file has them.
     pub fn cameras(&self) -> &[CalibratedCamera] {
         &self.cameras
@@ -259,6 +273,28 @@ impl From<&CameraResult> for CalibratedCamera {
     }
 }
 
+/// What trackers err by where no flight has shown it: the middle of what they and hands did on five
+/// cameras (docs/calibration.md).
+const USUAL_NOISE: LabelNoise = LabelNoise { white_px: 0.2, lasting_px: 0.5, lasting_s: 1.0 };
+/// Where nobody has said how often a camera takes pictures, s.
+const USUAL_FRAME_S: f64 = 1.0 / 30.0;
+
+impl From<&LandmarkResult> for CalibratedCamera {
+    /// A picture tells nothing of the clock: its times stay what they are.
+    fn from(result: &LandmarkResult) -> Self {
+        Self {
+            name: result.name.clone(),
+            camera: result.camera.clone(),
+            pose_covariance: result.pose_covariance,
+            lens: result.lens.clone(),
+            range_m: result.range_m,
+            clock: ClockCorrection::none(),
+            noise: USUAL_NOISE,
+            frame_s: USUAL_FRAME_S,
+        }
+    }
+}
+
 impl CalibratedCamera {
     /// What the cameras' channel says of it alone.
     fn message(&self, valid_from: Timestamp) -> CameraCalibration {
@@ -302,6 +338,11 @@ impl CalibratedCamera {
 }
 
 impl ClockCorrection {
+    /// None: the camera's times are the common ones, as good as the camera says.
+    fn none() -> Self {
+        Self { knots_s: Vec::new(), rate: 0.0, rate_sd: 0.0, wander_s: 0.0, readout_s: 0.0 }
+    }
+
     /// What one of its times is to be corrected by, and the standard deviation, s.
     pub fn at(&self, own_s: f64) -> (f64, f64) {
         let after = self.knots_s.partition_point(|knot| knot[0] <= own_s);

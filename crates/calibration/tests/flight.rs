@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use crossfix_calibration::{
-    CameraLabels, FlightError, FlightLog, FlightResult, Label, LogErrors, LogSample, Mirror,
-    Refusal, SiteCalibration, Survey, SurveyedPlace, TapedDistance, calibrate_flight,
+    CameraLabels, FlightError, FlightLog, FlightResult, Label, LensFreedom, LogErrors, LogSample,
+    Mirror, Refusal, SiteCalibration, Survey, SurveyedPlace, TapedDistance, calibrate_flight,
 };
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
 use nalgebra::{Matrix6, Point3, Rotation3, Vector3, Vector6};
@@ -76,7 +76,12 @@ fn labels(truth: &Truth, random: &mut ChaCha8Rng) -> CameraLabels {
             labels.push(Label { time_s: own, pixel: Pixel::new(pixel.x() + x, pixel.y() + y) });
         }
     }
-    CameraLabels { name: truth.name.parse().unwrap(), intrinsics: truth.file, labels }
+    CameraLabels {
+        name: truth.name.parse().unwrap(),
+        intrinsics: truth.file,
+        freedom: LensFreedom::All,
+        labels,
+    }
 }
 
 fn log(random: &mut ChaCha8Rng, axes: impl Fn(Point3<f64>) -> Point3<f64>) -> FlightLog {

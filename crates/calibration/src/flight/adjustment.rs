@@ -12,7 +12,7 @@ use super::noise::{LabelNoise, Tails, Whitening};
 use super::normal::{Covariance, NormalEquations, Solution, Term};
 use super::spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
 use super::unknowns::{Order, Touched};
-use crate::lens;
+use crate::lens::{self, LensFreedom};
 
 /// Labels farther apart in time than this have errors of their own, s. No more than the distance of
 /// the spline's knots: a row holds five coefficients.
@@ -58,6 +58,8 @@ pub(super) struct CameraPriors {
     pub(super) noise: LabelNoise,
     /// Of the lens's file.
     pub(super) lens: Intrinsics,
+    /// What of it may be otherwise.
+    pub(super) freedom: LensFreedom,
     /// Time between frames, s.
     pub(super) frame_s: f64,
     /// Power of the clock's random walk, s^2/s.
@@ -361,7 +363,7 @@ impl State {
         hold(CLOCK + 2, clock.readout_s - readout, readout);
         let values = lens::values(&camera.intrinsics);
         let known = lens::values(&priors.lens);
-        let deviations = lens::prior_sd(&priors.lens);
+        let deviations = priors.freedom.prior_sd(&priors.lens);
         for (k, sd) in deviations.into_iter().enumerate() {
             hold(POSE_AND_CLOCK + k, values[k] - known[k], sd);
         }

@@ -167,6 +167,7 @@ impl Begun {
         let prior = |camera: &CameraLabels| CameraPriors {
             noise: FIRST_NOISE,
             lens: camera.intrinsics,
+            freedom: camera.freedom,
             frame_s: frame_time(camera),
             wander: FIRST_WANDER,
         };

@@ -4,7 +4,7 @@ use crossfix_geometry::{Intrinsics, Pixel};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3, Vector2, Vector3};
 
-use crate::lens;
+use crate::lens::{self, LensFreedom};
 
 /// Where the target was seen in one frame.
 #[derive(Clone, Copy, Debug)]
@@ -22,6 +22,8 @@ pub struct CameraLabels {
     pub name: CameraName,
     /// Its lens, by its file.
     pub intrinsics: Intrinsics,
+    /// What of that may be otherwise.
+    pub freedom: LensFreedom,
     /// In order of time.
     pub labels: Vec<Label>,
 }

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, ensure};
 use crossfix_calibration::intrinsics_from_yaml;
-use crossfix_geometry::{Camera, ImageSize, Pixel, PixelCovariance, Pose};
+use crossfix_geometry::{Camera, ImageSize, Intrinsics, Pixel, PixelCovariance, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
@@ -212,14 +212,7 @@ impl CameraFile {
         }
         match (&self.intrinsics, &self.pose, &self.source) {
             (Some(intrinsics), Some(pose), _) => {
-                let text = std::fs::read_to_string(intrinsics)
-                    .with_context(|| {
-                        format!("key `intrinsics`: cannot read {}", intrinsics.display())
-                    })
-                    .with_context(wrong)?;
-                let intrinsics = intrinsics_from_yaml(&text).with_context(|| {
-                    format!("the intrinsics file {} has an error", intrinsics.display())
-                })?;
+                let intrinsics = read_lens(intrinsics).with_context(wrong)?;
                 let pose = pose.pose().context("section [pose]").with_context(wrong)?;
                 let camera = Camera::new(intrinsics, pose)?;
                 self.check_lens(&camera).with_context(wrong)?;
@@ -232,6 +225,18 @@ impl CameraFile {
             _ => Err(anyhow!("give both `intrinsics` and [pose], or `calibration`"))
                 .with_context(wrong),
         }
+    }
+
+    /// The lens that the file's intrinsics describe, whatever else is there yet.
+    pub fn lens(&self, path: &Path) -> anyhow::Result<Intrinsics> {
+        let intrinsics = self.intrinsics.as_ref().with_context(|| {
+            format!(
+                "the configuration file {} has no key `intrinsics`: a lens file is begun with",
+                path.display()
+            )
+        })?;
+        read_lens(intrinsics)
+            .with_context(|| format!("the configuration file {} has an error", path.display()))
     }
 
     /// The camera as the site's calibration has it, where the file names one.
@@ -426,6 +431,13 @@ fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<C
         format!("{} has no calibration of camera `{name}`", recording.display())
     })?;
     found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
+}
+
+fn read_lens(path: &Path) -> anyhow::Result<Intrinsics> {
+    let text = std::fs::read_to_string(path)
+        .with_context(|| format!("key `intrinsics`: cannot read {}", path.display()))?;
+    intrinsics_from_yaml(&text)
+        .with_context(|| format!("the intrinsics file {} has an error", path.display()))
 }
 
 impl PoseConfig {

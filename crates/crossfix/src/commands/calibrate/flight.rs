@@ -2,15 +2,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_calibration::{CameraLabels, Label, SiteCalibration, calibrate_flight};
+use crossfix_calibration::{CameraLabels, Label, LensFreedom, SiteCalibration, calibrate_flight};
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
 use super::log::{self, LogKind, LogTime, Reading};
-use super::report;
 use super::survey::{self, Distance};
+use super::{Lens, report};
 use crate::commands::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
@@ -54,6 +54,9 @@ pub struct Args {
     /// kind's without.
     #[arg(long, value_name = "METRES", value_parser = numbers::not_negative)]
     log_drift: Option<f64>,
+    /// What of the lenses may be otherwise than their files say.
+    #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
+    lens: Lens,
     /// The calibration (TOML) to write.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -73,7 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         antenna_m: args.antenna,
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
-    let cameras = labels(&args.recording)?;
+    let cameras = labels(&args.recording, args.lens.into())?;
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let survey = survey::read(args.positions.as_deref(), &args.distance, &names)?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
@@ -108,7 +111,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 /// What a recording's cameras saw, by their own clocks.
-fn labels(recording: &Path) -> anyhow::Result<Vec<CameraLabels>> {
+fn labels(recording: &Path, freedom: LensFreedom) -> anyhow::Result<Vec<CameraLabels>> {
     let mut lenses: BTreeMap<CameraName, Intrinsics> = BTreeMap::new();
     let mut seen: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
     let mut lacks = Lacks::default();
@@ -151,7 +154,7 @@ fn labels(recording: &Path) -> anyhow::Result<Vec<CameraLabels>> {
                 && (0.0..=f64::from(size.height)).contains(&label.pixel.y())
         });
         labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
-        cameras.push(CameraLabels { name, intrinsics, labels });
+        cameras.push(CameraLabels { name, intrinsics, freedom, labels });
     }
     ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
     Ok(cameras)

@@ -1,7 +1,11 @@
+mod clicks;
 mod flight;
+mod landmarks;
 mod log;
 mod report;
 mod survey;
+
+use crossfix_calibration::LensFreedom;
 
 /// Find where cameras stand, what their lenses are and how their clocks run.
 #[derive(Debug, clap::Args)]
@@ -16,10 +20,34 @@ pub struct Args {
 #[derive(Debug, clap::Subcommand)]
 enum Way {
     Flight(flight::Args),
+    Landmarks(landmarks::Args),
+}
+
+/// What of a lens may be otherwise than its file says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Lens {
+    /// Nothing.
+    Keep,
+    /// The focal length: 1 %.
+    Focal,
+    /// All: focal length 1 %, aspect 0.1 %, principal point 3 of 1920 pixels, each coefficient of
+    /// distortion a third of itself.
+    All,
+}
+
+impl From<Lens> for LensFreedom {
+    fn from(lens: Lens) -> Self {
+        match lens {
+            Lens::Keep => Self::Keep,
+            Lens::Focal => Self::Focal,
+            Lens::All => Self::All,
+        }
+    }
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     match &args.way {
         Way::Flight(args) => flight::run(args),
+        Way::Landmarks(args) => landmarks::run(args),
     }
 }

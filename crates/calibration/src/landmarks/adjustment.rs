@@ -1,0 +1,227 @@
+//! Pose and lens adjusted to clicks, by Levenberg and Marquardt.
+
+use crossfix_geometry::Intrinsics;
+use nalgebra::{
+    Cholesky, DMatrix, DVector, Dyn, Matrix2, Matrix2x3, Matrix6, OMatrix, Point3, Rotation3, U2,
+    Vector2,
+};
+
+use super::{Landmark, LandmarkPicture, LandmarkPlace};
+use crate::lens::{self, LensUncertainty};
+
+/// Unknowns of a pose: rotation about the camera's axes (rad), then its centre (m).
+pub(super) const POSE: usize = 6;
+/// Steps from a start: from a wrong place by half of the landmarks' range it takes fifteen.
+const STEPS: usize = 40;
+/// Nothing changes any more where the cost falls by less than this.
+const SETTLED: f64 = 1e-9;
+/// Two poses that the clicks tell apart by less than this difference of squares fit alike: three
+/// deviations.
+const ALIKE: f64 = 9.0;
+/// Poses are the same that lie within so many deviations (by the square).
+const SAME: f64 = 25.0;
+
+/// Pose and lens.
+#[derive(Clone, Debug)]
+pub(super) struct State {
+    pub(super) rotation: Rotation3<f64>,
+    pub(super) centre: Point3<f64>,
+    pub(super) intrinsics: Intrinsics,
+}
+
+impl State {
+    fn moved(&self, step: &DVector<f64>) -> Self {
+        Self {
+            rotation: self.rotation * Rotation3::new(step.fixed_rows::<3>(0).into_owned()),
+            centre: self.centre + step.fixed_rows::<3>(3),
+            intrinsics: lens::moved(&self.intrinsics, &step.as_slice()[POSE..]),
+        }
+    }
+}
+
+/// A state that fits best of all near it.
+#[derive(Clone, Debug)]
+pub(super) struct Adjusted {
+    pub(super) state: State,
+    /// Sum of the squares, in deviations, of clicks, lens and survey.
+    pub(super) cost: f64,
+    /// Covariance of rotation, centre and lens.
+    pub(super) covariance: DMatrix<f64>,
+}
+
+impl Adjusted {
+    /// Whether another pose fits as well, and is another.
+    pub(super) fn is_rivalled_by(&self, other: &Self) -> bool {
+        if other.cost > self.cost + ALIKE {
+            return false;
+        }
+        let turned = self.state.rotation.rotation_to(&other.state.rotation).angle();
+        let moved = other.state.centre - self.state.centre;
+        let place = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let turns = self.covariance.fixed_view::<3, 3>(0, 0).trace();
+        let apart = place.cholesky().map_or(0.0, |factor| moved.dot(&factor.solve(&moved)));
+        apart > SAME && turned * turned > SAME * turns
+    }
+
+    /// The pose's covariance with the lens held, and the lens with how the pose follows it.
+    pub(super) fn pose_and_lens(&self) -> Option<(Matrix6<f64>, LensUncertainty)> {
+        let count = self.covariance.nrows() - POSE;
+        let tied = self.covariance.view((0, POSE), (POSE, count));
+        let lens = self.covariance.view((POSE, POSE), (count, count)).into_owned();
+        let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
+        let held = self.covariance.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
+        let held = (&held + held.transpose()) * 0.5;
+        let pose = Matrix6::from_column_slice(held.as_slice());
+        Some((pose, LensUncertainty { covariance: lens, pose_by_lens }))
+    }
+}
+
+/// A click against where a state has it.
+#[derive(Clone, Debug)]
+pub(super) struct Seen {
+    /// Where it should be less where it is, pixels.
+    pub(super) residual: Vector2<f64>,
+    /// By pose and lens.
+    pub(super) by: OMatrix<f64, U2, Dyn>,
+    /// Covariance of the click with what the landmark's own place may be off by, pixels^2.
+    pub(super) noise: Matrix2<f64>,
+}
+
+/// A landmark as a state sees it; `None` behind the camera.
+pub(super) fn see(landmark: &Landmark, state: &State) -> Option<Seen> {
+    let camera_from_world = state.rotation.inverse();
+    let offset = match landmark.at {
+        LandmarkPlace::Place { position, .. } => camera_from_world * (position - state.centre),
+        LandmarkPlace::Direction { direction, .. } => camera_from_world * direction.into_inner(),
+    };
+    let seen = lens::project(&state.intrinsics, &offset)?;
+    let by_place: Matrix2x3<f64> = seen.by_point * camera_from_world.matrix();
+    let count = lens::numbers(&state.intrinsics);
+    let mut by = OMatrix::<f64, U2, Dyn>::zeros(POSE + count);
+    by.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * offset.cross_matrix()));
+    let own = match landmark.at {
+        LandmarkPlace::Place { sd_m, .. } => {
+            by.fixed_columns_mut::<3>(3).copy_from(&-by_place);
+            let scaled = by_place * nalgebra::Matrix3::from_diagonal(&sd_m);
+            scaled * scaled.transpose()
+        }
+        LandmarkPlace::Direction { sd_rad, .. } => by_place * by_place.transpose() * sd_rad.powi(2),
+    };
+    for (number, by_number) in seen.by_lens[..count].iter().enumerate() {
+        by.set_column(POSE + number, by_number);
+    }
+    let clicked = Vector2::new(landmark.pixel.x(), landmark.pixel.y());
+    let noise = own + Matrix2::identity() * landmark.click_sd_px.powi(2);
+    Some(Seen { residual: seen.pixel - clicked, by, noise })
+}
+
+/// The normal equations at a state.
+struct Equations {
+    cost: f64,
+    information: DMatrix<f64>,
+    right: DVector<f64>,
+}
+
+impl Equations {
+    fn at(picture: &LandmarkPicture, state: &State) -> Option<Self> {
+        let count = POSE + lens::numbers(&state.intrinsics);
+        let mut equations = Self {
+            cost: 0.0,
+            information: DMatrix::zeros(count, count),
+            right: DVector::zeros(count),
+        };
+        for landmark in &picture.landmarks {
+            let Seen { residual, by, noise } = see(landmark, state)?;
+            let weight = noise.try_inverse()?;
+            equations.cost += residual.dot(&(weight * residual));
+            equations.information += by.transpose() * weight * &by;
+            equations.right -= by.transpose() * (weight * residual);
+        }
+        let found = lens::values(&state.intrinsics);
+        let known = lens::values(&picture.intrinsics);
+        let deviations = picture.freedom.prior_sd(&picture.intrinsics);
+        for (number, sd) in deviations.into_iter().enumerate() {
+            equations.hold(POSE + number, found[number] - known[number], sd);
+        }
+        if let Some(place) = &picture.place {
+            for axis in 0..3 {
+                let off = state.centre[axis] - place.position[axis];
+                equations.hold(3 + axis, off, place.sd_m[axis]);
+            }
+        }
+        Some(equations)
+    }
+
+    fn hold(&mut self, unknown: usize, off: f64, sd: f64) {
+        let weight = sd.powi(-2);
+        self.cost += off * off * weight;
+        self.information[(unknown, unknown)] += weight;
+        self.right[unknown] -= off * weight;
+    }
+
+    /// The step, each unknown's information made larger by a share of itself.
+    fn step(&self, damping: f64) -> Option<DVector<f64>> {
+        let mut damped = self.information.clone();
+        for k in 0..damped.nrows() {
+            damped[(k, k)] *= 1.0 + damping;
+        }
+        Some(Scaled::of(&damped)?.solve(&self.right))
+    }
+}
+
+/// The factor of a matrix of unknowns whose units differ by many powers of ten.
+struct Scaled {
+    factor: Cholesky<f64, Dyn>,
+    scale: DVector<f64>,
+}
+
+impl Scaled {
+    fn of(matrix: &DMatrix<f64>) -> Option<Self> {
+        let scale = matrix.diagonal().map(|value| value.sqrt().recip());
+        if !scale.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let unit = |i: usize, j: usize| matrix[(i, j)] * scale[i] * scale[j];
+        let factor = DMatrix::from_fn(matrix.nrows(), matrix.ncols(), unit).cholesky()?;
+        Some(Self { factor, scale })
+    }
+
+    fn solve(&self, right: &DVector<f64>) -> DVector<f64> {
+        self.factor.solve(&right.component_mul(&self.scale)).component_mul(&self.scale)
+    }
+
+    fn inverse(&self) -> DMatrix<f64> {
+        let unit = self.factor.inverse();
+        DMatrix::from_fn(unit.nrows(), unit.ncols(), |i, j| {
+            unit[(i, j)] * self.scale[i] * self.scale[j]
+        })
+    }
+}
+
+/// The best state near a start; `None` if it leads nowhere, or something is not told at all.
+pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted> {
+    let mut state = start;
+    let mut equations = Equations::at(picture, &state)?;
+    let mut damping = 1e-3;
+    for _ in 0..STEPS {
+        let Some(step) = equations.step(damping) else {
+            damping *= 10.0;
+            continue;
+        };
+        let next = state.moved(&step);
+        match Equations::at(picture, &next) {
+            Some(after) if after.cost <= equations.cost => {
+                let fell = equations.cost - after.cost;
+                (state, equations) = (next, after);
+                damping /= 10.0;
+                if fell < SETTLED * (1.0 + equations.cost) {
+                    break;
+                }
+            }
+            _ => damping *= 10.0,
+        }
+    }
+    let covariance = Scaled::of(&equations.information)?.inverse();
+    let is_finite = covariance.iter().all(|value| value.is_finite());
+    is_finite.then_some(Adjusted { state, cost: equations.cost, covariance })
+}

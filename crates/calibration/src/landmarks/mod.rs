@@ -1,0 +1,309 @@
+//! A camera's pose from one picture: landmarks whose places are known, the sun, stars.
+//!
+//! Pose and lens are adjusted to the clicks. A landmark's own error is an error of its click, seen
+//! from where the camera stands; the lens file, and a survey of the camera's place, are measurements
+//! too.
+
+mod adjustment;
+mod start;
+
+use crossfix_geometry::{Camera, Intrinsics, Pixel, Pose};
+use crossfix_message::CameraName;
+use nalgebra::{Matrix2, Matrix6, Point3, Unit, Vector2, Vector3};
+use statrs::distribution::{ChiSquared, ContinuousCDF};
+use thiserror::Error;
+
+use crate::flight::SurveyedPlace;
+use crate::lens::{LensFreedom, LensUncertainty};
+use adjustment::Adjusted;
+
+/// Something in a picture of which is known where it is.
+#[derive(Clone, Debug)]
+pub struct Landmark {
+    /// What it is called.
+    pub name: String,
+    /// Where it was clicked.
+    pub pixel: Pixel,
+    /// Standard deviation of the click per axis, pixels.
+    pub click_sd_px: f64,
+    /// Where it is.
+    pub at: LandmarkPlace,
+}
+
+/// Where a landmark is.
+#[derive(Clone, Copy, Debug)]
+pub enum LandmarkPlace {
+    /// At a place.
+    Place {
+        /// Local ENU, m.
+        position: Point3<f64>,
+        /// Standard deviation per axis, m.
+        sd_m: Vector3<f64>,
+    },
+    /// So far away that only its direction counts: the sun, a star.
+    Direction {
+        /// Local ENU.
+        direction: Unit<Vector3<f64>>,
+        /// Standard deviation across it, rad.
+        sd_rad: f64,
+    },
+}
+
+/// A picture's landmarks.
+#[derive(Clone, Debug)]
+pub struct LandmarkPicture {
+    /// Whose picture it is.
+    pub camera: CameraName,
+    /// The lens as its file has it.
+    pub intrinsics: Intrinsics,
+    /// What of it may be otherwise.
+    pub freedom: LensFreedom,
+    /// Where the camera stands, if somebody has surveyed it.
+    pub place: Option<SurveyedPlace>,
+    /// The landmarks.
+    pub landmarks: Vec<Landmark>,
+}
+
+/// Why landmarks tell no pose.
+#[derive(Debug, Error)]
+pub enum LandmarkError {
+    /// There are too few for what is unknown.
+    #[error(
+        "camera `{camera}` has {given} landmarks: {needed} are needed{}",
+        if *is_surveyed { "" } else { ", or two and where the camera stands (--positions)" }
+    )]
+    TooFew {
+        /// The camera.
+        camera: CameraName,
+        /// How many there are.
+        given: usize,
+        /// How many it takes.
+        needed: usize,
+        /// Whether the camera's place is known.
+        is_surveyed: bool,
+    },
+    /// A click that the lens has no direction for.
+    #[error("camera `{camera}`: the lens has no direction where landmark `{landmark}` was clicked")]
+    NoDirection {
+        /// The camera.
+        camera: CameraName,
+        /// The landmark.
+        landmark: String,
+    },
+    /// Poses that are far apart fit as well as each other.
+    #[error(
+        "camera `{camera}`: its landmarks are seen alike from {} and from {}: add one, or say where the \
+         camera stands (--positions)",
+        place(.places[0]),
+        place(.places[1])
+    )]
+    Ambiguous {
+        /// The camera.
+        camera: CameraName,
+        /// Two of the places.
+        places: [Point3<f64>; 2],
+    },
+    /// No pose fits, or a direction of it is not told at all.
+    #[error(
+        "camera `{camera}`: its landmarks tell no pose (are they in one line, or names exchanged?)"
+    )]
+    NoSolution {
+        /// The camera.
+        camera: CameraName,
+    },
+}
+
+fn place(at: Point3<f64>) -> String {
+    format!("{:.1}, {:.1}, {:.1} m", at.x, at.y, at.z)
+}
+
+/// What landmarks have told of a camera.
+#[derive(Clone, Debug)]
+pub struct LandmarkResult {
+    /// Whose it is.
+    pub name: CameraName,
+    /// Lens and pose.
+    pub camera: Camera,
+    /// Covariance of the pose with the lens held at what it was found to be: rotation about the
+    /// camera's axes (rad), then position (m).
+    pub pose_covariance: Matrix6<f64>,
+    /// What is still unknown of the lens.
+    pub lens: LensUncertainty,
+    /// Range of the landmarks, in the middle, m.
+    pub range_m: f64,
+    /// The focal length against the lens file's.
+    pub focal_ratio: f64,
+    /// How each landmark fits, in the order that they were given in.
+    pub landmarks: Vec<LandmarkFit>,
+    /// Where something is wrong, each landmark without which nothing is.
+    pub suspects: Vec<String>,
+    /// How unlikely it is that clicks, places and lens err by as much as here or more: the chance
+    /// of the sum of their squares. `None` where as much is unknown as was measured, and nothing is
+    /// checked.
+    pub chance: Option<f64>,
+}
+
+/// How a landmark fits.
+#[derive(Clone, Debug)]
+pub struct LandmarkFit {
+    /// What it is called.
+    pub name: String,
+    /// Where it was clicked less where it should be seen, pixels.
+    pub residual_px: Vector2<f64>,
+    /// How far it lies beside where the others and the lens have it, in deviations; `None` where
+    /// they say nothing of that.
+    pub deviations: Option<f64>,
+}
+
+/// Fits this unlikely are wrong: one in ten thousand pictures.
+const LEAST_CHANCE: f64 = 1e-4;
+
+impl LandmarkResult {
+    /// Whether something of the picture must be wrong: a click, a place, the lens.
+    pub fn is_wrong(&self) -> bool {
+        self.chance.is_some_and(|chance| chance < LEAST_CHANCE)
+    }
+
+    /// The landmark that lies farthest beside where the others have it.
+    pub fn worst(&self) -> Option<&LandmarkFit> {
+        self.landmarks
+            .iter()
+            .filter(|landmark| landmark.deviations.is_some())
+            .max_by(|a, b| a.deviations.unwrap_or(0.0).total_cmp(&b.deviations.unwrap_or(0.0)))
+    }
+
+    /// Standard deviation across the line to a target at a range in the image's middle, pose and
+    /// lens together, rad per axis.
+    pub fn pointing_sd_rad(&self, range_m: f64) -> Option<f64> {
+        let model = self.camera.model();
+        let intrinsics = model.intrinsics();
+        let middle = Pixel::new(
+            f64::from(intrinsics.size.width) / 2.0,
+            f64::from(intrinsics.size.height) / 2.0,
+        );
+        let direction = model.direction(middle).ok()?.into_inner();
+        let place = (range_m, self.camera.pose().rotation());
+        let pose =
+            crate::lens::pose_variance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
+        let lens = self.lens.variance_px2(intrinsics, &direction, place)?;
+        Some((pose + lens).sqrt() / intrinsics.fx)
+    }
+}
+
+/// Fewest landmarks of a camera that nobody has surveyed: three are seen alike from up to four
+/// places.
+const LEAST: usize = 4;
+/// Of one whose place is known: one leaves it turning about the line to it.
+const LEAST_SURVEYED: usize = 2;
+
+/// Finds a camera's pose and lens by its landmarks.
+///
+/// # Errors
+/// [`LandmarkError`], where they do not tell the pose, or tell several.
+pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, LandmarkError> {
+    let camera = &picture.camera;
+    let with_places = |landmark: &&Landmark| matches!(landmark.at, LandmarkPlace::Place { .. });
+    let is_surveyed = picture.place.is_some();
+    let (given, needed) = if is_surveyed {
+        (picture.landmarks.len(), LEAST_SURVEYED)
+    } else {
+        // Directions turn the camera and place it nowhere.
+        (picture.landmarks.iter().filter(with_places).count(), LEAST)
+    };
+    if given < needed {
+        return Err(LandmarkError::TooFew { camera: camera.clone(), given, needed, is_surveyed });
+    }
+    let starts = start::starts(picture)?;
+    let mut found: Vec<Adjusted> =
+        starts.into_iter().filter_map(|start| adjustment::adjust(picture, start)).collect();
+    found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    let none = || LandmarkError::NoSolution { camera: camera.clone() };
+    let best = found.first().ok_or_else(none)?;
+    if let Some(other) = found.iter().find(|other| best.is_rivalled_by(other)) {
+        let places = [best.state.centre, other.state.centre];
+        return Err(LandmarkError::Ambiguous { camera: camera.clone(), places });
+    }
+    let mut result = result(picture, best).ok_or_else(none)?;
+    if result.is_wrong() {
+        result.suspects = suspects(picture, &best.state, needed);
+    }
+    Ok(result)
+}
+
+/// The landmarks without which the others fit.
+fn suspects(picture: &LandmarkPicture, near: &adjustment::State, needed: usize) -> Vec<String> {
+    let without = |index: usize| {
+        let mut rest = picture.clone();
+        rest.landmarks.remove(index);
+        // What the wrong one has bent is not to be begun with alone.
+        let mut starts = start::starts(&rest).unwrap_or_default();
+        starts.push(near.clone());
+        let adjusted = starts.into_iter().filter_map(|start| adjustment::adjust(&rest, start));
+        let best = adjusted.min_by(|a, b| a.cost.total_cmp(&b.cost))?;
+        let result = result(&rest, &best)?;
+        result
+            .chance
+            .is_some_and(|_| !result.is_wrong())
+            .then(|| picture.landmarks[index].name.clone())
+    };
+    if picture.landmarks.len() <= needed {
+        return Vec::new();
+    }
+    (0..picture.landmarks.len()).filter_map(without).collect()
+}
+
+fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResult> {
+    let state = &adjusted.state;
+    let pose = Pose::new(*state.rotation.matrix(), state.centre).ok()?;
+    let (pose_covariance, lens) = adjusted.pose_and_lens()?;
+    let fits: Option<Vec<LandmarkFit>> =
+        picture.landmarks.iter().map(|landmark| fit(landmark, adjusted)).collect();
+    let mut ranges: Vec<f64> = picture
+        .landmarks
+        .iter()
+        .filter_map(|landmark| match landmark.at {
+            LandmarkPlace::Place { position, .. } => Some((position - state.centre).norm()),
+            LandmarkPlace::Direction { .. } => None,
+        })
+        .collect();
+    ranges.sort_unstable_by(f64::total_cmp);
+    // Two numbers a click; what the lens file and the survey say makes up for what they leave open.
+    let surveyed = if picture.place.is_some() { 3 } else { 0 };
+    let freedom = (2 * picture.landmarks.len() + surveyed).saturating_sub(6);
+    let chance = (freedom > 0)
+        .then(|| ChiSquared::new(freedom as f64).ok().map(|chi| chi.sf(adjusted.cost)))
+        .flatten();
+    Some(LandmarkResult {
+        name: picture.camera.clone(),
+        camera: Camera::new(state.intrinsics, pose).ok()?,
+        pose_covariance,
+        lens,
+        range_m: ranges.get(ranges.len() / 2).copied().unwrap_or(DISTANT_M),
+        focal_ratio: state.intrinsics.fx / picture.intrinsics.fx,
+        landmarks: fits?,
+        suspects: Vec::new(),
+        chance,
+    })
+}
+
+/// Where only directions were seen, targets are taken to be so far away, m.
+const DISTANT_M: f64 = 1000.0;
+
+/// How a landmark fits, held against what the others leave open (its part of the covariance is in
+/// the residual's).
+fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
+    let seen = adjustment::see(landmark, &adjusted.state)?;
+    let by = &seen.by;
+    let explained = by * &adjusted.covariance * by.transpose();
+    let left: Matrix2<f64> = seen.noise - explained.fixed_view::<2, 2>(0, 0);
+    // What is left is nothing where this landmark alone tells something.
+    let is_told = left.symmetric_eigenvalues().min() > 1e-3 * seen.noise.trace();
+    let weighed =
+        |left: Matrix2<f64>| Some(seen.residual.dot(&(left.try_inverse()? * seen.residual)));
+    let squared = if is_told { weighed(left) } else { None };
+    Some(LandmarkFit {
+        name: landmark.name.clone(),
+        residual_px: -seen.residual,
+        deviations: squared.map(|squared| squared.max(0.0).sqrt()),
+    })
+}

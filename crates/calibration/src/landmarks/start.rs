@@ -1,0 +1,101 @@
+//! Where a camera may stand that sees its landmarks as it does.
+
+use crossfix_geometry::Intrinsics;
+use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
+
+use super::adjustment::State;
+use super::{LandmarkError, LandmarkPicture, LandmarkPlace};
+use crate::lens;
+
+/// Places that are tried lie on so many directions from the landmarks' middle, evenly spread ...
+const DIRECTIONS: usize = 60;
+/// ... and this far away, in the landmarks' spread: nearer a lens does not see them all, farther the
+/// adjustment goes by itself.
+const DISTANCES: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 8.0];
+/// So many of them are adjusted, those with the least misfit.
+const ADJUSTED: usize = 40;
+
+/// Poses to adjust from. Of each place the rotation that fits best is known in closed form.
+pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkError> {
+    let mut clicked = Vec::with_capacity(picture.landmarks.len());
+    for landmark in &picture.landmarks {
+        let direction = lens::direction(&picture.intrinsics, landmark.pixel).ok_or_else(|| {
+            LandmarkError::NoDirection {
+                camera: picture.camera.clone(),
+                landmark: landmark.name.clone(),
+            }
+        })?;
+        clicked.push((direction.normalize(), landmark.at));
+    }
+    let state = |(rotation, centre): (Rotation3<f64>, Point3<f64>)| State {
+        rotation,
+        centre,
+        intrinsics: Intrinsics { ..picture.intrinsics },
+    };
+    if let Some(place) = &picture.place {
+        let turned = turned(&clicked, place.position);
+        return Ok(turned
+            .map(|(_, rotation)| state((rotation, place.position)))
+            .into_iter()
+            .collect());
+    }
+    let mut tried: Vec<(f64, Rotation3<f64>, Point3<f64>)> = places(picture)
+        .into_iter()
+        .filter_map(|place| turned(&clicked, place).map(|(off, rotation)| (off, rotation, place)))
+        .collect();
+    tried.sort_by(|a, b| a.0.total_cmp(&b.0));
+    tried.truncate(ADJUSTED);
+    Ok(tried.into_iter().map(|(_, rotation, place)| state((rotation, place))).collect())
+}
+
+/// Places round the landmarks.
+fn places(picture: &LandmarkPicture) -> Vec<Point3<f64>> {
+    let known: Vec<Point3<f64>> = picture
+        .landmarks
+        .iter()
+        .filter_map(|landmark| match landmark.at {
+            LandmarkPlace::Place { position, .. } => Some(position),
+            LandmarkPlace::Direction { .. } => None,
+        })
+        .collect();
+    let count = known.len().max(1) as f64;
+    let middle = Point3::from(known.iter().map(|place| place.coords).sum::<Vector3<f64>>() / count);
+    let squares: f64 = known.iter().map(|place| (place - middle).norm_squared()).sum();
+    let spread = (squares / count).sqrt();
+    let place = |distance: f64| {
+        (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * (distance * spread))
+    };
+    DISTANCES.into_iter().flat_map(place).collect()
+}
+
+/// Directions evenly spread over the sphere, along a spiral.
+fn spiral(k: usize) -> Unit<Vector3<f64>> {
+    let golden = std::f64::consts::PI * (3.0 - 5.0f64.sqrt());
+    let up = 1.0 - (2.0 * k as f64 + 1.0) / DIRECTIONS as f64;
+    let (sin, cos) = (golden * k as f64).sin_cos();
+    let across = (1.0 - up * up).sqrt();
+    Unit::new_normalize(Vector3::new(across * cos, across * sin, up))
+}
+
+/// The rotation that turns what was clicked best towards the landmarks as seen from a place
+/// (Wahba's problem, by singular values), and the squares that it leaves.
+fn turned(
+    clicked: &[(Vector3<f64>, LandmarkPlace)],
+    centre: Point3<f64>,
+) -> Option<(f64, Rotation3<f64>)> {
+    let mut pairs = Vec::with_capacity(clicked.len());
+    for (direction, at) in clicked {
+        let world = match at {
+            LandmarkPlace::Place { position, .. } => Unit::try_new(position - centre, 1e-6)?,
+            LandmarkPlace::Direction { direction, .. } => *direction,
+        };
+        pairs.push((*direction, world.into_inner()));
+    }
+    let sum: Matrix3<f64> = pairs.iter().map(|(own, world)| world * own.transpose()).sum();
+    let factors = sum.svd(true, true);
+    let (u, v_t) = (factors.u?, factors.v_t?);
+    let handed = Vector3::new(1.0, 1.0, (u * v_t).determinant().signum());
+    let matrix = u * Matrix3::from_diagonal(&handed) * v_t;
+    let off = pairs.iter().map(|(own, world)| (matrix * own - world).norm_squared()).sum();
+    Some((off, Rotation3::from_matrix_unchecked(matrix)))
+}

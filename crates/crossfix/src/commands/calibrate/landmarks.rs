@@ -1,0 +1,261 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{
+    CalibratedCamera, LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks,
+};
+use crossfix_geometry::Geodetic;
+use crossfix_message::CameraName;
+use serde::Serialize;
+
+use super::{Lens, clicks, survey};
+use crate::calibrated;
+use crate::commands::numbers;
+use crate::config::{self, CameraFile};
+use crate::output;
+
+/// From one picture of each camera: landmarks of known places, the sun, stars.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --landmarks north.csv -o my-site/calibration.toml"
+)]
+pub struct Args {
+    /// The site's folder, or one camera's file (TOML): the lens is taken from it.
+    site: PathBuf,
+    /// The camera whose picture it is, where the landmarks' file has no column `camera`.
+    #[arg(long, value_name = "NAME")]
+    camera: Option<CameraName>,
+    /// A CSV with landmark, x_px, y_px, east_m, north_m, up_m, sd_m; or latitude_deg,
+    /// longitude_deg, height_m; or azimuth_deg, elevation_deg, sd_deg of the sun and stars.
+    #[arg(long, value_name = "FILE")]
+    landmarks: PathBuf,
+    /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two landmarks do then.
+    #[arg(long, value_name = "FILE")]
+    positions: Option<PathBuf>,
+    /// Where the site's origin is (WGS84 degrees, and metres as the landmarks' heights count), for
+    /// landmarks in degrees.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    /// What of the lens may be otherwise than its file says.
+    #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
+    lens: Lens,
+    /// The calibration (TOML) to write; other cameras in it stay as they are.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let clicked = clicks::read(&args.landmarks, args.camera.as_ref(), args.anchor)?;
+    let names: Vec<CameraName> = clicked.keys().cloned().collect();
+    let survey = survey::read(args.positions.as_deref(), &[], &names)?;
+    let files = camera_files(&args.site)?;
+    let (mut results, mut failed) = (Vec::new(), Vec::new());
+    for (camera, landmarks) in clicked {
+        let (path, file) =
+            files.iter().find(|(_, file)| file.name == camera).with_context(|| {
+                let known: Vec<&str> = files.iter().map(|(_, file)| file.name.as_str()).collect();
+                format!("the site has no camera `{camera}`: it has {}", known.join(", "))
+            })?;
+        let picture = LandmarkPicture {
+            place: survey.place(&camera).cloned(),
+            intrinsics: file.lens(path)?,
+            freedom: args.lens.into(),
+            camera,
+            landmarks,
+        };
+        match calibrate_landmarks(&picture) {
+            Ok(result) => results.push(result),
+            Err(error) => failed.push(error),
+        }
+    }
+    for error in &failed {
+        tracing::warn!("{error}");
+    }
+    let figures: Vec<Figures> = results.iter().map(Figures::from).collect();
+    if args.json {
+        output::json(&figures)?;
+    } else {
+        figures.iter().for_each(|camera| output::line(camera.render()));
+    }
+    let good = results.iter().filter(|result| !is_wrong(result)).map(CalibratedCamera::from);
+    let good: Vec<CalibratedCamera> = good.collect();
+    for wrong in results.iter().filter(|result| is_wrong(result)) {
+        tracing::warn!("camera `{}` is wrong and is not written", wrong.name);
+    }
+    ensure!(!good.is_empty(), "nothing is written: no camera has a pose");
+    write(args, good)
+}
+
+fn camera_files(site: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
+    if site.is_dir() {
+        config::load_cameras(site)
+    } else {
+        Ok(vec![(site.to_owned(), CameraFile::load(site, &[])?)])
+    }
+}
+
+/// Writes the cameras beside those that the file has already.
+fn write(args: &Args, cameras: Vec<CalibratedCamera>) -> anyhow::Result<()> {
+    let mut site = if args.output.exists() {
+        calibrated::load(&args.output)?
+    } else {
+        SiteCalibration::of(Vec::new())
+    };
+    let is_kept = |name: &CameraName| cameras.iter().all(|camera| camera.name != *name);
+    let kept: Vec<String> = site
+        .cameras()
+        .iter()
+        .map(|camera| &camera.name)
+        .filter(|name| is_kept(name))
+        .map(CameraName::to_string)
+        .collect();
+    cameras.into_iter().for_each(|camera| site.put(camera));
+    let text = format!(
+        "# Written by crossfix calibrate landmarks from {}.\n{}",
+        args.landmarks.display(),
+        site.to_toml()
+    );
+    output::write_file(&args.output, &[&args.landmarks], text.as_bytes())?;
+    if !args.json {
+        let beside = if kept.is_empty() {
+            String::new()
+        } else {
+            format!(", beside {}, which it had", kept.join(", "))
+        };
+        output::line(format!("written to {}{beside}", args.output.display()));
+    }
+    Ok(())
+}
+
+/// The figures of one camera.
+#[derive(Debug, Serialize)]
+struct Figures {
+    name: String,
+    position_m: [f64; 3],
+    position_sd_m: f64,
+    /// Pose and lens together, in the image's middle at the landmarks' range.
+    pointing_sd_mrad: Option<f64>,
+    range_m: f64,
+    focal_ratio: f64,
+    /// The chance of errors as large as these or larger; absent where nothing is checked.
+    chance: Option<f64>,
+    landmarks: Vec<LandmarkFigures>,
+    verdict: String,
+}
+
+#[derive(Debug, Serialize)]
+struct LandmarkFigures {
+    landmark: String,
+    /// Where it was clicked less where it should be.
+    residual_px: [f64; 2],
+    /// How far it lies beside where the others have it, in deviations; absent where they say
+    /// nothing.
+    deviations: Option<f64>,
+}
+
+/// A pose that points worse than this is weak, mrad: half a metre at 100 m.
+const WEAK_POINTING_MRAD: f64 = 5.0;
+
+/// Lenses are up to 2 % shorter or longer at a distance: beyond this share it is another lens, where
+/// the clicks do not fit either.
+const WRONG_FOCAL: f64 = 0.03;
+
+/// Whether a camera must not be used.
+fn is_wrong(result: &LandmarkResult) -> bool {
+    result.is_wrong() || is_upside_down(result)
+}
+
+fn is_upside_down(result: &LandmarkResult) -> bool {
+    result.camera.pose().rotation().matrix()[(2, 1)] > 0.5
+}
+
+fn verdict(result: &LandmarkResult, pointing_mrad: Option<f64>) -> String {
+    if is_upside_down(result) {
+        return "wrong: upside down, so heights may count downwards".to_owned();
+    }
+    if result.is_wrong() {
+        if !result.suspects.is_empty() {
+            let names: Vec<String> =
+                result.suspects.iter().map(|name| format!("`{name}`")).collect();
+            return format!(
+                "wrong: without {} the others fit (another click or place?)",
+                names.join(" or ")
+            );
+        }
+        if (result.focal_ratio - 1.0).abs() > WRONG_FOCAL {
+            return "wrong: not the lens of its file, or another resolution's".to_owned();
+        }
+        let worst = result.worst().map_or_else(String::new, |worst| {
+            format!(
+                ": `{}` lies {:.0} pixels beside where the others have it (another click or place?)",
+                worst.name,
+                worst.residual_px.norm()
+            )
+        });
+        return format!("wrong{worst}");
+    }
+    if result.chance.is_none() {
+        return "weak: nothing checks it; add a landmark".to_owned();
+    }
+    if pointing_mrad.is_none_or(|sd| sd > WEAK_POINTING_MRAD) {
+        return "weak: landmarks farther apart in the image, or better known, are needed"
+            .to_owned();
+    }
+    "good".to_owned()
+}
+
+impl From<&LandmarkResult> for Figures {
+    fn from(result: &LandmarkResult) -> Self {
+        let pointing_sd_mrad = result.pointing_sd_rad(result.range_m).map(|sd| sd * 1e3);
+        let landmarks = result.landmarks.iter().map(|fit| LandmarkFigures {
+            landmark: fit.name.clone(),
+            residual_px: fit.residual_px.into(),
+            deviations: fit.deviations,
+        });
+        Self {
+            name: result.name.to_string(),
+            position_m: result.camera.pose().position().coords.into(),
+            position_sd_m: result.pose_covariance.fixed_view::<3, 3>(3, 3).trace().sqrt(),
+            pointing_sd_mrad,
+            range_m: result.range_m,
+            focal_ratio: result.focal_ratio,
+            chance: result.chance,
+            landmarks: landmarks.collect(),
+            verdict: verdict(result, pointing_sd_mrad),
+        }
+    }
+}
+
+impl Figures {
+    fn render(&self) -> String {
+        let mut rows = vec![["landmark", "beside [px]", "deviations"].map(str::to_owned).to_vec()];
+        for landmark in &self.landmarks {
+            let [x, y] = landmark.residual_px;
+            rows.push(vec![
+                landmark.landmark.clone(),
+                format!("{x:+.1}, {y:+.1}"),
+                output::number(landmark.deviations, 1),
+            ]);
+        }
+        let [east, north, up] = self.position_m;
+        let pointing = self
+            .pointing_sd_mrad
+            .map_or_else(|| "not known".to_owned(), |sd| format!("± {sd:.2} mrad"));
+        let chance = self.chance.map_or_else(String::new, |chance| {
+            format!(", a fit as bad as this by chance: {chance:.2}")
+        });
+        format!(
+            "camera `{}`: {}\nat {east:.3}, {north:.3}, {up:.3} m ± {:.3} m; pointing {pointing} at \
+             {:.0} m; focal length {:+.2} %{chance}\n\n{}\n",
+            self.name,
+            self.verdict,
+            self.position_sd_m,
+            self.range_m,
+            100.0 * (self.focal_ratio - 1.0),
+            output::table(&rows)
+        )
+    }
+}

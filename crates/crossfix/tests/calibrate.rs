@@ -1,0 +1,109 @@
+//! The command `calibrate` on files as people write them.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use std::path::Path;
+
+use assert_cmd::Command;
+use crossfix_calibration::SiteCalibration;
+use crossfix_geometry::{Camera, Pose};
+use nalgebra::Point3;
+
+const NORTH: &str = r#"
+name = "north"
+network = "network.toml"
+intrinsics = "north.yaml"
+[source]
+kind = "video"
+path = "videos/north"
+start_s = 0.0
+rate_hz = 25.0
+[clock]
+source = "ntp"
+sd_s = 0.002
+"#;
+
+const LENS: &str = "image_width: 1920\nimage_height: 1080\ncamera_name: north\n\
+    camera_matrix: {rows: 3, cols: 3, data: [1460.0, 0.0, 959.5, 0.0, 1460.0, 539.5, 0.0, 0.0, 1.0]}\n\
+    distortion_model: plumb_bob\n\
+    distortion_coefficients: {rows: 1, cols: 5, data: [-0.01, 0.05, 0.0, 0.0, 0.0]}\n";
+
+/// Places round a camera at (15, 120, 3) m, and how far beside the first is clicked.
+fn landmarks(beside_px: f64) -> String {
+    let intrinsics = crossfix_calibration::intrinsics_from_yaml(LENS).unwrap();
+    let pose =
+        Pose::looking_at(Point3::new(15.0, 120.0, 3.0), Point3::new(0.0, 0.0, 46.0)).unwrap();
+    let camera = Camera::new(intrinsics, pose).unwrap();
+    let places = [
+        [-20.0, 40.0, 12.0],
+        [25.0, 20.0, 60.0],
+        [5.0, 60.0, 30.0],
+        [-30.0, -10.0, 55.0],
+        [30.0, 50.0, 20.0],
+        [0.0, 80.0, 10.0],
+    ];
+    let row = |(k, [x, y, z]): (usize, [f64; 3])| {
+        let pixel = camera.project(Point3::new(x, y, z)).unwrap();
+        let beside = if k == 0 { beside_px } else { 0.0 };
+        format!("mark {k},{},{},{x},{y},{z},0.05\n", pixel.x() + beside, pixel.y())
+    };
+    let rows: String = places.into_iter().enumerate().map(row).collect();
+    format!("landmark,x_px,y_px,east_m,north_m,up_m,sd_m\n{rows}")
+}
+
+fn site(landmarks: &str) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("north.toml", NORTH);
+    write("north.yaml", LENS);
+    write("points.csv", landmarks);
+    folder
+}
+
+/// Exit code, stdout and stderr of `calibrate landmarks` for a camera of the site.
+fn by_landmarks(folder: &Path, camera: &str) -> (Option<i32>, String, String) {
+    let file = |name: &str| folder.join(name).display().to_string();
+    let output = Command::new(assert_cmd::cargo::cargo_bin!("crossfix"))
+        .args(["calibrate", "landmarks", &file("north.toml"), "--camera", camera])
+        .args(["--landmarks", &file("points.csv"), "-o", &file("calibration.toml")])
+        .output()
+        .unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn landmarks_give_a_pose_and_a_second_camera_stands_beside_the_first() {
+    let folder = site(&landmarks(0.0));
+    let (code, said, log) = by_landmarks(folder.path(), "north");
+    assert!(code == Some(0) && said.contains("good"), "{said}{log}");
+    let read = || {
+        let text = std::fs::read_to_string(folder.path().join("calibration.toml")).unwrap();
+        SiteCalibration::from_toml(&text).unwrap()
+    };
+    let place = read().cameras()[0].camera.pose().position();
+    assert!((place - Point3::new(15.0, 120.0, 3.0)).norm() < 1e-3, "{place}");
+    let south = NORTH.replace("name = \"north\"", "name = \"south\"");
+    std::fs::write(folder.path().join("north.toml"), south).unwrap();
+    let (code, said, log) = by_landmarks(folder.path(), "south");
+    assert!(code == Some(0) && said.contains("beside north"), "{said}{log}");
+    assert_eq!(read().cameras().len(), 2);
+}
+
+#[test]
+fn a_wrong_click_is_named_and_nothing_is_written() {
+    let folder = site(&landmarks(40.0));
+    let (code, said, log) = by_landmarks(folder.path(), "north");
+    assert_eq!(code, Some(1), "{said}{log}");
+    assert!(said.contains("without `mark 0`") && log.contains("nothing is written"), "{said}{log}");
+    assert!(!folder.path().join("calibration.toml").exists());
+}
+
+#[test]
+fn too_few_landmarks_are_told_what_helps() {
+    let all = landmarks(0.0);
+    let few: String = all.split_inclusive('\n').take(3).collect();
+    let (code, said, log) = by_landmarks(site(&few).path(), "north");
+    assert_eq!(code, Some(1), "{said}{log}");
+    assert!(log.contains("--positions"), "{log}");
+}
