@@ -18,12 +18,14 @@
 //! # Ok::<(), crossfix_calibration::IntrinsicsError>(())
 //! ```
 
+mod comparison;
 mod flight;
 mod intrinsics;
 mod landmarks;
 mod lens;
 mod site_file;
 
+pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
     CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
     Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, Survey, SurveyedPlace, TapedDistance,

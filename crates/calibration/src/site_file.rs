@@ -327,6 +327,18 @@ impl CalibratedCamera {
         Ok(model.bearing(pixel, PixelCovariance::isotropic(sd_px))?)
     }
 
+    /// Standard deviation across the line to a target that a pixel shows at a range, pose and lens
+    /// together, rad per axis; `None` where the lens shows nothing.
+    pub fn pointing_sd_rad(&self, pixel: Pixel, range_m: f64) -> Option<f64> {
+        let model = self.camera.model();
+        let intrinsics = model.intrinsics();
+        let direction = model.direction(pixel).ok()?.into_inner();
+        let place = (range_m, self.camera.pose().rotation());
+        let pose = lens::pose_variance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
+        let lens = self.lens.variance_px2(intrinsics, &direction, place)?;
+        Some((pose + lens).sqrt() / intrinsics.fx)
+    }
+
     /// The common time of a row of a frame, from the frame's by the camera's own clock, and the
     /// standard deviation, s.
     pub fn common_time(&self, own: Timestamp, row: f64) -> (Timestamp, f64) {

@@ -15,6 +15,7 @@ use thiserror::Error;
 
 use crate::flight::SurveyedPlace;
 use crate::lens::{LensFreedom, LensUncertainty};
+use crate::site_file::CalibratedCamera;
 use adjustment::Adjusted;
 
 /// Something in a picture of which is known where it is.
@@ -172,21 +173,11 @@ impl LandmarkResult {
             .max_by(|a, b| a.deviations.unwrap_or(0.0).total_cmp(&b.deviations.unwrap_or(0.0)))
     }
 
-    /// Standard deviation across the line to a target at a range in the image's middle, pose and
-    /// lens together, rad per axis.
+    /// As [`CalibratedCamera::pointing_sd_rad`], in the image's middle.
     pub fn pointing_sd_rad(&self, range_m: f64) -> Option<f64> {
-        let model = self.camera.model();
-        let intrinsics = model.intrinsics();
-        let middle = Pixel::new(
-            f64::from(intrinsics.size.width) / 2.0,
-            f64::from(intrinsics.size.height) / 2.0,
-        );
-        let direction = model.direction(middle).ok()?.into_inner();
-        let place = (range_m, self.camera.pose().rotation());
-        let pose =
-            crate::lens::pose_variance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
-        let lens = self.lens.variance_px2(intrinsics, &direction, place)?;
-        Some((pose + lens).sqrt() / intrinsics.fx)
+        let size = self.camera.model().intrinsics().size;
+        let middle = Pixel::new(f64::from(size.width) / 2.0, f64::from(size.height) / 2.0);
+        CalibratedCamera::from(self).pointing_sd_rad(middle, range_m)
     }
 }
 

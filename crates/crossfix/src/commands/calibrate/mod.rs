@@ -1,4 +1,5 @@
 mod clicks;
+mod compare;
 mod flight;
 mod landmarks;
 mod log;
@@ -21,6 +22,7 @@ pub struct Args {
 enum Way {
     Flight(flight::Args),
     Landmarks(landmarks::Args),
+    Compare(compare::Args),
 }
 
 /// What of a lens may be otherwise than its file says.
@@ -49,5 +51,6 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     match &args.way {
         Way::Flight(args) => flight::run(args),
         Way::Landmarks(args) => landmarks::run(args),
+        Way::Compare(args) => compare::run(args),
     }
 }

@@ -1,0 +1,227 @@
+//! Two calibrations of one site held against each other.
+
+use crossfix_geometry::{Pixel, tangent_basis};
+use crossfix_message::CameraName;
+use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
+
+use crate::site_file::{CalibratedCamera, SiteCalibration};
+
+/// Pixels that are compared: so many columns and rows, evenly over the image.
+const COLUMNS: usize = 9;
+const ROWS: usize = 5;
+/// Gauss and Newton's steps to the move of the site: from what logs lie beside it takes three.
+const STEPS: usize = 8;
+/// What no sight tells of the move is nothing: deviations that leave what one tells, m, rad, share.
+const UNTOLD: [f64; 7] = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0, 3.0];
+
+/// A calibration that says that it knows a direction better than this, rad, counts no more: a
+/// thousandth of a pixel.
+const LEAST_SAID_RAD: f64 = 1e-6;
+
+/// How two calibrations differ.
+#[derive(Clone, Debug)]
+pub struct SiteComparison {
+    /// What brings the first to the second as a whole: where a log lay beside or went ahead, it
+    /// does so for all cameras.
+    pub moved: SiteMove,
+    /// How the cameras that both have differ beside that, in the order of the first.
+    pub cameras: Vec<CameraComparison>,
+    /// Cameras that one of them alone has.
+    pub missing: Vec<CameraName>,
+}
+
+/// How one site becomes another: `x -> centre + shift + size turn (x - centre)`.
+#[derive(Clone, Copy, Debug)]
+pub struct SiteMove {
+    /// The middle of what the cameras look at, in the first.
+    pub middle: Point3<f64>,
+    /// By how much that is shifted, m.
+    pub shift: Vector3<f64>,
+    /// How the second is turned against the first.
+    pub turn: Rotation3<f64>,
+    /// How many times larger the second is.
+    pub size: f64,
+    /// By how much the second's common time is later, s; `None` where no clock was calibrated in
+    /// both.
+    pub later_s: Option<f64>,
+}
+
+impl SiteMove {
+    fn applied(&self, place: Point3<f64>) -> Point3<f64> {
+        self.middle + self.shift + self.turn * (place - self.middle) * self.size
+    }
+
+    /// By how much a target misses the second's line of sight along its tangents, rad, and how that
+    /// follows shift, turn and the size's share.
+    fn miss(&self, sight: &Sight) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>)> {
+        let arm = self.turn * (sight.target - self.middle) * self.size;
+        let (towards, range) =
+            Unit::try_new_and_get(self.middle + self.shift + arm - sight.from, 1e-6)?;
+        let towards = towards.into_inner();
+        let tangents = tangent_basis(&sight.direction).transpose();
+        let by_place = tangents * (Matrix3::identity() - towards * towards.transpose()) / range;
+        let mut by = SMatrix::<f64, 2, 7>::zeros();
+        by.fixed_columns_mut::<3>(0).copy_from(&by_place);
+        by.fixed_columns_mut::<3>(3).copy_from(&(-by_place * arm.cross_matrix()));
+        by.set_column(6, &(by_place * arm));
+        Some((tangents * towards, by))
+    }
+}
+
+/// How one camera differs beside what the site is moved by.
+#[derive(Clone, Debug)]
+pub struct CameraComparison {
+    /// Which.
+    pub name: CameraName,
+    /// How far apart its centres are, m.
+    pub centre_m: f64,
+    /// Root mean square over the image of the angle between the directions of a pixel, towards
+    /// targets at the range of the first's, rad per axis.
+    pub apart_rad: f64,
+    /// The largest of these angles, rad.
+    pub most_rad: f64,
+    /// What both say that this may be: the root mean square over the same pixels, rad per axis.
+    pub said_rad: f64,
+    /// The root mean square of each pixel's angle by what is said of it: one, where both are honest
+    /// and know nothing of each other.
+    pub deviations: f64,
+    /// How many times longer the second's focal length is.
+    pub focal_ratio: f64,
+    /// By how much more the second's clock is corrected than the first's, beside what all are, s;
+    /// `None` where one was not calibrated.
+    pub later_s: Option<f64>,
+}
+
+/// A pixel of a camera in both calibrations.
+#[derive(Clone, Copy)]
+struct Sight {
+    /// Where a target is that it shows by the first.
+    target: Point3<f64>,
+    /// Where the second has the camera, ...
+    from: Point3<f64>,
+    /// ... and the pixel's direction.
+    direction: Unit<Vector3<f64>>,
+    /// Standard deviation of the angle between the two, rad per axis.
+    said_rad: f64,
+}
+
+/// Compares two calibrations. `None` if they have no camera in common, or one whose lens shows
+/// nothing.
+pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Option<SiteComparison> {
+    let pairs: Vec<(&CalibratedCamera, &CalibratedCamera)> = first
+        .cameras()
+        .iter()
+        .filter_map(|camera| Some((camera, second.camera(&camera.name)?)))
+        .collect();
+    let sights: Vec<Vec<Sight>> = pairs.iter().map(|(one, other)| sights(one, other)).collect();
+    let later: Vec<Option<f64>> = pairs.iter().map(|(one, other)| later_s(one, other)).collect();
+    let mut known: Vec<f64> = later.iter().copied().flatten().collect();
+    known.sort_unstable_by(f64::total_cmp);
+    let common_s = known.get(known.len() / 2).copied();
+    let moved = SiteMove { later_s: common_s, ..site_move(&sights.concat())? };
+    let cameras = pairs
+        .iter()
+        .zip(&sights)
+        .zip(later)
+        .filter(|((_, sights), _)| !sights.is_empty())
+        .map(|((pair, sights), later_s)| {
+            let later_s = later_s.zip(common_s).map(|(own, common)| own - common);
+            camera(*pair, sights, &moved, later_s)
+        })
+        .collect();
+    let names = |site: &SiteCalibration, other: &SiteCalibration| -> Vec<CameraName> {
+        let alone = |camera: &&CalibratedCamera| other.camera(&camera.name).is_none();
+        site.cameras().iter().filter(alone).map(|camera| camera.name.clone()).collect()
+    };
+    let missing = [names(first, second), names(second, first)].concat();
+    Some(SiteComparison { moved, cameras, missing })
+}
+
+/// The pixels that both calibrations have a direction for.
+fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
+    let size = one.camera.model().intrinsics().size;
+    let direction = |camera: &CalibratedCamera, pixel: Pixel| {
+        let own = camera.camera.model().direction(pixel).ok()?;
+        Some(Unit::new_normalize(camera.camera.pose().rotation() * own.into_inner()))
+    };
+    let pixels = (0..COLUMNS * ROWS).map(|k| {
+        let share = |k: usize, count: usize| (k as f64 + 0.5) / count as f64;
+        Pixel::new(
+            share(k % COLUMNS, COLUMNS) * f64::from(size.width),
+            share(k / COLUMNS, ROWS) * f64::from(size.height),
+        )
+    });
+    let said = |camera: &CalibratedCamera, pixel| camera.pointing_sd_rad(pixel, one.range_m);
+    let sight = |pixel| {
+        let target = direction(one, pixel)?.into_inner() * one.range_m;
+        Some(Sight {
+            target: one.camera.pose().position() + target,
+            from: other.camera.pose().position(),
+            direction: direction(other, pixel)?,
+            said_rad: said(one, pixel)?.hypot(said(other, pixel)?).max(LEAST_SAID_RAD),
+        })
+    };
+    pixels.filter_map(sight).collect()
+}
+
+/// The similarity that brings the first's targets nearest to the second's lines of sight, in
+/// deviations.
+fn site_move(sights: &[Sight]) -> Option<SiteMove> {
+    if sights.is_empty() {
+        return None;
+    }
+    let sum: Vector3<f64> = sights.iter().map(|sight| sight.target.coords).sum();
+    let mut moved = SiteMove {
+        middle: Point3::from(sum / sights.len() as f64),
+        shift: Vector3::zeros(),
+        turn: Rotation3::identity(),
+        size: 1.0,
+        later_s: None,
+    };
+    for _ in 0..STEPS {
+        let mut information =
+            SMatrix::<f64, 7, 7>::from_diagonal(&SVector::from(UNTOLD).map(|sd: f64| sd.powi(-2)));
+        let mut right = SVector::<f64, 7>::zeros();
+        for sight in sights {
+            let (residual, by) = moved.miss(sight)?;
+            let weight = sight.said_rad.powi(-2);
+            information += by.transpose() * by * weight;
+            right -= by.transpose() * residual * weight;
+        }
+        let step = information.cholesky()?.solve(&right);
+        moved.shift += step.fixed_rows::<3>(0);
+        moved.turn = Rotation3::new(step.fixed_rows::<3>(3).into_owned()) * moved.turn;
+        moved.size *= 1.0 + step[6].clamp(-0.5, 0.5);
+    }
+    Some(moved)
+}
+
+fn later_s(one: &CalibratedCamera, other: &CalibratedCamera) -> Option<f64> {
+    let middle = one.clock.knots_s.get(one.clock.knots_s.len() / 2)?[0];
+    other.clock.knots_s.first()?;
+    Some(other.clock.at(middle).0 - one.clock.at(middle).0)
+}
+
+fn camera(
+    (one, other): (&CalibratedCamera, &CalibratedCamera),
+    sights: &[Sight],
+    moved: &SiteMove,
+    later_s: Option<f64>,
+) -> CameraComparison {
+    let angle = |sight: &Sight| (moved.applied(sight.target) - sight.from).angle(&sight.direction);
+    let mean = |value: &dyn Fn(&Sight) -> f64| {
+        (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
+    };
+    let focal = |camera: &CalibratedCamera| camera.camera.model().intrinsics().fx;
+    let centre = moved.applied(one.camera.pose().position());
+    CameraComparison {
+        name: one.name.clone(),
+        centre_m: (other.camera.pose().position() - centre).norm(),
+        apart_rad: mean(&|sight| angle(sight).powi(2) / 2.0),
+        most_rad: sights.iter().map(angle).fold(0.0, f64::max),
+        said_rad: mean(&|sight| sight.said_rad.powi(2)),
+        deviations: mean(&|sight| (angle(sight) / sight.said_rad).powi(2) / 2.0),
+        focal_ratio: focal(other) / focal(one),
+        later_s,
+    }
+}

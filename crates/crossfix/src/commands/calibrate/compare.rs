@@ -1,0 +1,144 @@
+use std::path::PathBuf;
+
+use anyhow::Context;
+use crossfix_calibration::{CameraComparison, SiteComparison, compare_sites};
+use serde::Serialize;
+
+use crate::calibrated;
+use crate::output;
+
+/// How far two calibrations of one site lie apart.
+///
+/// What all cameras are off by alike (a log that lay beside) is said apart; the cameras are compared
+/// beside it, over their images.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Example:\n  crossfix calibrate compare my-site/calibration.toml my-site/calibration-today.toml"
+)]
+pub struct Args {
+    /// A calibration (TOML).
+    first: PathBuf,
+    /// Another one of the same cameras.
+    second: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let (first, second) = (calibrated::load(&args.first)?, calibrated::load(&args.second)?);
+    let comparison = compare_sites(&first, &second).with_context(|| {
+        format!("{} and {} have no camera in common", args.first.display(), args.second.display())
+    })?;
+    let figures = Figures::from(&comparison);
+    if args.json {
+        output::json(&figures)
+    } else {
+        output::line(figures.render());
+        Ok(())
+    }
+}
+
+#[derive(Debug, Serialize)]
+struct Figures {
+    /// Shift of the site's middle, east, north, up, m.
+    shift_m: [f64; 3],
+    /// Turn about east, north and up, mrad.
+    turn_mrad: [f64; 3],
+    /// How much larger the second is, as a share.
+    larger: f64,
+    /// By how much the second's common time is later, s.
+    later_s: Option<f64>,
+    cameras: Vec<CameraFigures>,
+    /// Cameras that one alone has.
+    missing: Vec<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct CameraFigures {
+    name: String,
+    centre_m: f64,
+    /// Root mean square over the image, per axis.
+    apart_mrad: f64,
+    most_mrad: f64,
+    /// What both say that it may be.
+    said_mrad: f64,
+    /// Root mean square of what is apart by what is said of each pixel.
+    deviations: f64,
+    /// How much longer the second's focal length is, as a share.
+    focal_longer: f64,
+    /// Beside what all clocks are.
+    later_ms: Option<f64>,
+}
+
+impl From<&SiteComparison> for Figures {
+    fn from(comparison: &SiteComparison) -> Self {
+        let moved = &comparison.moved;
+        Self {
+            shift_m: moved.shift.into(),
+            turn_mrad: (moved.turn.scaled_axis() * 1e3).into(),
+            larger: moved.size - 1.0,
+            later_s: moved.later_s,
+            cameras: comparison.cameras.iter().map(CameraFigures::from).collect(),
+            missing: comparison.missing.iter().map(ToString::to_string).collect(),
+        }
+    }
+}
+
+impl From<&CameraComparison> for CameraFigures {
+    fn from(camera: &CameraComparison) -> Self {
+        Self {
+            name: camera.name.to_string(),
+            centre_m: camera.centre_m,
+            apart_mrad: camera.apart_rad * 1e3,
+            most_mrad: camera.most_rad * 1e3,
+            said_mrad: camera.said_rad * 1e3,
+            deviations: camera.deviations,
+            focal_longer: camera.focal_ratio - 1.0,
+            later_ms: camera.later_s.map(|later| later * 1e3),
+        }
+    }
+}
+
+impl Figures {
+    fn render(&self) -> String {
+        let head = [
+            "camera",
+            "centre [m]",
+            "over the image [mrad]",
+            "most",
+            "said",
+            "deviations",
+            "focal length",
+            "clock [ms]",
+        ];
+        let mut rows = vec![head.map(str::to_owned).to_vec()];
+        for camera in &self.cameras {
+            rows.push(vec![
+                camera.name.clone(),
+                format!("{:.3}", camera.centre_m),
+                format!("{:.2}", camera.apart_mrad),
+                format!("{:.2}", camera.most_mrad),
+                format!("{:.2}", camera.said_mrad),
+                format!("{:.1}", camera.deviations),
+                format!("{:+.2} %", 100.0 * camera.focal_longer),
+                output::number(camera.later_ms, 1),
+            ]);
+        }
+        let [east, north, up] = self.shift_m;
+        let [about_east, about_north, about_up] = self.turn_mrad;
+        let later = self.later_s.map_or_else(String::new, |later| format!(", {later:+.3} s later"));
+        let missing = if self.missing.is_empty() {
+            String::new()
+        } else {
+            format!("\n\nin one of them alone: {}", self.missing.join(", "))
+        };
+        format!(
+            "the second as a whole: shifted by {east:+.3}, {north:+.3}, {up:+.3} m, turned by \
+             {about_east:+.2}, {about_north:+.2}, {about_up:+.2} mrad, {:+.3} % larger{later}\n\
+             beside that:\n\n{}{missing}",
+            100.0 * self.larger,
+            output::table(&rows)
+        )
+    }
+}
