@@ -50,12 +50,11 @@ fn cameras() -> Vec<CalibratedCamera> {
 
 fn with_pose(camera: &CalibratedCamera, name: &str, pose: Pose) -> CalibratedCamera {
     let intrinsics = *camera.camera.model().intrinsics();
-    let camera = CalibratedCamera {
+    CalibratedCamera {
         name: name.parse().unwrap(),
         camera: Camera::new(intrinsics, pose).unwrap(),
         ..camera.clone()
-    };
-    camera
+    }
 }
 
 #[test]
@@ -92,7 +91,7 @@ fn a_camera_that_was_knocked_stands_out() {
     second[1] = with_pose(&first[1], "east", Pose::new(*turned.matrix(), pose.position()).unwrap());
     second[2].name = "south".parse().unwrap();
     let mut before = first.clone();
-    before.push(with_pose(&first[2], "south", first[2].camera.pose().clone()));
+    before.push(with_pose(&first[2], "south", *first[2].camera.pose()));
     let found = compare_sites(&SiteCalibration::of(before), &SiteCalibration::of(second)).unwrap();
     assert_eq!(found.missing, ["west".parse().unwrap()]);
     let [north, east, south] = &found.cameras[..] else { panic!("{found:?}") };
