@@ -4,11 +4,10 @@ use crossfix_geometry::{Pixel, tangent_basis};
 use crossfix_message::CameraName;
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
-use crate::site_file::{CalibratedCamera, SiteCalibration};
+use crate::site_file::{CalibratedCamera, SiteCalibration, grid};
 
-/// Pixels that are compared: so many columns and rows, evenly over the image.
-const COLUMNS: usize = 9;
-const ROWS: usize = 5;
+/// Of fewer cameras a move of the site would take on what one of them was knocked by.
+const LEAST_MOVED: usize = 3;
 /// Gauss and Newton's steps to the move of the site: from what logs lie beside it takes three.
 const STEPS: usize = 8;
 /// What no sight tells of the move is nothing: deviations that leave what one tells, m, rad, share.
@@ -22,7 +21,8 @@ const LEAST_SAID_RAD: f64 = 1e-6;
 #[derive(Clone, Debug)]
 pub struct SiteComparison {
     /// What brings the first to the second as a whole: where a log lay beside or went ahead, it
-    /// does so for all cameras.
+    /// does so for all cameras. Nothing where fewer than three are in both: it would take on what
+    /// one of them was knocked by.
     pub moved: SiteMove,
     /// How the cameras that both have differ beside that, in the order of the first.
     pub cameras: Vec<CameraComparison>,
@@ -114,11 +114,12 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
         .filter_map(|camera| Some((camera, second.camera(&camera.name)?)))
         .collect();
     let sights: Vec<Vec<Sight>> = pairs.iter().map(|(one, other)| sights(one, other)).collect();
+    let steps = if pairs.len() < LEAST_MOVED { 0 } else { STEPS };
     let later: Vec<Option<f64>> = pairs.iter().map(|(one, other)| later_s(one, other)).collect();
     let mut known: Vec<f64> = later.iter().copied().flatten().collect();
     known.sort_unstable_by(f64::total_cmp);
     let common_s = known.get(known.len() / 2).copied();
-    let moved = SiteMove { later_s: common_s, ..site_move(&sights.concat())? };
+    let moved = SiteMove { later_s: common_s, ..site_move(&sights.concat(), steps)? };
     let cameras = pairs
         .iter()
         .zip(&sights)
@@ -144,13 +145,6 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
         let own = camera.camera.model().direction(pixel).ok()?;
         Some(Unit::new_normalize(camera.camera.pose().rotation() * own.into_inner()))
     };
-    let pixels = (0..COLUMNS * ROWS).map(|k| {
-        let share = |k: usize, count: usize| (k as f64 + 0.5) / count as f64;
-        Pixel::new(
-            share(k % COLUMNS, COLUMNS) * f64::from(size.width),
-            share(k / COLUMNS, ROWS) * f64::from(size.height),
-        )
-    });
     let said = |camera: &CalibratedCamera, pixel| camera.pointing_sd_rad(pixel, one.range_m);
     let sight = |pixel| {
         let target = direction(one, pixel)?.into_inner() * one.range_m;
@@ -161,12 +155,12 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
             said_rad: said(one, pixel)?.hypot(said(other, pixel)?).max(LEAST_SAID_RAD),
         })
     };
-    pixels.filter_map(sight).collect()
+    grid(size).filter_map(sight).collect()
 }
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
 /// deviations.
-fn site_move(sights: &[Sight]) -> Option<SiteMove> {
+fn site_move(sights: &[Sight], steps: usize) -> Option<SiteMove> {
     if sights.is_empty() {
         return None;
     }
@@ -178,7 +172,7 @@ fn site_move(sights: &[Sight]) -> Option<SiteMove> {
         size: 1.0,
         later_s: None,
     };
-    for _ in 0..STEPS {
+    for _ in 0..steps {
         let mut information =
             SMatrix::<f64, 7, 7>::from_diagonal(&SVector::from(UNTOLD).map(|sd: f64| sd.powi(-2)));
         let mut right = SVector::<f64, 7>::zeros();

@@ -135,32 +135,32 @@ pub struct LensUncertainty {
 }
 
 impl LensUncertainty {
-    /// The variance that it leaves a pixel in the mean of both axes, where targets at `range_m` are
-    /// seen in the camera's frame along `direction`, pixels^2: large where the image was not
-    /// covered.
-    pub(crate) fn variance_px2(
+    /// The covariance that it leaves a pixel, where targets at a range (m) are seen in the camera's
+    /// frame along `direction`, pixels^2: large where the image was not covered.
+    pub(crate) fn covariance_px2(
         &self,
         intrinsics: &Intrinsics,
         direction: &Vector3<f64>,
         place: (f64, &nalgebra::Rotation3<f64>),
-    ) -> Option<f64> {
+    ) -> Option<Matrix2<f64>> {
         let seen = project(intrinsics, &(direction * place.0))?;
         let count = self.covariance.nrows();
         let by_lens = DMatrix::from_fn(2, count, |axis, number| seen.by_lens[number][axis]);
         let by = by_lens + by_pose(&seen, direction, place) * &self.pose_by_lens;
-        Some((&by * &self.covariance * by.transpose()).trace() / 2.0)
+        let covariance = &by * &self.covariance * by.transpose();
+        Some(covariance.fixed_view::<2, 2>(0, 0).into_owned())
     }
 }
 
-/// The variance that a pose's covariance leaves a pixel in the mean of both axes, likewise.
-pub(crate) fn pose_variance_px2(
+/// The covariance that a pose's covariance leaves a pixel, likewise.
+pub(crate) fn pose_covariance_px2(
     intrinsics: &Intrinsics,
     direction: &Vector3<f64>,
     place: (f64, &nalgebra::Rotation3<f64>),
     covariance: &nalgebra::Matrix6<f64>,
-) -> Option<f64> {
+) -> Option<Matrix2<f64>> {
     let by = by_pose(&project(intrinsics, &(direction * place.0))?, direction, place);
-    Some((by * covariance * by.transpose()).trace() / 2.0)
+    Some(by * covariance * by.transpose())
 }
 
 /// How a pixel follows the camera's rotation about its axes and its centre.

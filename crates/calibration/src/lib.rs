@@ -38,5 +38,5 @@ pub use landmarks::{
 };
 pub use lens::{LensFreedom, LensUncertainty};
 pub use site_file::{
-    BearingError, CalibratedCamera, ClockCorrection, SiteCalibration, SiteFileError,
+    BearingError, CalibratedCamera, ClockCorrection, OverImage, SiteCalibration, SiteFileError,
 };

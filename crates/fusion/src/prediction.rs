@@ -71,6 +71,24 @@ pub(crate) struct Fit {
     pub(crate) log_density: f64,
 }
 
+impl Fit {
+    /// The likelier of two readings of a bearing, by what was known of its camera's errors or as
+    /// those that last have been drawn anew, which is of a probability.
+    pub(crate) fn likelier(
+        known: Option<Self>,
+        renewed: Option<Self>,
+        probability: f64,
+    ) -> Option<Self> {
+        let weighed = |fit: Option<Self>, probability: f64| {
+            fit.map(|fit| Self { log_density: fit.log_density + probability.ln(), ..fit })
+        };
+        [weighed(known, 1.0 - probability), weighed(renewed, probability)]
+            .into_iter()
+            .flatten()
+            .max_by(|a, b| a.log_density.total_cmp(&b.log_density))
+    }
+}
+
 impl BearingPrediction {
     /// The prediction of `imm` over `interval` seconds for a camera at `origin`; `None` if the
     /// target would be at the camera itself.
@@ -171,17 +189,7 @@ impl BearingPrediction {
         let offset = self.model.offset(line)?;
         let known = self.fit_by(&self.known, offset, line, gate);
         let Some((renewed, probability)) = &self.renewed else { return known };
-        let weighed = |fit: Fit, probability: f64| Fit {
-            log_density: fit.log_density + probability.ln(),
-            ..fit
-        };
-        let known = known.map(|fit| weighed(fit, 1.0 - probability));
-        let renewed =
-            self.fit_by(renewed, offset, line, gate).map(|fit| weighed(fit, *probability));
-        [known, renewed]
-            .into_iter()
-            .flatten()
-            .max_by(|a, b| a.log_density.total_cmp(&b.log_density))
+        Fit::likelier(known, self.fit_by(renewed, offset, line, gate), *probability)
     }
 
     fn fit_by(

@@ -9,7 +9,9 @@
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::passing_ranges;
-use nalgebra::{Matrix2x3, Matrix3, Matrix3x2, Matrix6, Matrix6x2, Point3, Unit, Vector3, Vector6};
+use nalgebra::{
+    Matrix2x3, Matrix3, Matrix3x2, Matrix3x6, Matrix6, Matrix6x2, Point3, Unit, Vector3, Vector6,
+};
 
 use crate::uncertainty::SharedTies;
 
@@ -71,6 +73,14 @@ impl Chart {
                 let by = chart.by_state();
                 (by * covariance * by.transpose(), by * ties)
             }
+        }
+    }
+
+    /// How the first three coordinates follow position and velocity.
+    pub(crate) fn place_by_state(&self) -> Matrix3x6<f64> {
+        match self {
+            Self::Cartesian(_) => Matrix3x6::identity(),
+            Self::ByRange(chart) => chart.by_state().fixed_rows::<3>(0).into_owned(),
         }
     }
 

@@ -325,12 +325,10 @@ impl Track {
             self.keep_ties_possible();
         }
         let seen_from = self.follower.filter(|_| !self.held);
-        let mut errors = self.errors_of(camera, interval);
-        let bearing = (line, &errors);
-        if let Some(anew) = self.renewed(&innovation, interval, bearing, uncertainty, motion) {
-            errors = anew;
-            self.renew(camera);
-        }
+        let known = self.errors_of(camera, interval);
+        let bearing = (line, &known);
+        let anew = self.renewed(&innovation, interval, bearing, uncertainty, motion);
+        let errors = anew.unwrap_or(known);
         let measured = Measured { line, camera: uncertainty, errors: &errors };
         let mut results: Vec<Option<Updated>> = Vec::with_capacity(crossfix_filter::MAX_MODELS);
         self.imm.update(interval, motion.models(self.ranged), |state| {
@@ -339,6 +337,9 @@ impl Track {
             results.push(result);
             likely
         })?;
+        if anew.is_some() {
+            self.renew(camera);
+        }
         let nis = self.carry((camera, uncertainty.lasting), (time, interval), &results);
         self.gather_information(interval, line, uncertainty);
         self.updated = time;

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
-use nalgebra::{Matrix2, Matrix2x3, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix6, Matrix6x2, Point3, Vector2, Vector6};
 
 use crate::range_chart::Chart;
 use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
@@ -46,8 +46,8 @@ pub(crate) struct Told {
     pub(crate) carried: Matrix6<f64>,
     /// ... less `gained` times the camera's own errors' covariance with it.
     pub(crate) gained: SharedTies,
-    /// How the bearing follows the place, ...
-    pub(crate) by: Matrix2x3<f64>,
+    /// How the bearing follows position and velocity before it, ...
+    pub(crate) by: Matrix2x6<f64>,
     /// ... and the camera's errors.
     pub(crate) shifts: Shifts,
     /// The inverse S^-1 of the innovation's covariance, ...
@@ -67,7 +67,7 @@ impl Told {
         let mut mean = Self {
             carried: Matrix6::zeros(),
             gained: SharedTies::zeros(),
-            by: Matrix2x3::zeros(),
+            by: Matrix2x6::zeros(),
             shifts: Shifts::zeros(),
             weight: Matrix2::zeros(),
             pull: Vector2::zeros(),
@@ -158,7 +158,7 @@ pub(crate) fn updated(
             told: Told {
                 carried,
                 gained: gain * shifts,
-                by: model.by_position(),
+                by: by * chart.place_by_state(),
                 shifts,
                 weight: inverse,
                 pull: inverse * innovation,

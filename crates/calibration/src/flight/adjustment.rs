@@ -292,6 +292,14 @@ impl State {
         }
     }
 
+    /// How both axes of a label, in pixels, follow what is unknown; `None` where it is not seen.
+    pub(super) fn told_by(&self, index: usize, label: &super::Label) -> Option<[Vec<Term>; 2]> {
+        let placed = self.placed(index, label)?;
+        let alone = Whitening { kept: 0.0, sd_px: 1.0 };
+        let rows = self.whitened(index, self.starts()[index], &placed, None, alone);
+        Some(rows.map(|(terms, _)| terms))
+    }
+
     fn placed(&self, index: usize, label: &super::Label) -> Option<Placed> {
         let (first, weights, seen) = self.see(index, label)?;
         let clock = &self.cameras[index].clock;

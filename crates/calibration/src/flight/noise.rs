@@ -87,18 +87,28 @@ impl LabelNoise {
     /// is. Between the two it errs towards caution.
     pub(super) fn after(&self, before_s: Option<f64>, frame_s: f64) -> Whitening {
         let variance = self.sd_px().powi(2);
-        let correlation =
-            |after_s: f64| self.lasting_px.powi(2) / variance * (-after_s / self.lasting_s).exp();
-        let of_frame = correlation(frame_s);
-        let averaged = variance * (1.0 + of_frame) / (1.0 - of_frame);
-        let caution = (self.white_equivalent_px(frame_s).powi(2) / averaged).max(1.0);
-        let kept = before_s.map_or(0.0, correlation);
+        let kept = before_s.map_or(0.0, |before_s| self.correlation(before_s));
+        let caution = self.caution(frame_s);
         Whitening { kept, sd_px: (variance * (1.0 - kept * kept) * caution).sqrt() }
+    }
+
+    /// Correlation of two labels so many seconds apart.
+    fn correlation(&self, apart_s: f64) -> f64 {
+        (self.lasting_px / self.sd_px()).powi(2) * (-apart_s / self.lasting_s).exp()
+    }
+
+    /// By how much the variance is made larger so that the mean of many labels, each whitened by the
+    /// one before, is not better known than it is.
+    pub(super) fn caution(&self, frame_s: f64) -> f64 {
+        let of_frame = self.correlation(frame_s);
+        let averaged = self.sd_px().powi(2) * (1.0 + of_frame) / (1.0 - of_frame);
+        (self.white_equivalent_px(frame_s).powi(2) / averaged).max(1.0)
     }
 
     /// As residuals show it, in order of time; `explained` is the variance (pixels^2, an axis) that
     /// the fitted way has taken from them.
     pub(super) fn of(residuals: &[(f64, Vector2<f64>)], explained: f64, frame_s: f64) -> Self {
+        let residuals = &without_strays(residuals);
         let variance = typical(residuals.iter().map(|(_, residual)| *residual)) + explained;
         let variance = variance.max(LEAST_SD_PX.powi(2));
         let steps = residuals.windows(2).filter(|pair| pair[1].0 - pair[0].0 < 1.5 * frame_s);
@@ -136,16 +146,28 @@ const LEAST_WHITE_PX: f64 = 0.03;
 fn typical(vectors: impl Iterator<Item = Vector2<f64>>) -> f64 {
     let mut squares: Vec<f64> = vectors.map(|vector| vector.norm_squared()).collect();
     squares.sort_unstable_by(f64::total_cmp);
-    let count = squares.len();
+    let (count, cut) = (squares.len(), squares.len() / ANYTHING);
     if count == 0 {
         return 0.0;
     }
     // Half of the square is an exponential deviate: above its quantile of 1 - s lie s (1 - ln s) of
     // its mean.
-    let share = 1.0 / ANYTHING as f64;
-    let left = 1.0 - share * (1.0 - share.ln());
-    let sum: f64 = squares[..count - count / ANYTHING].iter().sum();
+    let share = cut as f64 / count as f64;
+    let left = if cut == 0 { 1.0 } else { 1.0 - share * (1.0 - share.ln()) };
+    let sum: f64 = squares[..count - cut].iter().sum();
     sum / (2.0 * count as f64 * left)
+}
+
+/// Labels of something else, birds beside the drone: farther off than so many times the median. Of
+/// normal deviates none in 10^14 is; with half as many a hand's slips are left out.
+const STRAY: f64 = 7.0;
+
+/// The residuals without those of other things: as many as nearly half of them may be.
+fn without_strays(residuals: &[(f64, Vector2<f64>)]) -> Vec<(f64, Vector2<f64>)> {
+    let mut lengths: Vec<f64> = residuals.iter().map(|(_, residual)| residual.norm()).collect();
+    lengths.sort_unstable_by(f64::total_cmp);
+    let most = STRAY * lengths.get(lengths.len() / 2).copied().unwrap_or(0.0);
+    residuals.iter().copied().filter(|(_, residual)| residual.norm() <= most).collect()
 }
 
 fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
@@ -164,4 +186,42 @@ fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
 fn share_of_means(lasting_s: f64) -> f64 {
     let ratio = lasting_s / BLOCK_S;
     2.0 * ratio * (1.0 - ratio * (1.0 - (-ratio.recip()).exp()))
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    /// Half a minute of labels, a share of them of something else.
+    fn found(strays: f64) -> LabelNoise {
+        const FRAME_S: f64 = 1.0 / 30.0;
+        let mut random = ChaCha8Rng::seed_from_u64(9);
+        let mut lasting = Vector2::zeros();
+        let kept = (-FRAME_S / 1.0f64).exp();
+        let residuals: Vec<(f64, Vector2<f64>)> = (0..3000)
+            .map(|k| {
+                let mut normal =
+                    || Vector2::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut random) });
+                lasting = lasting * kept + normal() * (0.5 * (1.0 - kept * kept).sqrt());
+                let own = lasting + normal() * 0.2;
+                let stray = random.random_bool(strays);
+                (f64::from(k) * FRAME_S, if stray { own.add_scalar(150.0) } else { own })
+            })
+            .collect();
+        LabelNoise::of(&residuals, 0.0, FRAME_S)
+    }
+
+    #[test]
+    fn labels_of_something_else_are_no_noise() {
+        for strays in [0.0, 0.1, 0.3] {
+            let noise = found(strays);
+            assert!((0.15..0.3).contains(&noise.white_px), "{strays}: {noise:?}");
+            assert!((0.35..0.65).contains(&noise.lasting_px), "{strays}: {noise:?}");
+            assert!((0.5..=2.0).contains(&noise.lasting_s), "{strays}: {noise:?}");
+        }
+    }
 }

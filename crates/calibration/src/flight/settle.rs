@@ -6,7 +6,8 @@ use super::adjustment::{
     self, Adjusted, CameraPriors, Flight, NEARLY_SETTLED, Priors, SETTLED, State,
 };
 use super::noise::LabelNoise;
-use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
+use super::normal::Term;
+use super::spline::{KNOT_S, THIRD_DIFFERENCE};
 
 /// Rounds in which deviations and powers are found beside the unknowns.
 const ROUNDS: usize = 6;
@@ -49,8 +50,9 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
     let mut cameras = Vec::new();
     for (index, camera) in state.cameras.iter().enumerate() {
         let residuals = residuals(flight, state, index);
-        let explained = explained(flight, adjusted, index);
         let frame_s = priors.cameras[index].frame_s;
+        let caution = priors.cameras[index].noise.caution(frame_s);
+        let explained = explained(flight, adjusted, index, caution);
         let noise = LabelNoise::of(&residuals, explained, frame_s);
         let wander = wander(adjusted, index, priors.cameras[index].wander);
         tracing::debug!(
@@ -81,20 +83,21 @@ pub(super) fn residuals(
     labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.2.residual))).collect()
 }
 
-/// What of a label's variance the way has taken, pixels^2 an axis, in the mean.
-fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize) -> f64 {
-    const STRIDE: usize = 10;
-    let order = adjusted.state.order();
+/// What of a label's variance the adjustment has taken, pixels^2 an axis, in the mean.
+///
+/// What way and clock follow from moment to moment they took from labels whose variance had been made
+/// larger ([`LabelNoise::caution`]), so it is that much less. What cameras took is of the mean of many
+/// labels, which is as well known as it says.
+fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize, caution: f64) -> f64 {
+    const STRIDE: usize = 20;
     let (mut sum, mut count) = (0.0, 0);
     for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
-        let Some((first, weights, seen)) = adjusted.state.see(index, label) else { continue };
-        for axis in 0..2 {
-            let term = |k: usize| {
-                let by = seen.by_place[(axis, k % 3)] * weights[k / 3];
-                (order.way(first + k / 3, k % 3), by)
-            };
-            let terms: [_; 3 * SPAN] = std::array::from_fn(term);
-            sum += adjusted.covariance.variance_held(&terms);
+        for terms in adjusted.state.told_by(index, label).into_iter().flatten() {
+            let chain = adjusted.state.order().chain();
+            let of_chain: Vec<Term> =
+                terms.iter().copied().filter(|(unknown, _)| *unknown < chain).collect();
+            let held = adjusted.covariance.variance_held(&of_chain);
+            sum += held / caution + adjusted.covariance.variance(&terms) - held;
             count += 1;
         }
     }

@@ -15,7 +15,7 @@ use thiserror::Error;
 
 use crate::flight::SurveyedPlace;
 use crate::lens::{LensFreedom, LensUncertainty};
-use crate::site_file::CalibratedCamera;
+use crate::site_file::{CalibratedCamera, OverImage};
 use adjustment::Adjusted;
 
 /// Something in a picture of which is known where it is.
@@ -139,9 +139,8 @@ pub struct LandmarkResult {
     /// Where something is wrong, each landmark without which nothing is.
     pub suspects: Vec<String>,
     /// How unlikely it is that clicks, places and lens err by as much as here or more: the chance
-    /// of the sum of their squares. `None` where as much is unknown as was measured, and nothing is
-    /// checked.
-    pub chance: Option<f64>,
+    /// of the sum of their squares.
+    pub chance: f64,
 }
 
 /// How a landmark fits.
@@ -156,13 +155,21 @@ pub struct LandmarkFit {
     pub deviations: Option<f64>,
 }
 
+/// A camera that may be turned by more than this, rad, is not known to look anywhere.
+const MOST_TURN_RAD: f64 = 0.1;
 /// Fits this unlikely are wrong: one in ten thousand pictures.
 const LEAST_CHANCE: f64 = 1e-4;
 
 impl LandmarkResult {
     /// Whether something of the picture must be wrong: a click, a place, the lens.
     pub fn is_wrong(&self) -> bool {
-        self.chance.is_some_and(|chance| chance < LEAST_CHANCE)
+        self.chance < LEAST_CHANCE
+    }
+
+    /// Whether the pose is known at all: where nothing tells a turn, or a place, rounding does.
+    fn is_told(&self) -> bool {
+        let part = |from: usize| self.pose_covariance.fixed_view::<3, 3>(from, from).trace().sqrt();
+        part(0) < MOST_TURN_RAD && part(3) < self.range_m
     }
 
     /// The landmark that lies farthest beside where the others have it.
@@ -178,6 +185,11 @@ impl LandmarkResult {
         let size = self.camera.model().intrinsics().size;
         let middle = Pixel::new(f64::from(size.width) / 2.0, f64::from(size.height) / 2.0);
         CalibratedCamera::from(self).pointing_sd_rad(middle, range_m)
+    }
+
+    /// As [`CalibratedCamera::over_image`], at the landmarks' range.
+    pub fn over_image(&self) -> OverImage {
+        CalibratedCamera::from(self).over_image()
     }
 }
 
@@ -215,33 +227,45 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
         return Err(LandmarkError::Ambiguous { camera: camera.clone(), places });
     }
     let mut result = result(picture, best).ok_or_else(none)?;
+    if !result.is_told() {
+        return Err(none());
+    }
     if result.is_wrong() {
-        result.suspects = suspects(picture, &best.state, needed);
+        result.suspects = suspects(picture, (best, &result), needed);
     }
     Ok(result)
 }
 
 /// The landmarks without which the others fit.
-fn suspects(picture: &LandmarkPicture, near: &adjustment::State, needed: usize) -> Vec<String> {
+fn suspects(
+    picture: &LandmarkPicture,
+    (adjusted, result): (&Adjusted, &LandmarkResult),
+    needed: usize,
+) -> Vec<String> {
     let without = |index: usize| {
         let mut rest = picture.clone();
         rest.landmarks.remove(index);
         // What the wrong one has bent is not to be begun with alone.
         let mut starts = start::starts(&rest).unwrap_or_default();
-        starts.push(near.clone());
+        starts.push(adjusted.state.clone());
         let adjusted = starts.into_iter().filter_map(|start| adjustment::adjust(&rest, start));
         let best = adjusted.min_by(|a, b| a.cost.total_cmp(&b.cost))?;
-        let result = result(&rest, &best)?;
-        result
-            .chance
-            .is_some_and(|_| !result.is_wrong())
-            .then(|| picture.landmarks[index].name.clone())
+        let result = self::result(&rest, &best)?;
+        (!result.is_wrong()).then(|| picture.landmarks[index].name.clone())
     };
     if picture.landmarks.len() <= needed {
         return Vec::new();
     }
-    (0..picture.landmarks.len()).filter_map(without).collect()
+    let deviations = |index: &usize| result.landmarks[*index].deviations.unwrap_or(0.0);
+    let mut likely: Vec<usize> = (0..picture.landmarks.len()).collect();
+    likely.sort_by(|a, b| deviations(b).total_cmp(&deviations(a)));
+    likely.truncate(MOST_SUSPECTS);
+    likely.sort_unstable();
+    likely.into_iter().filter_map(without).collect()
 }
+
+/// So many landmarks, those that lie farthest beside, are left out in turn: each is a calibration.
+const MOST_SUSPECTS: usize = 12;
 
 fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResult> {
     let state = &adjusted.state;
@@ -258,12 +282,9 @@ fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResu
         })
         .collect();
     ranges.sort_unstable_by(f64::total_cmp);
-    // Two numbers a click; what the lens file and the survey say makes up for what they leave open.
-    let surveyed = if picture.place.is_some() { 3 } else { 0 };
-    let freedom = (2 * picture.landmarks.len() + surveyed).saturating_sub(6);
-    let chance = (freedom > 0)
-        .then(|| ChiSquared::new(freedom as f64).ok().map(|chi| chi.sf(adjusted.cost)))
-        .flatten();
+    // Two numbers a click; what the lens file says makes up for what is free of it.
+    let measured = 2 * picture.landmarks.len() + if picture.place.is_some() { 3 } else { 0 };
+    let chance = ChiSquared::new((measured - 6) as f64).ok()?.sf(adjusted.cost);
     Some(LandmarkResult {
         name: picture.camera.clone(),
         camera: Camera::new(state.intrinsics, pose).ok()?,

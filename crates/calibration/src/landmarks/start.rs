@@ -9,9 +9,9 @@ use crate::lens;
 
 /// Places that are tried lie on so many directions from the landmarks' middle, evenly spread ...
 const DIRECTIONS: usize = 60;
-/// ... and this far away, in the landmarks' spread: nearer a lens does not see them all, farther the
-/// adjustment goes by itself.
-const DISTANCES: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 8.0];
+/// ... and as far away as things of the landmarks' spread are seen under the clicks' angles, and
+/// nearer and farther: not all are seen from the front.
+const DISTANCES: [f64; 5] = [0.4, 0.7, 1.0, 1.4, 2.0];
 /// So many of them are adjusted, those with the least misfit.
 const ADJUSTED: usize = 40;
 
@@ -39,7 +39,7 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkEr
             .into_iter()
             .collect());
     }
-    let mut tried: Vec<(f64, Rotation3<f64>, Point3<f64>)> = places(picture)
+    let mut tried: Vec<(f64, Rotation3<f64>, Point3<f64>)> = places(picture, angle_of(&clicked))
         .into_iter()
         .filter_map(|place| turned(&clicked, place).map(|(off, rotation)| (off, rotation, place)))
         .collect();
@@ -48,8 +48,15 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkEr
     Ok(tried.into_iter().map(|(_, rotation, place)| state((rotation, place))).collect())
 }
 
-/// Places round the landmarks.
-fn places(picture: &LandmarkPicture) -> Vec<Point3<f64>> {
+/// Root mean square of the clicks' angles from their middle, rad.
+fn angle_of(clicked: &[(Vector3<f64>, LandmarkPlace)]) -> f64 {
+    let middle: Vector3<f64> = clicked.iter().map(|(direction, _)| direction).sum();
+    let squares: f64 = clicked.iter().map(|(direction, _)| direction.angle(&middle).powi(2)).sum();
+    (squares / clicked.len() as f64).sqrt().max(1e-4)
+}
+
+/// Places round the landmarks, which are seen under an angle.
+fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
     let known: Vec<Point3<f64>> = picture
         .landmarks
         .iter()
@@ -63,7 +70,7 @@ fn places(picture: &LandmarkPicture) -> Vec<Point3<f64>> {
     let squares: f64 = known.iter().map(|place| (place - middle).norm_squared()).sum();
     let spread = (squares / count).sqrt();
     let place = |distance: f64| {
-        (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * (distance * spread))
+        (0..DIRECTIONS).map(move |k| middle + spiral(k).into_inner() * (distance * spread / angle))
     };
     DISTANCES.into_iter().flat_map(place).collect()
 }

@@ -5,6 +5,7 @@ use crossfix_geometry::Camera;
 use crossfix_vision::TrackerConfig;
 use nalgebra::Vector3;
 
+use crate::calibrated;
 use crate::config::{self, CameraFile, Kind, Site, load_network};
 use crate::output;
 #[cfg(not(feature = "centre"))]
@@ -56,6 +57,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
                 .validate()
                 .with_context(|| format!("{} has an error", args.config.display()))?;
             toml::to_string(&tracker)?
+        }
+        Some(Kind::Calibration) => {
+            let site = calibrated::load(&args.config)?;
+            let names: Vec<&str> = site.cameras().iter().map(|c| c.name.as_str()).collect();
+            output::line(format!(
+                "{} is a calibration of {}",
+                args.config.display(),
+                names.join(", ")
+            ));
+            return Ok(());
         }
         #[cfg(feature = "centre")]
         Some(Kind::Scene) => check_scene(args)?,

@@ -34,13 +34,16 @@ pub enum Kind {
     Network,
     Scene,
     Tracker,
+    Calibration,
 }
 
 impl Kind {
     /// What a file is by its keys; `None` if they say nothing.
     pub fn of(keys: &toml::Table) -> Option<Self> {
         let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
-        if has(&["name", "source", "pose", "intrinsics"]) {
+        if has(&["form"]) {
+            Some(Self::Calibration)
+        } else if has(&["name", "source", "pose", "intrinsics"]) {
             Some(Self::Camera)
         } else if has(&["targets"]) {
             Some(Self::Scene)
@@ -65,6 +68,7 @@ impl fmt::Display for Kind {
             Self::Network => "a network file",
             Self::Scene => "a scene of the simulator",
             Self::Tracker => "an image tracker's file",
+            Self::Calibration => "a site's calibration",
         })
     }
 }

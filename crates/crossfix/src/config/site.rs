@@ -9,6 +9,7 @@ use crossfix_transport::NetworkConfig;
 #[cfg(feature = "centre")]
 use super::FusionFile;
 use super::{CameraFile, Kind};
+use crate::calibrated;
 
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
@@ -78,6 +79,7 @@ impl Site {
             match Kind::of(&keys) {
                 Some(Kind::Camera) => site.add_camera(&path)?,
                 Some(Kind::Network) => drop(load_network(&path)?),
+                Some(Kind::Calibration) => drop(calibrated::load(&path)?),
                 // A scene of the simulator, or a tracker's settings.
                 Some(Kind::Scene | Kind::Tracker) => {}
                 Some(Kind::Fusion) | None => fusion.push(path),

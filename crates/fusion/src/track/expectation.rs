@@ -43,7 +43,8 @@ impl Expectation {
                     let fit = Fit { gate_distance: nis, log_density: log_likelihood };
                     gate.holds(nis).then_some(fit)
                 };
-                fit(errors).or_else(|| fit(&errors.renewed()?.0))
+                let Some((anew, probability)) = errors.renewed() else { return fit(errors) };
+                Fit::likelier(fit(errors), fit(&anew), probability)
             }
         }
     }

@@ -133,13 +133,30 @@ impl Track {
         self.learnt.cameras.push(camera.clone());
         self.learnt.means.push(Vector2::zeros());
         let count = self.learnt.count();
+        // While it was considered its errors may have come to go with learnt ones.
+        let known =
+            self.ties.get(camera).map_or_else(|| LearntTies::zeros(0), |t| t.learnt.clone());
         for (name, ties) in &mut self.ties {
             let old = std::mem::replace(&mut ties.learnt, LearntTies::zeros(0));
             ties.learnt = old.resize_vertically(count, 0.0);
+            let mut own = ties.learnt.fixed_view_mut::<2, 2>(count - 2, LASTING);
             if name == camera {
-                ties.learnt.fixed_view_mut::<2, 2>(count - 2, LASTING).fill_with_identity();
+                own.fill_with_identity();
+            } else if let Some(row) = self.learnt.row_of(name) {
+                own.copy_from(&known.fixed_view::<2, 2>(row, LASTING).transpose());
             }
         }
+    }
+
+    /// The covariance of the learnt errors, as each camera's ties hold its columns.
+    fn learnt_covariance(&self) -> Option<DMatrix<f64>> {
+        let count = self.learnt.count();
+        let mut own = DMatrix::<f64>::zeros(count, count);
+        for (row, name) in self.learnt.rows() {
+            let columns = self.ties.get(name)?.learnt.fixed_columns::<2>(LASTING);
+            own.fixed_columns_mut::<2>(row).copy_from(&columns);
+        }
+        Some(own)
     }
 
     /// The rows of a camera that has been silent for so long that nothing is left to know.
@@ -203,7 +220,7 @@ impl Track {
             *mean += across.fixed_rows::<2>(row) * told.pull;
         }
         for ((name, ties), between) in self.ties.iter_mut().zip(&between) {
-            let seen = told.by * ties.covariance.fixed_rows::<3>(0) + told.shifts * between;
+            let seen = told.by * ties.covariance + told.shifts * between;
             ties.covariance = told.carried * ties.covariance - told.gained * between;
             match self.learnt.row_of(name) {
                 None => ties.learnt -= &gain * seen,
@@ -218,6 +235,19 @@ impl Track {
                 }
             }
         }
+        self.balance();
+    }
+
+    /// Makes the covariance of the learnt errors its own transpose again: rounding grows.
+    fn balance(&mut self) {
+        let Some(own) = self.learnt_covariance() else { return };
+        let own = (&own + own.transpose()) * 0.5;
+        for (row, name) in self.learnt.rows() {
+            if let Some(ties) = self.ties.get_mut(name) {
+                let mut columns = ties.learnt.fixed_columns_mut::<2>(LASTING);
+                columns.copy_from(&own.fixed_columns::<2>(row));
+            }
+        }
     }
 
     /// Covariance of the learnt errors with a bearing of a camera.
@@ -228,7 +258,7 @@ impl Track {
         let mut across = &own.learnt * told.shifts.transpose();
         for (row, name) in self.learnt.rows() {
             if let Some(ties) = self.ties.get(name) {
-                let tied = ties.covariance.fixed_view::<3, 2>(0, LASTING);
+                let tied = ties.covariance.fixed_columns::<2>(LASTING);
                 let mut rows = across.fixed_rows_mut::<2>(row);
                 rows += tied.transpose() * told.by.transpose();
             }
@@ -319,13 +349,10 @@ impl Track {
         if self.learnt.is_empty() {
             return Some(Matrix6::zeros());
         }
-        let count = self.learnt.count();
-        let mut own = DMatrix::<f64>::zeros(count, count);
-        let mut tied = OMatrix::<f64, U6, Dyn>::zeros(count);
+        let mut own = self.learnt_covariance()?;
+        let mut tied = OMatrix::<f64, U6, Dyn>::zeros(self.learnt.count());
         for (row, name) in self.learnt.rows() {
-            let ties = self.ties.get(name)?;
-            own.fixed_columns_mut::<2>(row).copy_from(&ties.learnt.fixed_columns::<2>(LASTING));
-            let columns = ties.covariance.fixed_columns::<2>(LASTING);
+            let columns = self.ties.get(name)?.covariance.fixed_columns::<2>(LASTING);
             tied.fixed_columns_mut::<2>(row).copy_from(&columns);
         }
         for (name, ties) in &self.ties {

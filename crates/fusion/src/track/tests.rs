@@ -139,7 +139,6 @@ fn flown(
         observability: Observability::of_information(&Matrix6::identity(), 1.0, 1.0),
     };
     let mut track = Track::start(&fix, [], &motion);
-    track.status = status;
     let step = FRAME_S / 3.0;
     for k in 0..540 {
         // Exact moments of white acceleration over a step.
@@ -161,6 +160,10 @@ fn flown(
         }
         let bearing = (timed.time, &uncertainty);
         track.measurement_update(&names[camera], &timed.line, bearing, &motion).unwrap();
+        if k == 30 {
+            // Until here all errors are considered.
+            track.status = status;
+        }
     }
     let error = track.state().mean - truth;
     (error, (error.transpose() * track.state().covariance.try_inverse().unwrap() * error).x)

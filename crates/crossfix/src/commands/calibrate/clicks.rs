@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
 use crossfix_calibration::{Landmark, LandmarkPlace};
-use crossfix_geometry::{Geodetic, LocalFrame, Pixel};
+use crossfix_geometry::{Geodetic, ImageSize, LocalFrame, Pixel};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Unit, Vector3};
 use serde::Deserialize;
@@ -17,6 +17,7 @@ const DIRECTION_SD_DEG: f64 = 0.01;
 
 /// A row of the file.
 #[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Row {
     camera: Option<CameraName>,
     landmark: String,
@@ -74,6 +75,22 @@ pub fn read(
     }
     ensure!(!cameras.is_empty(), "the landmarks {} have no rows of that camera", path.display());
     Ok(cameras)
+}
+
+/// Whether all were clicked in the image.
+pub fn check(landmarks: &[Landmark], size: ImageSize) -> anyhow::Result<()> {
+    for Landmark { name, pixel, .. } in landmarks {
+        ensure!(
+            (0.0..=f64::from(size.width)).contains(&pixel.x())
+                && (0.0..=f64::from(size.height)).contains(&pixel.y()),
+            "landmark `{name}` was clicked at {:.0}, {:.0}, outside of the image of {} x {}",
+            pixel.x(),
+            pixel.y(),
+            size.width,
+            size.height
+        );
+    }
+    Ok(())
 }
 
 impl Row {

@@ -78,7 +78,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
     let cameras = labels(&args.recording, args.lens.into())?;
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
-    let survey = survey::read(args.positions.as_deref(), &args.distance, &names)?;
+    let survey =
+        survey::read(args.positions.as_deref(), &args.distance, (&names, "the recording"))?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");

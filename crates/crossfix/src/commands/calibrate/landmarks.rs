@@ -1,9 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_calibration::{
-    CalibratedCamera, LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks,
-};
+use crossfix_calibration::{LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks};
 use crossfix_geometry::Geodetic;
 use crossfix_message::CameraName;
 use serde::Serialize;
@@ -49,19 +47,21 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let clicked = clicks::read(&args.landmarks, args.camera.as_ref(), args.anchor)?;
-    let names: Vec<CameraName> = clicked.keys().cloned().collect();
-    let survey = survey::read(args.positions.as_deref(), &[], &names)?;
     let files = camera_files(&args.site)?;
+    let known: Vec<CameraName> = files.iter().map(|(_, file)| file.name.clone()).collect();
+    let survey = survey::read(args.positions.as_deref(), &[], (&known, "the site"))?;
     let (mut results, mut failed) = (Vec::new(), Vec::new());
     for (camera, landmarks) in clicked {
         let (path, file) =
             files.iter().find(|(_, file)| file.name == camera).with_context(|| {
-                let known: Vec<&str> = files.iter().map(|(_, file)| file.name.as_str()).collect();
+                let known: Vec<&str> = known.iter().map(CameraName::as_str).collect();
                 format!("the site has no camera `{camera}`: it has {}", known.join(", "))
             })?;
+        let intrinsics = file.lens(path)?;
+        clicks::check(&landmarks, intrinsics.size).with_context(|| format!("camera `{camera}`"))?;
         let picture = LandmarkPicture {
             place: survey.place(&camera).cloned(),
-            intrinsics: file.lens(path)?,
+            intrinsics,
             freedom: args.lens.into(),
             camera,
             landmarks,
@@ -80,13 +80,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         figures.iter().for_each(|camera| output::line(camera.render()));
     }
-    let good = results.iter().filter(|result| !is_wrong(result)).map(CalibratedCamera::from);
-    let good: Vec<CalibratedCamera> = good.collect();
+    let good: Vec<&LandmarkResult> = results.iter().filter(|result| !is_wrong(result)).collect();
     for wrong in results.iter().filter(|result| is_wrong(result)) {
         tracing::warn!("camera `{}` is wrong and is not written", wrong.name);
     }
     ensure!(!good.is_empty(), "nothing is written: no camera has a pose");
-    write(args, good)
+    write(args, &good)
 }
 
 fn camera_files(site: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
@@ -98,7 +97,7 @@ fn camera_files(site: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
 }
 
 /// Writes the cameras beside those that the file has already.
-fn write(args: &Args, cameras: Vec<CalibratedCamera>) -> anyhow::Result<()> {
+fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
     let mut site = if args.output.exists() {
         calibrated::load(&args.output)?
     } else {
@@ -112,7 +111,14 @@ fn write(args: &Args, cameras: Vec<CalibratedCamera>) -> anyhow::Result<()> {
         .filter(|name| is_kept(name))
         .map(CameraName::to_string)
         .collect();
-    cameras.into_iter().for_each(|camera| site.put(camera));
+    if site.datum().is_some() {
+        tracing::warn!(
+            "{} is of a flight: its cameras stand where the flight's log has them, and these where \
+             the landmarks' survey does; metres may lie between the two",
+            args.output.display()
+        );
+    }
+    cameras.iter().for_each(|camera| site.put(camera));
     let text = format!(
         "# Written by crossfix calibrate landmarks from {}.\n{}",
         args.landmarks.display(),
@@ -136,12 +142,15 @@ struct Figures {
     name: String,
     position_m: [f64; 3],
     position_sd_m: f64,
-    /// Pose and lens together, in the image's middle at the landmarks' range.
-    pointing_sd_mrad: Option<f64>,
+    /// Pose and lens together, over the part of the image that the lens is known in, at the
+    /// landmarks' range.
+    pointing_sd_mrad: f64,
+    /// How large that part is; elsewhere nothing has a bearing.
+    image_share: f64,
     range_m: f64,
     focal_ratio: f64,
-    /// The chance of errors as large as these or larger; absent where nothing is checked.
-    chance: Option<f64>,
+    /// The chance of errors as large as these or larger.
+    chance: f64,
     landmarks: Vec<LandmarkFigures>,
     verdict: String,
 }
@@ -158,6 +167,8 @@ struct LandmarkFigures {
 
 /// A pose that points worse than this is weak, mrad: half a metre at 100 m.
 const WEAK_POINTING_MRAD: f64 = 5.0;
+/// A lens that is known in less than this share of the image leaves targets out.
+const WEAK_SHARE: f64 = 0.8;
 
 /// Lenses are up to 2 % shorter or longer at a distance: beyond this share it is another lens, where
 /// the clicks do not fit either.
@@ -172,7 +183,7 @@ fn is_upside_down(result: &LandmarkResult) -> bool {
     result.camera.pose().rotation().matrix()[(2, 1)] > 0.5
 }
 
-fn verdict(result: &LandmarkResult, pointing_mrad: Option<f64>) -> String {
+fn verdict(result: &LandmarkResult) -> String {
     if is_upside_down(result) {
         return "wrong: upside down, so heights may count downwards".to_owned();
     }
@@ -197,11 +208,13 @@ fn verdict(result: &LandmarkResult, pointing_mrad: Option<f64>) -> String {
         });
         return format!("wrong{worst}");
     }
-    if result.chance.is_none() {
-        return "weak: nothing checks it; add a landmark".to_owned();
-    }
-    if pointing_mrad.is_none_or(|sd| sd > WEAK_POINTING_MRAD) {
+    let over_image = result.over_image();
+    if over_image.sd_rad * 1e3 > WEAK_POINTING_MRAD {
         return "weak: landmarks farther apart in the image, or better known, are needed"
+            .to_owned();
+    }
+    if over_image.share < WEAK_SHARE {
+        return "weak: landmarks in the corners of the image are needed: the lens is not known there"
             .to_owned();
     }
     "good".to_owned()
@@ -209,7 +222,7 @@ fn verdict(result: &LandmarkResult, pointing_mrad: Option<f64>) -> String {
 
 impl From<&LandmarkResult> for Figures {
     fn from(result: &LandmarkResult) -> Self {
-        let pointing_sd_mrad = result.pointing_sd_rad(result.range_m).map(|sd| sd * 1e3);
+        let over_image = result.over_image();
         let landmarks = result.landmarks.iter().map(|fit| LandmarkFigures {
             landmark: fit.name.clone(),
             residual_px: fit.residual_px.into(),
@@ -219,12 +232,13 @@ impl From<&LandmarkResult> for Figures {
             name: result.name.to_string(),
             position_m: result.camera.pose().position().coords.into(),
             position_sd_m: result.pose_covariance.fixed_view::<3, 3>(3, 3).trace().sqrt(),
-            pointing_sd_mrad,
+            pointing_sd_mrad: over_image.sd_rad * 1e3,
+            image_share: over_image.share,
             range_m: result.range_m,
             focal_ratio: result.focal_ratio,
             chance: result.chance,
             landmarks: landmarks.collect(),
-            verdict: verdict(result, pointing_sd_mrad),
+            verdict: verdict(result),
         }
     }
 }
@@ -241,20 +255,18 @@ impl Figures {
             ]);
         }
         let [east, north, up] = self.position_m;
-        let pointing = self
-            .pointing_sd_mrad
-            .map_or_else(|| "not known".to_owned(), |sd| format!("± {sd:.2} mrad"));
-        let chance = self.chance.map_or_else(String::new, |chance| {
-            format!(", a fit as bad as this by chance: {chance:.2}")
-        });
         format!(
-            "camera `{}`: {}\nat {east:.3}, {north:.3}, {up:.3} m ± {:.3} m; pointing {pointing} at \
-             {:.0} m; focal length {:+.2} %{chance}\n\n{}\n",
+            "camera `{}`: {}\nat {east:.3}, {north:.3}, {up:.3} m ± {:.3} m; pointing ± {:.2} mrad over \
+             {:.0} % of the image at {:.0} m; focal length {:+.2} %; a fit as bad as this by chance: \
+             {:.2}\n\n{}\n",
             self.name,
             self.verdict,
             self.position_sd_m,
+            self.pointing_sd_mrad,
+            100.0 * self.image_share,
             self.range_m,
             100.0 * (self.focal_ratio - 1.0),
+            self.chance,
             output::table(&rows)
         )
     }

@@ -66,11 +66,11 @@ impl Row {
     }
 }
 
-/// What a survey says; the cameras that it names must be of the recording.
+/// What a survey says; the cameras that it names must be those of the recording or site.
 pub fn read(
     positions: Option<&Path>,
     distances: &[Distance],
-    cameras: &[CameraName],
+    (cameras, of): (&[CameraName], &str),
 ) -> anyhow::Result<Survey> {
     let places = positions.map(read_places).transpose()?.unwrap_or_default();
     let distances: Vec<TapedDistance> =
@@ -80,7 +80,7 @@ pub fn read(
         let known: Vec<&str> = cameras.iter().map(CameraName::as_str).collect();
         ensure!(
             cameras.contains(name),
-            "the survey names camera `{name}`, which the recording has not: it has {}",
+            "the survey names camera `{name}`, which {of} has not: it has {}",
             known.join(", ")
         );
     }
