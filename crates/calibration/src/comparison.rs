@@ -4,7 +4,8 @@ use crossfix_geometry::{Pixel, tangent_basis};
 use crossfix_message::CameraName;
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
-use crate::site_file::{CalibratedCamera, SiteCalibration, grid};
+use crate::calibrated_camera::{CalibratedCamera, grid};
+use crate::site_file::SiteCalibration;
 
 /// Of fewer cameras a move of the site would take on what one of them was knocked by.
 const LEAST_MOVED: usize = 3;

@@ -18,6 +18,7 @@
 //! # Ok::<(), crossfix_calibration::IntrinsicsError>(())
 //! ```
 
+mod calibrated_camera;
 mod comparison;
 mod flight;
 mod intrinsics;
@@ -25,6 +26,7 @@ mod landmarks;
 mod lens;
 mod site_file;
 
+pub use calibrated_camera::{BearingError, CalibratedCamera, ClockCorrection, OverImage};
 pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
     CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
@@ -37,6 +39,4 @@ pub use landmarks::{
     calibrate_landmarks,
 };
 pub use lens::{LensFreedom, LensUncertainty};
-pub use site_file::{
-    BearingError, CalibratedCamera, ClockCorrection, OverImage, SiteCalibration, SiteFileError,
-};
+pub use site_file::{SiteCalibration, SiteFileError};

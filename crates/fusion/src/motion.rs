@@ -14,11 +14,11 @@ pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 /// The motion models of all tracks, and the detector that a new track gets.
 #[derive(Clone, Debug)]
 pub(crate) struct Motion {
-    /// Of tracks that several cameras hold in their place.
+    /// Of tracks that several cameras see.
     models: MotionModels,
-    /// Of tracks that one camera alone follows: what the target does along its sight line nobody
+    /// Of tracks that one camera alone sees: what the target does along its sight line nobody
     /// sees, so every model that is not calm is as uncertain as the liveliest.
-    unheld: MotionModels,
+    unranged: MotionModels,
     /// A camera's bearing holds a track for so long, s.
     pub(crate) holding_s: f64,
     detector: Option<Detector>,
@@ -69,13 +69,14 @@ impl Motion {
             value: config.models.len() as f64,
             must: "one to four models with densities of 0 and more and positive shares".to_owned(),
         })?;
-        let unheld = models.partial();
-        Ok(Self { models, unheld, holding_s: config.coasting_after_s, detector })
+        let unranged = models.partial();
+        Ok(Self { models, unranged, holding_s: config.coasting_after_s, detector })
     }
 
-    /// The models of a track that is held in its place, or is not.
-    pub(crate) fn models(&self, held: bool) -> &MotionModels {
-        if held { &self.models } else { &self.unheld }
+    /// The models of a track that two cameras see, or of one whose motion along the one sight line
+    /// that is left nobody sees.
+    pub(crate) fn models(&self, ranged: bool) -> &MotionModels {
+        if ranged { &self.models } else { &self.unranged }
     }
 
     /// Density of acceleration over all models of a track that is held, m^2/s^3.

@@ -10,8 +10,10 @@ const ROUNDING: f64 = 1e-9;
 /// Errors that bearings of a camera share: two of its pose, one of its clock, and two that last from
 /// one bearing of a target to the next.
 pub(crate) const SHARED: usize = 5;
+/// How many are of its pose.
+pub(crate) const OF_POSE: usize = 2;
 /// Where the clock's is among them.
-pub(crate) const OF_CLOCK: usize = 2;
+pub(crate) const OF_CLOCK: usize = OF_POSE;
 /// Where those are that last, ...
 pub(crate) const LASTING: usize = 3;
 /// ... after so many that one target's bearings tell nothing of: they are considered.

@@ -213,7 +213,7 @@ impl Track {
         }
         let across = self.across(camera, told);
         let gain = &across * told.weight;
-        let learnt = &across * (told.weight - told.pull_spread);
+        let known = &across * (told.weight - told.pull_spread);
         let between: Vec<SharedCovariance> =
             self.ties.keys().map(|other| self.between(camera, other)).collect();
         for (mean, row) in self.learnt.means.iter_mut().zip((0..).step_by(2)) {
@@ -229,7 +229,7 @@ impl Track {
                     let mut considered = ties.learnt.fixed_columns_mut::<CONSIDERED>(0);
                     considered -= &gain * seen.fixed_columns::<CONSIDERED>(0);
                     let mut lasting = ties.learnt.fixed_columns_mut::<2>(LASTING);
-                    lasting -= &learnt * own;
+                    lasting -= &known * own;
                     let mut tied = ties.covariance.fixed_columns_mut::<2>(LASTING);
                     tied += told.moved * own;
                 }
@@ -319,7 +319,8 @@ impl Track {
         }
     }
 
-    /// What the shared errors do to the state: no less can be unknown of it.
+    /// What the shared errors do to the state: no less can be unknown of it. Where rounding has left
+    /// less than nothing of the learnt ones, they are taken for unknown again.
     pub(super) fn shared_part(&mut self) -> Matrix6<f64> {
         // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
         let sum = |mut parts: Vec<Matrix6<f64>>| -> Matrix6<f64> {

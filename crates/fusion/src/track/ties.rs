@@ -9,7 +9,7 @@ use super::learnt::LearntTies;
 use super::{Innovation, Track};
 use crate::cameras::{ClockChange, LastThree, Sample};
 use crate::motion::Motion;
-use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, SharedTies};
+use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, OF_POSE, SharedTies};
 use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
@@ -268,7 +268,7 @@ impl Track {
     /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances):
     /// what they have done to the track is as well.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
-        if let Some(change) = self.rescale::<OF_CLOCK>(camera, 0, (ratio, ratio.sqrt())) {
+        if let Some(change) = self.rescale::<OF_POSE>(camera, 0, (ratio, ratio.sqrt())) {
             self.imm.add_covariance(&change);
         }
     }

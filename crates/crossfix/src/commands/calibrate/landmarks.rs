@@ -118,7 +118,7 @@ fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
             args.output.display()
         );
     }
-    cameras.iter().for_each(|camera| site.put(camera));
+    cameras.iter().for_each(|camera| site.put(CalibratedCamera::from(*camera)));
     let text = format!(
         "# Written by crossfix calibrate landmarks from {}.\n{}",
         args.landmarks.display(),

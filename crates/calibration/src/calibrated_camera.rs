@@ -1,0 +1,205 @@
+//! What a calibration says of one camera.
+
+use crossfix_geometry::{Bearing, Camera, GeometryError, ImageSize, Pixel, PixelCovariance};
+use crossfix_message::{CameraCalibration, CameraName, LastingNoise, Timestamp};
+use nalgebra::{Matrix2, Matrix6};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::flight::LabelNoise;
+use crate::lens::{self, LensUncertainty};
+
+/// Where the lens may be off by so many times what labels err by, a pixel shows no direction: in
+/// the corners of a wide lens that no flight has crossed it is off by 50 pixels. At three a flight of
+/// a minute lost two fifths of its places; with twice it tracks are drawn aside.
+const MOST_LENS_SHARE: f64 = 5.0;
+
+/// Why a pixel has no bearing.
+#[derive(Debug, Error)]
+pub enum BearingError {
+    /// The lens model cannot be undone there.
+    #[error("the lens shows no direction there")]
+    Lens(#[from] GeometryError),
+    /// The calibration's flight did not cross that part of the image.
+    #[error(
+        "the lens is known to {sd_px:.0} pixels there: calibrate with a flight through that part of the image"
+    )]
+    Uncovered {
+        /// What it may be off by, pixels.
+        sd_px: f64,
+    },
+}
+
+/// One camera of a calibrated site.
+#[derive(Clone, Debug)]
+pub struct CalibratedCamera {
+    /// Whose it is.
+    pub name: CameraName,
+    /// Lens and pose.
+    pub camera: Camera,
+    /// Covariance of the pose: rotation about the camera's axes (rad), then position (m).
+    pub pose_covariance: Matrix6<f64>,
+    /// What is still unknown of the lens.
+    pub lens: LensUncertainty,
+    /// Range at which the calibration's targets were seen, in the middle, m.
+    pub range_m: f64,
+    /// Its clock.
+    pub clock: ClockCorrection,
+    /// What its bearings err by.
+    pub noise: LabelNoise,
+    /// Time between its frames, s.
+    pub frame_s: f64,
+}
+
+/// How a camera's times become common ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ClockCorrection {
+    /// `[own time, common time less own, standard deviation]`, s, in order of time; between two it
+    /// is straight.
+    pub knots_s: Vec<[f64; 3]>,
+    /// How the difference grows before the first knot and after the last, s/s.
+    pub rate: f64,
+    /// Standard deviation of that, s/s.
+    pub rate_sd: f64,
+    /// What the clock wanders beside, s after one second (it grows with the time's root).
+    pub wander_s: f64,
+    /// Time between the read-out of the image's first row and its last, s; frames have the time of
+    /// the middle row.
+    pub readout_s: f64,
+}
+
+/// No camera is said to point better than this, pixels.
+const LEAST_POINTING_PX: f64 = 1e-4;
+
+/// How well a camera points over its image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OverImage {
+    /// The share of the image whose pixels have a bearing: elsewhere the lens is not known.
+    pub share: f64,
+    /// Root mean square of their [`CalibratedCamera::pointing_sd_rad`].
+    pub sd_rad: f64,
+}
+
+/// Columns and rows of the pixels that stand for an image.
+const GRID: [usize; 2] = [9, 5];
+
+/// Pixels evenly over an image.
+pub(crate) fn grid(size: ImageSize) -> impl Iterator<Item = Pixel> {
+    let [columns, rows] = GRID;
+    (0..columns * rows).map(move |k| {
+        let share = |k: usize, count: usize| (k as f64 + 0.5) / count as f64;
+        Pixel::new(
+            share(k % columns, columns) * f64::from(size.width),
+            share(k / columns, rows) * f64::from(size.height),
+        )
+    })
+}
+
+impl CalibratedCamera {
+    /// What the cameras' channel says of it alone.
+    pub(crate) fn message(&self, valid_from: Timestamp) -> CameraCalibration {
+        CameraCalibration::new(&self.name, &self.camera, valid_from)
+            .with_pose_covariance(&self.pose_covariance)
+            .with_lasting_errors(self.lasting_noise(), self.clock.wander_s)
+    }
+
+    /// What of its bearings' noise lasts.
+    fn lasting_noise(&self) -> LastingNoise {
+        let focal_px = self.camera.model().intrinsics().fx;
+        LastingNoise { sd_rad: self.noise.lasting_px / focal_px, time_s: self.noise.lasting_s }
+    }
+
+    /// The bearing of a pixel, with the part of its noise that is new in every frame and what the
+    /// lens may be off by there.
+    ///
+    /// # Errors
+    /// [`BearingError`] where the lens has no direction, or nobody knows which.
+    pub fn bearing(&self, pixel: Pixel) -> Result<Bearing, BearingError> {
+        let model = self.camera.model();
+        let place = (self.range_m, self.camera.pose().rotation());
+        let direction = model.direction(pixel)?;
+        let lens = self.lens.covariance_px2(model.intrinsics(), &direction, place);
+        let lens_px = lens.map_or(f64::INFINITY, |lens| (lens.trace() / 2.0).sqrt());
+        if lens_px > MOST_LENS_SHARE * self.noise.sd_px() {
+            return Err(BearingError::Uncovered { sd_px: lens_px });
+        }
+        let sd_px = self.noise.white_px.hypot(lens_px);
+        Ok(model.bearing(pixel, PixelCovariance::isotropic(sd_px))?)
+    }
+
+    /// Standard deviation across the line to a target that a pixel shows at a range, pose and lens
+    /// together, rad per axis; `None` where the lens shows nothing.
+    pub fn pointing_sd_rad(&self, pixel: Pixel, range_m: f64) -> Option<f64> {
+        let model = self.camera.model();
+        let intrinsics = model.intrinsics();
+        let direction = model.direction(pixel).ok()?.into_inner();
+        let place = (range_m, self.camera.pose().rotation());
+        let pose = lens::pose_covariance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
+        let lens = self.lens.covariance_px2(intrinsics, &direction, place)?;
+        // No covariance of a bearing is nothing.
+        let least = Matrix2::identity() * LEAST_POINTING_PX.powi(2);
+        let bearing = model.bearing(pixel, PixelCovariance(pose + lens + least)).ok()?;
+        Some((bearing.covariance().trace() / 2.0).sqrt())
+    }
+
+    /// How well targets are pointed at over the whole image, at the calibration's range.
+    pub fn over_image(&self) -> OverImage {
+        let pixels = grid(self.camera.model().intrinsics().size);
+        let known: Vec<Pixel> = pixels.filter(|pixel| self.bearing(*pixel).is_ok()).collect();
+        let deviations = known.iter().filter_map(|p| self.pointing_sd_rad(*p, self.range_m));
+        let squares: f64 = deviations.map(|sd| sd * sd).sum();
+        let share = known.len() as f64 / (GRID[0] * GRID[1]) as f64;
+        OverImage { share, sd_rad: (squares / known.len().max(1) as f64).sqrt() }
+    }
+
+    /// The common time of a row of a frame, from the frame's by the camera's own clock, and the
+    /// standard deviation, s.
+    pub fn common_time(&self, own: Timestamp, row: f64) -> (Timestamp, f64) {
+        let height = f64::from(self.camera.model().intrinsics().size.height);
+        let (ahead_s, sd_s) = self.clock.at(own.seconds());
+        let row_s = self.clock.readout_s * (row / height - 0.5);
+        (own.plus_seconds(ahead_s + row_s), sd_s)
+    }
+}
+
+impl ClockCorrection {
+    /// None: the camera's times are the common ones, as good as the camera says.
+    pub(crate) fn none() -> Self {
+        Self { knots_s: Vec::new(), rate: 0.0, rate_sd: 0.0, wander_s: 0.0, readout_s: 0.0 }
+    }
+
+    /// What one of its times is to be corrected by, and the standard deviation, s.
+    pub fn at(&self, own_s: f64) -> (f64, f64) {
+        let after = self.knots_s.partition_point(|knot| knot[0] <= own_s);
+        let beyond = |knot: &[f64; 3]| {
+            let away = own_s - knot[0];
+            let variance = knot[2].powi(2)
+                + (self.rate_sd * away).powi(2)
+                + self.wander_s.powi(2) * away.abs();
+            (knot[1] + self.rate * away, variance.sqrt())
+        };
+        match (after.checked_sub(1).and_then(|k| self.knots_s.get(k)), self.knots_s.get(after)) {
+            (Some(before), Some(next)) => {
+                let share = (own_s - before[0]) / (next[0] - before[0]);
+                let between = |k: usize| before[k] + (next[k] - before[k]) * share;
+                (between(1), between(2))
+            }
+            (Some(last), None) => beyond(last),
+            (None, Some(first)) => beyond(first),
+            (None, None) => (0.0, 0.0),
+        }
+    }
+
+    pub(crate) fn is_possible(&self) -> bool {
+        let numbers = self.knots_s.iter().flatten();
+        let rest = [self.rate, self.rate_sd, self.wander_s, self.readout_s];
+        numbers.chain(&rest).all(|value| value.is_finite())
+            && self.knots_s.windows(2).all(|pair| pair[0][0] < pair[1][0])
+            && self.knots_s.iter().all(|knot| knot[2] >= 0.0)
+            && self.rate.abs() < 0.1
+            && self.rate_sd >= 0.0
+            && self.wander_s >= 0.0
+            && self.readout_s.abs() < 1.0
+    }
+}
