@@ -90,6 +90,58 @@ fn landmarks_give_a_pose_and_a_second_camera_stands_beside_the_first() {
     assert_eq!(read().cameras().len(), 2);
 }
 
+/// A picture tells nothing of a clock: what a flight has told of it stays.
+#[test]
+fn a_new_pose_leaves_the_clock_of_a_flight() {
+    let folder = site(&landmarks(0.0));
+    let (code, said, log) = by_landmarks(folder.path(), "north");
+    assert!(code == Some(0), "{said}{log}");
+    let file = folder.path().join("calibration.toml");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let flown = text
+        .replace("knots_s = []", "knots_s = [[0.0, -29.8, 0.001], [60.0, -29.8, 0.001]]")
+        .replace("lasting_px = 0.5", "lasting_px = 0.9");
+    assert_ne!(text, flown);
+    std::fs::write(&file, flown).unwrap();
+    let (code, said, log) = by_landmarks(folder.path(), "north");
+    assert!(code == Some(0), "{said}{log}");
+    let site = SiteCalibration::from_toml(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    assert_eq!(site.cameras()[0].clock.at(30.0).0, -29.8);
+    assert_eq!(site.cameras()[0].noise.lasting_px, 0.9);
+}
+
+#[test]
+fn a_calibration_is_compared_with_itself_and_not_with_another_site_s() {
+    let folder = site(&landmarks(0.0));
+    by_landmarks(folder.path(), "north");
+    let compare = |other: &str| {
+        let file = |name: &str| folder.path().join(name).display().to_string();
+        Command::new(assert_cmd::cargo::cargo_bin!("crossfix"))
+            .args(["calibrate", "compare", &file("calibration.toml"), &file(other)])
+            .output()
+            .unwrap()
+    };
+    let same = compare("calibration.toml");
+    let said = String::from_utf8(same.stdout).unwrap();
+    assert!(same.status.success() && said.contains("north"), "{said}");
+    let text = std::fs::read_to_string(folder.path().join("calibration.toml")).unwrap();
+    let other = text.replace("\"north\"", "\"south\"");
+    std::fs::write(folder.path().join("other.toml"), other).unwrap();
+    let refused = compare("other.toml");
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(String::from_utf8(refused.stderr).unwrap().contains("no camera in common"));
+}
+
+#[test]
+fn a_click_outside_of_the_image_is_refused() {
+    let text = landmarks(0.0);
+    let row = text.lines().nth(1).unwrap();
+    let outside = text.replace(row, "mark 0,-200,300,-20,40,12,0.05");
+    let (code, said, log) = by_landmarks(site(&outside).path(), "north");
+    assert_eq!(code, Some(1), "{said}{log}");
+    assert!(log.contains("`mark 0`") && log.contains("outside"), "{log}");
+}
+
 #[test]
 fn a_wrong_click_is_named_and_nothing_is_written() {
     let folder = site(&landmarks(40.0));

@@ -1,7 +1,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_calibration::{LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks};
+use crossfix_calibration::{
+    CalibratedCamera, LandmarkPicture, LandmarkResult, SiteCalibration, calibrate_landmarks,
+};
 use crossfix_geometry::Geodetic;
 use crossfix_message::CameraName;
 use serde::Serialize;
