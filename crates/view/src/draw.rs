@@ -173,6 +173,16 @@ pub(crate) fn position_sd(track: &Track) -> f64 {
     variance.max(0.0).sqrt()
 }
 
+/// A bound on the standard deviation of a track's position across a line, m: the root of the sum of
+/// its variances, without the one along it.
+pub(crate) fn across_sd(track: &Track, line: &Vector3<f64>) -> f64 {
+    let length = line.norm();
+    let of = |row: usize, column: usize| track.covariance.get(6 * row + column).unwrap_or(&0.0);
+    let along: f64 =
+        (0..9).map(|k| of(k / 3, k % 3) * line[k / 3] * line[k % 3]).sum::<f64>() / length.powi(2);
+    (position_sd(track).powi(2) - along).max(0.0).sqrt()
+}
+
 /// What a track's label says: its number, and what it is or how fast, how high and how sure.
 fn label(track: &Track, speed: f64, height: f64) -> String {
     let number = TrackNumber(track.id);

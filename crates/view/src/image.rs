@@ -7,7 +7,7 @@ use rerun::RecordingStream;
 use rerun_types::archetypes::{Boxes2D, LineStrips2D, Points2D};
 use rerun_types::components::Radius;
 
-use crate::draw::{SIGMAS, position_sd};
+use crate::draw::{SIGMAS, across_sd};
 use crate::paths::image_path;
 use crate::{ViewError, colour};
 
@@ -90,9 +90,11 @@ impl Ring {
             return None;
         }
         let pixel = camera.project(place)?;
-        let range = (place - camera.pose().position()).norm();
-        // A bound on the deviation across the line of sight, in pixels.
-        let deviation = position_sd(track) / range * camera.model().intrinsics().fx;
+        let line = place - camera.pose().position();
+        // A bound on the deviation across the line of sight, in pixels: along it one camera alone
+        // knows nothing.
+        let across = across_sd(track, &line);
+        let deviation = across / line.norm() * camera.model().intrinsics().fx;
         let radius = (SIGMAS * deviation).max(LEAST_RING_PX);
         Some(Self { centre: [pixel.x(), pixel.y()], radius, id: track.id })
     }
