@@ -177,8 +177,17 @@ mod tests {
         let track = Track { id: 7, covariance: vec![0.01; 36], ..Default::default() };
         let ring = Ring::of(&track, Point3::new(1.0, 0.0, 10.0), &camera()).unwrap();
         assert_eq!(ring.centre, [579.5, 249.5]);
-        // Three times 0.17 m at 10 m.
-        assert!((ring.radius - 41.6).abs() < 0.5, "{}", ring.radius);
+        // Of 0.173 m in all 0.109 m lie along the line (1, 0, 10): three times 0.134 m at 10 m.
+        assert!((ring.radius - 32.05).abs() < 0.05, "{}", ring.radius);
         assert!(Ring::of(&track, Point3::new(1.0, 0.0, -10.0), &camera()).is_none());
+    }
+
+    #[test]
+    fn a_range_that_is_not_known_makes_no_ring_larger() {
+        let mut covariance = vec![0.0; 36];
+        covariance[14] = 1e4;
+        let track = Track { id: 7, covariance, ..Default::default() };
+        let ring = Ring::of(&track, Point3::new(0.0, 0.0, 100.0), &camera()).unwrap();
+        assert_eq!(ring.radius, LEAST_RING_PX);
     }
 }
