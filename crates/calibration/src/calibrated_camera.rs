@@ -20,9 +20,10 @@ pub enum BearingError {
     /// The lens model cannot be undone there.
     #[error("the lens shows no direction there")]
     Lens(#[from] GeometryError),
-    /// The calibration's flight did not cross that part of the image.
+    /// Nothing of the calibration was seen in that part of the image.
     #[error(
-        "the lens is known to {sd_px:.0} pixels there: calibrate with a flight through that part of the image"
+        "the lens is known to {sd_px:.0} pixels there: calibrate with a flight or landmarks in that part \
+         of the image"
     )]
     Uncovered {
         /// What it may be off by, pixels.

@@ -22,9 +22,9 @@ const LEAST_SAID_RAD: f64 = 1e-6;
 #[derive(Clone, Debug)]
 pub struct SiteComparison {
     /// What brings the first to the second as a whole: where a log lay beside or went ahead, it
-    /// does so for all cameras. Nothing where fewer than three are in both: it would take on what
-    /// one of them was knocked by.
-    pub moved: SiteMove,
+    /// does so for all cameras. `None` where fewer than three are in both: it would take on what one
+    /// of them was knocked by, and they are compared as they are.
+    pub moved: Option<SiteMove>,
     /// How the cameras that both have differ beside that, in the order of the first.
     pub cameras: Vec<CameraComparison>,
     /// Cameras that one of them alone has.
@@ -48,6 +48,18 @@ pub struct SiteMove {
 }
 
 impl SiteMove {
+    /// A site that stays where it is; `None` if nothing is seen.
+    fn none(sights: &[Sight]) -> Option<Self> {
+        let sum: Vector3<f64> = sights.iter().map(|sight| sight.target.coords).sum();
+        (!sights.is_empty()).then(|| Self {
+            middle: Point3::from(sum / sights.len() as f64),
+            shift: Vector3::zeros(),
+            turn: Rotation3::identity(),
+            size: 1.0,
+            later_s: None,
+        })
+    }
+
     fn applied(&self, place: Point3<f64>) -> Point3<f64> {
         self.middle + self.shift + self.turn * (place - self.middle) * self.size
     }
@@ -115,19 +127,21 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
         .filter_map(|camera| Some((camera, second.camera(&camera.name)?)))
         .collect();
     let sights: Vec<Vec<Sight>> = pairs.iter().map(|(one, other)| sights(one, other)).collect();
-    let steps = if pairs.len() < LEAST_MOVED { 0 } else { STEPS };
+    let has_move = pairs.len() >= LEAST_MOVED;
     let later: Vec<Option<f64>> = pairs.iter().map(|(one, other)| later_s(one, other)).collect();
     let mut known: Vec<f64> = later.iter().copied().flatten().collect();
     known.sort_unstable_by(f64::total_cmp);
-    let common_s = known.get(known.len() / 2).copied();
-    let moved = SiteMove { later_s: common_s, ..site_move(&sights.concat(), steps)? };
+    let common_s = known.get(known.len() / 2).copied().filter(|_| has_move);
+    let all = sights.concat();
+    let stays = SiteMove::none(&all)?;
+    let moved = if has_move { site_move(stays, &all)? } else { stays };
     let cameras = pairs
         .iter()
         .zip(&sights)
         .zip(later)
         .filter(|((_, sights), _)| !sights.is_empty())
         .map(|((pair, sights), later_s)| {
-            let later_s = later_s.zip(common_s).map(|(own, common)| own - common);
+            let later_s = later_s.map(|own| own - common_s.unwrap_or(0.0));
             camera(*pair, sights, &moved, later_s)
         })
         .collect();
@@ -136,6 +150,7 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
         site.cameras().iter().filter(alone).map(|camera| camera.name.clone()).collect()
     };
     let missing = [names(first, second), names(second, first)].concat();
+    let moved = has_move.then_some(SiteMove { later_s: common_s, ..moved });
     Some(SiteComparison { moved, cameras, missing })
 }
 
@@ -161,19 +176,8 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
 /// deviations.
-fn site_move(sights: &[Sight], steps: usize) -> Option<SiteMove> {
-    if sights.is_empty() {
-        return None;
-    }
-    let sum: Vector3<f64> = sights.iter().map(|sight| sight.target.coords).sum();
-    let mut moved = SiteMove {
-        middle: Point3::from(sum / sights.len() as f64),
-        shift: Vector3::zeros(),
-        turn: Rotation3::identity(),
-        size: 1.0,
-        later_s: None,
-    };
-    for _ in 0..steps {
+fn site_move(mut moved: SiteMove, sights: &[Sight]) -> Option<SiteMove> {
+    for _ in 0..STEPS {
         let mut information =
             SMatrix::<f64, 7, 7>::from_diagonal(&SVector::from(UNTOLD).map(|sd: f64| sd.powi(-2)));
         let mut right = SVector::<f64, 7>::zeros();
@@ -203,7 +207,11 @@ fn camera(
     moved: &SiteMove,
     later_s: Option<f64>,
 ) -> CameraComparison {
-    let angle = |sight: &Sight| (moved.applied(sight.target) - sight.from).angle(&sight.direction);
+    // By the tangent: the cosine knows no angle below 1e-8.
+    let angle = |sight: &Sight| {
+        let before = moved.applied(sight.target) - sight.from;
+        before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))
+    };
     let mean = |value: &dyn Fn(&Sight) -> f64| {
         (sights.iter().map(value).sum::<f64>() / sights.len() as f64).sqrt()
     };

@@ -74,8 +74,13 @@ fn what_all_cameras_are_off_by_is_no_difference_of_any() {
     };
     let second = SiteCalibration::of(first.iter().map(moved).collect());
     let found = compare_sites(&SiteCalibration::of(first), &second).unwrap();
-    assert!(found.moved.turn.rotation_to(&turn).angle() < 1e-4, "{:?}", found.moved);
-    assert!((found.moved.later_s.unwrap() - later_s).abs() < 1e-9);
+    let found_move = found.moved.unwrap();
+    assert!(found_move.turn.rotation_to(&turn).angle() < 1e-6, "{found_move:?}");
+    assert!((found_move.size - size).abs() < 1e-6, "{found_move:?}");
+    let middle = found_move.middle;
+    let expected = turn * middle * size + shift - middle;
+    assert!((found_move.shift - expected).norm() < 1e-4, "{found_move:?}");
+    assert!((found_move.later_s.unwrap() - later_s).abs() < 1e-9);
     assert_eq!((found.cameras.len(), found.missing.len()), (3, 0));
     for camera in &found.cameras {
         assert!(camera.apart_rad < 1e-6 && camera.later_s.unwrap().abs() < 1e-9, "{camera:?}");
@@ -100,6 +105,22 @@ fn a_camera_that_was_knocked_stands_out() {
     for other in [north, south] {
         assert!(other.deviations < 0.8 * east.deviations, "{other:?} {east:?}");
     }
+}
+
+/// Of two cameras a move of the site would take on what one was turned by.
+#[test]
+fn two_cameras_are_compared_as_they_are() {
+    let first: Vec<_> = cameras().into_iter().take(2).collect();
+    let mut second = first.clone();
+    let pose = second[1].camera.pose();
+    let turned = pose.rotation() * Rotation3::new(Vector3::new(0.0, 0.02, 0.0));
+    second[1] = with_pose(&first[1], "east", Pose::new(*turned.matrix(), pose.position()).unwrap());
+    let found = compare_sites(&SiteCalibration::of(first), &SiteCalibration::of(second)).unwrap();
+    assert!(found.moved.is_none());
+    let [north, east] = &found.cameras[..] else { panic!("{found:?}") };
+    assert!(north.most_rad < 1e-9, "{north:?}");
+    // About its upright axis, on which a pixel's two axes share.
+    assert!((0.010..0.0145).contains(&east.apart_rad), "{east:?}");
 }
 
 #[test]

@@ -310,9 +310,8 @@ fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
     let left: Matrix2<f64> = seen.noise - explained.fixed_view::<2, 2>(0, 0);
     // What is left is nothing where this landmark alone tells something.
     let is_told = left.symmetric_eigenvalues().min() > 1e-3 * seen.noise.trace();
-    let weighed =
-        |left: Matrix2<f64>| Some(seen.residual.dot(&(left.try_inverse()? * seen.residual)));
-    let squared = if is_told { weighed(left) } else { None };
+    let weight = left.try_inverse().filter(|_| is_told);
+    let squared = weight.map(|weight| seen.residual.dot(&(weight * seen.residual)));
     Some(LandmarkFit {
         name: landmark.name.clone(),
         residual_px: -seen.residual,

@@ -1,6 +1,5 @@
 //! Where a camera may stand that sees its landmarks as it does.
 
-use crossfix_geometry::Intrinsics;
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::adjustment::State;
@@ -30,7 +29,7 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkEr
     let state = |(rotation, centre): (Rotation3<f64>, Point3<f64>)| State {
         rotation,
         centre,
-        intrinsics: Intrinsics { ..picture.intrinsics },
+        intrinsics: picture.intrinsics,
     };
     if let Some(place) = &picture.place {
         let turned = turned(&clicked, place.position);

@@ -1,7 +1,8 @@
+use std::fmt;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use crossfix_calibration::{CameraComparison, SiteComparison, compare_sites};
+use crossfix_calibration::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 use serde::Serialize;
 
 use crate::calibrated;
@@ -41,6 +42,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 #[derive(Debug, Serialize)]
 struct Figures {
+    /// The second as a whole; absent of fewer than three cameras.
+    moved: Option<MoveFigures>,
+    cameras: Vec<CameraFigures>,
+    /// Cameras that one alone has.
+    missing: Vec<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct MoveFigures {
     /// Shift of the site's middle, east, north, up, m.
     shift_m: [f64; 3],
     /// Turn about east, north and up, mrad.
@@ -49,9 +59,32 @@ struct Figures {
     larger: f64,
     /// By how much the second's common time is later, s.
     later_s: Option<f64>,
-    cameras: Vec<CameraFigures>,
-    /// Cameras that one alone has.
-    missing: Vec<String>,
+}
+
+impl From<&SiteMove> for MoveFigures {
+    fn from(moved: &SiteMove) -> Self {
+        Self {
+            shift_m: moved.shift.into(),
+            turn_mrad: (moved.turn.scaled_axis() * 1e3).into(),
+            larger: moved.size - 1.0,
+            later_s: moved.later_s,
+        }
+    }
+}
+
+impl fmt::Display for MoveFigures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [east, north, up] = self.shift_m;
+        let [about_east, about_north, about_up] = self.turn_mrad;
+        write!(
+            f,
+            "the second as a whole: shifted by {east:+.3}, {north:+.3}, {up:+.3} m, turned by \
+             {about_east:+.2}, {about_north:+.2}, {about_up:+.2} mrad, {:+.3} % larger",
+            100.0 * self.larger
+        )?;
+        self.later_s.map_or(Ok(()), |later| write!(f, ", {later:+.3} s later"))?;
+        f.write_str("\nbeside that:")
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -73,12 +106,8 @@ struct CameraFigures {
 
 impl From<&SiteComparison> for Figures {
     fn from(comparison: &SiteComparison) -> Self {
-        let moved = &comparison.moved;
         Self {
-            shift_m: moved.shift.into(),
-            turn_mrad: (moved.turn.scaled_axis() * 1e3).into(),
-            larger: moved.size - 1.0,
-            later_s: moved.later_s,
+            moved: comparison.moved.as_ref().map(MoveFigures::from),
             cameras: comparison.cameras.iter().map(CameraFigures::from).collect(),
             missing: comparison.missing.iter().map(ToString::to_string).collect(),
         }
@@ -125,20 +154,15 @@ impl Figures {
                 output::number(camera.later_ms, 1),
             ]);
         }
-        let [east, north, up] = self.shift_m;
-        let [about_east, about_north, about_up] = self.turn_mrad;
-        let later = self.later_s.map_or_else(String::new, |later| format!(", {later:+.3} s later"));
+        let moved = self.moved.as_ref().map_or_else(
+            || "of fewer than three cameras nothing is said of the site as a whole:".to_owned(),
+            MoveFigures::to_string,
+        );
         let missing = if self.missing.is_empty() {
             String::new()
         } else {
             format!("\n\nin one of them alone: {}", self.missing.join(", "))
         };
-        format!(
-            "the second as a whole: shifted by {east:+.3}, {north:+.3}, {up:+.3} m, turned by \
-             {about_east:+.2}, {about_north:+.2}, {about_up:+.2} mrad, {:+.3} % larger{later}\n\
-             beside that:\n\n{}{missing}",
-            100.0 * self.larger,
-            output::table(&rows)
-        )
+        format!("{moved}\n\n{}{missing}", output::table(&rows))
     }
 }
