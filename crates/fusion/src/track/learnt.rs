@@ -14,8 +14,8 @@ use crate::uncertainty::{CONSIDERED, LASTING, LastingNoise, SharedCovariance, Sh
 use crate::update::Told;
 
 /// Of so many cameras a track learns the errors at most, as an update's cost grows with the square
-/// of their number; those of the others are considered. With half as many a site of six cameras
-/// loses a part of what it gains in velocity.
+/// of their number; those of the others are considered. With half as many a site of six cameras errs
+/// by 1 % more in velocity.
 const MOST_LEARNT: usize = 8;
 /// After so many of the times for which an error lasts, what has been learnt of it is gone (e^-5),
 /// and another camera's may take its place.
