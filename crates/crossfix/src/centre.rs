@@ -197,7 +197,7 @@ impl Centre {
                     self.repeats.warn(&kind, Instant::now(), || format!("not used: {rejection}"));
                 }
                 Output::Camera(camera, standing) => report_camera(camera, *standing),
-                Output::Event(_) => {}
+                Output::Event(_) | Output::Smoothed(_) => {}
             }
         }
         outputs

@@ -18,6 +18,15 @@ pub struct FusionConfig {
     pub clocks: Clocks,
 }
 
+impl FusionConfig {
+    /// The same with such a [`Tracking::smoothing_s`], if there is one.
+    #[must_use]
+    pub fn smoothed(mut self, smoothing_s: Option<f64>) -> Self {
+        self.tracking.smoothing_s = smoothing_s.unwrap_or(self.tracking.smoothing_s);
+        self
+    }
+}
+
 /// How the cameras' clocks are estimated from the tracks. A clock's offset begins as its frames'
 /// standard deviation of the capture time says.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -259,6 +268,10 @@ pub struct Tracking {
     /// A track whose position is worse than this along any axis is lost, m. 0.001 to 100000.
     /// Default 20.
     pub max_position_sd_m: f64,
+    /// How long a track's state waits for later bearings that tell of it, s: it goes out at once,
+    /// and again when they have. 0 to 10. Default 0: it does not. Half a second halves the error of
+    /// the velocity; each bearing's cost grows with it.
+    pub smoothing_s: f64,
 }
 
 impl Default for Tracking {
@@ -288,6 +301,7 @@ impl Default for Tracking {
             coasting_after_s: 1.5,
             lost_after_s: 4.0,
             max_position_sd_m: 20.0,
+            smoothing_s: 0.0,
         }
     }
 }

@@ -1,4 +1,5 @@
 mod jumps;
+mod smoothing;
 
 use crossfix_message::{
     BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent,
@@ -12,8 +13,10 @@ use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::site_time::{SiteTime, Turn};
-use crate::track::{Track, TrackId};
+use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{TrackChange, Tracker};
+use smoothing::Smoothing;
+
 use crate::uncertainty::{LastingNoise, PoseUncertainty};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig, messages};
@@ -23,6 +26,9 @@ use crate::{ConfigError, Counters, FusionConfig, messages};
 pub enum Output {
     /// The tracks that an exposure has changed.
     Tracks(TrackFrame),
+    /// The same after a while, as the bearings since have told: see
+    /// [`crate::Tracking::smoothing_s`].
+    Smoothed(TrackFrame),
     /// Something happened to a track.
     Event(TrackEvent),
     /// Something was not used.
@@ -57,6 +63,7 @@ pub struct Fusion {
     site_time: SiteTime,
     /// Exposures in the order of their times less what their clocks are ahead.
     corrected: ReorderQueue<()>,
+    smoothing: Smoothing,
     counters: Counters,
     sequence: u64,
     now: Option<Timestamp>,
@@ -79,6 +86,7 @@ impl Fusion {
             unmet: Unmet::new(&config.initiation),
             site_time: SiteTime::new(config.event_time.lateness_s),
             corrected: ReorderQueue::default(),
+            smoothing: Smoothing::new(config.tracking.smoothing_s),
             counters: Counters::default(),
             sequence: 0,
             now: None,
@@ -171,6 +179,7 @@ impl Fusion {
         let mut outputs = Vec::new();
         self.site_time.end().iter().for_each(|frame| self.take(frame, &mut outputs));
         self.finish(&mut outputs);
+        self.smooth_all(&mut outputs);
         outputs
     }
 
@@ -428,8 +437,31 @@ impl Fusion {
                 ..Default::default()
             };
             self.sequence += 1;
-            outputs.push(Output::Tracks(frame.stamped()));
+            let frame = frame.stamped();
+            if self.smoothing.is_wanted() {
+                self.smoothing.wait(frame.clone());
+            }
+            outputs.push(Output::Tracks(frame));
         }
+        if self.smoothing.is_wanted() {
+            self.smooth(exposure.time, &due, outputs);
+        }
+    }
+
+    /// Keeps where tracks are now for what later bearings tell of it, and says what these have told
+    /// of what was kept before.
+    fn smooth(&mut self, now: Timestamp, due: &[TrackId], outputs: &mut Vec<Output>) {
+        let Self { smoothing, tracker, .. } = self;
+        tracker.remember(due, now);
+        for ended in tracker.tracks().filter(|track| track.status == TrackStatus::Lost) {
+            smoothing.settle(ended);
+        }
+        outputs.extend(smoothing.due(now, tracker).into_iter().map(Output::Smoothed));
+    }
+
+    /// Says what is known of all that was kept: no later bearings tell of it.
+    fn smooth_all(&mut self, outputs: &mut Vec<Output>) {
+        outputs.extend(self.smoothing.all(&mut self.tracker).into_iter().map(Output::Smoothed));
     }
 }
 

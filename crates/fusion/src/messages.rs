@@ -1,5 +1,6 @@
 //! What the fusion centre says, in the words of the wire.
 
+use crossfix_filter::KinematicState;
 use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackState};
 
 use crate::motion::Motion;
@@ -39,13 +40,9 @@ pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix
         let axis = track.observability.weak_axis.filter(|axis| axis.quantity == quantity)?;
         Some(axis.direction.into_inner().into())
     };
-    crossfix_message::Track {
+    let mut told = crossfix_message::Track {
         id: track.id.0,
         state: state.into(),
-        position: Some(now.position().into()),
-        velocity: Some(now.velocity().into()),
-        // Symmetric, so columns are rows.
-        covariance: now.covariance.as_slice().to_vec(),
         residuals: residuals.collect(),
         solver: track.solver.into(),
         rank: track.observability.rank as u32,
@@ -53,5 +50,16 @@ pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix
         updated_ns: track.updated.nanos(),
         weak_position_axis: weak(Quantity::Position),
         weak_velocity_axis: weak(Quantity::Velocity),
-    }
+        ..Default::default()
+    };
+    set_state(&mut told, &now);
+    told
+}
+
+/// Says where a track is and how it moves.
+pub(crate) fn set_state(told: &mut crossfix_message::Track, state: &KinematicState) {
+    told.position = Some(state.position().into());
+    told.velocity = Some(state.velocity().into());
+    // Symmetric, so columns are rows.
+    told.covariance = state.covariance.as_slice().to_vec();
 }

@@ -1,9 +1,10 @@
 mod expectation;
 mod innovation;
 mod learnt;
+mod past;
 mod ties;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 
 use crossfix_filter::{Imm, KinematicState};
@@ -20,6 +21,7 @@ use crate::visibility::Visibility;
 pub(crate) use expectation::Expectation;
 use innovation::Innovation;
 use learnt::Learnt;
+use past::Past;
 use ties::Ties;
 
 /// Two cameras alone must place a target at least this well (root of the sum over the axes, as a
@@ -116,6 +118,8 @@ pub struct Track {
     ties: BTreeMap<CameraName, Ties>,
     /// Whose errors that last it learns.
     learnt: Learnt,
+    /// Where it was of late, where that is asked for; the oldest first.
+    past: VecDeque<Past>,
     /// Fisher information of the bearings of late, for position and velocity.
     information: Matrix6<f64>,
     detector: Option<Detector>,
@@ -149,6 +153,7 @@ impl Track {
             imm: Imm::new(fix.state.clone(), motion.models(true)),
             ties: BTreeMap::new(),
             learnt: Learnt::default(),
+            past: VecDeque::new(),
             information: Matrix6::zeros(),
             detector: motion.detector(),
         };
@@ -322,6 +327,7 @@ impl Track {
             self.sees_manoeuvre(&innovation, interval, (camera, line), uncertainty, motion);
         if manoeuvre {
             self.imm.reinitialise(REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD);
+            self.settle_past();
             self.keep_ties_possible();
         }
         let seen_from = self.follower.filter(|_| !self.held);

@@ -123,6 +123,20 @@ impl Tracker {
         due
     }
 
+    /// Keeps where these tracks are now, so that later bearings tell of it.
+    pub(crate) fn remember(&mut self, tracks: &[TrackId], now: Timestamp) {
+        for id in tracks {
+            if let Some(track) = self.tracks.get_mut(id) {
+                track.remember(now, &self.motion);
+            }
+        }
+    }
+
+    /// Keeps nothing of where tracks were until a time.
+    pub(crate) fn forget_until(&mut self, time: Timestamp) {
+        self.tracks.values_mut().for_each(|track| track.forget_until(time));
+    }
+
     /// Whether any target is followed for sure.
     pub(crate) fn has_sure(&self) -> bool {
         self.tracks.values().any(Track::is_confirmed)

@@ -35,7 +35,7 @@ pub fn glance(channel: &Channel, bytes: &[u8]) -> Result<Option<Glance>, DecodeE
         Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
             of::<Health>(bytes)
         }
-        Channel::Tracks => of::<TrackFrame>(bytes),
+        Channel::Tracks | Channel::Smoothed => of::<TrackFrame>(bytes),
         Channel::Events => of::<TrackEvent>(bytes),
         Channel::Truth => of::<TruthFrame>(bytes),
         Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return Ok(None),

@@ -21,6 +21,9 @@ pub enum Channel {
     Alive(CameraName),
     /// `fusion/tracks`: [`crate::TrackFrame`].
     Tracks,
+    /// `fusion/smoothed`: [`crate::TrackFrame`], each a while after that of `fusion/tracks`, as the
+    /// bearings since have told.
+    Smoothed,
     /// `fusion/events`: [`crate::TrackEvent`].
     Events,
     /// `fusion/health`: [`crate::Health`], once a second.
@@ -112,6 +115,7 @@ impl fmt::Display for Key {
             Channel::CameraHealth(camera) => write!(f, "{camera}/health"),
             Channel::Alive(camera) => write!(f, "{camera}/alive"),
             Channel::Tracks => write!(f, "{FUSION}/tracks"),
+            Channel::Smoothed => write!(f, "{FUSION}/smoothed"),
             Channel::Events => write!(f, "{FUSION}/events"),
             Channel::FusionHealth => write!(f, "{FUSION}/health"),
             Channel::FusionAlive => write!(f, "{FUSION}/alive"),
@@ -135,6 +139,7 @@ impl FromStr for Key {
         let camera = || component.parse::<CameraName>().map_err(name);
         let channel = match (component, kind) {
             (FUSION, "tracks") => Channel::Tracks,
+            (FUSION, "smoothed") => Channel::Smoothed,
             (FUSION, "events") => Channel::Events,
             (FUSION, "health") => Channel::FusionHealth,
             (FUSION, "alive") => Channel::FusionAlive,
@@ -168,6 +173,7 @@ mod tests {
             camera.clone().prop_map(Channel::CameraHealth),
             camera.prop_map(Channel::Alive),
             Just(Channel::Tracks),
+            Just(Channel::Smoothed),
             Just(Channel::Events),
             Just(Channel::FusionHealth),
             Just(Channel::FusionAlive),

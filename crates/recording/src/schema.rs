@@ -12,7 +12,7 @@ pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
         Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
             Health::SCHEMA
         }
-        Channel::Tracks => TrackFrame::SCHEMA,
+        Channel::Tracks | Channel::Smoothed => TrackFrame::SCHEMA,
         Channel::Events => TrackEvent::SCHEMA,
         Channel::Truth => TruthFrame::SCHEMA,
         Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return None,

@@ -7,6 +7,7 @@ use crossfix_message::{Channel, Key, Payload, Timestamp};
 use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Role, Subscription};
 
 use crate::centre::Centre;
+use crate::commands::numbers;
 use crate::config::{self, FusionFile};
 use crate::lookout::Lookout;
 use crate::network::{self, rivalry};
@@ -26,6 +27,10 @@ pub struct Args {
     /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     sets: Vec<String>,
+    /// Publish each state of a track once more this long after it, seconds, as the bearings since
+    /// have told: on `fusion/smoothed`, beside those that go out at once.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::positive, allow_negative_numbers = true)]
+    lag: Option<f64>,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
@@ -36,6 +41,7 @@ struct Station {
     centre: Centre,
     link: Link,
     tracks: LinkPublisher,
+    smoothed: LinkPublisher,
     events: LinkPublisher,
     health: LinkPublisher,
     reception: Reception,
@@ -58,8 +64,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let everybody: Vec<_> = network.cameras.keys().cloned().collect();
     let lookout = Lookout::for_cameras(&link, &network, &everybody)?;
     let mut station = Station {
-        centre: Centre::new(file.fusion(), Some(cameras))?,
+        centre: Centre::new(file.fusion().smoothed(args.lag), Some(cameras))?,
         tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
+        smoothed: link.publisher(Channel::Smoothed, Delivery::Queued)?,
         events: link.publisher(Channel::Events, Delivery::Queued)?,
         health: link.publisher(Channel::FusionHealth, Delivery::Queued)?,
         reception: Reception::default(),
@@ -77,8 +84,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     station.work(&subscription, &shutdown)?;
     station.finish(&mut subscription, &shutdown)?;
     let frames = station.centre.frames();
-    let Station { link, tracks, events, health, lookout, .. } = station;
-    drop((alive, subscription, tracks, events, health, lookout));
+    let Station { link, tracks, smoothed, events, health, lookout, .. } = station;
+    drop((alive, subscription, tracks, smoothed, events, health, lookout));
     link.close(LEAVE)?;
     output::line(format!("fusion centre: {frames} track frames published"));
     Ok(())
@@ -151,6 +158,7 @@ impl Station {
         for output in outputs {
             match output {
                 Output::Tracks(frame) => self.tracks.put(frame.encode())?,
+                Output::Smoothed(frame) => self.smoothed.put(frame.encode())?,
                 Output::Event(event) => {
                     let number = crossfix_message::TrackNumber(event.track_id);
                     tracing::info!("track {number} {}", event.kind().as_str_name());

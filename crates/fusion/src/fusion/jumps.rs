@@ -36,6 +36,7 @@ impl Fusion {
             let by_s = exposure.time.seconds_since(time);
             self.refuse(exposure.refused(RejectionReason::Future { by_s }), outputs);
         }
+        self.smooth_all(outputs);
         let changes = self.tracker.restart(time);
         self.cameras.forget_strangers();
         self.emit_events(changes, time, outputs);
@@ -85,6 +86,7 @@ impl Fusion {
     fn step_time(&mut self, step_s: f64, outputs: &mut Vec<Output>) {
         self.counters.count("site_time_steps");
         self.finish(outputs);
+        self.smooth_all(outputs);
         self.buffer.begin_anew();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);

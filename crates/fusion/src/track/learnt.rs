@@ -148,6 +148,11 @@ impl Track {
         }
     }
 
+    /// Whether a camera's errors that last are learnt.
+    pub(super) fn learns(&self, camera: &CameraName) -> bool {
+        self.learnt.row_of(camera).is_some()
+    }
+
     /// The covariance of the learnt errors, as each camera's ties hold its columns.
     fn learnt_covariance(&self) -> Option<DMatrix<f64>> {
         let count = self.learnt.count();
@@ -180,6 +185,7 @@ impl Track {
 
     /// Takes a camera's errors that last for drawn anew: nothing is known of them.
     pub(super) fn renew(&mut self, camera: &CameraName) {
+        self.renew_past(camera);
         let Some(row) = self.learnt.row_of(camera) else { return };
         self.learnt.means[row / 2] = Vector2::zeros();
         for (name, ties) in &mut self.ties {
@@ -267,7 +273,7 @@ impl Track {
     }
 
     /// Covariance of the shared errors of one camera with those of another.
-    fn between(&self, one: &CameraName, other: &CameraName) -> SharedCovariance {
+    pub(super) fn between(&self, one: &CameraName, other: &CameraName) -> SharedCovariance {
         if one == other {
             return self.errors_of(one, 0.0).covariance;
         }
@@ -308,6 +314,7 @@ impl Track {
                 tied += state * own;
             }
         }
+        self.rescale_past::<N>(camera, first, (ratio, scale), &state);
         Some(state * state.transpose() * (ratio - 1.0))
     }
 

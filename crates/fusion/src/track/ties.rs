@@ -289,6 +289,7 @@ impl Track {
         let moved = ties.covariance.column(OF_CLOCK) * ahead;
         self.imm.shift(&moved);
         self.shift_learnt(camera, OF_CLOCK, ahead);
+        self.shift_past(camera, OF_CLOCK, ahead);
         let scale = ratio.min(ratio.recip()).sqrt();
         if let Some(change) = self.rescale::<1>(camera, OF_CLOCK, (ratio.min(1.0), scale)) {
             self.imm.add_covariance(&change);
@@ -323,8 +324,10 @@ impl Track {
         let nis = models.clone().map(|(after, weight)| after.nis * weight).sum();
         let told = Told::over(models);
         self.note(camera, self.updated);
+        self.pass_past(time);
         self.pass(interval);
         self.begin_to_learn(camera, lasting, time);
+        self.look_back(camera, &told);
         self.learn(camera, &told);
         if let Some(ties) = self.ties.get_mut(camera) {
             ties.lasting_s = lasting.time_s;

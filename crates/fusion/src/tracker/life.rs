@@ -142,6 +142,9 @@ impl Tracker {
             track.id = old.id;
             track.score = track.score.max(old.score);
             (track.has_ends, track.comparisons) = (old.has_ends, old.comparisons);
+            if let Some(old) = self.tracks.get_mut(&track.id) {
+                track.inherit(old);
+            }
             self.tracks.insert(track.id, track);
             return Vec::new();
         }

@@ -33,6 +33,11 @@ pub struct Args {
     /// Override a key of the configuration, e.g. event_time.lateness_s=1.
     #[arg(long = "set", value_name = "KEY=VALUE", requires = "fuse")]
     sets: Vec<String>,
+    /// Let each state of a track wait this long for the bearings after it that tell of it, seconds:
+    /// the tracks that are written are smoothed, and their velocities about twice as good.
+    #[arg(long, value_name = "SECONDS", requires = "fuse", value_parser = numbers::positive,
+          allow_negative_numbers = true)]
+    smooth: Option<f64>,
     /// The recording (MCAP) to write: all that was recorded, with the new tracks in place of the
     /// old.
     #[arg(short, long, value_name = "FILE", requires = "fuse")]

@@ -24,6 +24,8 @@ struct OfflineFusion {
     centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
     frames: u64,
+    /// Whether the tracks that are written are the smoothed ones.
+    is_smoothed: bool,
     site: Option<SiteName>,
     healthy_at: Option<Timestamp>,
     /// Time spent in the fusion itself, and the longest for one frame.
@@ -40,9 +42,12 @@ pub fn fuse(
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen();
     let file = FusionFile::load(args.config.as_deref(), &args.sets)?;
+    let config = file.fusion().smoothed(args.smooth);
+    let is_smoothed = config.tracking.smoothing_s > 0.0;
     let draft = Draft::new(output, &[&args.recording])?;
     let mut run = OfflineFusion {
-        centre: Centre::new(file.fusion(), None)?,
+        centre: Centre::new(config, None)?,
+        is_smoothed,
         writer: RecordingWriter::create(draft.path())?,
         frames: 0,
         site: None,
@@ -102,7 +107,9 @@ impl OfflineFusion {
     fn take(&mut self, entry: &Entry) -> anyhow::Result<()> {
         match &entry.key.channel {
             // What an earlier fusion made of the bearings.
-            Channel::Tracks | Channel::Events | Channel::FusionHealth => return Ok(()),
+            Channel::Tracks | Channel::Smoothed | Channel::Events | Channel::FusionHealth => {
+                return Ok(());
+            }
             Channel::Bearings(_) => self.frames += 1,
             _ => {}
         }
@@ -120,7 +127,11 @@ impl OfflineFusion {
     fn write(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
         for output in outputs {
             match output {
-                Output::Tracks(frame) => {
+                Output::Tracks(frame) if !self.is_smoothed => {
+                    let time = Timestamp::from_nanos(frame.time_ns);
+                    self.put(Channel::Tracks, time, frame.encode())?;
+                }
+                Output::Smoothed(frame) => {
                     let time = Timestamp::from_nanos(frame.time_ns);
                     self.put(Channel::Tracks, time, frame.encode())?;
                 }
@@ -130,7 +141,7 @@ impl OfflineFusion {
                     tracing::debug!("{time}: track {number} {}", event.kind().as_str_name());
                     self.put(Channel::Events, time, event.encode())?;
                 }
-                Output::Camera(..) | Output::Rejected(_) => {}
+                Output::Tracks(_) | Output::Camera(..) | Output::Rejected(_) => {}
             }
         }
         Ok(())

@@ -29,7 +29,11 @@ const SEAM_S: f64 = 0.1;
 fn is_cameras(channel: &Channel) -> bool {
     !matches!(
         channel,
-        Channel::Tracks | Channel::Events | Channel::FusionHealth | Channel::RecorderHealth
+        Channel::Tracks
+            | Channel::Smoothed
+            | Channel::Events
+            | Channel::FusionHealth
+            | Channel::RecorderHealth
     )
 }
 
@@ -179,7 +183,7 @@ impl Pass {
                 message.ended = false;
                 message.encode_unstamped()
             }
-            Channel::Tracks => {
+            Channel::Tracks | Channel::Smoothed => {
                 let mut message: TrackFrame = decode(data).ok()?;
                 moved(&mut message.time_ns);
                 for track in &mut message.tracks {

@@ -1,0 +1,73 @@
+//! Track frames that wait for what later bearings tell of them.
+
+use std::collections::VecDeque;
+
+use crossfix_message::{Timestamp, TrackFrame};
+
+use crate::messages;
+use crate::track::{Track, TrackId};
+use crate::tracker::Tracker;
+
+/// Track frames that wait, in the order of their times.
+#[derive(Debug)]
+pub(super) struct Smoothing {
+    lag_s: f64,
+    waiting: VecDeque<TrackFrame>,
+}
+
+impl Smoothing {
+    pub(super) fn new(lag_s: f64) -> Self {
+        Self { lag_s, waiting: VecDeque::new() }
+    }
+
+    pub(super) fn is_wanted(&self) -> bool {
+        self.lag_s > 0.0
+    }
+
+    /// Lets a frame wait.
+    pub(super) fn wait(&mut self, frame: TrackFrame) {
+        self.waiting.push_back(frame);
+    }
+
+    /// Takes what is known by now of where a track was into the frames that wait: it ends.
+    pub(super) fn settle(&mut self, track: &Track) {
+        self.waiting
+            .iter_mut()
+            .for_each(|frame| fill(frame, |id| Some(track).filter(|t| t.id == id)));
+    }
+
+    /// The frames that have waited long enough at a time.
+    pub(super) fn due(&mut self, now: Timestamp, tracker: &mut Tracker) -> Vec<TrackFrame> {
+        let is_due = |frame: &TrackFrame| {
+            now.seconds_since(Timestamp::from_nanos(frame.time_ns)) >= self.lag_s
+        };
+        let count = self.waiting.iter().take_while(|frame| is_due(frame)).count();
+        self.release(count, tracker)
+    }
+
+    /// All frames that wait.
+    pub(super) fn all(&mut self, tracker: &mut Tracker) -> Vec<TrackFrame> {
+        self.release(self.waiting.len(), tracker)
+    }
+
+    fn release(&mut self, count: usize, tracker: &mut Tracker) -> Vec<TrackFrame> {
+        let mut frames: Vec<TrackFrame> = self.waiting.drain(..count).collect();
+        for frame in &mut frames {
+            fill(frame, |id| tracker.track(id));
+        }
+        if let Some(last) = frames.last() {
+            tracker.forget_until(Timestamp::from_nanos(last.time_ns));
+        }
+        frames
+    }
+}
+
+/// Puts what is kept of tracks into a frame.
+fn fill<'a>(frame: &mut TrackFrame, track: impl Fn(TrackId) -> Option<&'a Track>) {
+    let time = Timestamp::from_nanos(frame.time_ns);
+    for told in &mut frame.tracks {
+        if let Some(state) = track(TrackId(told.id)).and_then(|track| track.remembered(time)) {
+            messages::set_state(told, state);
+        }
+    }
+}
