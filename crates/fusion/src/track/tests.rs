@@ -105,14 +105,20 @@ impl LastingErrors {
 
 const WHITE_RAD: f64 = 2e-5;
 
-/// Errors of position and velocity with their squares by the covariance, of a target that is driven
-/// by white acceleration for six seconds; a tentative track considers what lasts, a confirmed one
-/// learns it. `hand` shifts the bearings of a camera from a time on, rad.
+/// A state's error and its square by the covariance.
+fn erring(state: &KinematicState, truth: &Vector6<f64>) -> (Vector6<f64>, f64) {
+    let error = state.mean - truth;
+    (error, (error.transpose() * state.covariance.try_inverse().unwrap() * error).x)
+}
+
+/// Errors of position and velocity with their squares by the covariance, now and of half a second
+/// before as the bearings since have told, of a target that is driven by white acceleration for six
+/// seconds; a tentative track considers what lasts, a confirmed one learns it. `hand` shifts the bearings of a camera from a time on, rad.
 fn flown(
     status: TrackStatus,
     (hand_from_s, hand): (f64, Vector2<f64>),
     normal: &mut impl FnMut() -> f64,
-) -> (Vector6<f64>, f64) {
+) -> [(Vector6<f64>, f64); 2] {
     const DENSITY: f64 = 0.5;
     const FRAME_S: f64 = 1.0 / 30.0;
     let tracking = Tracking {
@@ -140,6 +146,7 @@ fn flown(
     };
     let mut track = Track::start(&fix, [], &motion);
     let step = FRAME_S / 3.0;
+    let mut before = (start, truth);
     for k in 0..540 {
         // Exact moments of white acceleration over a step.
         for axis in 0..3 {
@@ -164,9 +171,13 @@ fn flown(
             // Until here all errors are considered.
             track.status = status;
         }
+        if k == 494 {
+            before = (timed.time, truth);
+            track.remember(timed.time, &motion);
+        }
     }
-    let error = track.state().mean - truth;
-    (error, (error.transpose() * track.state().covariance.try_inverse().unwrap() * error).x)
+    let (then, truth_then) = before;
+    [erring(track.state(), &truth), erring(track.remembered(then).unwrap(), &truth_then)]
 }
 
 /// An error that lasts is in the next bearing too: where it is learnt, velocities are better known
@@ -177,26 +188,31 @@ fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
     let figures = |status: TrackStatus| {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
-        let (mut nees, mut square) = (0.0, 0.0);
+        let (mut nees, mut squares) = ([0.0; 2], [0.0; 2]);
         for _ in 0..RUNS {
-            let (error, squared) = flown(status, (f64::INFINITY, Vector2::zeros()), &mut normal);
-            nees += squared / f64::from(RUNS);
-            square += error.fixed_rows::<3>(3).norm_squared() / f64::from(RUNS);
+            let flown = flown(status, (f64::INFINITY, Vector2::zeros()), &mut normal);
+            for (k, (error, squared)) in flown.into_iter().enumerate() {
+                nees[k] += squared / f64::from(RUNS);
+                squares[k] += error.fixed_rows::<3>(3).norm_squared() / f64::from(RUNS);
+            }
         }
-        (nees, square.sqrt())
+        (nees, squares.map(f64::sqrt))
     };
     let (considered, learnt) = (figures(TrackStatus::Tentative), figures(TrackStatus::Confirmed));
     // A mean of n squares of six deviates is known to sqrt(12 / n).
     let tolerance = 3.0 * (12.0 / f64::from(RUNS)).sqrt();
-    for (nees, _) in [considered, learnt] {
+    for nees in [considered.0, learnt.0].into_iter().flatten() {
         assert!((nees - 6.0).abs() < tolerance, "{considered:?} {learnt:?}");
     }
     // The Riccati equations of one axis and the two of the cameras that look across it, iterated for
-    // a filter that considers the errors and for one that estimates them, m/s.
-    for ((_, found), expected) in [(considered, 0.219), (learnt, 0.189)] {
-        let axis = found / 3.0f64.sqrt();
-        let tolerance = 3.0 * expected / f64::from(2 * 3 * RUNS).sqrt();
-        assert!((axis - expected).abs() < tolerance, "{considered:?} {learnt:?}");
+    // a filter that considers the errors and for one that estimates them, m/s: now, and of half a
+    // second before.
+    for ((_, found), expected) in [(considered, [0.219, 0.129]), (learnt, [0.189, 0.123])] {
+        for (found, expected) in found.into_iter().zip(expected) {
+            let axis = found / 3.0f64.sqrt();
+            let tolerance = 3.0 * expected / f64::from(2 * 3 * RUNS).sqrt();
+            assert!((axis - expected).abs() < tolerance, "{considered:?} {learnt:?}");
+        }
     }
 }
 
@@ -207,7 +223,7 @@ fn an_error_that_is_drawn_anew_is_no_motion() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
     let mut velocity = |hand: (f64, Vector2<f64>)| {
-        let runs = (0..RUNS).map(|_| flown(TrackStatus::Confirmed, hand, &mut normal).0);
+        let runs = (0..RUNS).map(|_| flown(TrackStatus::Confirmed, hand, &mut normal)[0].0);
         let square: f64 = runs.map(|error| error.fixed_rows::<3>(3).norm_squared()).sum();
         (square / f64::from(RUNS)).sqrt()
     };
