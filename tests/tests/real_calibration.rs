@@ -5,8 +5,9 @@
 use std::path::{Path, PathBuf};
 
 use crossfix_calibration::{CalibratedCamera, SiteCalibration};
-use crossfix_tests::{real_data, succeed};
-use nalgebra::Point3;
+use crossfix_geometry::{Camera, Pose};
+use crossfix_tests::{crossfix, real_data, succeed};
+use nalgebra::{Point3, Rotation3, Vector3};
 use serde_json::Value;
 
 struct Flight {
@@ -122,4 +123,48 @@ fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
     let (least, most) =
         ahead.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, m), a| (l.min(*a), m.max(*a)));
     assert!(most - least < 0.02, "{ahead:?}");
+}
+
+/// What `calibrate check` says of a recording by a calibration: its exit code, and the verdict on each
+/// camera.
+fn checked(recording: &str, calibration: &str) -> (Option<i32>, Vec<(String, String)>) {
+    let output = crossfix(&["calibrate", "check", recording, "-c", calibration, "--json"]);
+    let cameras: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
+    let text = |camera: &Value, key: &str| camera[key].as_str().unwrap().to_owned();
+    let verdicts = cameras.iter().map(|camera| (text(camera, "name"), text(camera, "verdict")));
+    (output.status.code(), verdicts.collect())
+}
+
+#[test]
+fn a_camera_turned_since_the_calibration_flight_is_named_and_no_other() {
+    let Some(data) = real_data() else { return };
+    let flight = Flight::new(&data, "3", "mate10,sony5100,sony5n_1440x1080,sonyG");
+    let (known, later) = (flight.import("calibration"), flight.import("test"));
+    let (log, file) = (flight.named("calibration.csv"), flight.named("calibration.toml"));
+    succeed(&["calibrate", "flight", &known, "--log", &log, "--log-kind", "rtk", "-o", &file]);
+    for recording in [&known, &later] {
+        let (code, verdicts) = checked(recording, &file);
+        assert_eq!(code, Some(0), "{verdicts:?}");
+        assert!(verdicts.iter().all(|(_, verdict)| verdict == "fits"), "{verdicts:?}");
+    }
+    let site = SiteCalibration::from_toml(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    for camera in site.cameras() {
+        let mut turned = camera.clone();
+        let pose = camera.camera.pose();
+        let about_up = Rotation3::from_axis_angle(&Vector3::z_axis(), 2e-3) * pose.rotation();
+        let pose = Pose::new(about_up.into_inner(), pose.position()).unwrap();
+        turned.camera = Camera::new(*camera.camera.model().intrinsics(), pose).unwrap();
+        let mut elsewhere = site.clone();
+        elsewhere.put(turned);
+        let wrong = flight.named("turned.toml");
+        std::fs::write(&wrong, elsewhere.to_toml()).unwrap();
+        let (code, verdicts) = checked(&later, &wrong);
+        assert_eq!(code, Some(1), "{}: {verdicts:?}", camera.name);
+        let moved: Vec<&str> = verdicts
+            .iter()
+            .filter(|(_, verdict)| verdict == "moved")
+            .map(|(name, _)| name.as_str())
+            .collect();
+        assert_eq!(moved, [camera.name.as_str()], "{verdicts:?}");
+    }
 }

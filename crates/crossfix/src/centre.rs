@@ -9,6 +9,7 @@ use crossfix_message::{
     Health, Payload, Timestamp, decode,
 };
 
+use crate::pose_watch::PoseWatch;
 use crate::repeats::Repeats;
 
 /// The fusion with its doorkeeper.
@@ -19,6 +20,7 @@ pub struct Centre {
     refused: Refusals,
     repeats: Repeats,
     frames: u64,
+    poses: PoseWatch,
     scene_begins: Timestamp,
 }
 
@@ -87,6 +89,7 @@ impl Centre {
             refused: Refusals::default(),
             repeats: Repeats::default(),
             frames: 0,
+            poses: PoseWatch::default(),
             scene_begins: Timestamp::EPOCH,
         })
     }
@@ -131,6 +134,11 @@ impl Centre {
         if let Some(why) = self.fusion.why_nothing() {
             self.repeats
                 .warn("nothing found", Instant::now(), || format!("nothing is found: {why}"));
+        }
+        if self.poses.look(&self.fusion) {
+            for (camera, problem) in self.poses.problems() {
+                self.repeats.warn(&format!("moved {camera}"), Instant::now(), || problem);
+            }
         }
         self.follow(outputs)
     }
@@ -184,6 +192,7 @@ impl Centre {
     /// Handles everything that still waits.
     pub fn flush(&mut self) -> Vec<Output> {
         let outputs = self.fusion.flush();
+        self.poses.finish(&self.fusion);
         self.follow(outputs)
     }
 
@@ -201,6 +210,18 @@ impl Centre {
             }
         }
         outputs
+    }
+
+    /// Whether cameras still stand as they were calibrated.
+    pub fn poses(&self) -> &PoseWatch {
+        &self.poses
+    }
+
+    /// The cameras that are left out.
+    pub fn left_out(&self) -> Vec<CameraName> {
+        let reports = self.fusion.cameras();
+        let left_out = reports.filter(|report| report.standing == CameraStanding::Excluded);
+        left_out.map(|report| report.camera).collect()
     }
 
     /// What its warnings still have to say.
@@ -239,9 +260,9 @@ impl Centre {
         let counters = counted.map(|(name, value)| Counter { name: name.to_owned(), value });
         let mut counters: Vec<Counter> = counters.collect();
         counters.sort_by(|a, b| a.name.cmp(&b.name));
-        let left_out =
-            self.fusion.cameras().filter(|report| report.standing == CameraStanding::Excluded);
-        let left_out = left_out.map(|report| format!("camera `{}` is left out", report.camera));
+        let left_out = self.left_out();
+        let left_out = left_out.iter().map(|camera| format!("camera `{camera}` is left out"));
+        let moved = self.poses.problems().map(|(_, problem)| problem);
         let nothing = self.fusion.why_nothing().map(|why| format!("nothing is found: {why}"));
         Health {
             component: "fusion".to_owned(),
@@ -249,7 +270,7 @@ impl Centre {
             handled: self.frames,
             counters,
             cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
-            problems: left_out.chain(nothing).collect(),
+            problems: left_out.chain(moved).chain(nothing).collect(),
             scene_begins_ns: self.scene_begins.nanos(),
             ..Default::default()
         }

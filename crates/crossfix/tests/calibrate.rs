@@ -159,3 +159,35 @@ fn too_few_landmarks_are_told_what_helps() {
     assert_eq!(code, Some(1), "{said}{log}");
     assert!(log.contains("--positions"), "{log}");
 }
+
+/// What `calibrate check` does with a recording that is shipped: exit code, stdout and stderr.
+fn checked(more: &[&str]) -> (Option<i32>, String, String) {
+    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../../recordings/two-uavs.mcap");
+    let output = Command::new(assert_cmd::cargo::cargo_bin!("crossfix"))
+        .args(["calibrate", "check", recording])
+        .args(more)
+        .output()
+        .unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn cameras_of_a_recording_that_stand_as_they_say_fit() {
+    let (code, said, log) = checked(&[]);
+    assert_eq!(code, Some(0), "{said}{log}");
+    for camera in ["east", "north", "west"] {
+        assert!(
+            said.lines().any(|line| line.starts_with(camera) && line.ends_with("fits")),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn a_site_without_a_calibration_is_told_what_to_do() {
+    let folder = site("");
+    let (code, _, log) = checked(&["-c", &folder.path().display().to_string()]);
+    assert_eq!(code, Some(1));
+    assert!(log.contains("holds no calibration.toml: without -c"), "{log}");
+}

@@ -76,7 +76,7 @@ mod unmet;
 mod update;
 mod visibility;
 
-pub use cameras::CameraStanding;
+pub use cameras::{CameraStanding, PoseFinding};
 pub use clocks::ClockEstimate;
 pub use config::{
     Bearings, Clocks, ConfigError, EventTime, FlightModel, FusionConfig, Initiation,

@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | where it stands, from when on | its calibrations | `calibration.rs` |
 //! | how good its pose is | how well its lines meet the others' | `pose_scale.rs` |
+//! | whether it has been moved | the same, over a minute | `watch.rs` |
 //! | how noisy its bearings are | third differences of its own bearings | `noise.rs` |
 //! | how much it reports that is nobody's | what no track takes | `strangers.rs` |
 //! | what stands in its view for good | what it reports in one place | `rooted.rs` |
@@ -18,6 +19,7 @@ mod pose_scale;
 mod rooted;
 mod standing;
 mod strangers;
+mod watch;
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -31,6 +33,7 @@ use pose_scale::PoseScale;
 use rooted::View;
 use standing::Standing;
 use strangers::Strangers;
+use watch::Watch;
 
 pub(crate) use calibration::KnownCamera;
 pub(crate) use noise::LastThree;
@@ -39,6 +42,7 @@ pub(crate) use rooted::Rooted;
 pub use standing::CameraStanding;
 pub(crate) use standing::{Fitting, Fittings};
 pub(crate) use strangers::view_sr;
+pub use watch::PoseFinding;
 
 /// A camera whose noise is so many times (variance) what it reports is doubted.
 const DOUBTED_NOISE: f64 = 2.0;
@@ -196,12 +200,13 @@ pub(crate) struct Cameras {
     by_name: BTreeMap<CameraName, CameraState>,
     /// What stays in one place for this long is rooted, s.
     rooted_s: f64,
+    watch: Watch,
 }
 
 impl Cameras {
     /// None is known yet. What stays in one place for `rooted_s` is rooted.
     pub(crate) fn new(rooted_s: f64) -> Self {
-        Self { by_name: BTreeMap::new(), rooted_s }
+        Self { by_name: BTreeMap::new(), rooted_s, watch: Watch::default() }
     }
 
     /// Makes a camera known, or how it will stand from a capture time on. The first calibration
@@ -255,6 +260,7 @@ impl Cameras {
         for (name, camera) in &mut self.by_name {
             if camera.calibrations.advance(time) {
                 camera.move_on();
+                self.watch.forget(name);
                 moved.push(name.clone());
             }
         }

@@ -9,7 +9,7 @@
 //! camera says looks like a pose that is.
 
 use crossfix_message::CameraName;
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Vector2, Vector3};
 
 use super::Cameras;
 
@@ -58,6 +58,13 @@ pub(crate) struct Sample {
     pub(crate) noise: Matrix2<f64>,
     /// What the pose shifts it by as declared: the root of its covariance, rad.
     pub(crate) pose: Matrix2<f64>,
+    /// How it changes with rotation (rad/rad) and place (rad/m) of the camera, ...
+    pub(crate) by_pose: Matrix2x6<f64>,
+    /// ... and what a deviation of its clock shifts it by, rad.
+    pub(crate) clock: Vector2<f64>,
+    /// Covariance of white noise of draws that averages out as slowly, rad^2: some of it lasts from
+    /// one to the next.
+    pub(crate) slow_noise: Matrix2<f64>,
 }
 
 /// What a camera's pose covariance is to be multiplied with.

@@ -3,7 +3,7 @@
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
-use nalgebra::{Matrix2, Matrix2x3, Unit, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Unit, Vector2, Vector3};
 
 use super::learnt::LearntTies;
 use super::{Innovation, Track};
@@ -73,16 +73,18 @@ pub(super) struct Drawn {
     by_position: Matrix2x3<f64>,
     /// Covariance of each bearing's noise, rad^2.
     noise: Matrix2<f64>,
-    /// Variance of what lasts of it, and so is no less in the mean, rad^2.
-    lasting: f64,
+    /// What lasts of it, and so is no less in the mean.
+    lasting: LastingNoise,
     pose: Matrix2<f64>,
+    by_pose: Matrix2x6<f64>,
+    clock: Vector2<f64>,
 }
 
 impl Drawn {
     /// What is gathered with one bearing more.
     fn with(
         before: Option<Self>,
-        innovation: &Innovation,
+        (innovation, velocity): (&Innovation, Vector3<f64>),
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) -> Self {
@@ -93,22 +95,26 @@ impl Drawn {
             count: count + 1.0,
             by_position: innovation.model.by_position(),
             noise: innovation.model.covariance_of(line) * uncertainty.factor,
-            lasting: uncertainty.lasting.variance(),
+            lasting: uncertainty.lasting,
             pose: uncertainty.declared_pose(&innovation.model),
+            by_pose: innovation.model.by_pose(),
+            clock: innovation.model.by_time(velocity) * uncertainty.time_sd_s,
         }
     }
 
     /// The mean, of a target whose velocity is known to `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> Sample {
         let moved = self.by_position * (speed * DRAW_S / 10.0);
+        let white = self.noise / self.count + moved * moved.transpose();
         Sample {
             camera: camera.clone(),
             offset: self.offsets / self.count,
             by_position: self.by_position,
-            noise: self.noise / self.count
-                + moved * moved.transpose()
-                + Matrix2::identity() * self.lasting,
+            noise: white + Matrix2::identity() * self.lasting.variance(),
             pose: self.pose,
+            by_pose: self.by_pose,
+            clock: self.clock,
+            slow_noise: white + Matrix2::identity() * self.lasting.as_white(DRAW_S),
         }
     }
 }
@@ -221,8 +227,9 @@ impl Track {
         line: &SightLine,
         uncertainty: &CameraUncertainty,
     ) {
+        let velocity = self.state().velocity();
         if let Some(ties) = self.ties.get_mut(camera) {
-            ties.drawn = Some(Drawn::with(ties.drawn, innovation, line, uncertainty));
+            ties.drawn = Some(Drawn::with(ties.drawn, (innovation, velocity), line, uncertainty));
         }
     }
 
@@ -233,10 +240,12 @@ impl Track {
         (line, time): (&SightLine, Timestamp),
         uncertainty: &CameraUncertainty,
     ) {
+        let velocity = self.state().velocity();
         if let (Some(innovation), Some(ties)) =
             (self.innovation(time, line), self.ties.get_mut(camera))
         {
-            ties.beside = Some(Drawn::with(ties.beside, &innovation, line, uncertainty));
+            let seen = (&innovation, velocity);
+            ties.beside = Some(Drawn::with(ties.beside, seen, line, uncertainty));
         }
     }
 

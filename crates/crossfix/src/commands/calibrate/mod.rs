@@ -1,3 +1,4 @@
+mod check;
 mod clicks;
 mod compare;
 mod flight;
@@ -23,6 +24,7 @@ enum Way {
     Flight(flight::Args),
     Landmarks(landmarks::Args),
     Compare(compare::Args),
+    Check(check::Args),
 }
 
 /// What of a lens may be otherwise than its file says.
@@ -52,5 +54,6 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Way::Flight(args) => flight::run(args),
         Way::Landmarks(args) => landmarks::run(args),
         Way::Compare(args) => compare::run(args),
+        Way::Check(args) => check::run(args),
     }
 }

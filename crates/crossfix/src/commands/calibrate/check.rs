@@ -1,0 +1,245 @@
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{bail, ensure};
+use crossfix_fusion::{CameraStanding, Output};
+use crossfix_message::{CameraName, Channel, Timestamp};
+use crossfix_recording::Entry;
+use serde::Serialize;
+
+use crate::centre::Centre;
+use crate::config::FusionFile;
+use crate::output;
+use crate::pose_watch::{CameraWatch, Turn};
+use crate::recalibration::{Recalibration, Reordered};
+use crate::recorded::{self, Lacks};
+
+/// What a site's folder calls its calibration.
+const CALIBRATION: &str = "calibration.toml";
+/// Who has been watched beside others for less time than this has not been checked, s: a turn of some
+/// milliradians is not sure by then.
+const LEAST_WATCHED_S: f64 = 20.0;
+
+/// Whether cameras still stand as they were calibrated: by where the others see the targets.
+///
+/// A camera that has been turned by two milliradians is named after a minute of targets that it and
+/// two others see. The exit code is 1 if one does not fit.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix calibrate check last-night.mcap -c my-site\n  crossfix calibrate check last-night.mcap"
+)]
+pub struct Args {
+    /// A recording (MCAP) of targets that several cameras see.
+    recording: PathBuf,
+    /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what was
+    /// recorded.
+    #[arg(short, long, value_name = "PATH")]
+    config: Option<PathBuf>,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let calibration = args.config.as_deref().map(calibration_of).transpose()?;
+    let recalibration = calibration.as_deref().map(Recalibration::load).transpose()?;
+    let seen = watched(&args.recording, recalibration)?;
+    let figures: Vec<Figures> = seen.iter().map(|(name, seen)| Figures::of(name, seen)).collect();
+    if args.json {
+        output::json(&figures)?;
+    } else {
+        output::line(render(&figures));
+    }
+    let wrong: Vec<&str> = figures
+        .iter()
+        .filter(|camera| matches!(camera.verdict, Verdict::Moved | Verdict::Apart))
+        .map(|camera| camera.name.as_str())
+        .collect();
+    ensure!(wrong.is_empty(), "not as calibrated: {}", wrong.join(", "));
+    ensure!(
+        figures.iter().any(|camera| camera.verdict == Verdict::Fits),
+        "nothing is checked: no target was seen by three cameras for long enough"
+    );
+    Ok(())
+}
+
+fn calibration_of(path: &Path) -> anyhow::Result<PathBuf> {
+    if !path.is_dir() {
+        return Ok(path.to_owned());
+    }
+    let calibration = path.join(CALIBRATION);
+    if !calibration.is_file() {
+        bail!(
+            "{} holds no {CALIBRATION}: without -c the recording's own calibration is checked",
+            path.display()
+        );
+    }
+    Ok(calibration)
+}
+
+/// Who was left out for more than this share of a recording lies beside the others; a camera that a
+/// moment has accused is not.
+const LEFT_OUT: f64 = 0.2;
+
+/// What a recording has told of a camera.
+#[derive(Debug, Default)]
+struct Seen {
+    frames: u64,
+    /// Since when it is left out, if it is, ...
+    left_out_since: Option<Timestamp>,
+    /// ... and for how long it was before, s.
+    left_out_s: f64,
+    /// From its first frame to its last.
+    span: Option<(Timestamp, Timestamp)>,
+    watch: Option<CameraWatch>,
+}
+
+impl Seen {
+    fn see_frame(&mut self, time: Timestamp) {
+        self.frames += 1;
+        let first = self.span.map_or(time, |(first, _)| first);
+        self.span = Some((first, time));
+    }
+
+    fn note(&mut self, standing: CameraStanding, now: Timestamp) {
+        if standing == CameraStanding::Excluded {
+            self.left_out_since.get_or_insert(now);
+        } else if let Some(since) = self.left_out_since.take() {
+            self.left_out_s += now.seconds_since(since);
+        }
+    }
+
+    fn is_apart(&self) -> bool {
+        self.span.is_some_and(|(first, last)| {
+            let still_s = self.left_out_since.map_or(0.0, |since| last.seconds_since(since));
+            self.left_out_s + still_s > LEFT_OUT * last.seconds_since(first)
+        })
+    }
+}
+
+/// Fuses a recording and watches its cameras.
+fn watched(
+    recording: &Path,
+    recalibration: Option<Recalibration>,
+) -> anyhow::Result<BTreeMap<CameraName, Seen>> {
+    let mut centre = Centre::new(FusionFile::load(None, &[])?.fusion(), None)?;
+    let mut seen: BTreeMap<CameraName, Seen> = BTreeMap::new();
+    let mut take = |entry: Entry| {
+        match &entry.key.channel {
+            Channel::Bearings(name) => {
+                seen.entry(name.clone()).or_default().see_frame(entry.data_time);
+            }
+            // One that never saw anything is asked after, too.
+            Channel::Calibration(name) => drop(seen.entry(name.clone()).or_default()),
+            _ => {}
+        }
+        for output in centre.take(&entry.key.channel, &entry.data, "") {
+            if let Output::Camera(name, standing) = output {
+                seen.entry(name).or_default().note(standing, centre.now());
+            }
+        }
+        Ok(())
+    };
+    let mut lacks = Lacks::default();
+    let mut reordered = recalibration.map(Reordered::new);
+    recorded::for_each(recording, &mut lacks, |_, entry| match &mut reordered {
+        Some(reordered) => reordered.take(entry, &mut take),
+        None => take(entry),
+    })?;
+    if let Some(reordered) = &mut reordered {
+        reordered.finish(&mut take)?;
+    }
+    centre.flush();
+    lacks.say(recording);
+    lacks.ensure_found(seen.values().any(|seen| seen.frames > 0), "bearings", recording)?;
+    for (name, seen) in &mut seen {
+        seen.watch = centre.poses().cameras().get(name).cloned();
+    }
+    Ok(seen)
+}
+
+/// What is to be said of a camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+enum Verdict {
+    Fits,
+    Moved,
+    Apart,
+    Unchecked,
+}
+
+#[derive(Debug, Serialize)]
+struct Figures {
+    name: String,
+    verdict: Verdict,
+    /// The longest that it was watched beside others within a minute or so, s.
+    watched_s: f64,
+    /// By how much it would have been turned when most spoke for it, mrad.
+    turn_mrad: Option<f64>,
+    turn_sd_mrad: Option<f64>,
+    /// How many times more likely the lines are by that, as a power of ten.
+    evidence: Option<f64>,
+    /// When it was first sure, s after 1970.
+    moved_at_s: Option<f64>,
+    why: String,
+}
+
+impl Figures {
+    fn of(name: &CameraName, seen: &Seen) -> Self {
+        let watched_s = seen.watch.as_ref().map_or(0.0, |watch| watch.watched_s);
+        let moved_at = seen.watch.as_ref().and_then(|watch| watch.moved_at);
+        let (verdict, why) = match &seen.watch {
+            Some(watch) if let Some(at) = watch.moved_at => {
+                (Verdict::Moved, format!("{}, sure at {at}: calibrate it anew", Turn(&watch.worst)))
+            }
+            _ if seen.is_apart() => (
+                Verdict::Apart,
+                "its bearings lie far beside what the others see: its pose, its clock or its name is \
+                 wrong"
+                    .to_owned(),
+            ),
+            Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (Verdict::Fits, String::new()),
+            _ => (
+                Verdict::Unchecked,
+                format!("too few targets that two others see, in {} frames", seen.frames),
+            ),
+        };
+        let worst = seen.watch.as_ref().map(|watch| &watch.worst);
+        Self {
+            name: name.to_string(),
+            verdict,
+            watched_s,
+            turn_mrad: worst.map(|worst| 1e3 * worst.turn.norm()),
+            turn_sd_mrad: worst.map(|worst| 1e3 * worst.turn_sd),
+            evidence: worst.map(|worst| worst.log_odds / std::f64::consts::LN_10),
+            moved_at_s: moved_at.map(|at| at.seconds()),
+            why,
+        }
+    }
+}
+
+fn render(figures: &[Figures]) -> String {
+    let head = ["camera", "watched [s]", "turned by [mrad]", "SD [mrad]", "evidence", "verdict"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    for camera in figures {
+        let verdict = match camera.verdict {
+            Verdict::Fits => "fits",
+            Verdict::Moved => "MOVED: ",
+            Verdict::Apart => "APART: ",
+            Verdict::Unchecked => "unchecked: ",
+        };
+        rows.push(vec![
+            camera.name.clone(),
+            format!("{:.0}", camera.watched_s),
+            output::number(camera.turn_mrad, 2),
+            output::number(camera.turn_sd_mrad, 2),
+            camera.evidence.map_or_else(|| "-".to_owned(), |power| format!("10^{power:.1}")),
+            format!("{verdict}{}", camera.why),
+        ]);
+    }
+    format!(
+        "{}\n\nThe evidence is how many times more likely the lines are by a camera's having been \
+         moved: 10^3 and more is sure.",
+        output::table(&rows)
+    )
+}

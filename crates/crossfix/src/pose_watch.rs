@@ -1,0 +1,111 @@
+//! Whether cameras still stand as they were calibrated, asked of the fusion now and then.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use crossfix_fusion::{Fusion, PoseFinding};
+use crossfix_message::{CameraName, Timestamp};
+
+/// The fusion is asked this often, s of data time: what it tells is of the last minute, and of 64
+/// cameras it costs 0.1 s.
+const ASKED_EVERY_S: f64 = 10.0;
+
+/// What has been found of each camera that has been watched beside others.
+#[derive(Debug, Default)]
+pub struct PoseWatch {
+    asked: Option<Timestamp>,
+    cameras: BTreeMap<CameraName, CameraWatch>,
+}
+
+/// What has been found of a camera.
+#[derive(Clone, Debug)]
+pub struct CameraWatch {
+    /// At last.
+    pub now: PoseFinding,
+    /// When most spoke for its having been moved.
+    pub worst: PoseFinding,
+    /// When it was first sure that it had.
+    pub moved_at: Option<Timestamp>,
+    /// The longest that it was watched within the fusion's memory, s.
+    pub watched_s: f64,
+}
+
+impl CameraWatch {
+    fn new(found: PoseFinding) -> Self {
+        Self { now: found.clone(), worst: found, moved_at: None, watched_s: 0.0 }
+    }
+
+    fn take(&mut self, found: PoseFinding, time: Timestamp) {
+        if found.is_moved {
+            self.moved_at.get_or_insert(time);
+        }
+        // What is sure is worse than what is not, however much spoke for that.
+        let rank = |finding: &PoseFinding| (finding.is_moved, finding.log_odds);
+        if rank(&found) > rank(&self.worst) {
+            self.worst = found.clone();
+        }
+        self.watched_s = self.watched_s.max(found.watched_s);
+        self.now = found;
+    }
+}
+
+impl PoseWatch {
+    /// Asks the fusion if it is time; returns whether it was.
+    pub fn look(&mut self, fusion: &Fusion) -> bool {
+        let Some(now) = fusion.now() else { return false };
+        let asked = *self.asked.get_or_insert(now);
+        let is_due = now.seconds_since(asked).abs() >= ASKED_EVERY_S;
+        if is_due {
+            self.ask(fusion, now);
+        }
+        is_due
+    }
+
+    /// Asks the fusion at its end.
+    pub fn finish(&mut self, fusion: &Fusion) {
+        if let Some(now) = fusion.now() {
+            self.ask(fusion, now);
+        }
+    }
+
+    fn ask(&mut self, fusion: &Fusion, now: Timestamp) {
+        self.asked = Some(now);
+        for (name, found) in fusion.pose_findings() {
+            let camera =
+                self.cameras.entry(name).or_insert_with(|| CameraWatch::new(found.clone()));
+            camera.take(found, now);
+        }
+    }
+
+    /// What has been found of each camera, by name.
+    pub fn cameras(&self) -> &BTreeMap<CameraName, CameraWatch> {
+        &self.cameras
+    }
+
+    /// What is to be said of the cameras that have been moved.
+    pub fn problems(&self) -> impl Iterator<Item = (&CameraName, String)> {
+        self.cameras.iter().filter(|(_, camera)| camera.now.is_moved).map(|(name, camera)| {
+            (
+                name,
+                format!(
+                    "camera `{name}` has been moved since it was calibrated: {}",
+                    Turn(&camera.now)
+                ),
+            )
+        })
+    }
+}
+
+/// By how much a camera has been turned.
+pub struct Turn<'a>(pub &'a PoseFinding);
+
+impl fmt::Display for Turn<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let PoseFinding { turn, turn_sd, or_else, .. } = self.0;
+        write!(f, "turned by {:.1} mrad (± {:.1})", 1e3 * turn.norm(), 1e3 * turn_sd)?;
+        for (k, other) in or_else.iter().enumerate() {
+            write!(f, "{} `{other}`", if k == 0 { ", or it was" } else { " or" })?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,418 @@
+//! Which camera has been moved since it was calibrated, by where the others see the targets.
+//!
+//! What each camera's pose and clock are off by is estimated from how the sight lines of one target
+//! miss each other, all cameras' errors at once and each as small as its calibration says. A camera
+//! that somebody has turned is one whose error is far larger than that: with a prior as wide as a
+//! knock for it alone, the lines become so many times more likely. The errors themselves correct
+//! nothing; a new calibration does.
+
+use std::collections::BTreeMap;
+
+use crossfix_message::{CameraName, Timestamp};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Matrix6, SMatrix, SVector, Vector3};
+
+use super::{Cameras, Sample};
+
+/// A camera was moved so many seconds of targets ago, or more, each as likely: a large turn shows in
+/// the shorter time, and of the longer one most would be from before it; a small one, or that of a
+/// camera whose bearings are noisy, takes the longer to be sure.
+const MEMORIES_S: [f64; 2] = [20.0, 100.0];
+/// A target is not seen for longer than this between two draws that follow one another, s: what a
+/// pause lasts is not time in which anything is told.
+const LONGEST_DRAW_S: f64 = 1.0;
+/// A camera that is moved turns by as much as one of these an axis, rad, each as likely: a mast that
+/// settles, a gust, a hand, a fall. With the largest alone a turn of two milliradians would be less
+/// likely by a hundred times.
+const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
+/// No pose holds better than this: 0.1 mrad is what a mast does in the sun, ...
+const LEAST_TURN_RAD: f64 = 1e-4;
+/// ... and so many metres. Where an exact pose is declared, nothing else would be left for what a
+/// lens leaves over.
+const LEAST_SHIFT_M: f64 = 2e-3;
+/// Lines that miss each other by far more than anything explains are of two targets: they count as
+/// Student's t of so many degrees of freedom makes them.
+const FREEDOM: f64 = 4.0;
+/// A camera is said to have been moved if the lines are so many times (logarithm) more likely by it:
+/// a thousand times, as one of a site's is moved about once in so many minutes, a day. Of those that
+/// stand as they say none came to more than 320 times, on real flights; with half of it (30 times) a
+/// tenth of these would be accused.
+const SURE: f64 = 6.9;
+/// Another camera may have been moved in its place unless it is so many times (logarithm) less
+/// likely: one in a hundred.
+const DISTINCT: f64 = 4.6;
+
+/// Errors of a camera: rotation and place, and its clock, each in its own deviations.
+const ERRORS: usize = 7;
+
+/// What the lines say of a camera's having been moved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseFinding {
+    /// For how long it has been watched beside others, of the last minutes, s.
+    pub watched_s: f64,
+    /// By how much it would have been turned, about the world's axes, rad.
+    pub turn: Vector3<f64>,
+    /// Standard deviation of that along the axis that is known worst, rad.
+    pub turn_sd: f64,
+    /// Logarithm of how many times more likely the lines are by its having been moved than by
+    /// nothing's having.
+    pub log_odds: f64,
+    /// Whether it has been moved for sure: it, or one of those that are as likely.
+    pub is_moved: bool,
+    /// The other cameras that may have been moved in its place, if it has.
+    pub or_else: Vec<CameraName>,
+}
+
+/// What all cameras' lines say of their errors.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Watch {
+    cameras: Vec<Watched>,
+    memories: [Memory; MEMORIES_S.len()],
+    drawn: Option<Timestamp>,
+}
+
+/// What the lines of late have said.
+#[derive(Clone, Debug, Default)]
+struct Memory {
+    /// Fisher information of the errors of all, each in its own deviations, ...
+    information: DMatrix<f64>,
+    /// ... and its product with their estimate.
+    pull: DVector<f64>,
+}
+
+impl Memory {
+    /// Knows of so many errors.
+    fn widen(&mut self, errors: usize) {
+        self.information.resize_mut(errors, errors, 0.0);
+        self.pull.resize_vertically_mut(errors, 0.0);
+    }
+
+    /// Forgets a camera's errors, from this on.
+    fn forget(&mut self, first: usize) {
+        let information = std::mem::take(&mut self.information);
+        self.information = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
+        self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
+    }
+
+    /// Mean and covariance of the errors if no camera has been moved.
+    fn estimate(&self) -> Option<(DVector<f64>, DMatrix<f64>)> {
+        let size = self.pull.len();
+        let factor = (&self.information + DMatrix::identity(size, size)).cholesky()?;
+        Some((factor.solve(&self.pull), factor.inverse()))
+    }
+}
+
+#[derive(Clone, Debug)]
+struct Watched {
+    name: CameraName,
+    /// The pose's covariance by its calibration, and its root.
+    covariance: Matrix6<f64>,
+    root: Matrix6<f64>,
+    watched_s: f64,
+}
+
+impl Watched {
+    fn new(name: CameraName, declared: &Matrix6<f64>) -> Self {
+        let mut covariance = *declared;
+        for axis in 0..3 {
+            covariance[(axis, axis)] += LEAST_TURN_RAD.powi(2);
+            covariance[(axis + 3, axis + 3)] += LEAST_SHIFT_M.powi(2);
+        }
+        let root = covariance.cholesky().map_or_else(Matrix6::identity, |factor| factor.l());
+        Self { name, covariance, root, watched_s: 0.0 }
+    }
+
+    /// A line's change with the errors.
+    fn by_errors(&self, sample: &Sample) -> SMatrix<f64, 2, ERRORS> {
+        let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
+        by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
+        by.set_column(6, &sample.clock);
+        by
+    }
+
+    /// The inverse covariance of its errors if it has been knocked so hard, rad.
+    fn knocked(&self, knock_rad: f64) -> Option<SMatrix<f64, ERRORS, ERRORS>> {
+        let mut wide = self.covariance;
+        (0..3).for_each(|axis| wide[(axis, axis)] += knock_rad.powi(2));
+        let mut inverse = SMatrix::<f64, ERRORS, ERRORS>::identity();
+        let own = self.root.transpose() * wide.cholesky()?.inverse() * self.root;
+        inverse.fixed_view_mut::<6, 6>(0, 0).copy_from(&own);
+        Some(inverse)
+    }
+
+    /// What the lines say of it, by all errors' means and covariances if nothing has been moved; its
+    /// own are from `first` on.
+    fn found(
+        &self,
+        estimates: &[(DVector<f64>, DMatrix<f64>)],
+        first: usize,
+    ) -> Option<PoseFinding> {
+        let mut each = Vec::with_capacity(KNOCKS_RAD.len() * estimates.len());
+        for (mean, covariance) in estimates {
+            let mean = mean.fixed_rows::<ERRORS>(first).into_owned();
+            let own = covariance.fixed_view::<ERRORS, ERRORS>(first, first).into_owned();
+            for knock_rad in KNOCKS_RAD {
+                each.push(self.found_knocked(knock_rad, &mean, &own)?);
+            }
+        }
+        let likeliest = each.iter().max_by(|a, b| a.log_odds.total_cmp(&b.log_odds))?;
+        let odds = each.iter().map(|one| (one.log_odds - likeliest.log_odds).exp()).sum::<f64>();
+        let log_odds = likeliest.log_odds + (odds / each.len() as f64).ln();
+        Some(PoseFinding { log_odds, ..likeliest.clone() })
+    }
+
+    /// What the lines of a time say, if it has been knocked so hard, rad.
+    fn found_knocked(
+        &self,
+        knock_rad: f64,
+        mean: &SVector<f64, ERRORS>,
+        covariance: &SMatrix<f64, ERRORS, ERRORS>,
+    ) -> Option<PoseFinding> {
+        let prior = self.knocked(knock_rad)?;
+        let known = covariance.cholesky()?.inverse();
+        // The posterior with the wide prior in the place of the narrow one.
+        let wide = (known - SMatrix::identity() + prior).cholesky()?;
+        let moved = wide.solve(&(known * mean));
+        let log_determinant = |factor: &SMatrix<f64, ERRORS, ERRORS>| {
+            2.0 * factor.diagonal().iter().map(|root| root.ln()).sum::<f64>()
+        };
+        let log_odds = (log_determinant(&prior.cholesky()?.l())
+            - log_determinant(&covariance.cholesky()?.l())
+            - log_determinant(&wide.l())
+            + (known * mean).dot(&(moved - mean)))
+            / 2.0;
+        let turns = self.root.fixed_view::<3, 3>(0, 0);
+        let spread: Matrix3<f64> =
+            turns * wide.inverse().fixed_view::<3, 3>(0, 0) * turns.transpose();
+        Some(PoseFinding {
+            watched_s: self.watched_s,
+            turn: turns * moved.fixed_rows::<3>(0),
+            turn_sd: spread.symmetric_eigenvalues().max().max(0.0).sqrt(),
+            log_odds,
+            is_moved: false,
+            or_else: Vec::new(),
+        })
+    }
+}
+
+impl Watch {
+    fn place_of(&mut self, name: &CameraName, declared: &Matrix6<f64>) -> usize {
+        if let Some(place) = self.cameras.iter().position(|camera| camera.name == *name) {
+            return place;
+        }
+        self.cameras.push(Watched::new(name.clone(), declared));
+        let errors = ERRORS * self.cameras.len();
+        self.memories.iter_mut().for_each(|memory| memory.widen(errors));
+        self.cameras.len() - 1
+    }
+
+    /// A camera stands elsewhere, or is known otherwise: what was seen was of how it stood.
+    pub(super) fn forget(&mut self, name: &CameraName) {
+        let Some(place) = self.cameras.iter().position(|camera| camera.name == *name) else {
+            return;
+        };
+        self.cameras.remove(place);
+        self.memories.iter_mut().for_each(|memory| memory.forget(ERRORS * place));
+    }
+
+    /// Forgets by as much as the time since the last draw asks for.
+    fn age(&mut self, now: Timestamp) -> f64 {
+        let last = self.drawn.replace(now);
+        let since = last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
+        for (memory, memory_s) in self.memories.iter_mut().zip(MEMORIES_S) {
+            let kept = (-since / memory_s).exp();
+            memory.information *= kept;
+            memory.pull *= kept;
+        }
+        let longest_s = MEMORIES_S.into_iter().fold(0.0, f64::max);
+        let kept = (-since / longest_s).exp();
+        self.cameras.iter_mut().for_each(|camera| camera.watched_s *= kept);
+        since
+    }
+
+    /// Takes in what cameras have seen of one target; `places` are theirs among those watched.
+    fn learn(&mut self, samples: &[Sample], places: &[usize], since_s: f64) -> Option<()> {
+        let by_errors: Vec<_> = samples
+            .iter()
+            .zip(places)
+            .map(|(sample, place)| self.cameras[*place].by_errors(sample))
+            .collect();
+        // Lines by noise alone, and by noise and the errors that poses may have.
+        let weights = samples.iter().map(|sample| sample.slow_noise.try_inverse());
+        let weights: Vec<_> = weights.collect::<Option<_>>()?;
+        let loose = samples
+            .iter()
+            .zip(&by_errors)
+            .map(|(sample, by)| (sample.slow_noise + by * by.transpose()).try_inverse());
+        let loose: Vec<_> = loose.collect::<Option<_>>()?;
+        let squares = Meeting::of(samples, &loose)?.squares;
+        let count = 2.0 * samples.len() as f64 - 3.0;
+        let weight = (FREEDOM + count) / (FREEDOM + squares.max(count));
+        let meeting = Meeting::of(samples, &weights)?;
+        for (i, one) in places.iter().enumerate() {
+            let own = by_errors[i].transpose() * weights[i];
+            let away = samples[i].offset - samples[i].by_position * meeting.place;
+            for memory in &mut self.memories {
+                let mut pull = memory.pull.fixed_rows_mut::<ERRORS>(ERRORS * one);
+                pull += own * away * weight;
+            }
+            for (j, other) in places.iter().enumerate() {
+                let across = own
+                    * samples[i].by_position
+                    * meeting.spread
+                    * samples[j].by_position.transpose()
+                    * weights[j]
+                    * by_errors[j];
+                let direct = if i == j { own * by_errors[j] } else { SMatrix::zeros() };
+                for memory in &mut self.memories {
+                    let mut block = memory
+                        .information
+                        .fixed_view_mut::<ERRORS, ERRORS>(ERRORS * one, ERRORS * other);
+                    block += (direct - across) * weight;
+                }
+            }
+        }
+        for place in places {
+            self.cameras[*place].watched_s += since_s;
+        }
+        Some(())
+    }
+
+    /// What the lines say of each camera that has been watched.
+    fn findings(&self) -> BTreeMap<CameraName, PoseFinding> {
+        let estimates: Vec<_> = self.memories.iter().filter_map(Memory::estimate).collect();
+        let found = self.cameras.iter().enumerate().filter_map(|(place, camera)| {
+            Some((camera.name.clone(), camera.found(&estimates, ERRORS * place)?))
+        });
+        let mut found: BTreeMap<CameraName, PoseFinding> = found.collect();
+        let most = found.values().map(|own| own.log_odds).fold(f64::NEG_INFINITY, f64::max);
+        let likely = |own: &PoseFinding| own.log_odds > SURE && own.log_odds > most - DISTINCT;
+        let suspects: Vec<CameraName> =
+            found.iter().filter(|(_, own)| likely(own)).map(|(name, _)| name.clone()).collect();
+        for (name, own) in &mut found {
+            if likely(own) {
+                own.is_moved = true;
+                own.or_else = suspects.iter().filter(|other| *other != name).cloned().collect();
+            }
+        }
+        found
+    }
+}
+
+/// Where sight lines of one target meet.
+struct Meeting {
+    place: Vector3<f64>,
+    /// Covariance of the place.
+    spread: Matrix3<f64>,
+    /// Sum of the squares of what the lines miss it by.
+    squares: f64,
+}
+
+impl Meeting {
+    /// By the inverse covariance of each line.
+    fn of(samples: &[Sample], weights: &[Matrix2<f64>]) -> Option<Self> {
+        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
+        for (sample, weight) in samples.iter().zip(weights) {
+            let weighed = sample.by_position.transpose() * weight;
+            information += weighed * sample.by_position;
+            pull += weighed * sample.offset;
+        }
+        let spread = information.try_inverse()?;
+        let place = spread * pull;
+        let missed = |(sample, weight): (&Sample, &Matrix2<f64>)| {
+            let missed = sample.offset - sample.by_position * place;
+            missed.dot(&(weight * missed))
+        };
+        let squares = samples.iter().zip(weights).map(missed).sum();
+        Some(Self { place, spread, squares })
+    }
+}
+
+impl Cameras {
+    /// Takes in what cameras have seen of one target at a time.
+    pub(crate) fn watch(&mut self, samples: &[Sample], now: Timestamp) {
+        let Self { by_name, watch, .. } = self;
+        let since_s = watch.age(now);
+        let mut places = Vec::with_capacity(samples.len());
+        for sample in samples {
+            let Some(camera) = by_name.get(&sample.camera) else { return };
+            places.push(watch.place_of(&sample.camera, &camera.known().pose_covariance));
+        }
+        watch.learn(samples, &places, since_s);
+    }
+
+    /// What the lines say of each camera that has been watched beside others.
+    pub(crate) fn pose_findings(&self) -> BTreeMap<CameraName, PoseFinding> {
+        self.watch.findings()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_geometry::BearingModel;
+    use nalgebra::{Point3, Vector2};
+
+    use super::*;
+
+    /// What two cameras see of targets in several places, where one of them is turned.
+    fn samples(turn: Vector3<f64>, place: Point3<f64>) -> Vec<Sample> {
+        let sample = |name: &str, origin: Point3<f64>, turn: Vector3<f64>| {
+            let model = BearingModel::new(origin, place).unwrap();
+            Sample {
+                camera: name.parse().unwrap(),
+                offset: model.by_pose().fixed_columns::<3>(0) * turn,
+                by_position: model.by_position(),
+                noise: Matrix2::identity() * 1e-8,
+                pose: Matrix2::identity() * 3e-4,
+                by_pose: model.by_pose(),
+                clock: Vector2::zeros(),
+                slow_noise: Matrix2::identity() * 1e-8,
+            }
+        };
+        vec![
+            sample("a", Point3::new(-60.0, 0.0, 2.0), turn),
+            sample("b", Point3::new(60.0, -80.0, 2.0), Vector3::zeros()),
+        ]
+    }
+
+    /// A minute of a target that moves so far, m, seen by two cameras of which one is turned, rad.
+    fn watched(turn: Vector3<f64>, moves_m: f64) -> Watch {
+        let declared = Matrix6::from_diagonal_element(9e-8);
+        let mut watch = Watch::default();
+        for k in 0..200u32 {
+            let t = f64::from(k) * 0.3;
+            watch.age(Timestamp::from_seconds(t));
+            let (east, north) = ((0.2 * t).sin(), (0.3 * t).cos());
+            let place = Point3::new(moves_m * east, moves_m * north, 25.0);
+            let seen = samples(turn, place);
+            let places: Vec<usize> =
+                seen.iter().map(|one| watch.place_of(&one.camera, &declared)).collect();
+            watch.learn(&seen, &places, 0.3).unwrap();
+        }
+        watch
+    }
+
+    #[test]
+    fn where_a_target_hovers_between_two_cameras_either_may_have_been_moved() {
+        let mut watch = watched(Vector3::new(0.0, 0.04, 0.0), 0.0);
+        let found = watch.findings();
+        assert!(found.values().all(|own| own.is_moved), "{found:?}");
+        for (name, own) in &found {
+            assert_eq!(own.or_else.len(), 1, "{found:?}");
+            assert_ne!(own.or_else[0], *name);
+        }
+        // One is calibrated anew: nothing is left of what was seen of it.
+        let name: CameraName = "a".parse().unwrap();
+        watch.forget(&name);
+        let found = watch.findings();
+        assert!(!found.contains_key(&name));
+        assert_eq!(found.len(), 1);
+    }
+
+    #[test]
+    fn where_it_moves_it_tells_which() {
+        let found = watched(Vector3::new(5e-3, 0.0, 0.0), 20.0).findings();
+        let [a, b] = ["a", "b"].map(|name| &found[&name.parse::<CameraName>().unwrap()]);
+        assert!(a.is_moved && a.or_else.is_empty() && !b.is_moved, "{found:?}");
+        assert!((a.turn - Vector3::new(5e-3, 0.0, 0.0)).norm() < a.turn_sd, "{a:?}");
+    }
+}
