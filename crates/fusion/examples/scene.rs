@@ -144,6 +144,8 @@ impl Run {
                 Output::Camera(camera, standing) => {
                     writeln!(out, "S {index} {camera} {standing:?}")?;
                 }
+                // Asked for by no scene.
+                Output::Smoothed(_) => {}
             }
         }
         Ok(())

@@ -153,6 +153,7 @@ fn configure_more(config: &mut FusionConfig, bytes: &mut Bytes<'_>) {
     for _ in 0..2 {
         let (field, value) = (bytes.below(8), bytes.odd());
         match field {
+            0 if value != 0.0 => config.tracking.smoothing_s = 0.5,
             1 => config.clocks.estimate = false,
             2 => {
                 config.clocks.trusted =
@@ -244,6 +245,7 @@ struct Run<'a> {
     rejected: BTreeMap<&'static str, u64>,
     born: BTreeSet<u64>,
     frames_out: u64,
+    smoothed_out: u64,
 }
 
 impl Run<'_> {
@@ -475,6 +477,11 @@ impl Run<'_> {
                     assert!(frame.tracks.is_sorted_by(|a, b| a.id < b.id), "{frame:?}");
                     frame.tracks.iter().for_each(assert_sound);
                 }
+                Output::Smoothed(frame) => {
+                    assert_eq!(frame.sequence, self.smoothed_out, "each goes out once more");
+                    self.smoothed_out += 1;
+                    frame.tracks.iter().for_each(assert_sound);
+                }
                 Output::Event(event) => {
                     let first =
                         event.kind() == TrackEventKind::Born && self.born.insert(event.track_id);
@@ -596,6 +603,7 @@ pub fn drive(data: &[u8]) {
         rejected: BTreeMap::new(),
         born: BTreeSet::new(),
         frames_out: 0,
+        smoothed_out: 0,
     };
     for _ in 0..MOST_OPERATIONS {
         if run.bytes.0.is_empty() {
