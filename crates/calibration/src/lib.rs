@@ -29,9 +29,9 @@ mod site_file;
 pub use calibrated_camera::{BearingError, CalibratedCamera, ClockCorrection, OverImage};
 pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
-    CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
-    Label, LabelNoise, LogErrors, LogSample, Mirror, Refusal, Survey, SurveyedPlace, TapedDistance,
-    calibrate_flight,
+    Axis, CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
+    Label, LabelNoise, LogErrors, LogFit, LogSample, MovedAt, Refusal, Survey, SurveyedPlace,
+    TapedDistance, WouldFit, calibrate_flight,
 };
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
 pub use landmarks::{

@@ -4,7 +4,7 @@
 
 use crossfix_calibration::{
     CameraLabels, FlightError, FlightLog, FlightResult, Label, LensFreedom, LogErrors, LogSample,
-    Mirror, Refusal, SiteCalibration, Survey, SurveyedPlace, TapedDistance, calibrate_flight,
+    Refusal, SiteCalibration, Survey, SurveyedPlace, TapedDistance, WouldFit, calibrate_flight,
 };
 use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pixel, Pose};
 use nalgebra::{Matrix6, Point3, Rotation3, Vector3, Vector6};
@@ -204,10 +204,10 @@ fn a_mirrored_log_is_refused_and_said_to_be_one() {
     let mut random = ChaCha8Rng::seed_from_u64(2);
     let exchanged = log(&mut random, |place| Point3::new(place.y, place.x, place.z));
     let error = calibrate_flight(&labels, Some(&exchanged), &Survey::default()).unwrap_err();
-    let FlightError::NoCamera { why: Refusal::Misfit { mirror, .. }, .. } = &error else {
+    let FlightError::NoCamera { why: Refusal::Misfit { would_fit, .. }, .. } = &error else {
         panic!("{error}");
     };
-    assert_eq!(*mirror, Some(Mirror::AxesOrHeight));
+    assert_eq!(*would_fit, Some(WouldFit::MirrorImage));
     assert!(error.to_string().contains("east and north are exchanged"), "{error}");
 }
 

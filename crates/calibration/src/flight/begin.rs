@@ -8,7 +8,8 @@ use super::noise::LabelNoise;
 use super::pairs::{self, Pair, Sights};
 use super::spline::Spline;
 use super::{
-    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Mirror, Refusal, hours, start, triangulation,
+    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal, WouldFit, hours, start, triangulation,
+    would_fit,
 };
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3};
@@ -19,7 +20,10 @@ const MOST_MISFIT_RAD: f64 = 8e-3;
 /// ... and so many deviations of the log's own errors, as they are seen from where the camera
 /// stands.
 const LOG_DEVIATIONS: f64 = 3.0;
-/// The mirror image fits where it fits so many times better.
+/// A start that lies farther beside the log than this in the median is held against the mirror image,
+/// rad, ...
+const DOUBTED_RAD: f64 = 2e-3;
+/// ... which is what was flown if it fits so many times better.
 const CLEARLY_BETTER: f64 = 3.0;
 /// Beyond the labels the way goes on for so long, s: their times may still move.
 const MARGIN_S: f64 = 2.0;
@@ -55,7 +59,8 @@ impl Begun {
         for camera in cameras {
             let start = usable(camera)
                 .and_then(|()| placed_against(camera, &begun.course))
-                .map_err(|why| named_mirror(camera, &begun.course, why));
+                .and_then(|(state, misfit)| proven(camera, &begun.course, state, misfit))
+                .map_err(|why| with_cure(camera, &begun.course, cameras, why));
             begun.take(camera, start);
         }
         begun.leave_lonely_out(true);
@@ -194,7 +199,7 @@ impl Begun {
             self.refused.clear();
             for camera in cameras {
                 if self.cameras.iter().all(|placed| placed.name != camera.name) {
-                    let start = placed_against(camera, &self.course);
+                    let start = placed_against(camera, &self.course).map(|(state, _)| state);
                     self.take(camera, start);
                 }
             }
@@ -227,7 +232,7 @@ fn usable(camera: &CameraLabels) -> Result<(), Refusal> {
 }
 
 /// A camera's start against a course.
-fn placed_against(camera: &CameraLabels, course: &Course) -> Result<CameraState, Refusal> {
+fn placed_against(camera: &CameraLabels, course: &Course) -> Result<(CameraState, f64), Refusal> {
     let (state, misfit) = start::find(camera, course, frame_time(camera)).ok_or(Refusal::NoTime)?;
     tracing::debug!(
         "camera `{}` starts at {:.2} with the clock {:.3} s behind, {:.2} mrad off",
@@ -239,18 +244,38 @@ fn placed_against(camera: &CameraLabels, course: &Course) -> Result<CameraState,
     let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
     let range_m = course.middle_distance(state.centre);
     if misfit <= MOST_MISFIT_RAD + of_errors / range_m {
-        return Ok(state);
+        return Ok((state, misfit));
     }
-    Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, mirror: None })
+    Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, would_fit: None })
 }
 
-/// Exchanging two of a log's axes or turning one round is the same but for where the camera stands.
-fn named_mirror(camera: &CameraLabels, course: &Course, why: Refusal) -> Refusal {
-    let Refusal::Misfit { misfit_mrad, .. } = why else { return why };
-    let found = start::find(camera, &course.mirrored(), frame_time(camera));
-    let of_mirror = found.map_or(f64::INFINITY, |found| found.1);
-    let fits = of_mirror * 1e3 * CLEARLY_BETTER < misfit_mrad;
-    Refusal::Misfit { misfit_mrad, mirror: fits.then_some(Mirror::AxesOrHeight) }
+/// A camera's start against a log, if its mirror image does not fit far better: of a short flight that
+/// may lie near enough to be begun with.
+fn proven(
+    camera: &CameraLabels,
+    course: &Course,
+    state: CameraState,
+    misfit: f64,
+) -> Result<CameraState, Refusal> {
+    let mirrored = || start::find(camera, &course.mirrored(), frame_time(camera));
+    if misfit > DOUBTED_RAD && mirrored().is_some_and(|(_, other)| other * CLEARLY_BETTER < misfit)
+    {
+        let would_fit = Some(WouldFit::MirrorImage);
+        return Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, would_fit });
+    }
+    Ok(state)
+}
+
+/// Why a camera does not fit a log, with what would make it fit.
+fn with_cure(
+    camera: &CameraLabels,
+    course: &Course,
+    cameras: &[CameraLabels],
+    why: Refusal,
+) -> Refusal {
+    let Refusal::Misfit { misfit_mrad, would_fit: None } = why else { return why };
+    let would_fit = would_fit::find(camera, course, cameras, misfit_mrad * 1e-3);
+    Refusal::Misfit { misfit_mrad, would_fit }
 }
 
 /// Of the best pairs the one that most cameras fit, and fit best.

@@ -11,10 +11,13 @@ mod course;
 mod datum;
 mod gauge;
 mod halves;
+mod linear;
 mod model;
+mod moved;
 mod noise;
 mod normal;
 mod pairs;
+mod pieces;
 mod pull;
 mod results;
 mod settle;
@@ -23,6 +26,7 @@ mod start;
 mod survey;
 mod triangulation;
 mod unknowns;
+mod would_fit;
 
 use crossfix_message::CameraName;
 use thiserror::Error;
@@ -35,8 +39,10 @@ use settle::settle;
 pub use model::{
     CameraLabels, FlightLog, Label, LogErrors, LogSample, Survey, SurveyedPlace, TapedDistance,
 };
+pub use moved::MovedAt;
 pub use noise::LabelNoise;
-pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult};
+pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult, LogFit};
+pub use would_fit::{Axis, WouldFit};
 
 /// Why a flight cannot be adjusted.
 #[derive(Debug, Error)]
@@ -103,31 +109,18 @@ pub enum Refusal {
     NoTime,
     /// No pose and offset makes its labels fit the log.
     #[error(
-        "lies {misfit_mrad:.1} mrad beside the target's way wherever it stands{}",
-        mirror.map_or(String::new(), |mirror| format!(": {mirror}"))
+        "lies {misfit_mrad:.1} mrad beside the target's way wherever it stands: {}",
+        would_fit.as_ref().map_or_else(
+            || "it saw something else, or its lens or frame rate is another's".to_owned(),
+            WouldFit::to_string
+        )
     )]
     Misfit {
         /// The median angle between labels and log, mrad.
         misfit_mrad: f64,
         /// What makes it fit.
-        mirror: Option<Mirror>,
+        would_fit: Option<WouldFit>,
     },
-}
-
-/// A log whose axes are others than it says: only its mirror image fits what cameras see.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mirror {
-    /// East and north are exchanged, or the height's sign is: what cameras see does not tell which.
-    AxesOrHeight,
-}
-
-impl std::fmt::Display for Mirror {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(
-            "its mirror image fits, so east and north are exchanged in the log, or its height counts \
-             downwards",
-        )
-    }
 }
 
 /// A flight's equations take memory by its time: an hour of six cameras 0.2 GB, and minutes.

@@ -89,6 +89,11 @@ pub struct TapedDistance {
 }
 
 impl Survey {
+    /// Whether nothing was surveyed.
+    pub fn is_empty(&self) -> bool {
+        self.places.is_empty() && self.distances.is_empty()
+    }
+
     /// The place of a camera.
     pub fn place(&self, camera: &CameraName) -> Option<&SurveyedPlace> {
         self.places.iter().find(|place| place.camera == *camera)

@@ -8,6 +8,7 @@ use super::adjustment::{self, Adjusted, Flight, Priors, State};
 use super::datum::Followers;
 use super::gauge::Gauge;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
+use super::moved::{self, MovedAt};
 use super::noise::LabelNoise;
 use super::settle::residuals;
 use super::{Refusal, halves};
@@ -44,6 +45,8 @@ pub struct CameraResult {
     /// lens file and survey, so what is wrong with those does not show. `None`: one half saw too
     /// little.
     pub halves_ratio: Option<f64>,
+    /// The moment at which its residuals change most.
+    pub moved: Option<MovedAt>,
     /// The focal length against the lens file's.
     pub focal_ratio: f64,
     /// Its standard deviation.
@@ -90,8 +93,21 @@ pub struct FlightResult {
     pub refused: Vec<(CameraName, Refusal)>,
     /// Power of the target's jerk, m^2/s^5.
     pub jerk: f64,
-    /// Root mean square of the log's residuals per axis, m.
-    pub log_residual_m: Option<f64>,
+    /// How the log fits; `None` without one.
+    pub log: Option<LogFit>,
+}
+
+/// How a log fits the way that all have made of it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LogFit {
+    /// Its places at times of the way.
+    pub samples: usize,
+    /// Those of them that lie so far beside the way that they count next to nothing.
+    pub left_out: usize,
+    /// Root mean square of the others' residuals per axis, m.
+    pub residual_m: f64,
+    /// What was said to be the standard deviation of each, m per axis.
+    pub stated_sd_m: f64,
 }
 
 pub(super) fn results(
@@ -144,6 +160,7 @@ pub(super) fn results(
             used: squares.len(),
             residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
             halves_ratio: ratios[index],
+            moved: moved::likeliest(&residuals),
             focal_ratio: camera.intrinsics.fx / prior.lens.fx,
             focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
         });
@@ -153,7 +170,7 @@ pub(super) fn results(
         datum,
         refused: Vec::new(),
         jerk: priors.jerk,
-        log_residual_m: flight.log.map(|log| log_residual(log, state)),
+        log: flight.log.map(|log| log_fit(log, state)),
     })
 }
 
@@ -169,8 +186,11 @@ fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
     ranges.get(ranges.len() / 2).copied().unwrap_or(1.0)
 }
 
-fn log_residual(log: &FlightLog, state: &State) -> f64 {
-    let squares: Vec<f64> = log
+/// What lies beside the way by more than so many deviations is left out: of normal ones one in 2000.
+const LEFT_OUT: f64 = 4.2;
+
+fn log_fit(log: &FlightLog, state: &State) -> LogFit {
+    let mut squares: Vec<f64> = log
         .samples
         .iter()
         .filter_map(|sample| {
@@ -179,7 +199,17 @@ fn log_residual(log: &FlightLog, state: &State) -> f64 {
             Some((state.way.place(&weights) + bias - sample.position).norm_squared() / 3.0)
         })
         .collect();
-    (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+    squares.sort_unstable_by(f64::total_cmp);
+    // The median of the mean of three squares is 0.789 of their variance.
+    let typical = squares.get(squares.len() / 2).copied().unwrap_or_default() / 0.789;
+    let most = (LEFT_OUT.powi(2) / 3.0) * typical.max(log.errors.sd_m.powi(2));
+    let used = squares.partition_point(|square| *square <= most);
+    LogFit {
+        samples: squares.len(),
+        left_out: squares.len() - used,
+        residual_m: (squares[..used].iter().sum::<f64>() / used.max(1) as f64).sqrt(),
+        stated_sd_m: log.errors.sd_m,
+    }
 }
 
 /// One camera's part of the covariance of all but the way.

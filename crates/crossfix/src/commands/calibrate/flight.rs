@@ -9,6 +9,7 @@ use crossfix_message::{
 };
 
 use super::log::{self, LogKind, LogTime, Reading};
+use super::remarks::Rests;
 use super::survey::{self, Distance};
 use super::{Lens, report};
 use crate::commands::numbers;
@@ -54,6 +55,12 @@ pub struct Args {
     /// kind's without.
     #[arg(long, value_name = "METRES", value_parser = numbers::not_negative)]
     log_drift: Option<f64>,
+    /// Take what each camera saw from this time of its own on alone, s.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::number, allow_negative_numbers = true)]
+    from: Option<f64>,
+    /// Take what each camera saw until this time of its own alone, s.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::number, allow_negative_numbers = true)]
+    to: Option<f64>,
     /// What of the lenses may be otherwise than their files say.
     #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
     lens: Lens,
@@ -76,18 +83,23 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         antenna_m: args.antenna,
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
-    let cameras = labels(&args.recording, args.lens.into())?;
+    let mut cameras = labels(&args.recording, args.lens.into())?;
+    let (from_s, to_s) = (args.from.unwrap_or(f64::MIN), args.to.unwrap_or(f64::MAX));
+    for camera in &mut cameras {
+        camera.labels.retain(|label| (from_s..to_s).contains(&label.time_s));
+    }
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let survey =
         survey::read(args.positions.as_deref(), &args.distance, (&names, "the recording"))?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
+    let rests = if survey.is_empty() { Rests::OnLogAlone } else { Rests::OnSurvey };
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
     if args.json {
-        output::json(&report::figures(&result))?;
+        output::json(&report::figures(&result, rests))?;
     } else {
-        output::line(report::render(&result));
+        output::line(report::render(&result, rests));
     }
     for wrong in report::take_out_wrong(&mut result) {
         tracing::warn!("camera `{wrong}` is wrong and is not written");

@@ -4,8 +4,10 @@ mod compare;
 mod flight;
 mod landmarks;
 mod log;
+mod remarks;
 mod report;
 mod survey;
+mod verdict;
 
 use crossfix_calibration::LensFreedom;
 

@@ -4,10 +4,9 @@ use crossfix_calibration::{CameraResult, FlightResult};
 use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
+use super::remarks::{self, Rests};
+use super::verdict;
 use crate::output;
-
-/// A focal length that has moved by more than this share is remarked on.
-const REMARKED: f64 = 0.003;
 
 /// The figures of a calibration.
 #[derive(Debug, Serialize)]
@@ -15,8 +14,13 @@ pub struct Figures {
     cameras: Vec<CameraFigures>,
     /// Cameras that could not be calibrated, and why not.
     refused: Vec<(String, String)>,
-    /// Root mean square of the log's residuals per axis, m; absent without a log.
+    /// Root mean square of the log's residuals per axis, m, of what is not left out; absent without a
+    /// log.
     log_residual_m: Option<f64>,
+    /// How many of its places are left out, as they lie far beside the way.
+    log_left_out: Option<usize>,
+    /// What a person should know.
+    remarks: Vec<String>,
     /// Absent of one camera alone.
     datum: Option<DatumFigures>,
     /// Power of the target's jerk, m^2/s^5.
@@ -84,51 +88,16 @@ struct CameraFigures {
     halves_ratio: Option<f64>,
     readout_ms: f64,
     readout_sd_ms: f64,
-    verdict: &'static str,
-}
-
-/// A camera whose pointing is known worse than this is weak, mrad: at 100 m a target lies half a
-/// metre aside. With half of it a minute's flight would not do.
-const WEAK_POINTING_MRAD: f64 = 5.0;
-/// Nor may it stand this uncertainly, m.
-const WEAK_POSITION_M: f64 = 0.5;
-/// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
-const WRONG_MRAD: f64 = 8.0;
-/// A focal length that has moved by more than this share is not the file's lens, or nothing told how
-/// far off the target was: lenses move by 2 %.
-const WEAK_FOCAL: f64 = 0.025;
-/// A camera of whose labels less than this share fits has seen something else as well.
-const WEAK_SHARE: f64 = 0.8;
-
-/// What to think of a camera, and what to do about it.
-fn verdict(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> &'static str {
-    let noise_mrad = camera.noise.sd_px() / camera.intrinsics().fx * 1e3;
-    // The image's rows go down in the world where the camera is not held upside down.
-    let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
-    if is_upside_down {
-        "wrong: upside down, so heights may count downwards in the log or survey (north-east-down?)"
-    } else if noise_mrad > WRONG_MRAD {
-        "wrong: its labels lie far beside the target's way (another target or lens file?)"
-    } else if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
-        "weak: many labels are not the target's"
-    } else if (camera.focal_ratio - 1.0).abs() > WEAK_FOCAL {
-        "weak: its focal length is far from its file's (another lens file, or fly nearer and farther)"
-    } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
-        "weak: fly longer, near and far, high and low, through all of its image"
-    } else {
-        "good"
-    }
+    verdict: String,
 }
 
 /// Takes the cameras out of a result that are wrong, and names them.
 pub fn take_out_wrong(result: &mut FlightResult) -> Vec<CameraName> {
-    let is_wrong =
-        |camera: &mut CameraResult| CameraFigures::from(&*camera).verdict.starts_with(WRONG);
+    let is_wrong = |camera: &mut CameraResult| {
+        CameraFigures::from(&*camera).verdict.starts_with(verdict::WRONG)
+    };
     result.cameras.extract_if(.., is_wrong).map(|camera| camera.name).collect()
 }
-
-/// How the verdict of a camera begins that must not be used.
-const WRONG: &str = "wrong";
 
 impl From<&CameraResult> for CameraFigures {
     fn from(camera: &CameraResult) -> Self {
@@ -142,12 +111,13 @@ impl From<&CameraResult> for CameraFigures {
         let (least, most) = knots.fold((0.0_f64, 0.0_f64), |(least, most), knot| {
             (least.min(straight(knot)), most.max(straight(knot)))
         });
+        let wander_ms = (most - least) * 1e3;
         let middle = &clock.knots[clock.knots.len() / 2];
         let covariance = &camera.pose_covariance;
         let position_sd_m = covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
         let pointing_sd_mrad = covariance.fixed_view::<3, 3>(0, 0).trace().sqrt() * 1e3;
         Self {
-            verdict: verdict(camera, [position_sd_m, pointing_sd_mrad]),
+            verdict: verdict::of(camera, [position_sd_m, pointing_sd_mrad], wander_ms),
             name: camera.name.to_string(),
             labels: camera.labels,
             used: camera.used,
@@ -164,7 +134,7 @@ impl From<&CameraResult> for CameraFigures {
             clock_ahead_s: middle.ahead_s,
             clock_sd_s: middle.sd_s,
             clock_rate: clock.rate,
-            clock_wander_ms: (most - least) * 1e3,
+            clock_wander_ms: wander_ms,
             halves_ratio: camera.halves_ratio,
             readout_ms: clock.readout_s * 1e3,
             readout_sd_ms: clock.readout_sd_s * 1e3,
@@ -173,7 +143,7 @@ impl From<&CameraResult> for CameraFigures {
 }
 
 /// The figures for a program.
-pub fn figures(result: &FlightResult) -> Figures {
+pub fn figures(result: &FlightResult, rests: Rests) -> Figures {
     Figures {
         cameras: result.cameras.iter().map(CameraFigures::from).collect(),
         refused: result
@@ -181,14 +151,16 @@ pub fn figures(result: &FlightResult) -> Figures {
             .iter()
             .map(|(name, why)| (name.to_string(), why.to_string()))
             .collect(),
-        log_residual_m: result.log_residual_m,
+        log_residual_m: result.log.map(|log| log.residual_m),
+        log_left_out: result.log.map(|log| log.left_out),
+        remarks: remarks::of(result, rests),
         datum: result.datum.as_ref().map(DatumFigures::from),
         jerk: result.jerk,
     }
 }
 
 /// The figures for people.
-pub fn render(result: &FlightResult) -> String {
+pub fn render(result: &FlightResult, rests: Rests) -> String {
     let head = [
         "camera",
         "labels used",
@@ -206,7 +178,7 @@ pub fn render(result: &FlightResult) -> String {
         "verdict",
     ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
-    let figures = figures(result);
+    let figures = figures(result, rests);
     for camera in &figures.cameras {
         rows.push(vec![
             camera.name.clone(),
@@ -222,24 +194,22 @@ pub fn render(result: &FlightResult) -> String {
             format!("{:.1} ± {:.1}", camera.readout_ms, camera.readout_sd_ms),
             format!("{:+.2} %", 100.0 * (camera.focal_ratio - 1.0)),
             output::number(camera.halves_ratio, 1),
-            camera.verdict.to_owned(),
+            camera.verdict.clone(),
         ]);
     }
-    let moved = figures.cameras.iter().any(|camera| (camera.focal_ratio - 1.0).abs() > REMARKED);
-    let remark = if moved {
-        "\n\nA lens's focal length is shorter or longer at a distance than near the checkerboard that \
-         its file was made with: that is usual up to 2 %."
-    } else {
-        ""
-    };
     let refused: String = figures
         .refused
         .iter()
         .map(|(name, why)| format!("\n\ncamera `{name}` is not calibrated: it {why}"))
         .collect();
-    let log = figures.log_residual_m.map_or_else(String::new, |metres| {
-        format!("\n\nthe log lies {metres:.3} m beside the way, root mean square per axis")
+    let log = result.log.map_or_else(String::new, |log| {
+        format!(
+            "\n\nthe log lies {:.3} m beside the way, root mean square per axis; {} of its {} places lie \
+             farther off and are left out",
+            log.residual_m, log.left_out, log.samples
+        )
     });
     let datum = figures.datum.map_or_else(String::new, |datum| format!("\n\n{datum}"));
-    format!("{}{refused}{log}{datum}{remark}", output::table(&rows))
+    let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
+    format!("{}{refused}{log}{datum}{remarks}", output::table(&rows))
 }

@@ -1,0 +1,195 @@
+//! A camera's pose from directions and places, without a start: the direct linear transformation.
+
+use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Vector3};
+
+/// A direction in the camera's frame, and the place that is seen there.
+pub(super) type Seen = (Vector3<f64>, Point3<f64>);
+
+/// Rounds in which pairs that do not fit are weighed less: with half of them a tenth of strays still
+/// bends the solution.
+const ROUNDS: usize = 6;
+
+/// A linear map from places to directions, `d ~ M X + m` for any matrix M: of a camera whose lens or log
+/// may be stretched, too.
+#[derive(Clone, Debug)]
+pub(super) struct Linear {
+    /// M, up to its scale.
+    pub(super) matrix: Matrix3<f64>,
+    shift: Vector3<f64>,
+}
+
+impl Linear {
+    /// With the sign by which most places lie ahead.
+    fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[Seen]) -> Self {
+        let is_ahead =
+            |(direction, place): &&Seen| direction.dot(&(matrix * place.coords + shift)) > 0.0;
+        let ahead = pairs.iter().filter(is_ahead).count();
+        let sign = if 2 * ahead >= pairs.len() { 1.0 } else { -1.0 };
+        Self { matrix: matrix * sign, shift: shift * sign }
+    }
+
+    /// Angle between a direction and where the map has its place, rad.
+    fn misfit(&self, (direction, place): &Seen) -> f64 {
+        (self.matrix * place.coords + self.shift).angle(direction)
+    }
+
+    /// What most pairs lie below.
+    pub(super) fn typical_misfit(&self, pairs: &[Seen]) -> f64 {
+        typical(pairs.iter().map(|pair| self.misfit(pair)))
+    }
+
+    /// The rotation that lies nearest to it, and where its camera stands; `None` if that is a mirror
+    /// image.
+    pub(super) fn pose(&self) -> Option<(Rotation3<f64>, Point3<f64>)> {
+        let factors = self.matrix.svd(true, true);
+        let camera_from_world = factors.u? * factors.v_t?;
+        let size = factors.singular_values.mean();
+        if size <= 0.0 || camera_from_world.determinant() < 0.0 {
+            return None;
+        }
+        let centre = -(camera_from_world.transpose() * self.shift) / size;
+        let rotation = Rotation3::from_matrix_unchecked(camera_from_world.transpose());
+        Some((rotation, Point3::from(centre)))
+    }
+}
+
+/// So many of all pairs must fit: the rest may be of birds. Half of them can be made to fit a wrong
+/// clock by a pose that leaves the other half anywhere.
+const FITTING: f64 = 0.7;
+
+/// What that share of some numbers lies below; infinite of none.
+pub(super) fn typical(numbers: impl Iterator<Item = f64>) -> f64 {
+    let mut numbers: Vec<f64> = numbers.collect();
+    numbers.sort_unstable_by(f64::total_cmp);
+    let place = (FITTING * numbers.len() as f64) as usize;
+    numbers.get(place).copied().unwrap_or(f64::INFINITY)
+}
+
+/// The map that most pairs fit: those that do not, birds among the labels, are weighed less from round
+/// to round.
+pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
+    let axes = Normalised::of(pairs)?;
+    let mut weights = vec![1.0; pairs.len()];
+    let mut best: Option<(f64, Linear)> = None;
+    for _ in 0..ROUNDS {
+        let linear = axes.in_space(pairs, &weights)?;
+        let misfit = linear.typical_misfit(pairs);
+        for (weight, pair) in weights.iter_mut().zip(pairs) {
+            *weight = (1.0 + (linear.misfit(pair) / misfit.max(LEAST_RAD)).powi(2)).recip();
+        }
+        if best.as_ref().is_none_or(|(least, _)| misfit < *least) {
+            best = Some((misfit, linear));
+        }
+    }
+    best.map(|(_, linear)| linear)
+}
+
+/// Pairs that fit as well as this need no weights, rad.
+const LEAST_RAD: f64 = 1e-5;
+
+/// The direct linear transformation: `d x (M X + m) = 0` for every direction d and place X.
+pub(super) fn in_space(pairs: &[Seen]) -> Option<Linear> {
+    Normalised::of(pairs)?.in_space(pairs, &vec![1.0; pairs.len()])
+}
+
+/// The same for places in a plane, as of a flight at one height: the third axis follows from two.
+pub(super) fn in_plane(pairs: &[Seen]) -> Option<Linear> {
+    Normalised::of(pairs)?.in_plane(pairs)
+}
+
+/// Places in axes of their own: about their middle, along their widest spread first, of size one.
+struct Normalised {
+    middle: Point3<f64>,
+    axes: Matrix3<f64>,
+    scale: f64,
+}
+
+impl Normalised {
+    fn of(pairs: &[Seen]) -> Option<Self> {
+        let count = pairs.len() as f64;
+        let middle =
+            Point3::from(pairs.iter().map(|(_, p)| p.coords).sum::<Vector3<f64>>() / count);
+        let spread = |sum: Matrix3<f64>, (_, p): &(_, Point3<f64>)| {
+            let offset = p - middle;
+            sum + offset * offset.transpose()
+        };
+        let spread = pairs.iter().fold(Matrix3::zeros(), spread) / count;
+        let eigen = spread.symmetric_eigen();
+        let mut order = [0, 1, 2];
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        let columns = order.map(|k| eigen.eigenvectors.column(k).into_owned());
+        let mut axes = Matrix3::from_columns(&columns);
+        if axes.determinant() < 0.0 {
+            axes.column_mut(2).neg_mut();
+        }
+        let scale = spread.trace().sqrt();
+        (scale > 0.0).then_some(Self { middle, axes, scale })
+    }
+
+    fn place(&self, place: Point3<f64>) -> Vector3<f64> {
+        self.axes.transpose() * (place - self.middle) / self.scale
+    }
+
+    /// A map of these axes as one of the world.
+    fn in_world(&self, matrix: &Matrix3<f64>, shift: &Vector3<f64>, pairs: &[Seen]) -> Linear {
+        let from_world = matrix * self.axes.transpose();
+        let shift = shift * self.scale - from_world * self.middle.coords;
+        Linear::new(from_world, shift, pairs)
+    }
+
+    /// See [`in_space`]; each pair counts by its weight.
+    fn in_space(&self, pairs: &[Seen], weights: &[f64]) -> Option<Linear> {
+        let mut sum = SMatrix::<f64, 12, 12>::zeros();
+        for ((direction, place), weight) in pairs.iter().zip(weights) {
+            let place = self.place(*place);
+            let across = direction.cross_matrix();
+            let mut rows = SMatrix::<f64, 3, 12>::zeros();
+            for k in 0..3 {
+                rows.fixed_columns_mut::<3>(3 * k).copy_from(&(across * place[k]));
+            }
+            rows.fixed_columns_mut::<3>(9).copy_from(&across);
+            sum += rows.transpose() * rows * *weight;
+        }
+        let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
+        let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        let matrix = Matrix3::from_column_slice(&least.as_slice()[..9]);
+        Some(self.in_world(&matrix, &least.fixed_rows::<3>(9).into_owned(), pairs))
+    }
+
+    /// See [`in_plane`].
+    fn in_plane(&self, pairs: &[Seen]) -> Option<Linear> {
+        let mut sum = SMatrix::<f64, 9, 9>::zeros();
+        for (direction, place) in pairs {
+            let place = self.place(*place);
+            let across = direction.cross_matrix();
+            let mut rows = SMatrix::<f64, 3, 9>::zeros();
+            for k in 0..2 {
+                rows.fixed_columns_mut::<3>(3 * k).copy_from(&(across * place[k]));
+            }
+            rows.fixed_columns_mut::<3>(6).copy_from(&across);
+            sum += rows.transpose() * rows;
+        }
+        let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
+        let least: SVector<f64, 9> =
+            eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        let (x, y) = (least.fixed_rows::<3>(0).into_owned(), least.fixed_rows::<3>(3).into_owned());
+        let shift = least.fixed_rows::<3>(6).into_owned();
+        let size = f64::midpoint(x.norm(), y.norm());
+        if size <= 0.0 {
+            return None;
+        }
+        let (x, y, shift) = (x / size, y / size, shift / size);
+        // Both signs of what has none: that of the third axis follows.
+        let ahead = pairs.iter().filter(|(direction, place)| {
+            let place = self.place(*place);
+            direction.dot(&(x * place.x + y * place.y + shift)) > 0.0
+        });
+        let sign = if 2 * ahead.count() >= pairs.len() { 1.0 } else { -1.0 };
+        let (x, y) = (x * sign, y * sign);
+        let matrix = Matrix3::from_columns(&[x, y, x.cross(&y)]);
+        Some(self.in_world(&matrix, &(shift * sign), pairs))
+    }
+}
+
+/// A symmetric matrix of a dozen rows takes ten or so; one with what is no number would take for ever.
+const MOST_ITERATIONS: usize = 200;

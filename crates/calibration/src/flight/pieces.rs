@@ -1,0 +1,67 @@
+//! Labels in pieces: what follows one thing through the image.
+//!
+//! A bird that flies by is seen for a moment, the target for most of the time.
+
+use super::model::{CameraLabels, Label};
+
+/// From frame to frame nothing moves farther than this share of the image's width: with half of it fast
+/// targets near by fall into pieces, with twice as much a bird goes on where the target was.
+const STEP: f64 = 0.03;
+/// A piece ends after so many frames without a label.
+const FRAMES: f64 = 10.0;
+/// The longest pieces that hold this share of all labels are taken: a third may be of other things.
+const SHARE: f64 = 0.67;
+
+/// A piece under way: where each of its labels is among all.
+struct Piece {
+    labels: Vec<usize>,
+}
+
+impl Piece {
+    /// How far a label lies from where the piece has come to, as a share of how far it may.
+    fn away(&self, labels: &[Label], next: &Label, step_px: f64, frame_s: f64) -> Option<f64> {
+        let last = &labels[*self.labels.last()?];
+        let frames = ((next.time_s - last.time_s) / frame_s).round();
+        let [x, y] = [next.pixel.x() - last.pixel.x(), next.pixel.y() - last.pixel.y()];
+        let share = x.hypot(y) / (step_px * frames);
+        ((1.0..=FRAMES).contains(&frames) && share <= 1.0).then_some(share)
+    }
+}
+
+/// The labels of the pieces that last longest, in the order of their times.
+pub(super) fn longest(camera: &CameraLabels, frame_s: f64) -> Vec<Label> {
+    let labels = &camera.labels;
+    let mut pieces = cut(labels, STEP * f64::from(camera.intrinsics.size.width), frame_s);
+    pieces.sort_by_key(|piece| std::cmp::Reverse(piece.labels.len()));
+    let enough = (SHARE * labels.len() as f64).ceil() as usize;
+    let mut taken: Vec<usize> = Vec::new();
+    for piece in pieces {
+        if taken.len() >= enough {
+            break;
+        }
+        taken.extend(piece.labels);
+    }
+    taken.sort_unstable();
+    taken.into_iter().map(|index| labels[index]).collect()
+}
+
+fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {
+    let (mut open, mut ended): (Vec<Piece>, Vec<Piece>) = (Vec::new(), Vec::new());
+    for (index, label) in labels.iter().enumerate() {
+        let is_over = |piece: &mut Piece| {
+            let last = piece.labels.last().map_or(f64::NEG_INFINITY, |last| labels[*last].time_s);
+            label.time_s - last > (FRAMES + 0.5) * frame_s
+        };
+        ended.extend(open.extract_if(.., is_over));
+        let nearest = open
+            .iter_mut()
+            .filter_map(|piece| Some((piece.away(labels, label, step_px, frame_s)?, piece)))
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        match nearest {
+            Some((_, piece)) => piece.labels.push(index),
+            None => open.push(Piece { labels: vec![index] }),
+        }
+    }
+    ended.extend(open);
+    ended
+}

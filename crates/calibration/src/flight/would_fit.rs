@@ -1,0 +1,166 @@
+//! What would make a camera fit that does not: the usual slips.
+
+use std::fmt;
+
+use crossfix_message::CameraName;
+use nalgebra::Matrix3;
+
+use super::begin::frame_time;
+use super::course::Course;
+use super::linear::Linear;
+use super::model::CameraLabels;
+use super::start;
+
+/// What fits does so many times better than what was given.
+const CLEARLY_BETTER: f64 = 3.0;
+/// What is said to fit lies no farther beside the way than this, rad: lens files leave up to 4 mrad.
+const FITS_RAD: f64 = 8e-3;
+/// What a lens file leaves where it is the camera's, rad.
+const LENS_RAD: f64 = 1e-3;
+/// A stretch by less than this share is none: lenses move by 2 %, and short flights tell no better.
+const LEAST_STRETCH: f64 = 0.05;
+/// Two axes are alike, and at right angles, to this share.
+const ALIKE: f64 = 0.05;
+
+/// What would make a camera fit that does not.
+#[derive(Clone, Debug, PartialEq)]
+pub enum WouldFit {
+    /// The mirror image of the way: east and north are exchanged, or the height's sign is; what cameras
+    /// see does not tell which.
+    MirrorImage,
+    /// One axis of the log is so many times as long as it should be against the other two.
+    Stretched {
+        /// Which.
+        axis: Axis,
+        /// How many times.
+        times: f64,
+    },
+    /// A focal length so many times that of the lens's file.
+    Focal {
+        /// How many times.
+        times: f64,
+    },
+    /// Another camera's lens.
+    LensOf {
+        /// Whose.
+        camera: CameraName,
+    },
+}
+
+/// An axis of the site.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Axis {
+    /// East.
+    East,
+    /// North.
+    North,
+    /// Up.
+    Up,
+}
+
+impl fmt::Display for WouldFit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::MirrorImage => f.write_str(
+                "its mirror image fits, so east and north are exchanged in the log, or its height \
+                 counts downwards",
+            ),
+            Self::Stretched { axis: Axis::Up, times } => write!(
+                f,
+                "it fits if heights in the log are {times:.2} times what they should be against east \
+                 and north: feet for metres, or places of a map whose metre is another"
+            ),
+            Self::Stretched { axis, times } => write!(
+                f,
+                "it fits if {} in the log is {times:.2} times what it should be: degrees of longitude \
+                 are shorter than those of latitude",
+                if *axis == Axis::East { "east" } else { "north" }
+            ),
+            Self::Focal { times } => write!(
+                f,
+                "it fits with {times:.2} times the focal length of its lens file: a file for another \
+                 resolution, or a zoom"
+            ),
+            Self::LensOf { camera } => {
+                write!(f, "it fits with the lens of camera `{camera}`: are their names exchanged?")
+            }
+        }
+    }
+}
+
+/// What makes a camera fit that lies beside the way by an angle, rad.
+pub(super) fn find(
+    camera: &CameraLabels,
+    course: &Course,
+    others: &[CameraLabels],
+    misfit: f64,
+) -> Option<WouldFit> {
+    let better = |found: f64| found * CLEARLY_BETTER < misfit && found < FITS_RAD;
+    let frame_s = frame_time(camera);
+    if start::find(camera, &course.mirrored(), frame_s).is_some_and(|(_, found)| better(found)) {
+        return Some(WouldFit::MirrorImage);
+    }
+    let (map, found) = start::mapped(camera, course)?;
+    if !better(found) {
+        return None;
+    }
+    // That any linear map fits says that the target is the right one.
+    let stretched = stretched(&map);
+    if stretched.is_some() {
+        return stretched;
+    }
+    let with_lens = |other: &CameraLabels| {
+        let is_seen = camera.labels.iter().all(|label| {
+            let size = other.intrinsics.size;
+            label.pixel.x() <= f64::from(size.width) && label.pixel.y() <= f64::from(size.height)
+        });
+        let lent = CameraLabels { intrinsics: other.intrinsics, ..camera.clone() };
+        let found = is_seen.then(|| start::find(&lent, course, frame_s)).flatten()?;
+        Some((found.1, other.name.clone()))
+    };
+    let lent = others.iter().filter(|other| other.name != camera.name).filter_map(with_lens);
+    let lent = lent.min_by(|a, b| a.0.total_cmp(&b.0));
+    // Another camera's lens may lie near what was zoomed to.
+    let as_good = |of_lens: f64| better(of_lens) && of_lens < 2.0 * found.max(LENS_RAD);
+    match lent.filter(|(of_lens, _)| as_good(*of_lens)) {
+        Some((_, camera)) => Some(WouldFit::LensOf { camera }),
+        None => zoomed(&map),
+    }
+}
+
+/// The log's odd axis: a place is seen in M X, so the log's axes are what they should be where M' M is
+/// the identity.
+fn stretched(map: &Linear) -> Option<WouldFit> {
+    let inverse = square(&(map.matrix.transpose() * map.matrix))?;
+    let lengths = inverse.map(|square| square.sqrt().recip());
+    let [axis, one, other] = odd_one(lengths)?;
+    let times = lengths[axis] / (lengths[one] * lengths[other]).sqrt();
+    let axis = [Axis::East, Axis::North, Axis::Up][axis];
+    ((times - 1.0).abs() > LEAST_STRETCH).then_some(WouldFit::Stretched { axis, times })
+}
+
+/// The lens's focal length against its file's: the image is M X, and M M' is the identity where it is
+/// what it should be.
+fn zoomed(map: &Linear) -> Option<WouldFit> {
+    let [x, y, ahead] = square(&(map.matrix * map.matrix.transpose()))?;
+    let times = ((x * y).sqrt() / ahead).sqrt();
+    let is_round = (x / y).ln().abs() < 2.0 * ALIKE;
+    (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(WouldFit::Focal { times })
+}
+
+/// The diagonal of a matrix that has little else.
+fn square(matrix: &Matrix3<f64>) -> Option<[f64; 3]> {
+    let diagonal = matrix.diagonal();
+    let is_small = |(i, j): (usize, usize)| {
+        matrix[(i, j)].abs() < 2.0 * ALIKE * (diagonal[i] * diagonal[j]).sqrt()
+    };
+    [(0, 1), (0, 2), (1, 2)].into_iter().all(is_small).then_some(diagonal.into())
+}
+
+/// Which of three is unlike the other two, which are alike.
+fn odd_one(lengths: [f64; 3]) -> Option<[usize; 3]> {
+    let apart = |[_, one, other]: [usize; 3]| (lengths[one] / lengths[other]).ln().abs();
+    let orders = [[0, 1, 2], [1, 0, 2], [2, 0, 1]];
+    let best = orders.into_iter().min_by(|a, b| apart(*a).total_cmp(&apart(*b)))?;
+    (apart(best) < 2.0 * ALIKE).then_some(best)
+}

@@ -1,0 +1,164 @@
+//! What a person should know of a calibration that no figure says.
+
+use crossfix_calibration::{CameraResult, FlightResult};
+
+/// A focal length that has moved by more than this share is remarked on.
+const REMARKED_FOCAL: f64 = 0.003;
+/// A log that lies so many times farther beside the way than its kind allows is remarked on.
+const REMARKED_LOG: f64 = 2.5;
+/// Cameras whose clocks run alike to this have one clock in common that they run against: the log's.
+const ALIKE_RATE: f64 = 1e-4;
+/// Against it they run by more than this: two quartzes are within 1e-4.
+const REMARKED_RATE: f64 = 2e-4;
+/// Fewer cameras do not outvote a log.
+const LEAST_CAMERAS: usize = 3;
+/// Times of day, and not seconds since the camera was switched on: 1973 and later, s.
+const CLOCK_S: f64 = 1e8;
+/// Clocks that agree among themselves to this are set, s.
+const ALIKE_S: f64 = 2.0;
+/// GPS's time is ahead of UTC by this, s.
+const GPS_S: f64 = 18.0;
+/// Time zones are multiples of this, s.
+const ZONE_S: f64 = 900.0;
+
+/// What the size of the site, and where it is, rests on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rests {
+    /// The log, and nothing that could contradict it.
+    OnLogAlone,
+    /// A survey, with a log or without.
+    OnSurvey,
+}
+
+/// All of them.
+pub fn of(result: &FlightResult, rests: Rests) -> Vec<String> {
+    let times: Vec<ClockAgainstLog> = result.cameras.iter().map(ClockAgainstLog::of).collect();
+    let of_times = |say: fn(&[ClockAgainstLog]) -> Option<String>| {
+        result.log.is_some().then(|| say(&times)).flatten()
+    };
+    [of_log(result), of_size(rests), of_times(of_offsets), of_times(of_rates), of_lenses(result)]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+fn of_size(rests: Rests) -> Option<String> {
+    (rests == Rests::OnLogAlone).then(|| {
+        "Where the site is and how large rests on the log alone: feet for metres, or heights over \
+         another sea, would not show. Places of two cameras (--positions) or a taped --distance would \
+         tell."
+            .to_owned()
+    })
+}
+
+fn of_log(result: &FlightResult) -> Option<String> {
+    let log = result.log?;
+    let times = log.residual_m / log.stated_sd_m;
+    (times > REMARKED_LOG).then(|| {
+        format!(
+            "The log lies {times:.1} times as far beside the way as its kind allows: another \
+             --log-kind, or feet for metres."
+        )
+    })
+}
+
+/// How a camera's clock stands against the log's.
+#[derive(Clone, Copy, Debug)]
+struct ClockAgainstLog {
+    own_s: f64,
+    /// The log's time less its own, s.
+    ahead_s: f64,
+    rate: f64,
+}
+
+impl ClockAgainstLog {
+    fn of(camera: &CameraResult) -> Self {
+        let middle = &camera.clock.knots[camera.clock.knots.len() / 2];
+        Self { own_s: middle.time_s, ahead_s: middle.ahead_s, rate: camera.clock.rate }
+    }
+}
+
+/// The middle of some numbers, if all but every third lie within a distance of it.
+fn agreed(numbers: impl Iterator<Item = f64>, within: f64) -> Option<f64> {
+    let mut numbers: Vec<f64> = numbers.collect();
+    numbers.sort_unstable_by(f64::total_cmp);
+    let middle = *numbers.get(numbers.len() / 2)?;
+    let near = numbers.iter().filter(|number| (*number - middle).abs() < within).count();
+    (near >= LEAST_CAMERAS && 3 * near >= 2 * numbers.len()).then_some(middle)
+}
+
+fn of_rates(clocks: &[ClockAgainstLog]) -> Option<String> {
+    let rate = agreed(clocks.iter().map(|clock| clock.rate), ALIKE_RATE)?;
+    (rate.abs() > REMARKED_RATE).then(|| {
+        let word = if rate > 0.0 { "fast" } else { "slow" };
+        format!(
+            "The log's clock runs {:.2} % {word} against the cameras', which agree among themselves: \
+             its times are hardly seconds.",
+            100.0 * rate.abs()
+        )
+    })
+}
+
+fn of_offsets(clocks: &[ClockAgainstLog]) -> Option<String> {
+    if clocks.iter().any(|clock| clock.own_s < CLOCK_S) {
+        return None;
+    }
+    let ahead_s = agreed(clocks.iter().map(|clock| clock.ahead_s), ALIKE_S)?;
+    if ahead_s.abs() < ALIKE_S {
+        return None;
+    }
+    let zones = (ahead_s / ZONE_S).round();
+    let why = if (ahead_s - GPS_S).abs() < ALIKE_S {
+        ": they are GPS's (--time gps)".to_owned()
+    } else if zones != 0.0 && (ahead_s - zones * ZONE_S).abs() < ALIKE_S {
+        format!(": another time zone, by {} h", zones * ZONE_S / 3600.0)
+    } else {
+        String::new()
+    };
+    let word = if ahead_s > 0.0 { "ahead of" } else { "behind" };
+    Some(format!("The log's times are {:.1} s {word} all cameras' clocks{why}.", ahead_s.abs()))
+}
+
+fn of_lenses(result: &FlightResult) -> Option<String> {
+    let moved = |camera: &CameraResult| (camera.focal_ratio - 1.0).abs() > REMARKED_FOCAL;
+    result.cameras.iter().any(moved).then(|| {
+        "A lens's focal length is shorter or longer at a distance than near the checkerboard that its \
+         file was made with: that is usual up to 2 %."
+            .to_owned()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn clocks(ahead_s: [f64; 3], rates: [f64; 3]) -> Vec<ClockAgainstLog> {
+        let clock = |(ahead_s, rate)| ClockAgainstLog { own_s: 1.7e9, ahead_s, rate };
+        ahead_s.into_iter().zip(rates).map(clock).collect()
+    }
+
+    #[test]
+    fn a_log_in_gps_time_or_of_another_zone_is_named() {
+        let said = |ahead_s| of_offsets(&clocks(ahead_s, [0.0; 3]));
+        assert_eq!(said([0.02, -0.3, 0.1]), None);
+        assert!(said([18.02, 17.9, 18.4]).unwrap().contains("--time gps"));
+        assert!(said([-7200.1, -7199.8, -7200.0]).unwrap().contains("by -2 h"));
+        assert!(said([41.0, 40.9, 41.2]).unwrap().contains("41.0 s ahead of all"));
+        // Cameras that do not agree among themselves have clocks that nobody has set.
+        assert_eq!(said([41.0, -900.0, 12.0]), None);
+    }
+
+    #[test]
+    fn seconds_since_a_camera_was_switched_on_are_no_times_of_day() {
+        let mut clocks = clocks([18.0; 3], [0.0; 3]);
+        clocks.iter_mut().for_each(|clock| clock.own_s = 151.0);
+        assert_eq!(of_offsets(&clocks), None);
+    }
+
+    #[test]
+    fn a_log_whose_seconds_are_none_is_named_and_a_phone_is_not() {
+        let said = |rates| of_rates(&clocks([0.0; 3], rates));
+        assert!(said([9.8e-4, 1.0e-3, 1.02e-3]).unwrap().contains("0.10 % fast"));
+        assert_eq!(said([-8.3e-4, 2e-6, 1.9e-5]), None);
+    }
+}

@@ -1,0 +1,91 @@
+//! What to think of a camera that a flight has calibrated, and what to do about it.
+
+use crossfix_calibration::CameraResult;
+
+/// How the verdict of a camera begins that must not be used.
+pub const WRONG: &str = "wrong";
+
+/// A camera whose pointing is known worse than this is weak, mrad: at 100 m a target lies half a
+/// metre aside. With half of it a minute's flight would not do.
+const WEAK_POINTING_MRAD: f64 = 5.0;
+/// Nor may it stand this uncertainly, m.
+const WEAK_POSITION_M: f64 = 0.5;
+/// A camera that may stand anywhere within this share of its range is not calibrated at all.
+const NOWHERE: f64 = 0.5;
+/// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
+const WRONG_MRAD: f64 = 8.0;
+/// Nor do a hand and a tracker err by more than so many pixels ...
+const WRONG_PX: f64 = 3.0;
+/// ... that are more than this, mrad: of a short flight the wrong camera's labels lie no farther off.
+const WRONG_PX_MRAD: f64 = 2.0;
+/// No clock wanders by more than this within a flight, ms: phones do by 60.
+const WRONG_WANDER_MS: f64 = 300.0;
+/// A focal length that has moved by more than this share is not the file's lens, or nothing told how
+/// far off the target was: lenses move by 2 %.
+const WEAK_FOCAL: f64 = 0.025;
+/// A camera of whose labels less than this share fits has seen something else as well.
+const WEAK_SHARE: f64 = 0.8;
+/// Residuals that change for good by more than this were seen by a camera that was moved, pixels: of 143
+/// that stood still none changed by more than 1.3, as targets cross other parts of the image, ...
+const MOVED_PX: f64 = 2.0;
+/// ... nor by more than so many deviations of a second's mean: 2.6 at most. Two that were knocked by 9
+/// pixels changed by 2.8 and 11.
+const MOVED_DEVIATIONS: f64 = 2.7;
+
+/// The verdict: good; weak, and what mends it; wrong, and why.
+pub fn of(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2], wander_ms: f64) -> String {
+    wrong(camera, position_m, wander_ms)
+        .map(|why| format!("{WRONG}: {why}"))
+        .or_else(|| weak(camera, [position_m, pointing_mrad]).map(|why| format!("weak: {why}")))
+        .unwrap_or_else(|| "good".to_owned())
+}
+
+fn wrong(camera: &CameraResult, position_m: f64, wander_ms: f64) -> Option<String> {
+    let mrad = |px: f64| px / camera.intrinsics().fx * 1e3;
+    let residual = (camera.residual_px, mrad(camera.residual_px));
+    // The image's rows go down in the world where the camera is not held upside down.
+    let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
+    let moved =
+        camera.moved.filter(|moved| moved.by_px > MOVED_PX && moved.deviations > MOVED_DEVIATIONS);
+    if is_upside_down {
+        Some(
+            "upside down, so heights may count downwards in the log or survey (north-east-down?)"
+                .to_owned(),
+        )
+    } else if let Some(moved) = moved {
+        Some(format!(
+            "moved by {:.0} px at {:.0} s of its own time: calibrate before and after that apart \
+             (--from, --to)",
+            moved.by_px, moved.time_s
+        ))
+    } else if mrad(camera.noise.sd_px()) > WRONG_MRAD
+        || (residual.0 > WRONG_PX && residual.1 > WRONG_PX_MRAD)
+    {
+        Some(
+            "its labels lie far beside the target's way (another target, lens file or log?)"
+                .to_owned(),
+        )
+    } else if wander_ms > WRONG_WANDER_MS {
+        Some(format!(
+            "its clock would wander by {wander_ms:.0} ms (another target, lens file or frame rate?)"
+        ))
+    } else if position_m > NOWHERE * camera.range_m {
+        Some("nothing tells where it stands".to_owned())
+    } else {
+        None
+    }
+}
+
+fn weak(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> Option<&'static str> {
+    if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
+        Some("many labels are not the target's")
+    } else if (camera.focal_ratio - 1.0).abs() > WEAK_FOCAL {
+        Some(
+            "its focal length is far from its file's (another lens file, or fly nearer and farther)",
+        )
+    } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
+        Some("fly longer, near and far, high and low, through all of its image")
+    } else {
+        None
+    }
+}
