@@ -87,7 +87,9 @@ fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
     let flight = Flight::new(&data, "3", "gopro3,sony5100,sonyG");
     let (known, unknown) = (flight.import("calibration"), flight.import("test"));
     let (log, file) = (flight.named("calibration.csv"), flight.named("known.toml"));
-    succeed(&["calibrate", "flight", &known, "--log", &log, "--log-kind", "rtk", "-o", &file]);
+    let log = ["--log", &log, "--log-kind", "rtk"];
+    let said = succeed(&[&["calibrate", "flight", &known][..], &log, &["-o", &file]].concat());
+    assert!(said.contains("rests on the log alone"), "{said}");
     let read =
         |file: &str| SiteCalibration::from_toml(&std::fs::read_to_string(file).unwrap()).unwrap();
     let by_log = read(&file);
@@ -99,7 +101,8 @@ fn an_unknown_flight_finds_cameras_where_a_known_one_did() {
     let survey = flight.named("survey.csv");
     std::fs::write(&survey, format!("camera,east_m,north_m,up_m,sd_m\n{rows}")).unwrap();
     let file = flight.named("unknown.toml");
-    succeed(&["calibrate", "flight", &unknown, "--positions", &survey, "-o", &file]);
+    let said = succeed(&["calibrate", "flight", &unknown, "--positions", &survey, "-o", &file]);
+    assert!(!said.contains("rests on the log alone"), "{said}");
     let by_places = read(&file);
     let drone = Point3::new(40.0, 0.0, 20.0);
     let mut ahead = Vec::new();

@@ -59,9 +59,18 @@ const FITTING: f64 = 0.7;
 
 /// What that share of some numbers lies below; infinite of none.
 pub(super) fn typical(numbers: impl Iterator<Item = f64>) -> f64 {
+    quantile(numbers, FITTING)
+}
+
+/// What half of some numbers lies below; infinite of none.
+pub(super) fn median(numbers: impl Iterator<Item = f64>) -> f64 {
+    quantile(numbers, 0.5)
+}
+
+fn quantile(numbers: impl Iterator<Item = f64>, share: f64) -> f64 {
     let mut numbers: Vec<f64> = numbers.collect();
     numbers.sort_unstable_by(f64::total_cmp);
-    let place = (FITTING * numbers.len() as f64) as usize;
+    let place = (share * numbers.len() as f64) as usize;
     numbers.get(place).copied().unwrap_or(f64::INFINITY)
 }
 

@@ -18,9 +18,9 @@ const TRIED: usize = 120;
 const LEAST_TRIED: usize = 12;
 /// And this share of them.
 const LEAST_SHARE: f64 = 0.4;
-/// A start that lies no farther beside the way than this in the median is beyond doubt, rad: lens files
-/// leave up to 4 mrad, most of them 1.
-const CLEAR_RAD: f64 = 2e-3;
+/// A start that lies no farther beside the way than this is not looked for again without birds, rad:
+/// lens files leave up to 4 mrad, and what birds have bent lies tens beside.
+const CLEAR_RAD: f64 = 4e-3;
 /// Of all offsets, the linear solutions of so many are made again without what does not fit them, ...
 const CLEANED: usize = 60;
 /// ... and so many are followed up.
@@ -32,7 +32,7 @@ struct Candidate {
     rotation: Rotation3<f64>,
     centre: Point3<f64>,
     offset_s: f64,
-    /// Median angle between labels and the log, rad.
+    /// What most angles between labels and the log lie below, rad.
     misfit: f64,
 }
 
@@ -63,8 +63,9 @@ pub(super) fn find(
     let by_pieces = if is_clear { None } else { by_pieces() };
     let both = by_all.into_iter().chain(by_pieces);
     let best = both.min_by(|a, b| a.misfit.total_cmp(&b.misfit))?;
-    let Candidate { rotation, centre, offset_s, misfit } = best;
-    Some((state(camera, course, (rotation, centre, offset_s)), misfit))
+    let state = state(camera, course, (best.rotation, best.centre, best.offset_s));
+    let misfit = misfit_of(camera, &state, course);
+    Some((state, misfit))
 }
 
 /// The best pose over all offsets that begins with a linear solution of some rays, refined by all.
@@ -115,8 +116,9 @@ pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraState, course: &Cou
         let weights = course.weights(state.clock.common_s(ray.time_s))?;
         Some((ray.direction, course.way.place(&weights)))
     };
-    let pairs: Vec<_> = rays(camera, &camera.labels).iter().filter_map(at).collect();
-    if pairs.is_empty() { f64::INFINITY } else { misfit(&pairs, &state.rotation, state.centre) }
+    let rays = rays(camera, &camera.labels);
+    let pairs: Vec<Seen> = rays.iter().filter_map(at).collect();
+    linear::median(angles(&pairs, &state.rotation, state.centre))
 }
 
 /// A camera's labels, evenly spread over all of these.
@@ -170,19 +172,20 @@ fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<Seen>> {
 impl Candidate {
     fn of(map: &Linear, pairs: &[Seen], offset_s: f64) -> Option<Self> {
         let (rotation, centre) = map.pose()?;
-        Some(Self { rotation, centre, offset_s, misfit: misfit(pairs, &rotation, centre) })
+        let misfit = linear::typical(angles(pairs, &rotation, centre));
+        Some(Self { rotation, centre, offset_s, misfit })
     }
 }
 
-fn misfit(
-    pairs: &[(Vector3<f64>, Point3<f64>)],
+/// The angles between directions and where a camera that stands so has their places, rad.
+fn angles(
+    pairs: &[Seen],
     rotation: &Rotation3<f64>,
     centre: Point3<f64>,
-) -> f64 {
-    let angle = |(direction, place): &(Vector3<f64>, Point3<f64>)| {
+) -> impl Iterator<Item = f64> {
+    pairs.iter().map(move |(direction, place)| {
         rotation.inverse_transform_vector(&(place - centre)).angle(direction)
-    };
-    linear::typical(pairs.iter().map(angle))
+    })
 }
 
 /// Gauss and Newton's steps of pose, offset and read-out against the log's way, with weights
@@ -227,7 +230,7 @@ fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Opt
         for k in 0..7 {
             normal[(k, k)] *= 1.0 + 1e-3;
         }
-        now.misfit = misfit(&seen, &now.rotation, now.centre);
+        now.misfit = linear::typical(angles(&seen, &now.rotation, now.centre));
         if best.as_ref().is_none_or(|best| now.misfit < best.misfit) {
             best = Some(now.clone());
         }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use crossfix_geometry::Intrinsics;
 use crossfix_message::CameraName;
 use nalgebra::Matrix3;
 
@@ -15,8 +16,8 @@ use super::start;
 const CLEARLY_BETTER: f64 = 3.0;
 /// What is said to fit lies no farther beside the way than this, rad: lens files leave up to 4 mrad.
 const FITS_RAD: f64 = 8e-3;
-/// What a lens file leaves where it is the camera's, rad.
-const LENS_RAD: f64 = 1e-3;
+/// Another camera's lens fits about as well as any focal length if it misses by no more times as much.
+const LITTLE_WORSE: f64 = 1.5;
 /// A stretch by less than this share is none: lenses move by 2 %, and short flights tell no better.
 const LEAST_STRETCH: f64 = 0.05;
 /// Two axes are alike, and at right angles, to this share.
@@ -100,12 +101,9 @@ pub(super) fn find(
     if start::find(camera, &course.mirrored(), frame_s).is_some_and(|(_, found)| better(found)) {
         return Some(WouldFit::MirrorImage);
     }
-    let (map, found) = start::mapped(camera, course)?;
-    if !better(found) {
-        return None;
-    }
-    // That any linear map fits says that the target is the right one.
-    let stretched = stretched(&map);
+    // Where any linear map fits, the target is the right one.
+    let map = start::mapped(camera, course).filter(|(_, found)| better(*found)).map(|(map, _)| map);
+    let stretched = map.as_ref().and_then(stretched);
     if stretched.is_some() {
         return stretched;
     }
@@ -121,11 +119,23 @@ pub(super) fn find(
     let lent = others.iter().filter(|other| other.name != camera.name).filter_map(with_lens);
     let lent = lent.min_by(|a, b| a.0.total_cmp(&b.0));
     // Another camera's lens may lie near what was zoomed to.
-    let as_good = |of_lens: f64| better(of_lens) && of_lens < 2.0 * found.max(LENS_RAD);
+    let zoomed =
+        map.as_ref().and_then(zoomed).map(|times| (times, with_focal(camera, course, times)));
+    let as_good = |of_lens: f64| {
+        better(of_lens) && zoomed.is_none_or(|(_, of_zoom)| of_lens < LITTLE_WORSE * of_zoom)
+    };
     match lent.filter(|(of_lens, _)| as_good(*of_lens)) {
         Some((_, camera)) => Some(WouldFit::LensOf { camera }),
-        None => zoomed(&map),
+        None => zoomed.map(|(times, _)| WouldFit::Focal { times }),
     }
+}
+
+/// By how much a camera misses the way with another focal length, rad.
+fn with_focal(camera: &CameraLabels, course: &Course, times: f64) -> f64 {
+    let own = camera.intrinsics;
+    let intrinsics = Intrinsics { fx: own.fx * times, fy: own.fy * times, ..own };
+    let zoomed = CameraLabels { intrinsics, ..camera.clone() };
+    start::find(&zoomed, course, frame_time(camera)).map_or(f64::INFINITY, |found| found.1)
 }
 
 /// The log's odd axis: a place is seen in M X, so the log's axes are what they should be where M' M is
@@ -141,11 +151,11 @@ fn stretched(map: &Linear) -> Option<WouldFit> {
 
 /// The lens's focal length against its file's: the image is M X, and M M' is the identity where it is
 /// what it should be.
-fn zoomed(map: &Linear) -> Option<WouldFit> {
+fn zoomed(map: &Linear) -> Option<f64> {
     let [x, y, ahead] = square(&(map.matrix * map.matrix.transpose()))?;
     let times = ((x * y).sqrt() / ahead).sqrt();
     let is_round = (x / y).ln().abs() < 2.0 * ALIKE;
-    (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(WouldFit::Focal { times })
+    (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(times)
 }
 
 /// The diagonal of a matrix that has little else.
