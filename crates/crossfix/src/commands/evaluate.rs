@@ -47,11 +47,21 @@ pub struct Question {
     /// that just after.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub min_cameras: usize,
+    /// The smoothed tracks (of `fuse --lag`) in the place of those that went out at once.
+    #[arg(long)]
+    pub smoothed: bool,
 }
 
 impl Default for Question {
     fn default() -> Self {
-        Self { truth: None, cutoff_m: 5.0, skip_s: 0.0, truth_sd: 0.0, min_cameras: 0 }
+        Self {
+            truth: None,
+            cutoff_m: 5.0,
+            skip_s: 0.0,
+            truth_sd: 0.0,
+            min_cameras: 0,
+            smoothed: false,
+        }
     }
 }
 
@@ -95,7 +105,7 @@ impl Run {
         estimates
     }
 
-    fn read(&mut self, path: &Path) -> anyhow::Result<Lacks> {
+    fn read(&mut self, path: &Path, smoothed: bool) -> anyhow::Result<Lacks> {
         let mut lacks = Lacks::default();
         recorded::for_each(path, &mut lacks, |lacks, entry| {
             match entry.key.channel {
@@ -105,7 +115,9 @@ impl Run {
                     self.datum = self.datum.take().or(datum);
                 }
                 Channel::Truth => self.truth.extend(lacks.read::<TruthFrame>(&entry.data)),
-                Channel::Tracks => {
+                Channel::Tracks | Channel::Smoothed
+                    if smoothed == (entry.key.channel == Channel::Smoothed) =>
+                {
                     if let Some(frame) = lacks.read::<TrackFrame>(&entry.data) {
                         self.track_frames += 1;
                         self.latency.tracks(&frame.camera, frame.camera_sequence, entry.arrival);
@@ -141,11 +153,11 @@ fn targets(frame: &TruthFrame) -> Vec<TrueTarget> {
 /// Evaluates a recording.
 pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluation> {
     let mut run = Run::default();
-    let mut lacks = run.read(recording)?;
+    let mut lacks = run.read(recording, question.smoothed)?;
     lacks.ensure_found(run.track_frames > 0, "tracks", recording)?;
     if let Some(path) = &question.truth {
         let mut other = Run::default();
-        let theirs = other.read(path)?;
+        let theirs = other.read(path, question.smoothed)?;
         theirs.ensure_found(!other.truth.is_empty(), "truth", path)?;
         run.truth = other.truth;
         lacks.damage = lacks.damage.or(theirs.damage);

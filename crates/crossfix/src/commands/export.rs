@@ -32,6 +32,9 @@ pub struct Args {
     /// is a guess.
     #[arg(long)]
     all: bool,
+    /// The smoothed tracks (of `fuse --lag`) in the place of those that went out at once.
+    #[arg(long)]
+    smoothed: bool,
 }
 
 /// What a track is, in a word.
@@ -54,8 +57,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut history = TrackHistory::default();
     let mut lacks = Lacks::default();
     let mut frames = 0_u64;
+    let channel = if args.smoothed { Channel::Smoothed } else { Channel::Tracks };
     recorded::for_each(&args.recording, &mut lacks, |lacks, entry| {
-        if entry.key.channel == Channel::Tracks
+        if entry.key.channel == channel
             && let Some(frame) = lacks.read::<TrackFrame>(&entry.data)
         {
             frames += 1;
@@ -64,7 +68,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Ok(())
     })?;
     lacks.say(&args.recording);
-    lacks.ensure_found(frames > 0, "tracks", &args.recording)?;
+    let what = if args.smoothed { "smoothed tracks" } else { "tracks" };
+    lacks.ensure_found(frames > 0, what, &args.recording)?;
     let inputs: Vec<&Path> =
         std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
     let draft = Draft::new(&args.csv, &inputs)?;

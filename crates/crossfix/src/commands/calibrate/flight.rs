@@ -101,10 +101,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         output::line(report::render(&result, rests));
     }
-    for wrong in report::take_out_wrong(&mut result) {
+    let wrong = report::take_out_wrong(&mut result);
+    for wrong in &wrong {
         tracing::warn!("camera `{wrong}` is wrong and is not written");
     }
     ensure!(!result.cameras.is_empty(), "nothing is written: each camera is wrong");
+    // They have the log and the way in common with the others.
+    ensure!(
+        wrong.len() <= result.cameras.len(),
+        "nothing is written: most cameras are wrong, so the log or the survey is hardly of this flight"
+    );
     let inputs: Vec<&Path> = [Some(&args.recording), args.log.as_ref(), args.positions.as_ref()]
         .into_iter()
         .flatten()
