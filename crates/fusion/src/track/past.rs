@@ -13,6 +13,10 @@ use crate::motion::Motion;
 use crate::uncertainty::{LASTING, SharedTies};
 use crate::update::Told;
 
+/// Where it is tells no more than this share of what is unknown of where it was: rounding takes the
+/// rest.
+const CLOSEST: f64 = 1.0 - 1e-9;
+
 /// Where a track was at a time.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Past {
@@ -72,6 +76,27 @@ impl Past {
                 gain * by_errors
             };
             *self.ties_to(camera) -= change;
+        }
+    }
+
+    /// Makes the tie to where the target is now no closer than two states can be tied, by the inverse
+    /// covariance of that: the models' weights change it otherwise than any bearing does, and what a
+    /// tie that is too close promises is not there.
+    fn keep_possible(&mut self, now: &Matrix6<f64>) {
+        let explained = self.with_now.transpose() * now * self.with_now;
+        if (self.state.covariance * CLOSEST - explained).cholesky().is_some() {
+            return;
+        }
+        // The largest eigenvalue of L^-1 E L^-T, with L L' the covariance and E what of it the tie
+        // explains.
+        let largest = self.state.covariance.cholesky().and_then(|factor| {
+            let half = factor.l().solve_lower_triangular(&explained)?;
+            let whole = factor.l().solve_lower_triangular(&half.transpose())?;
+            Some(whole.symmetric_eigenvalues().max())
+        });
+        match largest.filter(|largest| largest.is_finite() && *largest > 0.0) {
+            Some(largest) => self.with_now *= (CLOSEST / largest).min(1.0).sqrt(),
+            None => self.settle(),
         }
     }
 
@@ -147,7 +172,14 @@ impl Track {
             })
             .collect();
         let mut past = std::mem::take(&mut self.past);
-        past.iter_mut().for_each(|past| past.learn(camera, told, &seen));
+        let now = self.imm.combined().covariance.cholesky().map(|factor| factor.inverse());
+        for past in &mut past {
+            past.learn(camera, told, &seen);
+            match &now {
+                Some(now) => past.keep_possible(now),
+                None => past.settle(),
+            }
+        }
         self.past = past;
     }
 
