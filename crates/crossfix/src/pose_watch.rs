@@ -20,8 +20,8 @@ pub struct PoseWatch {
 /// What has been found of a camera.
 #[derive(Clone, Debug)]
 pub struct CameraWatch {
-    /// At last.
-    pub now: PoseFinding,
+    /// At last; `None` if nothing has told since it was calibrated anew.
+    pub now: Option<PoseFinding>,
     /// When most spoke for its having been moved.
     pub worst: PoseFinding,
     /// When it was first sure that it had.
@@ -32,7 +32,7 @@ pub struct CameraWatch {
 
 impl CameraWatch {
     fn new(found: PoseFinding) -> Self {
-        Self { now: found.clone(), worst: found, moved_at: None, watched_s: 0.0 }
+        Self { now: None, worst: found, moved_at: None, watched_s: 0.0 }
     }
 
     fn take(&mut self, found: PoseFinding, time: Timestamp) {
@@ -45,7 +45,7 @@ impl CameraWatch {
             self.worst = found.clone();
         }
         self.watched_s = self.watched_s.max(found.watched_s);
-        self.now = found;
+        self.now = Some(found);
     }
 }
 
@@ -70,6 +70,7 @@ impl PoseWatch {
 
     fn ask(&mut self, fusion: &Fusion, now: Timestamp) {
         self.asked = Some(now);
+        self.cameras.values_mut().for_each(|camera| camera.now = None);
         for (name, found) in fusion.pose_findings() {
             let camera =
                 self.cameras.entry(name).or_insert_with(|| CameraWatch::new(found.clone()));
@@ -84,14 +85,11 @@ impl PoseWatch {
 
     /// What is to be said of the cameras that have been moved.
     pub fn problems(&self) -> impl Iterator<Item = (&CameraName, String)> {
-        self.cameras.iter().filter(|(_, camera)| camera.now.is_moved).map(|(name, camera)| {
-            (
-                name,
-                format!(
-                    "camera `{name}` has been moved since it was calibrated: {}",
-                    Turn(&camera.now)
-                ),
-            )
+        let moved = |camera: &'_ CameraWatch| camera.now.clone().filter(|now| now.is_moved);
+        self.cameras.iter().filter_map(move |(name, camera)| {
+            let now = moved(camera)?;
+            let what = "has been moved since it was calibrated";
+            Some((name, format!("camera `{name}` {what}: {}", Turn(&now))))
         })
     }
 }

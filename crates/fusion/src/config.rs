@@ -269,8 +269,9 @@ pub struct Tracking {
     /// Default 20.
     pub max_position_sd_m: f64,
     /// How long a track's state waits for later bearings that tell of it, s: it goes out at once,
-    /// and again when they have. 0 to 10. Default 0: it does not. Half a second halves the error of
-    /// the velocity; each bearing's cost grows with it.
+    /// and again when they have (`replay --fuse` writes those alone). 0 to 2. Default 0: it does not.
+    /// Half a second halves the error of the velocity, more tells little more; the cost of each bearing
+    /// grows with it.
     pub smoothing_s: f64,
 }
 

@@ -151,7 +151,7 @@ impl FusionConfig {
             range("tracking.coasting_after_s", it.coasting_after_s, 1e-3, 3600.0),
             range("tracking.lost_after_s", it.lost_after_s, 1e-3, 3600.0),
             range("tracking.max_position_sd_m", it.max_position_sd_m, 1e-3, 1e5),
-            range("tracking.smoothing_s", it.smoothing_s, 0.0, 10.0),
+            range("tracking.smoothing_s", it.smoothing_s, 0.0, 2.0),
         ]
     }
 

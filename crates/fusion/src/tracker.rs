@@ -289,6 +289,10 @@ impl Tracker {
             if let Some(owner) = sighting.and_then(|index| owners.get_mut(index)) {
                 *owner = Some(track.id);
             }
+            let mut track = track;
+            if let Some(old) = self.tracks.get_mut(&track.id) {
+                track.inherit(old);
+            }
             self.tracks.insert(track.id, track);
         }
     }

@@ -11,6 +11,8 @@ use crossfix_message::{Timestamp, TrackFrame};
 use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 const LAG_S: f64 = 0.5;
+/// Tracks are lost so soon that states of before still wait, s.
+const LOST_S: f64 = 1.0;
 
 /// A target that turns now this way and now that, at 12 m/s, until a time, s.
 fn weaving(until_s: f64) -> common::Path {
@@ -28,7 +30,8 @@ fn velocity(t: f64) -> Vector3<f64> {
 /// The frames that go out at once, and those that go out later with what the centre had handled by
 /// then, s.
 fn fused(scene: &Scene, smoothing_s: f64, seed: u64) -> (Vec<TrackFrame>, Vec<(TrackFrame, f64)>) {
-    let config = FusionConfig::default().smoothed(Some(smoothing_s));
+    let mut config = FusionConfig::default().smoothed(Some(smoothing_s));
+    config.tracking.lost_after_s = LOST_S;
     let mut fusion = fusion_of(config, &scene.eyes);
     let (mut at_once, mut later) = (Vec::new(), Vec::new());
     let mut keep = |outputs: Vec<Output>, now: f64| {
@@ -125,12 +128,13 @@ fn a_velocity_is_far_better_known_half_a_second_later_and_as_well_as_is_said() {
 
 #[test]
 fn what_is_known_when_a_track_ends_goes_into_what_waits() {
-    // The target is gone at 7 s, its track is lost at 11 s: all that waits then is of coasting.
+    // The target is gone at 7 s, its track is lost at 8 s: the last second of it still waits then.
     let scene = Scene::new(vec![weaving(7.0)], 14.0);
-    let (_, later) = fused(&scene, 6.0, 2);
-    let seen = later.iter().map(|(frame, _)| frame).filter(|frame| time_s(frame) < 6.5);
+    let last = |frame: &&TrackFrame| (6.0..6.8).contains(&time_s(frame));
+    let (_, later) = fused(&scene, 2.0, 2);
+    let seen = later.iter().map(|(frame, _)| frame).filter(last);
     let smoothed = velocity_error(seen);
     let (at_once, _) = fused(&scene, 0.0, 2);
-    let filtered = velocity_error(at_once.iter().filter(|frame| time_s(frame) < 6.5));
+    let filtered = velocity_error(at_once.iter().filter(last));
     assert!(smoothed < 0.6 * filtered, "{smoothed} of {filtered} m/s");
 }

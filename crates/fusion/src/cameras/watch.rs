@@ -41,13 +41,18 @@ const SURE: f64 = 6.9;
 /// likely: one in a hundred.
 const DISTINCT: f64 = 4.6;
 
+/// Information of errors that are in their own deviations: next to none.
+const UNSEEN: f64 = 1e-9;
+/// Fewer cameras do not check one another: an error in the plane of two sight lines shows in neither.
+const LEAST_TOGETHER: usize = 3;
+
 /// Errors of a camera: rotation and place, and its clock, each in its own deviations.
 const ERRORS: usize = 7;
 
 /// What the lines say of a camera's having been moved.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseFinding {
-    /// For how long it has been watched beside others, of the last minutes, s.
+    /// For how long it has been watched beside two others, of the last minutes, s.
     pub watched_s: f64,
     /// By how much it would have been turned, about the world's axes, rad.
     pub turn: Vector3<f64>,
@@ -86,11 +91,25 @@ impl Memory {
         self.pull.resize_vertically_mut(errors, 0.0);
     }
 
-    /// Forgets a camera's errors, from this on.
+    /// Forgets a camera's errors, from this on: what was said of the others' counts for as much as it
+    /// says where these may have been anything (the Schur complement).
     fn forget(&mut self, first: usize) {
         let information = std::mem::take(&mut self.information);
-        self.information = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
-        self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
+        let own = information.view((first, first), (ERRORS, ERRORS)).into_owned();
+        let own_pull = self.pull.rows(first, ERRORS).into_owned();
+        let ties = information.columns(first, ERRORS).into_owned().remove_rows(first, ERRORS);
+        let mut left = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
+        let mut pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
+        // Not all of them need have been seen at all.
+        let least = DMatrix::identity(ERRORS, ERRORS) * UNSEEN;
+        if let Some(factor) = (own + least).cholesky() {
+            left -= &ties * factor.solve(&ties.transpose());
+            pull -= &ties * factor.solve(&own_pull);
+        } else {
+            left.fill(0.0);
+            pull.fill(0.0);
+        }
+        (self.information, self.pull) = (left, pull);
     }
 
     /// Mean and covariance of the errors if no camera has been moved.
@@ -108,6 +127,8 @@ struct Watched {
     covariance: Matrix6<f64>,
     root: Matrix6<f64>,
     watched_s: f64,
+    /// When it was last seen beside others.
+    drawn: Option<Timestamp>,
 }
 
 impl Watched {
@@ -118,7 +139,14 @@ impl Watched {
             covariance[(axis + 3, axis + 3)] += LEAST_SHIFT_M.powi(2);
         }
         let root = covariance.cholesky().map_or_else(Matrix6::identity, |factor| factor.l());
-        Self { name, covariance, root, watched_s: 0.0 }
+        Self { name, covariance, root, watched_s: 0.0, drawn: None }
+    }
+
+    /// Notes that it has been seen beside others.
+    fn draw(&mut self, now: Timestamp) {
+        let last = self.drawn.replace(now);
+        self.watched_s +=
+            last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
     }
 
     /// A line's change with the errors.
@@ -215,7 +243,7 @@ impl Watch {
     }
 
     /// Forgets by as much as the time since the last draw asks for.
-    fn age(&mut self, now: Timestamp) -> f64 {
+    fn age(&mut self, now: Timestamp) {
         let last = self.drawn.replace(now);
         let since = last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
         for (memory, memory_s) in self.memories.iter_mut().zip(MEMORIES_S) {
@@ -226,11 +254,10 @@ impl Watch {
         let longest_s = MEMORIES_S.into_iter().fold(0.0, f64::max);
         let kept = (-since / longest_s).exp();
         self.cameras.iter_mut().for_each(|camera| camera.watched_s *= kept);
-        since
     }
 
     /// Takes in what cameras have seen of one target; `places` are theirs among those watched.
-    fn learn(&mut self, samples: &[Sample], places: &[usize], since_s: f64) -> Option<()> {
+    fn learn(&mut self, samples: &[Sample], places: &[usize], now: Timestamp) -> Option<()> {
         let by_errors: Vec<_> = samples
             .iter()
             .zip(places)
@@ -271,8 +298,8 @@ impl Watch {
                 }
             }
         }
-        for place in places {
-            self.cameras[*place].watched_s += since_s;
+        if places.len() >= LEAST_TOGETHER {
+            places.iter().for_each(|place| self.cameras[*place].draw(now));
         }
         Some(())
     }
@@ -331,13 +358,13 @@ impl Cameras {
     /// Takes in what cameras have seen of one target at a time.
     pub(crate) fn watch(&mut self, samples: &[Sample], now: Timestamp) {
         let Self { by_name, watch, .. } = self;
-        let since_s = watch.age(now);
+        watch.age(now);
         let mut places = Vec::with_capacity(samples.len());
         for sample in samples {
             let Some(camera) = by_name.get(&sample.camera) else { return };
             places.push(watch.place_of(&sample.camera, &camera.known().pose_covariance));
         }
-        watch.learn(samples, &places, since_s);
+        watch.learn(samples, &places, now);
     }
 
     /// What the lines say of each camera that has been watched beside others.
@@ -386,7 +413,7 @@ mod tests {
             let seen = samples(turn, place);
             let places: Vec<usize> =
                 seen.iter().map(|one| watch.place_of(&one.camera, &declared)).collect();
-            watch.learn(&seen, &places, 0.3).unwrap();
+            watch.learn(&seen, &places, Timestamp::from_seconds(t)).unwrap();
         }
         watch
     }
@@ -405,7 +432,7 @@ mod tests {
         watch.forget(&name);
         let found = watch.findings();
         assert!(!found.contains_key(&name));
-        assert_eq!(found.len(), 1);
+        assert!(found.values().all(|own| !own.is_moved) && found.len() == 1, "{found:?}");
     }
 
     #[test]

@@ -25,6 +25,8 @@ pub(super) struct Past {
     /// Covariance of where the track is at `carried_to` with where it was.
     with_now: Matrix6<f64>,
     carried_to: Timestamp,
+    /// Whether nothing more is told of it.
+    is_settled: bool,
     /// What ties it to the shared errors of each camera; in the order of their names.
     ties: Vec<(CameraName, SharedTies)>,
 }
@@ -102,6 +104,7 @@ impl Past {
 
     /// Is told nothing more.
     fn settle(&mut self) {
+        self.is_settled = true;
         self.with_now = Matrix6::zeros();
         self.ties.clear();
     }
@@ -123,7 +126,14 @@ impl Track {
         let ties =
             self.ties.iter().map(|(name, ties)| (name.clone(), ties.predicted(interval))).collect();
         let with_now = state.covariance;
-        self.past.push_back(Past { time, state, with_now, carried_to: time, ties });
+        self.past.push_back(Past {
+            time,
+            state,
+            with_now,
+            carried_to: time,
+            is_settled: false,
+            ties,
+        });
     }
 
     /// Where the track was at a time, if that is kept.
@@ -138,10 +148,15 @@ impl Track {
         }
     }
 
-    /// Takes over what another track of the same target has kept; nothing more is told of it.
+    /// Takes over what another track of the same target has kept since this one has anything; nothing
+    /// more is told of it.
     pub(crate) fn inherit(&mut self, old: &mut Self) {
-        self.past = std::mem::take(&mut old.past);
-        self.past.iter_mut().for_each(Past::settle);
+        let last = self.past.back().map(|past| past.time);
+        let newer = old.past.drain(..).filter(|past| last.is_none_or(|last| past.time > last));
+        self.past.extend(newer.map(|mut past| {
+            past.settle();
+            past
+        }));
     }
 
     /// Takes what is kept on to a time.
@@ -173,7 +188,7 @@ impl Track {
             .collect();
         let mut past = std::mem::take(&mut self.past);
         let now = self.imm.combined().covariance.cholesky().map(|factor| factor.inverse());
-        for past in &mut past {
+        for past in past.iter_mut().filter(|past| !past.is_settled) {
             past.learn(camera, told, &seen);
             match &now {
                 Some(now) => past.keep_possible(now),
