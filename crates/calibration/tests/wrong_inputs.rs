@@ -179,11 +179,12 @@ fn fifteen_seconds_of_a_log_are_refused_or_said_to_be_weak() {
     let samples = log.samples.into_iter().filter(|s| (50.0..65.0).contains(&s.time_s)).collect();
     let log = FlightLog { samples, errors: log.errors };
     match calibrate_flight(&labels, Some(&log), &Survey::default()) {
-        Err(_) => {}
+        Err(error) => assert!(matches!(error, FlightError::NoCamera { .. }), "{error}"),
         Ok(result) => {
             for camera in &result.cameras {
                 let spread = camera.pose_covariance.fixed_view::<3, 3>(3, 3).trace().sqrt();
-                assert!(spread > 0.05, "{}: {spread} m", camera.name);
+                // What half a metre is: see the command's verdict.
+                assert!(spread > 0.5, "{}: {spread} m", camera.name);
             }
         }
     }

@@ -319,6 +319,8 @@ fn best_of_pairs(cameras: &[&CameraLabels]) -> Option<Begun> {
 pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
     let mut steps: Vec<f64> =
         camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
+    // Several labels may be of one frame.
+    steps.retain(|step| *step > 0.0);
     steps.sort_unstable_by(f64::total_cmp);
     steps.get(steps.len() / 2).copied().unwrap_or_default().max(1e-3)
 }

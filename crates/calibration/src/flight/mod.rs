@@ -125,7 +125,8 @@ pub enum Refusal {
 
 /// A flight's equations take memory by its time: an hour of six cameras 0.2 GB, and minutes.
 const LONGEST_FLIGHT_H: f64 = 1.0;
-/// All of a log's times are tried for each camera's clock: six hours take seconds a camera.
+/// All of a log's times are tried for each camera's clock: six hours take seconds a camera, and minutes
+/// one that does not fit, as what would make it fit is looked for.
 const LONGEST_LOG_H: f64 = 6.0;
 /// A log with fewer samples is none.
 const LEAST_SAMPLES: usize = 20;

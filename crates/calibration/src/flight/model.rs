@@ -89,9 +89,9 @@ pub struct TapedDistance {
 }
 
 impl Survey {
-    /// Whether nothing was surveyed.
-    pub fn is_empty(&self) -> bool {
-        self.places.is_empty() && self.distances.is_empty()
+    /// Whether it tells how large the site is.
+    pub fn tells_size(&self) -> bool {
+        self.places.len() > 1 || !self.distances.is_empty()
     }
 
     /// The place of a camera.

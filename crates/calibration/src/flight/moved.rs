@@ -2,6 +2,8 @@
 
 use nalgebra::Vector2;
 
+use super::linear::median;
+
 /// Residuals over this time are averaged, s: labels err alike for as long.
 const BLOCK_S: f64 = 1.0;
 /// Each part must have so many of them.
@@ -34,28 +36,66 @@ fn blocks(residuals: &[(f64, Vector2<f64>)]) -> Vec<Block> {
     residuals.chunk_by(same).map(block).collect()
 }
 
-/// The moment that divides residuals, in the order of their times, best into two parts of one mean
-/// each; `None` of too few.
+/// The medians of some blocks, axis by axis, and the mean distance from them an axis, pixels.
+fn middle(blocks: &[Block]) -> (Vector2<f64>, f64) {
+    let axis = |axis: usize| median(blocks.iter().map(|block| block.mean[axis]));
+    let middle = Vector2::new(axis(0), axis(1));
+    let away: f64 = blocks.iter().map(|block| (block.mean - middle).lp_norm(1)).sum();
+    (middle, away / 2.0)
+}
+
+/// The moment that divides residuals, in the order of their times, best into two parts of one median
+/// each, so that a bird at the beginning or the end is no part; `None` of too few.
 pub(super) fn likeliest(residuals: &[(f64, Vector2<f64>)]) -> Option<MovedAt> {
+    /// A normal deviate's standard deviation by the mean of its size.
+    const BY_MEAN: f64 = 1.253;
     let blocks = blocks(residuals);
-    let all: Vector2<f64> = blocks.iter().map(|block| block.mean).sum();
-    let squares: f64 = blocks.iter().map(|block| block.mean.norm_squared()).sum();
-    let mut before = Vector2::zeros();
-    let mut best: Option<(f64, MovedAt)> = None;
-    for (k, block) in blocks.iter().enumerate() {
-        let (left, right) = (k as f64, (blocks.len() - k) as f64);
-        if k >= LEAST_BLOCKS && blocks.len() - k >= LEAST_BLOCKS {
-            let (one, other) = (before / left, (all - before) / right);
-            // What the two means leave, per axis.
-            let explained = before.norm_squared() / left + (all - before).norm_squared() / right;
-            let sd = ((squares - explained).max(0.0) / (2.0 * (left + right))).sqrt();
-            let by_px = (other - one).norm();
-            if best.as_ref().is_none_or(|(most, _)| explained > *most) {
-                let deviations = by_px / sd.max(f64::MIN_POSITIVE);
-                best = Some((explained, MovedAt { time_s: block.time_s, by_px, deviations }));
-            }
-        }
-        before += block.mean;
+    let last = blocks.len().checked_sub(LEAST_BLOCKS)?;
+    let divided = (LEAST_BLOCKS..=last).map(|k| {
+        let ((one, left), (other, right)) = (middle(&blocks[..k]), middle(&blocks[k..]));
+        let sd = BY_MEAN * (left + right) / blocks.len() as f64;
+        let by_px = (other - one).norm();
+        let deviations = by_px / sd.max(f64::MIN_POSITIVE);
+        (left + right, MovedAt { time_s: blocks[k].time_s, by_px, deviations })
+    });
+    divided.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, moved)| moved)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    /// Two minutes of residuals of half a pixel, with something added at a time.
+    fn residuals(added: impl Fn(f64) -> f64) -> Vec<(f64, Vector2<f64>)> {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
+        let residual = |k: u32| {
+            let time_s = f64::from(k) * 0.04;
+            (time_s, Vector2::new(0.5 * normal() + added(time_s), 0.5 * normal()))
+        };
+        (0..3000).map(residual).collect()
     }
-    best.map(|(_, moved)| moved)
+
+    #[test]
+    fn a_knock_is_found_wherever_it_is() {
+        for at_s in [15.0, 60.0, 100.0] {
+            let moved = likeliest(&residuals(|t| if t > at_s { 6.0 } else { 0.0 })).unwrap();
+            assert!((moved.time_s - at_s).abs() < 1.5, "{moved:?}");
+            assert!(moved.by_px > 2.0 && moved.deviations > 2.5, "{at_s}: {moved:?}");
+        }
+    }
+
+    #[test]
+    fn a_bird_at_either_end_is_no_knock() {
+        for from_s in [0.0, 3.0, 117.0] {
+            let bird = (from_s..from_s + 2.5, 200.0);
+            let moved = likeliest(&residuals(|t| if bird.0.contains(&t) { bird.1 } else { 0.0 }));
+            let moved = moved.unwrap();
+            assert!(moved.by_px < 2.0 && moved.deviations < 2.5, "{from_s}: {moved:?}");
+        }
+    }
 }

@@ -116,7 +116,7 @@ pub(super) fn find(
         let found = is_seen.then(|| start::find(&lent, course, frame_s)).flatten()?;
         Some((found.1, other.name.clone()))
     };
-    let lent = others.iter().filter(|other| other.name != camera.name).filter_map(with_lens);
+    let lent = others.iter().filter(|other| is_another(other, camera)).filter_map(with_lens);
     let lent = lent.min_by(|a, b| a.0.total_cmp(&b.0));
     // Another camera's lens may lie near what was zoomed to.
     let zoomed =
@@ -128,6 +128,11 @@ pub(super) fn find(
         Some((_, camera)) => Some(WouldFit::LensOf { camera }),
         None => zoomed.map(|(times, _)| WouldFit::Focal { times }),
     }
+}
+
+/// Whether a camera has a lens of its own.
+fn is_another(other: &CameraLabels, camera: &CameraLabels) -> bool {
+    other.name != camera.name && other.intrinsics != camera.intrinsics
 }
 
 /// By how much a camera misses the way with another focal length, rad.

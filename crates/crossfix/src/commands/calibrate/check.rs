@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{bail, ensure};
 use crossfix_fusion::{CameraStanding, Output};
-use crossfix_message::{CameraName, Channel, Timestamp};
+use crossfix_message::{CameraCalibration, CameraName, Channel, Timestamp};
 use crossfix_recording::Entry;
 use serde::Serialize;
 
@@ -26,13 +26,13 @@ const LEAST_WATCHED_S: f64 = 20.0;
 /// two others see. The exit code is 1 if one does not fit.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix calibrate check last-night.mcap -c my-site\n  crossfix calibrate check last-night.mcap"
+    after_help = "Examples:\n  crossfix calibrate check last-night.mcap\n  crossfix calibrate check raw.mcap -c my-site"
 )]
 pub struct Args {
     /// A recording (MCAP) of targets that several cameras see.
     recording: PathBuf,
     /// The calibration, or the site's folder with `calibration.toml` in it, in the place of what was
-    /// recorded.
+    /// recorded: of a recording that was made without one.
     #[arg(short, long, value_name = "PATH")]
     config: Option<PathBuf>,
     /// Print JSON.
@@ -40,10 +40,14 @@ pub struct Args {
     json: bool,
 }
 
+/// What a site's folder calls the fusion centre's file.
+const FUSION: &str = "fusion.toml";
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let calibration = args.config.as_deref().map(calibration_of).transpose()?;
+    let fusion = args.config.as_deref().map(|path| path.join(FUSION)).filter(|file| file.is_file());
     let recalibration = calibration.as_deref().map(Recalibration::load).transpose()?;
-    let seen = watched(&args.recording, recalibration)?;
+    let seen = watched(&args.recording, recalibration, fusion.as_deref())?;
     let figures: Vec<Figures> = seen.iter().map(|(name, seen)| Figures::of(name, seen)).collect();
     if args.json {
         output::json(&figures)?;
@@ -117,12 +121,40 @@ impl Seen {
     }
 }
 
+/// The first calibration of each camera in a recording, which holds for all that was captured before it.
+/// Where others take their place, the bearings must not have been made with ones that correct clocks: they
+/// would be corrected twice.
+fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entry>> {
+    let mut first: BTreeMap<CameraName, Entry> = BTreeMap::new();
+    recorded::for_each(recording, &mut Lacks::default(), |lacks, entry| {
+        if let Channel::Calibration(name) = &entry.key.channel
+            && !first.contains_key(name)
+        {
+            let message = lacks.read::<CameraCalibration>(&entry.data);
+            ensure!(
+                !(are_replaced && message.is_some_and(|message| message.datum.is_some())),
+                "the bearings of {} were made with a flight's calibration: leave -c away to check that",
+                recording.display()
+            );
+            first.insert(name.clone(), entry);
+        }
+        Ok(())
+    })?;
+    Ok(first.into_values().collect())
+}
+
 /// Fuses a recording and watches its cameras.
 fn watched(
     recording: &Path,
     recalibration: Option<Recalibration>,
+    fusion: Option<&Path>,
 ) -> anyhow::Result<BTreeMap<CameraName, Seen>> {
-    let mut centre = Centre::new(FusionFile::load(None, &[])?.fusion(), None)?;
+    let mut centre = Centre::new(FusionFile::load(fusion, &[])?.fusion(), None)?;
+    for entry in calibrations(recording, recalibration.is_some())? {
+        let entry =
+            recalibration.as_ref().map_or_else(|| entry.clone(), |new| new.applied(entry.clone()));
+        centre.take(&entry.key.channel, &entry.data, "");
+    }
     let mut seen: BTreeMap<CameraName, Seen> = BTreeMap::new();
     let mut take = |entry: Entry| {
         match &entry.key.channel {

@@ -55,12 +55,12 @@ pub struct Args {
     /// kind's without.
     #[arg(long, value_name = "METRES", value_parser = numbers::not_negative)]
     log_drift: Option<f64>,
-    /// Take what each camera saw from this time of its own on alone, s.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::number, allow_negative_numbers = true)]
-    from: Option<f64>,
-    /// Take what each camera saw until this time of its own alone, s.
-    #[arg(long, value_name = "SECONDS", value_parser = numbers::number, allow_negative_numbers = true)]
-    to: Option<f64>,
+    /// Take what a camera saw from this time of its own on alone, s, as in north=151.
+    #[arg(long, value_name = "CAMERA=SECONDS")]
+    from: Vec<Moment>,
+    /// Take what a camera saw until this time of its own alone, s.
+    #[arg(long, value_name = "CAMERA=SECONDS")]
+    to: Vec<Moment>,
     /// What of the lenses may be otherwise than their files say.
     #[arg(long, default_value = "all", value_enum, value_name = "WHAT")]
     lens: Lens,
@@ -84,15 +84,17 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
     let mut cameras = labels(&args.recording, args.lens.into())?;
-    let (from_s, to_s) = (args.from.unwrap_or(f64::MIN), args.to.unwrap_or(f64::MAX));
-    for camera in &mut cameras {
-        camera.labels.retain(|label| (from_s..to_s).contains(&label.time_s));
+    for Moment { camera, time_s } in &args.from {
+        cut(&mut cameras, camera, |label| label.time_s >= *time_s)?;
+    }
+    for Moment { camera, time_s } in &args.to {
+        cut(&mut cameras, camera, |label| label.time_s < *time_s)?;
     }
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let survey =
         survey::read(args.positions.as_deref(), &args.distance, (&names, "the recording"))?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
-    let rests = if survey.is_empty() { Rests::OnLogAlone } else { Rests::OnSurvey };
+    let rests = if survey.tells_size() { Rests::OnSurvey } else { Rests::OnLogAlone };
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
@@ -126,6 +128,38 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if !args.json {
         output::line(format!("\nwritten to {}", args.output.display()));
     }
+    Ok(())
+}
+
+/// A time of a camera's own clock, s.
+#[derive(Clone, Debug)]
+struct Moment {
+    camera: CameraName,
+    time_s: f64,
+}
+
+impl std::str::FromStr for Moment {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let (camera, time_s) =
+            text.split_once('=').ok_or("a camera and a time are wanted, as in north=151")?;
+        let camera = camera.parse().map_err(|error| format!("{error}"))?;
+        let time_s = time_s.parse::<f64>().ok().filter(|time_s| time_s.is_finite());
+        Ok(Self { camera, time_s: time_s.ok_or("the time is no number of seconds")? })
+    }
+}
+
+/// Keeps of what a camera saw what fits.
+fn cut(
+    cameras: &mut [CameraLabels],
+    name: &CameraName,
+    fits: impl Fn(&Label) -> bool,
+) -> anyhow::Result<()> {
+    let camera = cameras.iter_mut().find(|camera| camera.name == *name);
+    let camera = camera.with_context(|| format!("the recording has no camera `{name}`"))?;
+    camera.labels.retain(fits);
+    ensure!(!camera.labels.is_empty(), "of camera `{name}` nothing is left between those times");
     Ok(())
 }
 

@@ -100,7 +100,8 @@ fn of_rates(clocks: &[ClockAgainstLog]) -> Option<String> {
 }
 
 fn of_offsets(clocks: &[ClockAgainstLog]) -> Option<String> {
-    if clocks.iter().any(|clock| clock.own_s < CLOCK_S) {
+    let is_of_day = |s: f64| s > CLOCK_S;
+    if !clocks.iter().all(|c| is_of_day(c.own_s) && is_of_day(c.own_s + c.ahead_s)) {
         return None;
     }
     let ahead_s = agreed(clocks.iter().map(|clock| clock.ahead_s), ALIKE_S)?;
@@ -153,6 +154,8 @@ mod tests {
         let mut clocks = clocks([18.0; 3], [0.0; 3]);
         clocks.iter_mut().for_each(|clock| clock.own_s = 151.0);
         assert_eq!(of_offsets(&clocks), None);
+        // Nor are those since a log was begun.
+        assert_eq!(of_offsets(&self::clocks([-1.7e9 + 20.0; 3], [0.0; 3])), None);
     }
 
     #[test]
