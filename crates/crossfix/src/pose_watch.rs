@@ -39,8 +39,11 @@ impl CameraWatch {
         if found.is_moved {
             self.moved_at.get_or_insert(time);
         }
-        // What is sure is worse than what is not, however much spoke for that.
-        let rank = |finding: &PoseFinding| (finding.is_moved, finding.log_odds);
+        // What is sure is worse than what is not, and what this camera alone explains than what another
+        // might have, however much spoke for that.
+        let rank = |finding: &PoseFinding| {
+            (finding.is_moved, finding.or_else.is_empty(), finding.log_odds)
+        };
         if rank(&found) > rank(&self.worst) {
             self.worst = found.clone();
         }
@@ -76,6 +79,17 @@ impl PoseWatch {
                 self.cameras.entry(name).or_insert_with(|| CameraWatch::new(found.clone()));
             camera.take(found, now);
         }
+    }
+
+    /// Whether a camera has been moved, by all that has been found: not one that for a moment might have
+    /// been in the place of another, which was then found to have been alone.
+    pub fn has_moved(&self, name: &CameraName) -> bool {
+        let is_alone = |other: &CameraName| {
+            self.cameras.get(other).is_some_and(|camera| camera.worst.is_moved_alone())
+        };
+        self.cameras.get(name).is_some_and(|camera| {
+            camera.worst.is_moved && !camera.worst.or_else.iter().any(is_alone)
+        })
     }
 
     /// What has been found of each camera, by name.

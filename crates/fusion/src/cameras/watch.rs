@@ -34,8 +34,8 @@ const LEAST_SHIFT_M: f64 = 2e-3;
 const FREEDOM: f64 = 4.0;
 /// A camera is said to have been moved if the lines are so many times (logarithm) more likely by it:
 /// a thousand times, as one of a site's is moved about once in so many minutes, a day. Of those that
-/// stand as they say none came to more than 320 times, on real flights; with half of it (30 times) three in
-/// a hundred of these would be accused.
+/// stand as they say none came to more than 320 times, on real flights; with half of it (30 times)
+/// three in a hundred of these would be accused.
 const SURE: f64 = 6.9;
 /// Another camera may have been moved in its place unless it is so many times (logarithm) less
 /// likely: one in a hundred.
@@ -65,6 +65,13 @@ pub struct PoseFinding {
     pub is_moved: bool,
     /// The other cameras that may have been moved in its place, if it has.
     pub or_else: Vec<CameraName>,
+}
+
+impl PoseFinding {
+    /// Whether it has been moved for sure, and no other in its place.
+    pub fn is_moved_alone(&self) -> bool {
+        self.is_moved && self.or_else.is_empty()
+    }
 }
 
 /// What all cameras' lines say of their errors.

@@ -159,9 +159,14 @@ impl Track {
         }));
     }
 
+    /// What is kept and may still be told more of.
+    fn open_past(&mut self) -> impl Iterator<Item = &mut Past> {
+        self.past.iter_mut().filter(|past| !past.is_settled)
+    }
+
     /// Takes what is kept on to a time.
     pub(super) fn pass_past(&mut self, to: Timestamp) {
-        for past in &mut self.past {
+        for past in self.past.iter_mut().filter(|past| !past.is_settled) {
             let interval = to.seconds_since(past.carried_to);
             for (name, own) in &mut past.ties {
                 let Some(ties) = self.ties.get(name) else { continue };
@@ -205,14 +210,14 @@ impl Track {
 
     /// A camera's errors that last have been drawn anew.
     pub(super) fn renew_past(&mut self, camera: &CameraName) {
-        for past in &mut self.past {
+        for past in self.open_past() {
             past.ties_to(camera).fixed_columns_mut::<2>(LASTING).fill(0.0);
         }
     }
 
     /// A camera's shared error has been found to be `ahead` of its own deviations, ...
     pub(super) fn shift_past(&mut self, camera: &CameraName, error: usize, ahead: f64) {
-        for past in &mut self.past {
+        for past in self.open_past() {
             let moved: Vector6<f64> = past.ties_to(camera).column(error) * ahead;
             past.state.mean += moved;
         }
@@ -227,7 +232,7 @@ impl Track {
         (ratio, scale): (f64, f64),
         with_now: &nalgebra::SMatrix<f64, 6, N>,
     ) {
-        for past in &mut self.past {
+        for past in self.open_past() {
             let ties = past.ties_to(camera);
             let own = ties.fixed_columns::<N>(first).into_owned();
             let mut columns = ties.fixed_columns_mut::<N>(first);

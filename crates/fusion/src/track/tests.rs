@@ -113,7 +113,8 @@ fn erring(state: &KinematicState, truth: &Vector6<f64>) -> (Vector6<f64>, f64) {
 
 /// Errors of position and velocity with their squares by the covariance, now and of half a second
 /// before as the bearings since have told, of a target that is driven by white acceleration for six
-/// seconds; a tentative track considers what lasts, a confirmed one learns it. `hand` shifts the bearings of a camera from a time on, rad.
+/// seconds; a tentative track considers what lasts, a confirmed one learns it. `hand` shifts the
+/// bearings of a camera from a time on, rad.
 fn flown(
     status: TrackStatus,
     (hand_from_s, hand): (f64, Vector2<f64>),

@@ -96,6 +96,7 @@ struct Seen {
     /// From its first frame to its last.
     span: Option<(Timestamp, Timestamp)>,
     watch: Option<CameraWatch>,
+    has_moved: bool,
 }
 
 impl Seen {
@@ -186,6 +187,7 @@ fn watched(
     lacks.ensure_found(seen.values().any(|seen| seen.frames > 0), "bearings", recording)?;
     for (name, seen) in &mut seen {
         seen.watch = centre.poses().cameras().get(name).cloned();
+        seen.has_moved = centre.poses().has_moved(name);
     }
     Ok(seen)
 }
@@ -219,9 +221,10 @@ struct Figures {
 impl Figures {
     fn of(name: &CameraName, seen: &Seen) -> Self {
         let watched_s = seen.watch.as_ref().map_or(0.0, |watch| watch.watched_s);
-        let moved_at = seen.watch.as_ref().and_then(|watch| watch.moved_at);
+        let moved_at =
+            seen.watch.as_ref().and_then(|watch| watch.moved_at).filter(|_| seen.has_moved);
         let (verdict, why) = match &seen.watch {
-            Some(watch) if let Some(at) = watch.moved_at => {
+            Some(watch) if let Some(at) = watch.moved_at.filter(|_| seen.has_moved) => {
                 (Verdict::Moved, format!("{}, sure at {at}: calibrate it anew", Turn(&watch.worst)))
             }
             _ if seen.is_apart() => (
