@@ -1,6 +1,12 @@
-//! A recorder behind five kilobytes a second, in network namespaces of its own.
+//! Recorders behind five kilobytes a second, and behind a cable that is pulled, in network
+//! namespaces of their own.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "a test that cannot set itself up has failed, and one that measures says what it found"
+)]
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -12,6 +18,11 @@ use crossfix_tests::{Site, messages, program, succeed};
 /// How long the site is played: `CROSSFIX_SLOW_S` asks for more. What waits for the slow one fills
 /// its queues within the first twelve seconds.
 const PLAYED_S: f64 = 30.0;
+/// How long it is played where a cable is pulled, and when that is. A receiver is given up 3 s later.
+const PLAYED_TO_PULL_S: f64 = 15.0;
+const PULLED_AFTER: Duration = Duration::from_secs(5);
+/// More receivers than Zenoh has threads to receive on unless it is told to have more.
+const PULLED_RECORDERS: usize = 3;
 /// Where the site is.
 const ADDRESS: &str = "10.213.0.1";
 
@@ -48,6 +59,11 @@ impl Namespaces {
             ),
         ];
         steps.iter().all(|step| ip(step)).then_some(names)
+    }
+
+    /// Nothing passes any more, and nobody is told.
+    fn pull_the_cable(&self) {
+        assert!(ip(&format!("-n {} link set cf{}y down", self.far, std::process::id())));
     }
 
     /// Starts the program in one of them.
@@ -88,40 +104,57 @@ impl Drop for Running {
     }
 }
 
+/// What is on the far side of the link.
+enum Far {
+    Nobody,
+    SlowRecorder,
+    /// The cable is pulled in mid-play.
+    LostRecorders,
+}
+
 /// Plays the site in the namespaces and returns the 99th percentile of bearing to track, ms, as a
 /// recorder beside the fusion centre sees it.
-fn p99_ms(names: &Namespaces, site: &Site, has_slow_one: bool) -> f64 {
+fn p99_ms(names: &Namespaces, site: &Site, far: &Far) -> f64 {
     let network = site.path("network.toml");
-    let (near, slow) = (site.path("near.mcap"), site.path("slow.mcap"));
+    let near = site.path("near.mcap");
+    let record = |namespace: &str, file: &str| {
+        names.start(namespace, &["record", "-c", &network, "-o", file, "--overwrite"])
+    };
     let fusion = names.start(&names.site, &["fuse", "-c", &site.path("fusion.toml")]);
-    let recorder =
-        names.start(&names.site, &["record", "-c", &network, "-o", &near, "--overwrite"]);
-    let observer = has_slow_one
-        .then(|| names.start(&names.far, &["record", "-c", &network, "-o", &slow, "--overwrite"]));
+    let recorder = record(&names.site, &near);
+    let far_files: Vec<String> = match far {
+        Far::Nobody => Vec::new(),
+        Far::SlowRecorder => vec![site.path("slow.mcap")],
+        Far::LostRecorders => {
+            (0..PULLED_RECORDERS).map(|n| site.path(&format!("lost{n}.mcap"))).collect()
+        }
+    };
+    let observers: Vec<Running> = far_files.iter().map(|file| record(&names.far, file)).collect();
     let mut replay =
         names.start(&names.site, &["replay", &site.path("source.mcap"), "--network", &network]);
+    if matches!(far, Far::LostRecorders) {
+        std::thread::sleep(PULLED_AFTER);
+        names.pull_the_cable();
+    }
     assert!(replay.0.wait().unwrap().success());
     std::thread::sleep(Duration::from_millis(500));
     recorder.stop();
     fusion.stop();
-    if let Some(observer) = observer {
-        observer.stop();
-    }
+    observers.into_iter().for_each(Running::stop);
     let evaluation: serde_json::Value =
         serde_json::from_str(&succeed(&["evaluate", &near, "--json"])).unwrap();
     evaluation["latency"]["p99_ms"].as_f64().unwrap()
 }
 
-#[test]
-fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
+/// A site of so many seconds whose addresses are in the namespaces; `None`, and a clear word, where
+/// there can be none.
+fn site(played_s: f64) -> Option<(Namespaces, Site)> {
     let Some(names) = Namespaces::new() else {
         eprintln!(
             "SKIPPED: network namespaces need root, `ip` and `tc` (apt-get install iproute2)"
         );
-        return;
+        return None;
     };
-    let played_s =
-        std::env::var("CROSSFIX_SLOW_S").ok().and_then(|s| s.parse().ok()).unwrap_or(PLAYED_S);
     let site = Site::new(played_s);
     let mut network = site.network().clone();
     for endpoint in network.cameras.values_mut().chain([&mut network.fusion]) {
@@ -129,13 +162,23 @@ fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
     }
     site.write("network.toml", &toml::to_string(&network).unwrap());
     site.write("fusion.toml", "network = \"network.toml\"\n");
-    let alone = p99_ms(&names, &site, false);
-    let beside = p99_ms(&names, &site, true);
-    println!(
-        "{played_s} s: bearing to track p99 {alone:.1} ms alone, {beside:.1} ms beside the slow recorder"
-    );
-    // A publisher that waits for the slow one stalls for seconds; this is the machine's own noise.
+    Some((names, site))
+}
+
+/// Who waits for the far side stalls for seconds; this is the machine's own noise.
+fn assert_nobody_waited(alone: f64, beside: f64) {
+    println!("bearing to track p99 {alone:.1} ms alone, {beside:.1} ms beside them");
     assert!(beside < 2.0 * alone + 100.0, "p99 {beside:.1} ms instead of {alone:.1} ms");
+}
+
+#[test]
+fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
+    let played_s =
+        std::env::var("CROSSFIX_SLOW_S").ok().and_then(|s| s.parse().ok()).unwrap_or(PLAYED_S);
+    let Some((names, site)) = site(played_s) else { return };
+    let alone = p99_ms(&names, &site, &Far::Nobody);
+    let beside = p99_ms(&names, &site, &Far::SlowRecorder);
+    assert_nobody_waited(alone, beside);
 
     let frames =
         |file: &str| messages(Path::new(&site.path(file)), |c| *c == Channel::Tracks).len();
@@ -148,4 +191,12 @@ fn a_recorder_behind_a_slow_link_loses_and_counts_and_nobody_else_waits() {
         counted("received_missing")
     );
     assert!(slow < near && counted("received_missing") > 0, "{slow} of {near}: {last:?}");
+}
+
+#[test]
+fn recorders_whose_cable_is_pulled_hold_nobody_up() {
+    let Some((names, site)) = site(PLAYED_TO_PULL_S) else { return };
+    let alone = p99_ms(&names, &site, &Far::Nobody);
+    let beside = p99_ms(&names, &site, &Far::LostRecorders);
+    assert_nobody_waited(alone, beside);
 }

@@ -52,6 +52,7 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
+    network::give_zenoh_threads();
     // Misuse ends in clap, with exit code 2.
     let cli = Cli::parse();
     logging::start(&cli.logging);

@@ -10,6 +10,26 @@ use crate::shutdown::Shutdown;
 const PATIENCE: Duration = Duration::from_secs(2);
 const PERIOD: Duration = Duration::from_secs(60);
 
+/// The threads of Zenoh's pools, if whoever starts the program does not say otherwise. Zenoh closes
+/// the connection to a receiver that is lost on a thread that receives for all, and there the system
+/// waits for up to ten seconds for what had not gone out yet (eclipse-zenoh issue 1101). Of its own
+/// accord Zenoh receives on two: a switch that died with two recorders behind it stopped a site for
+/// ten seconds. With half of these, one with a dozen would.
+const ZENOH_THREADS: &str = "(rx: (worker_threads: 32), tx: (worker_threads: 4), \
+                             acc: (worker_threads: 4), net: (worker_threads: 4))";
+/// Where Zenoh reads that, once a process, when its first thread is started.
+const ZENOH_THREADS_VARIABLE: &str = "ZENOH_RUNTIME";
+
+/// Gives Zenoh threads enough that lost receivers hold nobody up. Only at the very beginning, while
+/// the program has no other thread.
+#[expect(unsafe_code, reason = "Zenoh takes this from its environment alone")]
+pub fn give_zenoh_threads() {
+    if std::env::var_os(ZENOH_THREADS_VARIABLE).is_none() {
+        // SAFETY: the main thread is the only one yet, so none reads the environment meanwhile.
+        unsafe { std::env::set_var(ZENOH_THREADS_VARIABLE, ZENOH_THREADS) };
+    }
+}
+
 /// Opens a session; `None` if the program was asked to stop before a router answered.
 pub fn open(
     network: &NetworkConfig,

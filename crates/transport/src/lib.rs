@@ -19,6 +19,10 @@
 //! the slowest ([`Delivery::Every`]). A published message that nobody
 //! subscribes to is gone: who plays a file watches ([`Link::presence`]) until
 //! those who must hear it are there.
+//!
+//! A receiver that is lost costs one of Zenoh's receiving threads up to ten seconds, and of its own
+//! accord Zenoh has two: a program gives it more before its first thread is started, as `crossfix`
+//! does by the variable `ZENOH_RUNTIME`.
 
 mod config;
 mod link;
