@@ -6,7 +6,7 @@ use nalgebra::{Matrix2, Matrix6};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::flight::LabelNoise;
+use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
 /// Where the lens may be off by so many times what labels err by, a pixel shows no direction: in

@@ -22,21 +22,24 @@ mod calibrated_camera;
 mod comparison;
 mod flight;
 mod intrinsics;
+mod label_noise;
 mod landmarks;
 mod lens;
 mod site_file;
+mod survey;
 
 pub use calibrated_camera::{BearingError, CalibratedCamera, ClockCorrection, OverImage};
 pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
     Axis, CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
-    Label, LabelNoise, LogErrors, LogFit, LogSample, MovedAt, Refusal, Survey, SurveyedPlace,
-    TapedDistance, WouldFit, calibrate_flight,
+    Label, LandmarkMisfit, LogErrors, LogFit, LogSample, MovedAt, Refusal, WouldFit,
+    calibrate_flight,
 };
 pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
+pub use label_noise::LabelNoise;
 pub use landmarks::{
-    Landmark, LandmarkError, LandmarkFit, LandmarkPicture, LandmarkPlace, LandmarkResult,
-    calibrate_landmarks,
+    Landmark, LandmarkError, LandmarkFit, LandmarkPicture, LandmarkResult, calibrate_landmarks,
 };
 pub use lens::{LensFreedom, LensUncertainty};
 pub use site_file::{SiteCalibration, SiteFileError};
+pub use survey::{Click, LandmarkPlace, Survey, SurveyedLandmark, SurveyedPlace, TapedDistance};

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
-use crate::flight::{CameraResult, FlightResult, LabelNoise};
+use crate::flight::{CameraResult, FlightResult};
+use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
 /// The form of the file that this build writes, and the only one that it reads.

@@ -181,7 +181,7 @@ fn survey(truths: &[Truth], random: &mut ChaCha8Rng) -> Survey {
         position: truth.camera.pose().position() + aside(),
         sd_m: Vector3::repeat(SD_M),
     };
-    Survey { places: truths.iter().map(place).collect(), distances: Vec::new() }
+    Survey { places: truths.iter().map(place).collect(), ..Survey::default() }
 }
 
 /// With nothing but where the cameras stand: their clocks differ by seconds, nobody knows where they
@@ -218,7 +218,7 @@ fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
         metres: (place(0) - place(2)).norm(),
         sd_m: 0.05,
     };
-    let survey = Survey { places: Vec::new(), distances: vec![distance] };
+    let survey = Survey { distances: vec![distance], ..Survey::default() };
     let result = calibrate_flight(&labels, None, &survey).unwrap();
     let found = |index: usize| result.cameras[index].camera.pose().position();
     let ratio = (found(0) - found(1)).norm() / (place(0) - place(1)).norm();

@@ -151,6 +151,33 @@ fn a_wrong_click_is_named_and_nothing_is_written() {
     assert!(!folder.path().join("calibration.toml").exists());
 }
 
+/// The recording has two targets, so nothing is adjusted here: what is wrong of the landmarks is said
+/// before.
+#[test]
+fn landmarks_of_a_flight_are_of_its_cameras_and_in_their_images() {
+    let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../../recordings/two-uavs.mcap");
+    let said = |rows: &str| {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str| folder.path().join(name).display().to_string();
+        let head = "camera,landmark,x_px,y_px,east_m,north_m,up_m,sd_m\n";
+        std::fs::write(file("points.csv"), format!("{head}{rows}")).unwrap();
+        let output = Command::new(assert_cmd::cargo::cargo_bin!("crossfix"))
+            .args(["calibrate", "flight", recording, "--landmarks", &file("points.csv")])
+            .args(["-o", &file("calibration.toml")])
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(!Path::new(&file("calibration.toml")).exists());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let unknown = said("nort,mast,10,20,1,2,3,0.1\n");
+    assert!(unknown.contains("`nort`") && unknown.contains("north"), "{unknown}");
+    let outside = said("north,mast,5000,20,1,2,3,0.1\n");
+    assert!(outside.contains("outside of the image"), "{outside}");
+    let two_places = said("north,mast,10,20,1,2,3,0.1\neast,mast,10,20,9,2,3,0.1\n");
+    assert!(two_places.contains("another place"), "{two_places}");
+}
+
 #[test]
 fn too_few_landmarks_are_told_what_helps() {
     let all = landmarks(0.0);

@@ -5,14 +5,14 @@ use crossfix_geometry::Intrinsics;
 use nalgebra::{Vector2, Vector3};
 
 use super::gauge::Gauge;
-use super::model::{
-    CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen, Survey,
-};
-use super::noise::{LabelNoise, Tails, Whitening};
+use super::model::{CLOCK, CameraLabels, CameraState, FlightLog, Knots, POSE_AND_CLOCK, Seen};
+use super::noise::{Tails, Whitening};
 use super::normal::{Covariance, NormalEquations, Solution, Term};
 use super::spline::{KNOT_S, SPAN, Spline, THIRD_DIFFERENCE};
 use super::unknowns::{Order, Touched};
+use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensFreedom};
+use crate::survey::Survey;
 
 /// Labels farther apart in time than this have errors of their own, s. No more than the distance of
 /// the spline's knots: a row holds five coefficients.
@@ -40,7 +40,7 @@ const RATE_KNOWN_BY: f64 = 1e-3;
 const READOUT_SHARE: f64 = 0.5;
 
 /// What a label counts, in deviations, that the way does not reach or that lies behind its camera.
-const UNSEEN: f64 = 1e3;
+pub(super) const UNSEEN: f64 = 1e3;
 
 /// What all residuals are held against.
 #[derive(Clone, Debug)]
@@ -187,6 +187,7 @@ impl State {
             gauge.rows(self, sink);
         }
         self.distance_rows(flight, sink);
+        self.landmark_rows(flight, sink);
         let starts = self.starts();
         for (index, camera) in flight.cameras.iter().enumerate() {
             self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);

@@ -1,10 +1,14 @@
 //! A site that was put together from what cameras saw is brought to where it stands.
 
+use crossfix_geometry::Pose;
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::adjustment::State;
-use super::model::{CameraLabels, CameraState, Survey};
-use super::survey::ENOUGH_FOR_UP;
+use super::model::{CameraLabels, CameraState};
+use super::triangulation;
+use crate::landmarks::{Landmark, LandmarkPicture, calibrate_landmarks};
+use crate::lens;
+use crate::survey::{Click, ENOUGH_PLACES, Survey, SurveyedLandmark};
 
 /// A turn, a size and a shift.
 struct Similarity {
@@ -14,6 +18,12 @@ struct Similarity {
     to: Point3<f64>,
 }
 
+/// What is known here and there: of the site as cameras saw it, and as the survey has it.
+struct Known {
+    places: Vec<(Point3<f64>, Point3<f64>)>,
+    rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
+}
+
 /// Brings cameras and way to where the survey has them, as near as it says, and says how many times
 /// larger they are there. `None`: it says nothing of the size.
 pub(super) fn to_survey(
@@ -21,21 +31,81 @@ pub(super) fn to_survey(
     labels: &[CameraLabels],
     survey: &Survey,
 ) -> Option<(State, f64)> {
-    let places: Vec<(Point3<f64>, Point3<f64>)> = labels
-        .iter()
-        .zip(&state.cameras)
-        .filter_map(|(labels, camera)| Some((camera.centre, survey.place(&labels.name)?.position)))
-        .collect();
+    let Known { places, rotations } = Known::of(state, labels, survey);
     let scale = size(&places).or_else(|| taped(state, labels, survey))?;
     let (from, to) = if places.is_empty() {
         (state.cameras.first()?.centre, Point3::origin())
     } else {
         (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
     };
-    let arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
-    let rotation = turn(&arms).filter(|_| places.len() >= ENOUGH_FOR_UP);
+    let mut arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
+    let rotation = if rotations.is_empty() {
+        turn(&arms).filter(|_| places.len() >= ENOUGH_PLACES)
+    } else {
+        // Whoever tells a camera's pose tells where its axes point.
+        let length = arms.iter().map(|(here, _)| here.norm()).fold(1.0, f64::max);
+        let axes = [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| axis * length);
+        let turned = rotations.iter().flat_map(|(here, there)| axes.map(|a| (here * a, there * a)));
+        arms.extend(turned);
+        turn(&arms)
+    };
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
     Some((Similarity { rotation, scale, from, to }.moved(state), scale))
+}
+
+impl Known {
+    /// Cameras' surveyed places, landmarks that two cameras see, and cameras whose own landmarks tell
+    /// their pose.
+    fn of(state: &State, labels: &[CameraLabels], survey: &Survey) -> Self {
+        let mut known = Self { places: Vec::new(), rotations: Vec::new() };
+        for (labels, camera) in labels.iter().zip(&state.cameras) {
+            if let Some(place) = survey.place(&labels.name) {
+                known.places.push((camera.centre, place.position));
+            }
+            if let Some(pose) = by_own_landmarks(labels, survey) {
+                known.rotations.push((camera.rotation, *pose.rotation()));
+                known.places.push((camera.centre, pose.position()));
+            }
+        }
+        for (landmark, place) in survey.placed_landmarks() {
+            let line = |click: &Click| {
+                let index = labels.iter().position(|camera| camera.name == click.camera)?;
+                let direction = lens::direction(&labels[index].intrinsics, click.pixel)?;
+                let camera = &state.cameras[index];
+                Some((camera.centre, camera.rotation * direction.normalize()))
+            };
+            let lines: Vec<_> = landmark.clicks.iter().filter_map(line).collect();
+            known.places.extend(triangulation::place(&lines).map(|(here, _)| (here, place)));
+        }
+        known
+    }
+}
+
+/// A camera's pose by the landmarks in its own picture, if they tell it.
+fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Option<Pose> {
+    let landmark = |landmark: &SurveyedLandmark| {
+        let click = landmark.clicks.iter().find(|click| click.camera == camera.name)?;
+        Some(Landmark {
+            name: landmark.name.clone(),
+            pixel: click.pixel,
+            click_sd_px: click.sd_px,
+            at: landmark.at,
+        })
+    };
+    let mut picture = LandmarkPicture {
+        camera: camera.name.clone(),
+        intrinsics: camera.intrinsics,
+        freedom: camera.freedom,
+        place: survey.place(&camera.name).cloned(),
+        landmarks: survey.landmarks.iter().filter_map(landmark).collect(),
+    };
+    let result = calibrate_landmarks(&picture).ok()?;
+    if let [wrong] = &result.suspects[..] {
+        picture.landmarks.retain(|landmark| landmark.name != *wrong);
+        let without = calibrate_landmarks(&picture).ok().filter(|result| !result.is_wrong())?;
+        return Some(*without.camera.pose());
+    }
+    (!result.is_wrong()).then(|| *result.camera.pose())
 }
 
 fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {

@@ -3,14 +3,15 @@
 use super::adjustment::{CameraPriors, Priors, RATE_SD, State};
 use super::align;
 use super::course::Course;
-use super::model::{CameraLabels, CameraState, FlightLog, Survey};
-use super::noise::LabelNoise;
+use super::model::{CameraLabels, CameraState, FlightLog};
 use super::pairs::{self, Pair, Sights};
 use super::spline::Spline;
 use super::{
     FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal, WouldFit, hours, start, triangulation,
     would_fit,
 };
+use crate::label_noise::LabelNoise;
+use crate::survey::Survey;
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3};
 

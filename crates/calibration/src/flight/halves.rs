@@ -10,7 +10,7 @@ use super::LEAST_LABELS;
 use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
 use super::datum::Followers;
 use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
-use super::noise::LabelNoise;
+use crate::label_noise::LabelNoise;
 
 /// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.
 const STRIDE: usize = 20;

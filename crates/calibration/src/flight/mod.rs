@@ -7,6 +7,7 @@
 mod adjustment;
 mod align;
 mod begin;
+mod clicked;
 mod course;
 mod datum;
 mod gauge;
@@ -36,11 +37,11 @@ use begin::Begun;
 use results::results;
 use settle::settle;
 
-pub use model::{
-    CameraLabels, FlightLog, Label, LogErrors, LogSample, Survey, SurveyedPlace, TapedDistance,
-};
+use crate::survey::Survey;
+
+pub use clicked::LandmarkMisfit;
+pub use model::{CameraLabels, FlightLog, Label, LogErrors, LogSample};
 pub use moved::MovedAt;
-pub use noise::LabelNoise;
 pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult, LogFit};
 pub use would_fit::{Axis, WouldFit};
 
@@ -76,7 +77,8 @@ pub enum FlightError {
     /// Nothing says how large the site is.
     #[error(
         "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \
-         or --distance between two"
+         --distance between two, or --landmarks: two of them in two cameras' pictures, or four in each \
+         of two cameras'"
     )]
     NoSize,
     /// The equations have no solution.

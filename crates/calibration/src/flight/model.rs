@@ -57,49 +57,6 @@ pub struct LogErrors {
     pub drift_time_s: f64,
 }
 
-/// Where cameras stand, by others than their own pictures.
-#[derive(Clone, Debug, Default)]
-pub struct Survey {
-    /// Places of cameras.
-    pub places: Vec<SurveyedPlace>,
-    /// Distances between cameras.
-    pub distances: Vec<TapedDistance>,
-}
-
-/// Where a camera stands.
-#[derive(Clone, Debug)]
-pub struct SurveyedPlace {
-    /// The camera.
-    pub camera: CameraName,
-    /// Local ENU, m.
-    pub position: Point3<f64>,
-    /// Standard deviation per axis, m.
-    pub sd_m: Vector3<f64>,
-}
-
-/// How far two cameras are apart.
-#[derive(Clone, Debug)]
-pub struct TapedDistance {
-    /// The cameras.
-    pub between: [CameraName; 2],
-    /// m.
-    pub metres: f64,
-    /// Standard deviation, m.
-    pub sd_m: f64,
-}
-
-impl Survey {
-    /// Whether it tells how large the site is.
-    pub fn tells_size(&self) -> bool {
-        self.places.len() > 1 || !self.distances.is_empty()
-    }
-
-    /// The place of a camera.
-    pub fn place(&self, camera: &CameraName) -> Option<&SurveyedPlace> {
-        self.places.iter().find(|place| place.camera == *camera)
-    }
-}
-
 /// A camera's clock: `common time = straight + wander(straight)` with `straight = own + offset + rate
 /// (own - reference)`, and a row of the image is read out `read-out (row / height - 1/2)` after the
 /// frame's time.

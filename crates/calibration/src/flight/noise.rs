@@ -2,6 +2,8 @@
 
 use nalgebra::Vector2;
 
+use crate::label_noise::LabelNoise;
+
 /// Degrees of freedom of the heavy tails: at four, a residual of ten deviations counts a fifth of
 /// one, and clean labels lose a tenth of their weight.
 const FREEDOM: f64 = 4.0;
@@ -36,17 +38,6 @@ impl Tails {
     }
 }
 
-/// The error of a camera's labels, per axis: a part that is new in every frame, and one that lasts.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LabelNoise {
-    /// Standard deviation of what is new in every frame, pixels.
-    pub white_px: f64,
-    /// Of what lasts, pixels.
-    pub lasting_px: f64,
-    /// Time after which e^-1 of that is left, s.
-    pub lasting_s: f64,
-}
-
 /// No label is nearer to its target's middle than this, pixels: the noise of a camera that alone
 /// holds the track would be found to be nothing.
 const LEAST_SD_PX: f64 = 0.1;
@@ -66,19 +57,6 @@ pub(super) struct Whitening {
 }
 
 impl LabelNoise {
-    /// Standard deviation in all, pixels.
-    pub fn sd_px(&self) -> f64 {
-        self.white_px.hypot(self.lasting_px)
-    }
-
-    /// The deviation of white noise of labels `frame_s` apart that over seconds averages out as
-    /// slowly as this does, pixels: `w^2 + c^2 (1 + a) / (1 - a)` with `a = exp(-frame / T)`.
-    pub fn white_equivalent_px(&self, frame_s: f64) -> f64 {
-        let kept = (-frame_s / self.lasting_s).exp();
-        let slow = (1.0 + kept) / (1.0 - kept);
-        (self.white_px.powi(2) + self.lasting_px.powi(2) * slow).sqrt()
-    }
-
     /// How a label is whitened after one so many seconds before, where frames are `frame_s` apart.
     ///
     /// The sum of a white part and a lasting one would need all labels before to be whitened. The

@@ -5,13 +5,14 @@ use crossfix_message::{CameraName, Datum};
 use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
 
 use super::adjustment::{self, Adjusted, Flight, Priors, State};
+use super::clicked::LandmarkMisfit;
 use super::datum::Followers;
 use super::gauge::Gauge;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::moved::{self, MovedAt};
-use super::noise::LabelNoise;
 use super::settle::residuals;
 use super::{Refusal, halves};
+use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
 /// What a flight has shown of one camera.
@@ -95,6 +96,8 @@ pub struct FlightResult {
     pub jerk: f64,
     /// How the log fits; `None` without one.
     pub log: Option<LogFit>,
+    /// How each landmark fits, in each camera's picture.
+    pub landmarks: Vec<LandmarkMisfit>,
 }
 
 /// How a log fits the way that all have made of it.
@@ -171,6 +174,7 @@ pub(super) fn results(
         refused: Vec::new(),
         jerk: priors.jerk,
         log: flight.log.map(|log| log_fit(log, state)),
+        landmarks: state.landmark_misfits(flight),
     })
 }
 

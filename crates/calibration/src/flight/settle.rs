@@ -5,9 +5,9 @@ use nalgebra::Vector2;
 use super::adjustment::{
     self, Adjusted, CameraPriors, Flight, NEARLY_SETTLED, Priors, SETTLED, State,
 };
-use super::noise::LabelNoise;
 use super::normal::Term;
 use super::spline::{KNOT_S, THIRD_DIFFERENCE};
+use crate::label_noise::LabelNoise;
 
 /// Rounds in which deviations and powers are found beside the unknowns.
 const ROUNDS: usize = 6;

@@ -5,6 +5,7 @@ use nalgebra::{Rotation3, Vector3};
 use super::adjustment::{Flight, Row, Sink, State};
 use super::model::CameraLabels;
 use super::noise::Tails;
+use crate::survey::ENOUGH_PLACES;
 
 /// Whoever sets a camera up holds its picture level to this, rad. It turns a site upright that three
 /// surveyed places do not; with half of it a tripod on a slope would be believed.
@@ -53,7 +54,8 @@ impl State {
     /// Cameras are held level, where no log says which way is up.
     pub(super) fn level_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
         let named = |camera: &&CameraLabels| flight.survey.place(&camera.name).is_some();
-        if flight.cameras.iter().filter(named).count() >= ENOUGH_FOR_UP {
+        let places = flight.cameras.iter().filter(named).count();
+        if places + flight.survey.placed_landmarks().count() >= ENOUGH_PLACES {
             return;
         }
         for (camera, start) in self.cameras.iter().zip(self.starts()) {
@@ -63,9 +65,6 @@ impl State {
         }
     }
 }
-
-/// So many places say which way is up.
-pub(super) const ENOUGH_FOR_UP: usize = 3;
 
 /// How far an image's rows are from level (the sine), and its derivative by a small rotation about
 /// the camera's axes.

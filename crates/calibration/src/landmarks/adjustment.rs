@@ -1,16 +1,11 @@
 //! Pose and lens adjusted to clicks, by Levenberg and Marquardt.
 
-use crossfix_geometry::Intrinsics;
-use nalgebra::{
-    Cholesky, DMatrix, DVector, Dyn, Matrix2, Matrix2x3, Matrix6, OMatrix, Point3, Rotation3, U2,
-    Vector2,
-};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6};
 
-use super::{Landmark, LandmarkPicture, LandmarkPlace};
+use super::LandmarkPicture;
+use super::seen::{self, POSE, Seen, State};
 use crate::lens::{self, LensUncertainty};
 
-/// Unknowns of a pose: rotation about the camera's axes (rad), then its centre (m).
-pub(super) const POSE: usize = 6;
 /// Steps from a start: from a wrong place by half of the landmarks' range it takes fifteen.
 const STEPS: usize = 40;
 /// Nothing changes any more where the cost falls by less than this.
@@ -20,24 +15,6 @@ const SETTLED: f64 = 1e-9;
 const ALIKE: f64 = 9.0;
 /// Poses are the same that lie within so many deviations (by the square).
 const SAME: f64 = 25.0;
-
-/// Pose and lens.
-#[derive(Clone, Debug)]
-pub(super) struct State {
-    pub(super) rotation: Rotation3<f64>,
-    pub(super) centre: Point3<f64>,
-    pub(super) intrinsics: Intrinsics,
-}
-
-impl State {
-    fn moved(&self, step: &DVector<f64>) -> Self {
-        Self {
-            rotation: self.rotation * Rotation3::new(step.fixed_rows::<3>(0).into_owned()),
-            centre: self.centre + step.fixed_rows::<3>(3),
-            intrinsics: lens::moved(&self.intrinsics, &step.as_slice()[POSE..]),
-        }
-    }
-}
 
 /// A state that fits best of all near it.
 #[derive(Clone, Debug)]
@@ -76,45 +53,6 @@ impl Adjusted {
     }
 }
 
-/// A click against where a state has it.
-#[derive(Clone, Debug)]
-pub(super) struct Seen {
-    /// Where it should be less where it is, pixels.
-    pub(super) residual: Vector2<f64>,
-    /// By pose and lens.
-    pub(super) by: OMatrix<f64, U2, Dyn>,
-    /// Covariance of the click with what the landmark's own place may be off by, pixels^2.
-    pub(super) noise: Matrix2<f64>,
-}
-
-/// A landmark as a state sees it; `None` behind the camera.
-pub(super) fn see(landmark: &Landmark, state: &State) -> Option<Seen> {
-    let camera_from_world = state.rotation.inverse();
-    let offset = match landmark.at {
-        LandmarkPlace::Place { position, .. } => camera_from_world * (position - state.centre),
-        LandmarkPlace::Direction { direction, .. } => camera_from_world * direction.into_inner(),
-    };
-    let seen = lens::project(&state.intrinsics, &offset)?;
-    let by_place: Matrix2x3<f64> = seen.by_point * camera_from_world.matrix();
-    let count = lens::numbers(&state.intrinsics);
-    let mut by = OMatrix::<f64, U2, Dyn>::zeros(POSE + count);
-    by.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * offset.cross_matrix()));
-    let own = match landmark.at {
-        LandmarkPlace::Place { sd_m, .. } => {
-            by.fixed_columns_mut::<3>(3).copy_from(&-by_place);
-            let scaled = by_place * nalgebra::Matrix3::from_diagonal(&sd_m);
-            scaled * scaled.transpose()
-        }
-        LandmarkPlace::Direction { sd_rad, .. } => by_place * by_place.transpose() * sd_rad.powi(2),
-    };
-    for (number, by_number) in seen.by_lens[..count].iter().enumerate() {
-        by.set_column(POSE + number, by_number);
-    }
-    let clicked = Vector2::new(landmark.pixel.x(), landmark.pixel.y());
-    let noise = own + Matrix2::identity() * landmark.click_sd_px.powi(2);
-    Some(Seen { residual: seen.pixel - clicked, by, noise })
-}
-
 /// The normal equations at a state.
 struct Equations {
     cost: f64,
@@ -131,8 +69,9 @@ impl Equations {
             right: DVector::zeros(count),
         };
         for landmark in &picture.landmarks {
-            let Seen { residual, by, noise } = see(landmark, state)?;
-            let weight = noise.try_inverse()?;
+            let seen = seen::see(&landmark.at, landmark.pixel, state)?;
+            let weight = seen.noise(landmark.click_sd_px).try_inverse()?;
+            let Seen { residual, by, .. } = seen;
             equations.cost += residual.dot(&(weight * residual));
             equations.information += by.transpose() * weight * &by;
             equations.right -= by.transpose() * (weight * residual);

@@ -5,17 +5,19 @@
 //! too.
 
 mod adjustment;
+pub(crate) mod seen;
 mod start;
 
 use crossfix_geometry::{Camera, Intrinsics, Pixel, Pose};
 use crossfix_message::CameraName;
-use nalgebra::{Matrix2, Matrix6, Point3, Unit, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix6, Point3, Vector2};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 use thiserror::Error;
 
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection, OverImage};
-use crate::flight::{LabelNoise, SurveyedPlace};
+use crate::label_noise::LabelNoise;
 use crate::lens::{LensFreedom, LensUncertainty};
+use crate::survey::{LandmarkPlace, SurveyedPlace};
 use adjustment::Adjusted;
 
 /// Something in a picture of which is known where it is.
@@ -29,25 +31,6 @@ pub struct Landmark {
     pub click_sd_px: f64,
     /// Where it is.
     pub at: LandmarkPlace,
-}
-
-/// Where a landmark is.
-#[derive(Clone, Copy, Debug)]
-pub enum LandmarkPlace {
-    /// At a place.
-    Place {
-        /// Local ENU, m.
-        position: Point3<f64>,
-        /// Standard deviation per axis, m.
-        sd_m: Vector3<f64>,
-    },
-    /// So far away that only its direction counts: the sun, a star.
-    Direction {
-        /// Local ENU.
-        direction: Unit<Vector3<f64>>,
-        /// Standard deviation across it, rad.
-        sd_rad: f64,
-    },
 }
 
 /// A picture's landmarks.
@@ -304,12 +287,13 @@ const DISTANT_M: f64 = 1000.0;
 /// How a landmark fits, held against what the others leave open (its part of the covariance is in
 /// the residual's).
 fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
-    let seen = adjustment::see(landmark, &adjusted.state)?;
+    let seen = seen::see(&landmark.at, landmark.pixel, &adjusted.state)?;
+    let noise = seen.noise(landmark.click_sd_px);
     let by = &seen.by;
     let explained = by * &adjusted.covariance * by.transpose();
-    let left: Matrix2<f64> = seen.noise - explained.fixed_view::<2, 2>(0, 0);
+    let left: Matrix2<f64> = noise - explained.fixed_view::<2, 2>(0, 0);
     // What is left is nothing where this landmark alone tells something.
-    let is_told = left.symmetric_eigenvalues().min() > 1e-3 * seen.noise.trace();
+    let is_told = left.symmetric_eigenvalues().min() > 1e-3 * noise.trace();
     let weight = left.try_inverse().filter(|_| is_told);
     let squared = weight.map(|weight| seen.residual.dot(&(weight * seen.residual)));
     Some(LandmarkFit {

@@ -2,9 +2,10 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
-use super::adjustment::State;
-use super::{LandmarkError, LandmarkPicture, LandmarkPlace};
+use super::seen::State;
+use super::{LandmarkError, LandmarkPicture};
 use crate::lens;
+use crate::survey::LandmarkPlace;
 
 /// Places that are tried lie on so many directions from the landmarks' middle, evenly spread ...
 const DIRECTIONS: usize = 60;

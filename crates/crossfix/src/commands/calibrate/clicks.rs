@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
-use crossfix_calibration::{Landmark, LandmarkPlace};
+use crossfix_calibration::{Click, Landmark, LandmarkPlace, SurveyedLandmark};
 use crossfix_geometry::{Geodetic, ImageSize, LocalFrame, Pixel};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Unit, Vector3};
@@ -75,6 +75,33 @@ pub fn read(
     }
     ensure!(!cameras.is_empty(), "the landmarks {} have no rows of that camera", path.display());
     Ok(cameras)
+}
+
+/// The landmarks of several cameras' pictures, each once: what is called alike is one thing. The sun
+/// has moved from one picture to the next.
+pub fn together(
+    cameras: BTreeMap<CameraName, Vec<Landmark>>,
+) -> anyhow::Result<Vec<SurveyedLandmark>> {
+    let mut together: Vec<SurveyedLandmark> = Vec::new();
+    for (camera, landmarks) in cameras {
+        for Landmark { name, pixel, click_sd_px, at } in landmarks {
+            let click = Click { camera: camera.clone(), pixel, sd_px: click_sd_px };
+            let known = together.iter_mut().find(|known| known.name == name);
+            match (known, at) {
+                (Some(known), LandmarkPlace::Place { position, .. }) => {
+                    ensure!(
+                        matches!(known.at, LandmarkPlace::Place { position: other, .. } if other == position),
+                        "landmark `{name}` of camera `{camera}` has another place than that of camera \
+                         `{}`: call it otherwise",
+                        known.clicks[0].camera
+                    );
+                    known.clicks.push(click);
+                }
+                _ => together.push(SurveyedLandmark { name, at, clicks: vec![click] }),
+            }
+        }
+    }
+    Ok(together)
 }
 
 /// Whether all were clicked in the image.
@@ -184,6 +211,20 @@ mod tests {
         let LandmarkPlace::Direction { direction, .. } = sun.at else { panic!("{sun:?}") };
         assert!((direction.x - 0.75f64.sqrt()).abs() < 1e-12 && (direction.z - 0.5).abs() < 1e-12);
         assert_eq!(clicks(text, Some("south")).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn what_two_cameras_see_is_one_landmark_and_has_one_place() {
+        let head = "camera,landmark,x_px,y_px,east_m,north_m,up_m,sd_m,azimuth_deg,elevation_deg\n";
+        let rows = "north,mast,10,20,1,2,3,0.1,,\nsouth,mast,30,40,1,2,3,0.1,,\n\
+            north,sun,50,60,,,,,90,30\nsouth,sun,50,60,,,,,91,31\n";
+        let landmarks = together(clicks(&format!("{head}{rows}"), None).unwrap()).unwrap();
+        let pictures: Vec<(&str, usize)> =
+            landmarks.iter().map(|l| (l.name.as_str(), l.clicks.len())).collect();
+        assert_eq!(pictures, [("mast", 2), ("sun", 1), ("sun", 1)]);
+        let moved = format!("{head}{}", rows.replace("30,40,1,2,3", "30,40,1,2,4"));
+        let error = together(clicks(&moved, None).unwrap()).unwrap_err().to_string();
+        assert!(error.contains("`mast`") && error.contains("another place"), "{error}");
     }
 
     #[test]

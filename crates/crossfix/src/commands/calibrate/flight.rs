@@ -2,7 +2,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_calibration::{CameraLabels, Label, LensFreedom, SiteCalibration, calibrate_flight};
+use crossfix_calibration::{
+    CameraLabels, Label, LensFreedom, SiteCalibration, SurveyedLandmark, calibrate_flight,
+};
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
@@ -11,7 +13,7 @@ use crossfix_message::{
 use super::log::{self, LogKind, LogTime, Reading};
 use super::remarks::Rests;
 use super::survey::{self, Distance};
-use super::{Lens, report};
+use super::{Lens, clicks, report};
 use crate::commands::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
@@ -19,17 +21,17 @@ use crate::recorded::{self, Lacks};
 /// From the flight of one target: with the log of its own receiver, or with where cameras stand.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml"
+    after_help = "Examples:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml"
 )]
 pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
     /// latitude_deg, longitude_deg, height_m; or GPX.
-    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance"])]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks"])]
     log: Option<PathBuf>,
-    /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log in
-    /// degrees; its first place without.
+    /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log or
+    /// landmarks in degrees; the log's first place without.
     #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
     anchor: Option<Geodetic>,
     /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
@@ -45,6 +47,11 @@ pub struct Args {
     /// How far two cameras are apart, as in north,east,79.3 (m, to 5 cm). May be given again.
     #[arg(long, value_name = "A,B,METRES")]
     distance: Vec<Distance>,
+    /// What was clicked in the cameras' pictures: a CSV with camera, landmark, x_px, y_px, east_m,
+    /// north_m, up_m, sd_m; or latitude_deg, longitude_deg, height_m; or azimuth_deg, elevation_deg of
+    /// the sun and stars. Of the same name is the same thing.
+    #[arg(long, value_name = "FILE")]
+    landmarks: Option<PathBuf>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
@@ -91,8 +98,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         cut(&mut cameras, camera, |label| label.time_s < *time_s)?;
     }
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
-    let survey =
-        survey::read(args.positions.as_deref(), &args.distance, (&names, "the recording"))?;
+    let landmarks = landmarks(args, &cameras)?;
+    let of = (&names[..], "the recording");
+    let survey = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
     let rests = if survey.tells_size() { Rests::OnSurvey } else { Rests::OnLogAlone };
     for (camera, why) in &result.refused {
@@ -113,11 +121,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         wrong.len() <= result.cameras.len(),
         "nothing is written: most cameras are wrong, so the log or the survey is hardly of this flight"
     );
-    let inputs: Vec<&Path> = [Some(&args.recording), args.log.as_ref(), args.positions.as_ref()]
-        .into_iter()
-        .flatten()
-        .map(PathBuf::as_path)
-        .collect();
+    let inputs: Vec<&Path> = [
+        Some(&args.recording),
+        args.log.as_ref(),
+        args.positions.as_ref(),
+        args.landmarks.as_ref(),
+    ]
+    .into_iter()
+    .flatten()
+    .map(PathBuf::as_path)
+    .collect();
     let from: Vec<String> = inputs.iter().map(|path| path.display().to_string()).collect();
     let text = format!(
         "# Written by crossfix calibrate flight from {}.\n{}",
@@ -129,6 +142,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         output::line(format!("\nwritten to {}", args.output.display()));
     }
     Ok(())
+}
+
+/// What was clicked in the pictures of the recording's cameras.
+fn landmarks(args: &Args, cameras: &[CameraLabels]) -> anyhow::Result<Vec<SurveyedLandmark>> {
+    let Some(path) = &args.landmarks else { return Ok(Vec::new()) };
+    let clicked = clicks::read(path, None, args.anchor)?;
+    for (name, landmarks) in &clicked {
+        if let Some(camera) = cameras.iter().find(|camera| camera.name == *name) {
+            clicks::check(landmarks, camera.intrinsics.size)
+                .with_context(|| format!("camera `{name}`"))?;
+        }
+    }
+    clicks::together(clicked)
 }
 
 /// A time of a camera's own clock, s.

@@ -1,6 +1,6 @@
 //! What a person should know of a calibration that no figure says.
 
-use crossfix_calibration::{CameraResult, FlightResult};
+use crossfix_calibration::{CameraResult, FlightResult, LandmarkMisfit};
 
 /// A focal length that has moved by more than this share is remarked on.
 const REMARKED_FOCAL: f64 = 0.003;
@@ -21,6 +21,9 @@ const GPS_S: f64 = 18.0;
 /// Time zones are multiples of this, s.
 const ZONE_S: f64 = 900.0;
 
+/// A landmark beside itself by more deviations is remarked on: of good clicks one in 7000.
+const BESIDE: f64 = 4.2;
+
 /// What the size of the site, and where it is, rests on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rests {
@@ -36,10 +39,17 @@ pub fn of(result: &FlightResult, rests: Rests) -> Vec<String> {
     let of_times = |say: fn(&[ClockAgainstLog]) -> Option<String>| {
         result.log.is_some().then(|| say(&times)).flatten()
     };
-    [of_log(result), of_size(rests), of_times(of_offsets), of_times(of_rates), of_lenses(result)]
-        .into_iter()
-        .flatten()
-        .collect()
+    [
+        of_log(result),
+        of_size(rests),
+        of_landmarks(&result.landmarks),
+        of_times(of_offsets),
+        of_times(of_rates),
+        of_lenses(result),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 fn of_size(rests: Rests) -> Option<String> {
@@ -60,6 +70,28 @@ fn of_log(result: &FlightResult) -> Option<String> {
              --log-kind, or feet for metres."
         )
     })
+}
+
+fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
+    let beside: Vec<&LandmarkMisfit> =
+        landmarks.iter().filter(|misfit| misfit.deviations > BESIDE).collect();
+    if beside.is_empty() {
+        return None;
+    }
+    if 2 * beside.len() > landmarks.len() {
+        return Some(
+            "Most landmarks lie beside where the flight has them: places counted from another origin \
+             than the log's or the survey's, or pictures taken before a camera was moved."
+                .to_owned(),
+        );
+    }
+    let name = |misfit: &&LandmarkMisfit| format!("`{}` of `{}`", misfit.landmark, misfit.camera);
+    let names: Vec<String> = beside.iter().map(name).collect();
+    Some(format!(
+        "Beside where the flight and the other landmarks have it, and all but left out: {}. A wrong \
+         click, or another's place.",
+        names.join(", ")
+    ))
 }
 
 /// How a camera's clock stands against the log's.

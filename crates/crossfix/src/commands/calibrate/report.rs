@@ -1,6 +1,6 @@
 //! What a calibration has found, for people and for programs.
 
-use crossfix_calibration::{CameraResult, FlightResult};
+use crossfix_calibration::{CameraResult, FlightResult, LandmarkMisfit};
 use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
@@ -19,12 +19,46 @@ pub struct Figures {
     log_residual_m: Option<f64>,
     /// How many of its places are left out, as they lie far beside the way.
     log_left_out: Option<usize>,
+    /// How each landmark fits, in each camera's picture.
+    landmarks: Vec<LandmarkFigures>,
     /// What a person should know.
     remarks: Vec<String>,
     /// Absent of one camera alone.
     datum: Option<DatumFigures>,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct LandmarkFigures {
+    landmark: String,
+    camera: String,
+    /// Where it was clicked less where it should be seen; absent behind the camera.
+    residual_px: Option<[f64; 2]>,
+    /// The same in deviations of click and place.
+    deviations: f64,
+}
+
+impl From<&LandmarkMisfit> for LandmarkFigures {
+    fn from(misfit: &LandmarkMisfit) -> Self {
+        Self {
+            landmark: misfit.landmark.clone(),
+            camera: misfit.camera.to_string(),
+            residual_px: misfit.residual_px.map(Into::into),
+            deviations: misfit.deviations,
+        }
+    }
+}
+
+impl LandmarkFigures {
+    fn row(&self) -> Vec<String> {
+        let beside = |axis: usize| {
+            self.residual_px
+                .map_or_else(|| "behind it".to_owned(), |px| format!("{:+.1}", px[axis]))
+        };
+        let deviations = format!("{:.1}", self.deviations);
+        vec![self.landmark.clone(), self.camera.clone(), beside(0), beside(1), deviations]
+    }
 }
 
 /// What the site may be off by as a whole: standard deviations.
@@ -153,6 +187,7 @@ pub fn figures(result: &FlightResult, rests: Rests) -> Figures {
             .collect(),
         log_residual_m: result.log.map(|log| log.residual_m),
         log_left_out: result.log.map(|log| log.left_out),
+        landmarks: result.landmarks.iter().map(LandmarkFigures::from).collect(),
         remarks: remarks::of(result, rests),
         datum: result.datum.as_ref().map(DatumFigures::from),
         jerk: result.jerk,
@@ -209,7 +244,15 @@ pub fn render(result: &FlightResult, rests: Rests) -> String {
             log.residual_m, log.left_out, log.samples
         )
     });
+    let landmarks = if figures.landmarks.is_empty() {
+        String::new()
+    } else {
+        let head = ["landmark", "camera", "right of it [px]", "below [px]", "deviations"];
+        let mut rows = vec![head.map(str::to_owned).to_vec()];
+        rows.extend(figures.landmarks.iter().map(LandmarkFigures::row));
+        format!("\n\n{}", output::table(&rows))
+    };
     let datum = figures.datum.map_or_else(String::new, |datum| format!("\n\n{datum}"));
     let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
-    format!("{}{refused}{log}{datum}{remarks}", output::table(&rows))
+    format!("{}{refused}{landmarks}{log}{datum}{remarks}", output::table(&rows))
 }

@@ -1,10 +1,10 @@
-//! Where cameras stand by a survey, and how far apart by a tape.
+//! Where cameras stand by a survey, how far apart by a tape, and landmarks in their pictures.
 
 use std::path::Path;
 use std::str::FromStr;
 
 use anyhow::{Context, ensure};
-use crossfix_calibration::{Survey, SurveyedPlace, TapedDistance};
+use crossfix_calibration::{Survey, SurveyedLandmark, SurveyedPlace, TapedDistance};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Vector3};
 use serde::Deserialize;
@@ -70,13 +70,16 @@ impl Row {
 pub fn read(
     positions: Option<&Path>,
     distances: &[Distance],
+    landmarks: Vec<SurveyedLandmark>,
     (cameras, of): (&[CameraName], &str),
 ) -> anyhow::Result<Survey> {
     let places = positions.map(read_places).transpose()?.unwrap_or_default();
     let distances: Vec<TapedDistance> =
         distances.iter().map(|distance| distance.0.clone()).collect();
     let named = places.iter().map(|place| &place.camera);
-    for name in named.chain(distances.iter().flat_map(|distance| &distance.between)) {
+    let clicked = landmarks.iter().flat_map(|landmark| &landmark.clicks).map(|click| &click.camera);
+    let taped = distances.iter().flat_map(|distance| &distance.between);
+    for name in named.chain(taped).chain(clicked) {
         let known: Vec<&str> = cameras.iter().map(CameraName::as_str).collect();
         ensure!(
             cameras.contains(name),
@@ -84,7 +87,7 @@ pub fn read(
             known.join(", ")
         );
     }
-    Ok(Survey { places, distances })
+    Ok(Survey { places, distances, landmarks })
 }
 
 fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {

@@ -1,0 +1,111 @@
+//! Landmarks that were clicked in the cameras' pictures, beside a flight.
+
+use crossfix_message::CameraName;
+use nalgebra::{DMatrix, DVector, Dyn, OMatrix, U3, Vector2};
+
+use super::adjustment::{Flight, Row, Sink, State, UNSEEN};
+use super::model::POSE_AND_CLOCK;
+use super::noise::Tails;
+use crate::landmarks::seen::{self, POSE, Seen};
+use crate::survey::{Click, SurveyedLandmark};
+
+/// How a landmark lies beside where a flight's cameras have it.
+#[derive(Clone, Debug)]
+pub struct LandmarkMisfit {
+    /// What it is called.
+    pub landmark: String,
+    /// Whose picture it was clicked in.
+    pub camera: CameraName,
+    /// Where it was clicked less where it should be seen, pixels; `None` behind the camera.
+    pub residual_px: Option<Vector2<f64>>,
+    /// The same in deviations of the click and the landmark's place: one an axis where all is as it
+    /// says.
+    pub deviations: f64,
+}
+
+impl State {
+    /// A landmark in the pictures. What its place is off by is common to all cameras that see it, so
+    /// its clicks are whitened together.
+    pub(super) fn landmark_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
+        for landmark in &flight.survey.landmarks {
+            let clicks = self.clicks(flight, landmark);
+            if clicks.iter().any(|(.., seen)| seen.is_none()) {
+                // As far off as can be: or it would pay to have it out of sight.
+                sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
+            }
+            let seen: Vec<(usize, &Click, Seen)> =
+                clicks.into_iter().filter_map(|(k, click, seen)| Some((k, click, seen?))).collect();
+            // Its place may be another's, and a click beside it.
+            sink.take(&self.whitened_clicks(&seen).unwrap_or_default(), Tails::Heavy);
+        }
+    }
+
+    /// A landmark's clicks in the pictures of cameras of the flight, by their numbers, as these see it.
+    fn clicks<'a>(
+        &self,
+        flight: &Flight<'_>,
+        landmark: &'a SurveyedLandmark,
+    ) -> Vec<(usize, &'a Click, Option<Seen>)> {
+        let clicks = landmark.clicks.iter().filter_map(|click| {
+            let index = flight.cameras.iter().position(|camera| camera.name == click.camera)?;
+            let camera = &self.cameras[index];
+            let state = seen::State {
+                rotation: camera.rotation,
+                centre: camera.centre,
+                intrinsics: camera.intrinsics,
+            };
+            Some((index, click, seen::see(&landmark.at, click.pixel, &state)))
+        });
+        clicks.collect()
+    }
+
+    fn whitened_clicks(&self, clicks: &[(usize, &Click, Seen)]) -> Option<Vec<Row>> {
+        let (starts, rows) = (self.starts(), 2 * clicks.len());
+        let mut by_place = OMatrix::<f64, Dyn, U3>::zeros(rows);
+        let mut noise = DMatrix::zeros(rows, rows);
+        let mut residual = DVector::zeros(rows);
+        for (k, (_, click, seen)) in clicks.iter().enumerate() {
+            by_place.fixed_rows_mut::<2>(2 * k).copy_from(&seen.by_place);
+            residual.fixed_rows_mut::<2>(2 * k).copy_from(&seen.residual);
+            (2 * k..2 * k + 2).for_each(|row| noise[(row, row)] = click.sd_px.powi(2));
+        }
+        noise += &by_place * by_place.transpose();
+        let whitening = noise.cholesky()?.l().try_inverse()?;
+        residual = &whitening * residual;
+        let row = |row: usize| -> Row {
+            let mut terms = Vec::new();
+            // Whitening takes off of each what those before it have told.
+            for (k, (index, _, seen)) in clicks[..=row / 2].iter().enumerate() {
+                let by = whitening.view((row, 2 * k), (1, 2)) * &seen.by;
+                let unknown =
+                    |own: usize| if own < POSE { own } else { own - POSE + POSE_AND_CLOCK };
+                let own = by.iter().enumerate();
+                terms.extend(own.map(|(own, value)| (starts[*index] + unknown(own), *value)));
+            }
+            (terms, residual[row])
+        };
+        Some((0..rows).map(row).collect())
+    }
+
+    /// How each click fits.
+    pub(super) fn landmark_misfits(&self, flight: &Flight<'_>) -> Vec<LandmarkMisfit> {
+        let misfits = flight.survey.landmarks.iter().flat_map(|landmark| {
+            let misfit = |(_, click, seen): (usize, &Click, Option<Seen>)| LandmarkMisfit {
+                landmark: landmark.name.clone(),
+                camera: click.camera.clone(),
+                residual_px: seen.as_ref().map(|seen| -seen.residual),
+                deviations: seen
+                    .as_ref()
+                    .and_then(|seen| deviations(seen, click))
+                    .unwrap_or(UNSEEN),
+            };
+            self.clicks(flight, landmark).into_iter().map(misfit).collect::<Vec<_>>()
+        });
+        misfits.collect()
+    }
+}
+
+fn deviations(seen: &Seen, click: &Click) -> Option<f64> {
+    let weight = seen.noise(click.sd_px).try_inverse()?;
+    Some(seen.residual.dot(&(weight * seen.residual)).sqrt())
+}

@@ -1,0 +1,74 @@
+//! A landmark in a picture.
+
+use crossfix_geometry::{Intrinsics, Pixel};
+use nalgebra::{
+    DVector, Dyn, Matrix2, Matrix2x3, Matrix3, OMatrix, Point3, Rotation3, U2, Vector2,
+};
+
+use crate::lens;
+use crate::survey::LandmarkPlace;
+
+/// Unknowns of a pose: rotation about the camera's axes (rad), then its centre (m).
+pub(crate) const POSE: usize = 6;
+
+/// A camera's pose and lens.
+#[derive(Clone, Debug)]
+pub(crate) struct State {
+    pub(crate) rotation: Rotation3<f64>,
+    pub(crate) centre: Point3<f64>,
+    pub(crate) intrinsics: Intrinsics,
+}
+
+impl State {
+    pub(super) fn moved(&self, step: &DVector<f64>) -> Self {
+        Self {
+            rotation: self.rotation * Rotation3::new(step.fixed_rows::<3>(0).into_owned()),
+            centre: self.centre + step.fixed_rows::<3>(3),
+            intrinsics: lens::moved(&self.intrinsics, &step.as_slice()[POSE..]),
+        }
+    }
+}
+
+/// A click against where a state has it.
+#[derive(Clone, Debug)]
+pub(crate) struct Seen {
+    /// Where it should be less where it is, pixels.
+    pub(crate) residual: Vector2<f64>,
+    /// By pose and lens.
+    pub(crate) by: OMatrix<f64, U2, Dyn>,
+    /// By what the landmark's own place or direction may be off by, in deviations.
+    pub(crate) by_place: Matrix2x3<f64>,
+}
+
+impl Seen {
+    /// Covariance of the click with what the landmark's own place may be off by, pixels^2.
+    pub(crate) fn noise(&self, click_sd_px: f64) -> Matrix2<f64> {
+        self.by_place * self.by_place.transpose() + Matrix2::identity() * click_sd_px.powi(2)
+    }
+}
+
+/// A landmark as a state sees it, against where it was clicked; `None` behind the camera.
+pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<Seen> {
+    let camera_from_world = state.rotation.inverse();
+    let offset = match at {
+        LandmarkPlace::Place { position, .. } => camera_from_world * (position - state.centre),
+        LandmarkPlace::Direction { direction, .. } => camera_from_world * direction.into_inner(),
+    };
+    let seen = lens::project(&state.intrinsics, &offset)?;
+    let by_place: Matrix2x3<f64> = seen.by_point * camera_from_world.matrix();
+    let count = lens::numbers(&state.intrinsics);
+    let mut by = OMatrix::<f64, U2, Dyn>::zeros(POSE + count);
+    by.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * offset.cross_matrix()));
+    let by_place = match at {
+        LandmarkPlace::Place { sd_m, .. } => {
+            by.fixed_columns_mut::<3>(3).copy_from(&-by_place);
+            by_place * Matrix3::from_diagonal(sd_m)
+        }
+        LandmarkPlace::Direction { sd_rad, .. } => by_place * *sd_rad,
+    };
+    for (number, by_number) in seen.by_lens[..count].iter().enumerate() {
+        by.set_column(POSE + number, by_number);
+    }
+    let residual = seen.pixel - Vector2::new(clicked.x(), clicked.y());
+    Some(Seen { residual, by, by_place })
+}
