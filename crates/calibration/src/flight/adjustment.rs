@@ -75,11 +75,13 @@ pub(super) struct State {
     pub(super) bias: Vec<Knots>,
 }
 
-/// A residual that is one by its deviation, and what it hangs on.
-pub(super) type Row = (Vec<Term>, f64);
+pub(super) use super::normal::Row;
 
 /// Takes rows in that have their tails in common.
 pub(super) trait Sink {
+    /// Whether it makes anything of what rows hang on.
+    const TAKES_TERMS: bool = true;
+
     fn take(&mut self, rows: &[Row], tails: Tails);
 }
 
@@ -89,15 +91,15 @@ impl Sink for Linear {
     fn take(&mut self, rows: &[Row], tails: Tails) {
         let weight =
             tails.weight(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
-        for (terms, residual) in rows {
-            self.0.add(terms, *residual, weight);
-        }
+        self.0.add(rows, weight);
     }
 }
 
 pub(super) struct Cost(pub(super) f64);
 
 impl Sink for Cost {
+    const TAKES_TERMS: bool = false;
+
     fn take(&mut self, rows: &[Row], tails: Tails) {
         self.0 +=
             tails.loss(rows.iter().map(|(_, residual)| residual * residual).sum(), rows.len());
@@ -260,13 +262,13 @@ impl State {
         }
     }
 
-    fn label_rows(
+    fn label_rows<S: Sink>(
         &self,
         index: usize,
         start: usize,
         camera: &CameraLabels,
         priors: &CameraPriors,
-        sink: &mut impl Sink,
+        sink: &mut S,
     ) {
         let mut before: Option<(f64, Placed)> = None;
         for label in &camera.labels {
@@ -288,7 +290,13 @@ impl State {
                 .noise
                 .after(earlier.map(|(time_s, _)| label.time_s - time_s), priors.frame_s);
             let earlier = earlier.as_ref().map(|(_, earlier)| earlier);
-            sink.take(&self.whitened(index, start, &placed, earlier, whitening), Tails::Heavy);
+            let rows = if S::TAKES_TERMS {
+                self.whitened(index, start, &placed, earlier, whitening)
+            } else {
+                whitened_residual(&placed, earlier, whitening)
+                    .map(|residual| (Vec::new(), residual))
+            };
+            sink.take(&rows, Tails::Heavy);
             before = Some((label.time_s, placed));
         }
     }
@@ -309,26 +317,26 @@ impl State {
         placed.touched().fit().then_some(placed)
     }
 
-    /// A label's residual less what of it is the one's before, by the deviation of what is new.
+    /// See [`whitened_residual`], with what it hangs on.
     fn whitened(
         &self,
         index: usize,
         start: usize,
         now: &Placed,
         before: Option<&Placed>,
-        Whitening { kept, sd_px }: Whitening,
+        whitening: Whitening,
     ) -> [Row; 2] {
+        let Whitening { kept, sd_px } = whitening;
+        let residuals = whitened_residual(now, before, whitening);
         let (order, own) = (self.order(), self.cameras[index].own());
         let first = before.map_or(now.first, |before| before.first);
         [0, 1].map(|axis| {
             let mut chain = [0.0; OF_A_PAIR];
             let mut terms: Vec<Term> = Vec::with_capacity(OF_A_PAIR + own + 4);
             let mut own_terms = [0.0; super::model::MOST_OWN];
-            let mut residual = 0.0;
             let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
             for (part, share) in parts.into_iter().flatten() {
                 let share = share / sd_px;
-                residual += part.seen.residual[axis] * share;
                 for (k, weight) in part.weights.iter().enumerate() {
                     for dimension in 0..3 {
                         chain[3 * (part.first - first + k) + dimension] +=
@@ -347,7 +355,7 @@ impl State {
             let of_way = chain[..used].iter().enumerate();
             terms.extend(of_way.map(|(k, value)| (order.way(first + k / 3, k % 3), *value)));
             terms.extend(own_terms[..own].iter().enumerate().map(|(k, value)| (start + k, *value)));
-            (terms, residual)
+            (terms, residuals[axis])
         })
     }
 
@@ -403,6 +411,16 @@ struct Placed {
     wander: [(usize, f64); 2],
 }
 
+/// A label's residual less what of it is the one's before, by the deviation of what is new.
+fn whitened_residual(
+    now: &Placed,
+    before: Option<&Placed>,
+    Whitening { kept, sd_px }: Whitening,
+) -> [f64; 2] {
+    let carried = before.map_or(Vector2::zeros(), |before| before.seen.residual * kept);
+    ((now.seen.residual - carried) / sd_px).into()
+}
+
 impl Placed {
     fn touched(&self) -> Touched {
         Touched::by(self.first, self.wander[0].0)
@@ -435,26 +453,28 @@ pub(super) fn adjust(
     let gauge = if flight.log.is_none() { Some(Gauge::of(&start)?) } else { None };
     let model = Model { flight: *flight, priors, gauge: gauge.as_ref() };
     let seen = start.seen_coefficients(flight);
-    let cost_of = |state: &State, pull: f64| {
+    let cost_of_rows = |state: &State| {
         let mut cost = Cost(0.0);
         state.all(&model, &mut cost);
-        cost.0 + state.lean(pull, &seen)
+        cost.0
     };
     let (mut state, mut damping) = (start, FIRST_DAMPING);
-    let mut cost = 0.0;
+    let mut of_rows = cost_of_rows(&state);
+    let mut cost = of_rows;
     for _ in 0..MOST_STEPS {
         // A rough start pulls more than what it becomes.
         let pull = state.pull(priors);
-        cost = cost_of(&state, pull);
-        let mut linear = linearised(&model, &state);
-        state.lean_against(pull, &seen, &mut linear);
-        let before = cost;
+        let before = of_rows + state.lean(pull, &seen);
+        cost = before;
         while damping < MOST_DAMPING {
-            let Solution { step, .. } = linear.clone().solve(damping)?;
+            let mut linear = linearised(&model, &state);
+            state.lean_against(pull, &seen, &mut linear);
+            let Solution { step, .. } = linear.solve(damping)?;
             let next = state.moved(step.as_slice());
-            let next_cost = cost_of(&next, pull);
+            let next_of_rows = cost_of_rows(&next);
+            let next_cost = next_of_rows + next.lean(pull, &seen);
             if next_cost < cost {
-                (state, cost) = (next, next_cost);
+                (state, of_rows, cost) = (next, next_of_rows, next_cost);
                 damping /= DAMPING_STEP;
                 break;
             }

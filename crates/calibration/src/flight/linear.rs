@@ -148,17 +148,11 @@ impl Normalised {
 
     /// See [`in_space`]; each pair counts by its weight.
     fn in_space(&self, pairs: &[Seen], weights: &[f64]) -> Option<Linear> {
-        let mut sum = SMatrix::<f64, 12, 12>::zeros();
-        for ((direction, place), weight) in pairs.iter().zip(weights) {
-            let place = self.place(*place);
-            let across = direction.cross_matrix();
-            let mut rows = SMatrix::<f64, 3, 12>::zeros();
-            for k in 0..3 {
-                rows.fixed_columns_mut::<3>(3 * k).copy_from(&(across * place[k]));
-            }
-            rows.fixed_columns_mut::<3>(9).copy_from(&across);
-            sum += rows.transpose() * rows * *weight;
-        }
+        let sum: SMatrix<f64, 12, 12> =
+            squares(pairs.iter().zip(weights).map(|((direction, place), weight)| {
+                let place = self.place(*place);
+                (direction, [place.x, place.y, place.z, 1.0], *weight)
+            }));
         let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
         let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
         let matrix = Matrix3::from_column_slice(&least.as_slice()[..9]);
@@ -167,17 +161,10 @@ impl Normalised {
 
     /// See [`in_plane`].
     fn in_plane(&self, pairs: &[Seen]) -> Option<Linear> {
-        let mut sum = SMatrix::<f64, 9, 9>::zeros();
-        for (direction, place) in pairs {
+        let sum: SMatrix<f64, 9, 9> = squares(pairs.iter().map(|(direction, place)| {
             let place = self.place(*place);
-            let across = direction.cross_matrix();
-            let mut rows = SMatrix::<f64, 3, 9>::zeros();
-            for k in 0..2 {
-                rows.fixed_columns_mut::<3>(3 * k).copy_from(&(across * place[k]));
-            }
-            rows.fixed_columns_mut::<3>(6).copy_from(&across);
-            sum += rows.transpose() * rows;
-        }
+            (direction, [place.x, place.y, 1.0], 1.0)
+        }));
         let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
         let least: SVector<f64, 9> =
             eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
@@ -198,6 +185,28 @@ impl Normalised {
         let matrix = Matrix3::from_columns(&[x, y, x.cross(&y)]);
         Some(self.in_world(&matrix, &(shift * sign), pairs))
     }
+}
+
+/// The sum of `A'A` of the equations `d x (M h) = 0`, for directions d and homogeneous places h with
+/// their weights: as `A = h' (x) [d]x` it is `h h' (x) [d]x'[d]x`.
+fn squares<'a, const H: usize, const N: usize>(
+    pairs: impl Iterator<Item = (&'a Vector3<f64>, [f64; H], f64)>,
+) -> SMatrix<f64, N, N> {
+    const { assert!(N == 3 * H) };
+    let mut sum = SMatrix::<f64, N, N>::zeros();
+    for (direction, place, weight) in pairs {
+        let across = (Matrix3::from_diagonal_element(direction.norm_squared())
+            - direction * direction.transpose())
+            * weight;
+        for row in 0..H {
+            for column in 0..=row {
+                let mut block = sum.fixed_view_mut::<3, 3>(3 * row, 3 * column);
+                block += across * (place[row] * place[column]);
+            }
+        }
+    }
+    sum.fill_upper_triangle_with_lower_triangle();
+    sum
 }
 
 /// A symmetric matrix of a dozen rows takes ten or so; one with what is no number would take for ever.

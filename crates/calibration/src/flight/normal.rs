@@ -6,6 +6,12 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 /// An unknown that has a part in a residual, and the residual's derivative by it.
 pub(super) type Term = (usize, f64);
 
+/// A residual that is one by its deviation, and what it hangs on.
+pub(super) type Row = (Vec<Term>, f64);
+
+/// An unknown that has a part in two residuals.
+type TwoTerms = (usize, [f64; 2]);
+
 /// `J'WJ` and `-J'Wr` of weighted residuals, gathered row by row.
 ///
 /// Unknowns are counted with the chain first.
@@ -20,9 +26,9 @@ pub(super) struct NormalEquations {
     cross: DMatrix<f64>,
     others: DMatrix<f64>,
     right: DVector<f64>,
-    /// Room for one row's terms.
-    of_chain: Vec<Term>,
-    of_others: Vec<Term>,
+    /// Room for the terms of two rows.
+    of_chain: Vec<TwoTerms>,
+    of_others: Vec<TwoTerms>,
 }
 
 /// The solution, and what is left of the others' block when the chain is eliminated.
@@ -57,18 +63,24 @@ impl Solution {
         let Self { schur, factor, mut cross, width, .. } = self;
         let chain = factor.len() / width;
         let mut band = vec![0.0; factor.len()];
+        // The same by the later unknown, the farthest first: a row's neighbours lie beside one another.
+        let mut back = vec![0.0; factor.len()];
+        let mut below = vec![0.0; width];
         for row in (0..chain).rev() {
             let inverse_diagonal = factor[row * width];
             let reach = width.min(chain - row);
+            let below = &mut below[..reach];
+            below.iter_mut().enumerate().for_each(|(d, l)| *l = factor[(row + d) * width + d]);
             for ahead in (0..reach).rev() {
                 let column = row + ahead;
-                let mut value = if ahead == 0 { inverse_diagonal } else { 0.0 };
-                for below in 1..reach {
-                    let k = row + below;
-                    let (least, most) = (k.min(column), k.max(column));
-                    value -= factor[k * width + below] * band[least * width + most - least];
-                }
-                band[row * width + ahead] = value * inverse_diagonal;
+                let nearer = &back[(column + 1) * width - ahead..][..ahead];
+                let farther = &band[column * width + 1..][..reach - ahead - 1];
+                let known =
+                    dot(&below[1..ahead + 1], &nearer[..ahead]) + dot(&below[ahead + 1..], farther);
+                let diagonal = if ahead == 0 { inverse_diagonal } else { 0.0 };
+                let value = (diagonal - known) * inverse_diagonal;
+                band[row * width + ahead] = value;
+                back[column * width + width - 1 - ahead] = value;
             }
         }
         let others = cross.nrows();
@@ -82,10 +94,13 @@ impl Solution {
 impl Covariance {
     /// The variance of a sum of the chain's unknowns, all within the band's width, the others held.
     pub(super) fn variance_held(&self, terms: &[Term]) -> f64 {
-        let pairs = terms.iter().flat_map(|a| terms.iter().map(move |b| (a, b)));
-        pairs
-            .map(|(&(i, x), &(j, y))| x * y * self.band[i.min(j) * self.width + i.abs_diff(j)])
-            .sum()
+        let covariance = |i: usize, j: usize| self.band[i.min(j) * self.width + i.abs_diff(j)];
+        let mut sum = 0.0;
+        for (at, &(i, x)) in terms.iter().enumerate() {
+            let before = terms[..at].iter().map(|&(j, y)| y * covariance(i, j)).sum::<f64>();
+            sum += x * (x * covariance(i, i) + 2.0 * before);
+        }
+        sum
     }
 
     /// The variance of a sum of unknowns, those of the chain within the band's width.
@@ -134,35 +149,56 @@ impl NormalEquations {
         }
     }
 
-    /// Takes a residual in with its weight. Terms may name an unknown more than once.
-    pub(super) fn add(&mut self, terms: &[Term], residual: f64, weight: f64) {
+    /// Takes residuals in with their weight. Terms may name an unknown more than once.
+    pub(super) fn add(&mut self, rows: &[Row], weight: f64) {
+        if let [(first, a), (second, b)] = rows
+            && first.len() == second.len()
+            && first.iter().zip(second).all(|(first, second)| first.0 == second.0)
+        {
+            // Both axes of a label: what there is to look up is looked up once.
+            let pairs = first.iter().zip(second);
+            return self.add_two(pairs.map(|(a, b)| (a.0, [a.1, b.1])), [*a, *b], weight);
+        }
+        for (terms, residual) in rows {
+            let terms = terms.iter().map(|(unknown, by)| (*unknown, [*by, 0.0]));
+            self.add_two(terms, [*residual, 0.0], weight);
+        }
+    }
+
+    /// Takes two residuals in that hang on the same unknowns.
+    fn add_two(&mut self, terms: impl Iterator<Item = TwoTerms>, residuals: [f64; 2], weight: f64) {
         let (mut of_chain, mut of_others) =
             (std::mem::take(&mut self.of_chain), std::mem::take(&mut self.of_others));
-        for &(unknown, by) in terms.iter().filter(|(_, by)| *by != 0.0) {
-            self.right[unknown] -= weight * by * residual;
+        for (unknown, by) in terms.filter(|(_, by)| *by != [0.0; 2]) {
+            self.right[unknown] -= weight * (by[0] * residuals[0] + by[1] * residuals[1]);
             if unknown < self.chain {
                 of_chain.push((unknown, by));
             } else {
                 of_others.push((unknown - self.chain, by));
             }
         }
-        for &(row, by_row) in &of_chain {
-            let weighed = weight * by_row;
-            for &(column, by_column) in of_chain.iter().filter(|(column, _)| *column <= row) {
-                debug_assert!(row - column < self.width, "beyond the band");
-                self.band[row * self.width + row - column] += weighed * by_column;
+        in_order(&mut of_chain);
+        in_order(&mut of_others);
+        for (at, &(row, by_row)) in of_chain.iter().enumerate() {
+            let weighed = by_row.map(|by| weight * by);
+            let band = &mut self.band[row * self.width..][..self.width];
+            for &(column, by) in &of_chain[..=at] {
+                band[row - column] += weighed[0] * by[0] + weighed[1] * by[1];
             }
             let mut ties = self.cross.column_mut(row);
             let ties = ties.as_mut_slice();
-            of_others.iter().for_each(|&(other, by)| ties[other] += weighed * by);
+            for &(other, by) in &of_others {
+                ties[other] += weighed[0] * by[0] + weighed[1] * by[1];
+            }
         }
-        for &(column, by_column) in &of_others {
-            let weighed = weight * by_column;
+        for (at, &(column, by_column)) in of_others.iter().enumerate() {
+            let weighed = by_column.map(|by| weight * by);
             let mut ties = self.others.column_mut(column);
             let ties = ties.as_mut_slice();
             // The lower triangle.
-            let below = of_others.iter().filter(|(row, _)| *row >= column);
-            below.for_each(|&(row, by)| ties[row] += weighed * by);
+            for &(row, by) in &of_others[at..] {
+                ties[row] += weighed[0] * by[0] + weighed[1] * by[1];
+            }
         }
         of_chain.clear();
         of_others.clear();
@@ -227,6 +263,18 @@ impl NormalEquations {
         }
         Some(())
     }
+}
+
+/// Puts terms in the order of their unknowns, each once.
+fn in_order(terms: &mut Vec<TwoTerms>) {
+    terms.sort_unstable_by_key(|(unknown, _)| *unknown);
+    terms.dedup_by(|next, first| {
+        let is_same = next.0 == first.0;
+        if is_same {
+            (0..2).for_each(|row| first.1[row] += next.1[row]);
+        }
+        is_same
+    });
 }
 
 /// Solves `L x = b` in place, for so many right sides that lie beside one another.
@@ -297,7 +345,7 @@ mod tests {
             let columns = (first..first + WIDTH).chain([other]);
             let terms: Vec<Term> = columns.map(|c| (c, random.random_range(-1.0..1.0))).collect();
             let residual = random.random_range(-1.0..1.0);
-            equations.add(&terms, residual, 2.0);
+            equations.add(&[(terms.clone(), residual)], 2.0);
             for &(row, by_row) in &terms {
                 right[row] -= 2.0 * by_row * residual;
                 for &(column, by_column) in &terms {
@@ -325,7 +373,7 @@ mod tests {
     #[test]
     fn an_unknown_that_is_tied_to_nothing_has_no_solution() {
         let mut equations = NormalEquations::new(3, 2, 1);
-        equations.add(&[(0, 1.0)], 1.0, 1.0);
+        equations.add(&[(vec![(0, 1.0)], 1.0)], 1.0);
         assert!(equations.solve(0.0).is_none());
     }
 }
