@@ -70,6 +70,8 @@ pub struct ClockCorrection {
     pub readout_s: f64,
 }
 
+/// No clock shows a time or is off by one beyond this, s: 30 000 years.
+const LARGEST_S: f64 = 1e12;
 /// No camera is said to point better than this, pixels.
 const LEAST_POINTING_PX: f64 = 1e-4;
 
@@ -195,12 +197,12 @@ impl ClockCorrection {
     pub(crate) fn is_possible(&self) -> bool {
         let numbers = self.knots_s.iter().flatten();
         let rest = [self.rate, self.rate_sd, self.wander_s, self.readout_s];
-        numbers.chain(&rest).all(|value| value.is_finite())
+        numbers.chain(&rest).all(|value| value.abs() < LARGEST_S)
             && self.knots_s.windows(2).all(|pair| pair[0][0] < pair[1][0])
             && self.knots_s.iter().all(|knot| knot[2] >= 0.0)
             && self.rate.abs() < 0.1
-            && self.rate_sd >= 0.0
-            && self.wander_s >= 0.0
+            && (0.0..1.0).contains(&self.rate_sd)
+            && (0.0..1.0).contains(&self.wander_s)
             && self.readout_s.abs() < 1.0
     }
 }

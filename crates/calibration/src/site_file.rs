@@ -11,6 +11,9 @@ use crate::flight::{CameraResult, FlightResult};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
+/// No place (m), deviation or square of one in a calibration is larger: beyond it sums and squares
+/// come to no numbers.
+const LARGEST: f64 = 1e12;
 /// The form of the file that this build writes, and the only one that it reads.
 const FORM: u32 = 1;
 
@@ -32,6 +35,9 @@ pub enum SiteFileError {
         #[source]
         source: GeometryError,
     },
+    /// Two cameras of one name.
+    #[error("camera `{0}` is there twice")]
+    Twice(CameraName),
     /// A datum that cannot be.
     #[error("`datum` is impossible")]
     Datum,
@@ -133,7 +139,13 @@ impl SiteCalibration {
         if file.form != FORM {
             return Err(SiteFileError::Form(file.form));
         }
-        let cameras = file.cameras.into_iter().map(FileCamera::parse).collect::<Result<_, _>>()?;
+        let cameras: Vec<CalibratedCamera> =
+            file.cameras.into_iter().map(FileCamera::parse).collect::<Result<_, _>>()?;
+        let named_before =
+            |k: usize| cameras[..k].iter().any(|other| other.name == cameras[k].name);
+        if let Some(twice) = (0..cameras.len()).find(|k| named_before(*k)) {
+            return Err(SiteFileError::Twice(cameras[twice].name.clone()));
+        }
         let datum =
             file.datum.map(|datum| datum.parse().ok_or(SiteFileError::Datum)).transpose()?;
         Ok(Self { cameras, datum })
@@ -282,6 +294,9 @@ impl FileCamera {
             return Err(impossible("range_m"));
         }
         let rotation = Matrix3::from(self.rotation).transpose();
+        if self.position_m.iter().any(|metres| metres.abs() > LARGEST) {
+            return Err(impossible("position_m"));
+        }
         let pose = Pose::new(rotation, Point3::from(self.position_m)).map_err(geometry)?;
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
         if !self.clock.is_possible() {
@@ -297,9 +312,7 @@ impl FileCamera {
             return Err(impossible("noise"));
         }
         let pose_covariance = Matrix6::from(self.pose_covariance);
-        let is_covariance = pose_covariance.iter().all(|value| value.is_finite())
-            && pose_covariance.symmetric_eigenvalues().min() >= -1e-9 * pose_covariance.amax();
-        if !is_covariance {
+        if !is_covariance(&DMatrix::from_column_slice(6, 6, pose_covariance.as_slice())) {
             return Err(impossible("pose_covariance"));
         }
         let noise = LabelNoise { white_px, lasting_px, lasting_s };
@@ -321,18 +334,35 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
     matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-/// The matrix of these rows, if they make one of this size and of finite numbers.
+/// Whether a matrix may be a covariance. Its numbers have units of their own: each counts by its own
+/// deviation.
+fn is_covariance(matrix: &DMatrix<f64>) -> bool {
+    // Rounding, and a person who has shortened the numbers.
+    const ABOUT: f64 = 1e-4;
+    if !matrix.iter().all(|value| value.abs() < LARGEST) || matrix.diagonal().min() < 0.0 {
+        return false;
+    }
+    let by = matrix
+        .diagonal()
+        .map(|variance| if variance > 0.0 { variance.sqrt().recip() } else { 0.0 });
+    let correlation =
+        DMatrix::from_fn(matrix.nrows(), matrix.ncols(), |i, j| by[i] * matrix[(i, j)] * by[j]);
+    let is_symmetric = (&correlation - correlation.transpose()).amax() <= ABOUT;
+    is_symmetric && correlation.symmetric_eigenvalues().min() >= -ABOUT
+}
+
+/// The matrix of these rows, if they make one of this size and of numbers that can be.
 fn matrix(rows: &[Vec<f64>], size: (usize, usize)) -> Option<DMatrix<f64>> {
     let is_whole = rows.len() == size.0 && rows.iter().all(|row| row.len() == size.1);
-    let is_finite = rows.iter().flatten().all(|value| value.is_finite());
-    (is_whole && is_finite).then(|| DMatrix::from_fn(size.0, size.1, |i, j| rows[i][j]))
+    let is_number = rows.iter().flatten().all(|value| value.abs() < LARGEST);
+    (is_whole && is_number).then(|| DMatrix::from_fn(size.0, size.1, |i, j| rows[i][j]))
 }
 
 impl FileLens {
     fn uncertainty(&self) -> Option<LensUncertainty> {
         let count = lens::numbers(&self.parse()?);
         Some(LensUncertainty {
-            covariance: matrix(&self.covariance, (count, count))?,
+            covariance: matrix(&self.covariance, (count, count)).filter(is_covariance)?,
             pose_by_lens: matrix(&self.pose_by_lens, (6, count))?,
         })
     }
