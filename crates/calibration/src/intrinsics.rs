@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use crossfix_geometry::{CameraModel, Distortion, GeometryError, ImageSize, Intrinsics};
 use serde::Deserialize;
 use thiserror::Error;
@@ -6,7 +8,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum IntrinsicsError {
     /// No YAML, or without a key that it needs.
-    #[error("the file is no camera calibration of OpenCV or ROS")]
+    #[error("the file is no camera calibration of OpenCV, ROS or Kalibr")]
     Yaml(#[source] Box<serde_saphyr::Error>),
     /// A matrix of the wrong shape.
     #[error("`{key}` must have {wanted} numbers, it has {found}")]
@@ -22,8 +24,19 @@ pub enum IntrinsicsError {
     #[error("`camera_matrix` has a skew of {0}: only images with square corners are supported")]
     Skew(f64),
     /// A lens model that we do not have.
-    #[error("the distortion model `{0}` is not known: plumb_bob, equidistant or fisheye")]
+    #[error("the lens model `{0}` is not known: plumb_bob, radtan, equidistant or fisheye")]
     Model(String),
+    /// A file of several cameras, none of which was asked for.
+    #[error("the file is of several cameras ({0}): say which, as in `camchain.yaml#{first}`", first = .0.split(", ").next().unwrap_or("cam0"))]
+    Several(String),
+    /// A camera that the file has not.
+    #[error("the file has no camera `{wanted}`: it has {known}")]
+    NoSuch {
+        /// Which was asked for.
+        wanted: String,
+        /// Those that it has.
+        known: String,
+    },
     /// Numbers that are no camera's.
     #[error("the numbers describe no camera")]
     Numbers(#[source] GeometryError),
@@ -46,11 +59,28 @@ struct CalibrationFile {
     distortion_coefficients: YamlMatrix,
 }
 
-/// Reads the YAML of ROS (`camera_info`) or of OpenCV's `FileStorage`.
+/// A camera of Kalibr's `camchain.yaml`; where it stands to the others is left alone.
+#[derive(Debug, Deserialize)]
+struct ChainCamera {
+    camera_model: String,
+    intrinsics: Vec<f64>,
+    distortion_model: String,
+    distortion_coeffs: Vec<f64>,
+    resolution: [u32; 2],
+}
+
+/// Reads the YAML of ROS (`camera_info`), of OpenCV's `FileStorage`, or Kalibr's `camchain.yaml` of one
+/// camera.
 ///
 /// # Errors
 /// [`IntrinsicsError`] naming the key that is wrong.
 pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
+    if let Ok(chain) = serde_saphyr::from_str::<BTreeMap<String, ChainCamera>>(text) {
+        return match chain.values().next() {
+            Some(camera) if chain.len() == 1 => camera.intrinsics(),
+            _ => Err(IntrinsicsError::Several(names(&chain))),
+        };
+    }
     // OpenCV begins with a directive that YAML does not have.
     let text = match text.split_once('\n') {
         Some((first, rest)) if first.starts_with("%YAML:") => rest,
@@ -68,14 +98,70 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
     if k[1].abs() > 1e-3 {
         return Err(IntrinsicsError::Skew(k[1]));
     }
-    let coefficients = &file.distortion_coefficients.data;
-    let model = file.distortion_model.as_deref().unwrap_or("plumb_bob");
-    let shape = |wanted| IntrinsicsError::Shape {
-        key: "distortion_coefficients",
-        wanted,
-        found: coefficients.len(),
+    let intrinsics = Intrinsics {
+        size: ImageSize { width: file.image_width, height: file.image_height },
+        fx: k[0],
+        fy: k[4],
+        cx: k[2],
+        cy: k[5],
+        distortion: distortion(
+            file.distortion_model.as_deref().unwrap_or("plumb_bob"),
+            ("distortion_coefficients", &file.distortion_coefficients.data),
+        )?,
     };
-    let distortion = match model {
+    CameraModel::new(intrinsics).map_err(IntrinsicsError::Numbers)?;
+    Ok(intrinsics)
+}
+
+/// Reads a camera of Kalibr's `camchain.yaml`.
+///
+/// # Errors
+/// [`IntrinsicsError`] naming the key that is wrong, or the cameras that the file has.
+pub fn intrinsics_from_camchain(text: &str, camera: &str) -> Result<Intrinsics, IntrinsicsError> {
+    let chain: BTreeMap<String, ChainCamera> =
+        serde_saphyr::from_str(text).map_err(|error| IntrinsicsError::Yaml(Box::new(error)))?;
+    let no_such = || IntrinsicsError::NoSuch { wanted: camera.to_owned(), known: names(&chain) };
+    chain.get(camera).ok_or_else(no_such)?.intrinsics()
+}
+
+fn names(chain: &BTreeMap<String, ChainCamera>) -> String {
+    chain.keys().map(String::as_str).collect::<Vec<_>>().join(", ")
+}
+
+impl ChainCamera {
+    fn intrinsics(&self) -> Result<Intrinsics, IntrinsicsError> {
+        if self.camera_model != "pinhole" {
+            return Err(IntrinsicsError::Model(self.camera_model.clone()));
+        }
+        let [fx, fy, cx, cy] = self.intrinsics[..] else {
+            let found = self.intrinsics.len();
+            return Err(IntrinsicsError::Shape { key: "intrinsics", wanted: "4", found });
+        };
+        let [width, height] = self.resolution;
+        let intrinsics = Intrinsics {
+            size: ImageSize { width, height },
+            fx,
+            fy,
+            cx,
+            cy,
+            distortion: distortion(
+                &self.distortion_model,
+                ("distortion_coeffs", &self.distortion_coeffs),
+            )?,
+        };
+        CameraModel::new(intrinsics).map_err(IntrinsicsError::Numbers)?;
+        Ok(intrinsics)
+    }
+}
+
+/// The distortion of a model by the name that it has in these files, with the key and what stands there.
+fn distortion(
+    model: &str,
+    (key, coefficients): (&'static str, &[f64]),
+) -> Result<Distortion, IntrinsicsError> {
+    let shape = |wanted| IntrinsicsError::Shape { key, wanted, found: coefficients.len() };
+    Ok(match model {
+        "none" => Distortion::None,
         "plumb_bob" | "pinhole" | "radtan" => match coefficients[..] {
             [] => Distortion::None,
             [k1, k2, p1, p2] => Distortion::BrownConrady([k1, k2, p1, p2, 0.0]),
@@ -83,20 +169,10 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
             _ => return Err(shape("4 or 5")),
         },
         "equidistant" | "fisheye" | "kannala_brandt" => {
-            Distortion::Fisheye(coefficients.as_slice().try_into().map_err(|_| shape("4"))?)
+            Distortion::Fisheye(coefficients.try_into().map_err(|_| shape("4"))?)
         }
         other => return Err(IntrinsicsError::Model(other.to_owned())),
-    };
-    let intrinsics = Intrinsics {
-        size: ImageSize { width: file.image_width, height: file.image_height },
-        fx: k[0],
-        fy: k[4],
-        cx: k[2],
-        cy: k[5],
-        distortion,
-    };
-    CameraModel::new(intrinsics).map_err(IntrinsicsError::Numbers)?;
-    Ok(intrinsics)
+    })
 }
 
 /// Writes the YAML of ROS.
@@ -132,6 +208,35 @@ mod tests {
         let without = intrinsics_from_yaml(OPENCV.split_once("---\n").unwrap().1).unwrap();
         assert_eq!(with, without);
         assert_eq!(with.distortion, Distortion::BrownConrady([-0.1, 0.02, 0.0, 0.0, 0.0]));
+    }
+
+    const KALIBR: &str = "cam0:\n  camera_model: pinhole\n  intrinsics: [461.6, 460.2, 362.7, 246.0]\n  \
+        distortion_model: radtan\n  distortion_coeffs: [-0.277, 0.0671, 0.0009, 0.0001]\n  \
+        rostopic: /cam0/image_raw\n  resolution: [752, 480]\n";
+
+    #[test]
+    fn kalibrs_chain_is_read_camera_by_camera() {
+        let first = intrinsics_from_yaml(KALIBR).unwrap();
+        assert_eq!(first.size, ImageSize { width: 752, height: 480 });
+        assert_eq!((first.fx, first.cy), (461.6, 246.0));
+        assert_eq!(
+            first.distortion,
+            Distortion::BrownConrady([-0.277, 0.0671, 0.0009, 0.0001, 0.0])
+        );
+        let second = KALIBR.replace("cam0", "cam1").replace("radtan", "equidistant");
+        let both = format!("{KALIBR}{second}  T_cn_cnm1:\n  - [1.0, 0.0, 0.0, 0.1]\n");
+        assert_eq!(intrinsics_from_camchain(&both, "cam0").unwrap(), first);
+        let second = intrinsics_from_camchain(&both, "cam1").unwrap();
+        assert!(matches!(second.distortion, Distortion::Fisheye(_)));
+        let several = intrinsics_from_yaml(&both).unwrap_err().to_string();
+        assert!(
+            several.contains("cam0, cam1") && several.contains("camchain.yaml#cam0"),
+            "{several}"
+        );
+        let none = intrinsics_from_camchain(&both, "cam2").unwrap_err().to_string();
+        assert!(none.contains("`cam2`") && none.contains("cam0, cam1"), "{none}");
+        let omni = KALIBR.replace("pinhole", "omni");
+        assert!(matches!(intrinsics_from_yaml(&omni), Err(IntrinsicsError::Model(_))));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! What cameras are: poses, clocks and lenses with their covariance, from the flight of one target
 //! ([`calibrate_flight`]) or from landmarks in a picture ([`calibrate_landmarks`]); the file of a site
-//! that holds them ([`SiteCalibration`]); and intrinsics as OpenCV and ROS write them:
+//! that holds them ([`SiteCalibration`]); and intrinsics as OpenCV, ROS and Kalibr write them:
 //!
 //! ```
 //! use crossfix_calibration::intrinsics_from_yaml;
@@ -35,7 +35,9 @@ pub use flight::{
     Label, LandmarkMisfit, LogErrors, LogFit, LogSample, MovedAt, Refusal, WouldFit,
     calibrate_flight,
 };
-pub use intrinsics::{IntrinsicsError, intrinsics_from_yaml, intrinsics_to_yaml};
+pub use intrinsics::{
+    IntrinsicsError, intrinsics_from_camchain, intrinsics_from_yaml, intrinsics_to_yaml,
+};
 pub use label_noise::LabelNoise;
 pub use landmarks::{
     Landmark, LandmarkError, LandmarkFit, LandmarkPicture, LandmarkResult, calibrate_landmarks,

@@ -39,7 +39,7 @@ pub struct TapedDistance {
 }
 
 /// Where a landmark is.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LandmarkPlace {
     /// At a place.
     Place {
@@ -79,15 +79,42 @@ pub struct Click {
     pub sd_px: f64,
 }
 
+/// So many landmarks in its picture tell a camera's pose: three are seen alike from up to four places.
+pub(crate) const ENOUGH_FOR_POSE: usize = 4;
 /// So many places say which way is up, and how large a site is whatever sees them.
 pub(crate) const ENOUGH_PLACES: usize = 3;
 
 impl Survey {
-    /// Whether it tells how large the site is.
-    pub fn tells_size(&self) -> bool {
-        self.places.len() > 1
-            || !self.distances.is_empty()
-            || self.placed_landmarks().count() >= ENOUGH_PLACES
+    /// Whether it tells these cameras how large their site is.
+    pub fn tells_size(&self, cameras: &[&CameraName]) -> bool {
+        let stands = |place: &&SurveyedPlace| cameras.contains(&&place.camera);
+        let are_there = |distance: &TapedDistance| {
+            distance.between.iter().all(|camera| cameras.contains(&camera))
+        };
+        self.places.iter().filter(stands).count() > 1
+            || self.distances.iter().any(are_there)
+            || self.telling_landmarks(cameras) >= ENOUGH_PLACES
+    }
+
+    /// How many landmarks tell these cameras where they are: those that two of them see, and those of
+    /// a camera that has enough for its pose.
+    pub(crate) fn telling_landmarks(&self, cameras: &[&CameraName]) -> usize {
+        let seen = |camera: &CameraName| {
+            let in_picture = |landmark: &SurveyedLandmark| {
+                landmark.clicks.iter().any(|click| click.camera == *camera)
+            };
+            self.placed_landmarks().filter(|(landmark, _)| in_picture(landmark)).count()
+        };
+        let tells = |landmark: &SurveyedLandmark| {
+            let by: Vec<&CameraName> = landmark
+                .clicks
+                .iter()
+                .map(|click| &click.camera)
+                .filter(|camera| cameras.contains(camera))
+                .collect();
+            by.len() > 1 || by.iter().any(|camera| seen(camera) >= ENOUGH_FOR_POSE)
+        };
+        self.placed_landmarks().filter(|(landmark, _)| tells(landmark)).count()
     }
 
     /// Landmarks with a place, and not only a direction.

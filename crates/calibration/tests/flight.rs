@@ -231,7 +231,7 @@ fn a_taped_distance_gives_the_size_and_level_cameras_which_way_is_up() {
         assert!(across.z.abs() < 0.02, "{across}");
     }
     let error = calibrate_flight(&labels, None, &Survey::default()).unwrap_err();
-    assert!(matches!(error, FlightError::NoSize), "{error}");
+    assert!(matches!(error, FlightError::NoSize { .. }), "{error}");
     let error = calibrate_flight(&labels[..1], None, &survey).unwrap_err();
     assert!(matches!(error, FlightError::NoPair), "{error}");
 }

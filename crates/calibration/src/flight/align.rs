@@ -5,8 +5,8 @@ use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::adjustment::State;
 use super::model::{CameraLabels, CameraState};
-use super::triangulation;
-use crate::landmarks::{Landmark, LandmarkPicture, calibrate_landmarks};
+use super::{linear, triangulation};
+use crate::landmarks::{Landmark, LandmarkError, LandmarkPicture, calibrate_landmarks};
 use crate::lens;
 use crate::survey::{Click, ENOUGH_PLACES, Survey, SurveyedLandmark};
 
@@ -18,27 +18,35 @@ struct Similarity {
     to: Point3<f64>,
 }
 
+/// A place of the site as cameras saw it, and as the survey has it.
+type Place = (Point3<f64>, Point3<f64>);
+
 /// What is known here and there: of the site as cameras saw it, and as the survey has it.
 struct Known {
-    places: Vec<(Point3<f64>, Point3<f64>)>,
+    places: Vec<Place>,
     rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
+    /// Cameras whose own landmarks tell no pose, and why not.
+    untold: Vec<String>,
 }
 
 /// Brings cameras and way to where the survey has them, as near as it says, and says how many times
-/// larger they are there. `None`: it says nothing of the size.
+/// larger they are there.
+///
+/// # Errors
+/// It says nothing of the size: what its landmarks lack.
 pub(super) fn to_survey(
     state: &State,
     labels: &[CameraLabels],
     survey: &Survey,
-) -> Option<(State, f64)> {
-    let Known { places, rotations } = Known::of(state, labels, survey);
-    let scale = size(&places).or_else(|| taped(state, labels, survey))?;
+) -> Result<(State, f64), Vec<String>> {
+    let Known { places, rotations, untold } = Known::of(state, labels, survey).without_wrong();
+    let scale = size(&places).or_else(|| taped(state, labels, survey)).ok_or(untold)?;
     let (from, to) = if places.is_empty() {
-        (state.cameras.first()?.centre, Point3::origin())
+        (state.cameras[0].centre, Point3::origin())
     } else {
-        (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
+        middles(&places)
     };
-    let mut arms: Vec<_> = places.iter().map(|(here, there)| (here - from, there - to)).collect();
+    let mut arms = arms(&places, from, to);
     let rotation = if rotations.is_empty() {
         turn(&arms).filter(|_| places.len() >= ENOUGH_PLACES)
     } else {
@@ -50,21 +58,91 @@ pub(super) fn to_survey(
         turn(&arms)
     };
     let rotation = rotation.unwrap_or_else(|| about(&arms, upright(&state.cameras)));
-    Some((Similarity { rotation, scale, from, to }.moved(state), scale))
+    Ok((Similarity { rotation, scale, from, to }.moved(state), scale))
+}
+
+fn middles(places: &[Place]) -> Place {
+    (middle(places.iter().map(|pair| pair.0)), middle(places.iter().map(|pair| pair.1)))
+}
+
+fn arms(places: &[Place], from: Point3<f64>, to: Point3<f64>) -> Vec<(Vector3<f64>, Vector3<f64>)> {
+    places.iter().map(|(here, there)| (here - from, there - to)).collect()
+}
+
+/// Of more places than these, evenly chosen ones make the threes that are tried: 1140.
+const TRIED_PLACES: usize = 20;
+/// A place that lies this many times as far beside as half of them do is another's, ...
+const FAR: f64 = 4.0;
+/// ... if that is more than this share of how far they are spread: lenses are off by percents as yet.
+const LEAST_FAR: f64 = 0.05;
+/// And so is a pose that is turned by more than this, rad.
+const FAR_TURNED_RAD: f64 = 0.2;
+
+impl Similarity {
+    /// The one that three places show; `None` where they lie on a line.
+    fn of_three(three: &[Place]) -> Option<Self> {
+        let (from, to) = middles(three);
+        let rotation = turn(&arms(three, from, to))?;
+        Some(Self { rotation, scale: size(three)?, from, to })
+    }
+
+    fn place(&self, place: Point3<f64>) -> Point3<f64> {
+        self.to + self.rotation * (place - self.from) * self.scale
+    }
+
+    fn misfit(&self, (here, there): &Place) -> f64 {
+        (self.place(*here) - there).norm()
+    }
 }
 
 impl Known {
+    /// Without what is not where the others are: one wrong place among four would turn the site over.
+    /// By the three places whose similarity half of all fit best.
+    fn without_wrong(mut self) -> Self {
+        if self.places.len() <= ENOUGH_PLACES {
+            return self;
+        }
+        let tried: Vec<Place> =
+            self.places.iter().step_by(self.places.len().div_ceil(TRIED_PLACES)).copied().collect();
+        let mut best: Option<(f64, Similarity)> = None;
+        for a in 0..tried.len() {
+            for b in a + 1..tried.len() {
+                for c in b + 1..tried.len() {
+                    let three = [tried[a], tried[b], tried[c]];
+                    let Some(shown) = Similarity::of_three(&three) else { continue };
+                    let misfit =
+                        linear::median(self.places.iter().map(|place| shown.misfit(place)));
+                    if best.as_ref().is_none_or(|(least, _)| misfit < *least) {
+                        best = Some((misfit, shown));
+                    }
+                }
+            }
+        }
+        let Some((misfit, shown)) = best else { return self };
+        let (_, to) = middles(&self.places);
+        let spread = linear::median(self.places.iter().map(|(_, there)| (there - to).norm()));
+        let most = FAR * misfit.max(LEAST_FAR / FAR * spread);
+        self.places.retain(|place| shown.misfit(place) <= most);
+        self.rotations
+            .retain(|(here, there)| (shown.rotation * here).angle_to(there) < FAR_TURNED_RAD);
+        self
+    }
+
     /// Cameras' surveyed places, landmarks that two cameras see, and cameras whose own landmarks tell
     /// their pose.
     fn of(state: &State, labels: &[CameraLabels], survey: &Survey) -> Self {
-        let mut known = Self { places: Vec::new(), rotations: Vec::new() };
+        let mut known = Self { places: Vec::new(), rotations: Vec::new(), untold: Vec::new() };
         for (labels, camera) in labels.iter().zip(&state.cameras) {
             if let Some(place) = survey.place(&labels.name) {
                 known.places.push((camera.centre, place.position));
             }
-            if let Some(pose) = by_own_landmarks(labels, survey) {
-                known.rotations.push((camera.rotation, *pose.rotation()));
-                known.places.push((camera.centre, pose.position()));
+            match by_own_landmarks(labels, survey) {
+                Ok(Some(pose)) => {
+                    known.rotations.push((camera.rotation, *pose.rotation()));
+                    known.places.push((camera.centre, pose.position()));
+                }
+                Ok(None) => {}
+                Err(why) => known.untold.push(why),
             }
         }
         for (landmark, place) in survey.placed_landmarks() {
@@ -81,8 +159,11 @@ impl Known {
     }
 }
 
-/// A camera's pose by the landmarks in its own picture, if they tell it.
-fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Option<Pose> {
+/// A camera's pose by the landmarks in its own picture; none where it has too few.
+///
+/// # Errors
+/// Why they do not tell it.
+fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pose>, String> {
     let landmark = |landmark: &SurveyedLandmark| {
         let click = landmark.clicks.iter().find(|click| click.camera == camera.name)?;
         Some(Landmark {
@@ -99,13 +180,21 @@ fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Option<Pose> {
         place: survey.place(&camera.name).cloned(),
         landmarks: survey.landmarks.iter().filter_map(landmark).collect(),
     };
-    let result = calibrate_landmarks(&picture).ok()?;
+    let mut result = match calibrate_landmarks(&picture) {
+        Err(LandmarkError::TooFew { .. }) => return Ok(None),
+        result => result.map_err(|error| error.to_string())?,
+    };
     if let [wrong] = &result.suspects[..] {
         picture.landmarks.retain(|landmark| landmark.name != *wrong);
-        let without = calibrate_landmarks(&picture).ok().filter(|result| !result.is_wrong())?;
-        return Some(*without.camera.pose());
+        result = calibrate_landmarks(&picture).map_err(|error| error.to_string())?;
     }
-    (!result.is_wrong()).then(|| *result.camera.pose())
+    if result.is_wrong() {
+        return Err(format!(
+            "camera `{}`: its landmarks do not fit one another (six let a wrong one be named)",
+            camera.name
+        ));
+    }
+    Ok(Some(*result.camera.pose()))
 }
 
 fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {
@@ -181,7 +270,7 @@ fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rota
 
 impl Similarity {
     fn moved(&self, state: &State) -> State {
-        let place = |place: Point3<f64>| self.to + self.rotation * (place - self.from) * self.scale;
+        let place = |place: Point3<f64>| self.place(place);
         let mut moved = state.clone();
         for camera in &mut moved.cameras {
             camera.centre = place(camera.centre);

@@ -93,7 +93,7 @@ impl Begun {
         begun.leave_lonely_out(false);
         let state = begun.unknowns(false);
         let aligned = align::to_survey(&state, &begun.cameras, survey);
-        let (state, growth) = aligned.ok_or(FlightError::NoSize)?;
+        let (state, growth) = aligned.map_err(|untold| FlightError::NoSize { untold })?;
         // From here on the aligned state counts; of what it was begun with only the jerk does.
         begun.course.jerk *= growth * growth;
         Ok((begun, state))

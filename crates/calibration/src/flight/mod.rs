@@ -77,10 +77,14 @@ pub enum FlightError {
     /// Nothing says how large the site is.
     #[error(
         "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \
-         --distance between two, or --landmarks: two of them in two cameras' pictures, or four in each \
-         of two cameras'"
+         --distance between two, or --landmarks: three of them in two cameras' pictures, or four in each \
+         of two cameras'{}",
+        untold.iter().map(|why| format!("; {why}")).collect::<String>()
     )]
-    NoSize,
+    NoSize {
+        /// Why landmarks of cameras do not tell it.
+        untold: Vec<String>,
+    },
     /// The equations have no solution.
     #[error("the adjustment has no solution: labels, log and survey are hardly of one flight")]
     NoSolution,

@@ -345,11 +345,18 @@ mod tests {
             let columns = (first..first + WIDTH).chain([other]);
             let terms: Vec<Term> = columns.map(|c| (c, random.random_range(-1.0..1.0))).collect();
             let residual = random.random_range(-1.0..1.0);
-            equations.add(&[(terms.clone(), residual)], 2.0);
-            for &(row, by_row) in &terms {
-                right[row] -= 2.0 * by_row * residual;
-                for &(column, by_column) in &terms {
-                    dense[(row, column)] += 2.0 * by_row * by_column;
+            // Another row on the same unknowns, and one that names an unknown twice.
+            let turned = terms.iter().rev().map(|(_, by)| *by).zip(&terms);
+            let second: Vec<Term> = turned.map(|(by, (c, _))| (*c, by)).collect();
+            let twice: Vec<Term> = terms.iter().chain(&second[..2]).copied().collect();
+            equations.add(&[(terms.clone(), residual), (second.clone(), 0.3)], 2.0);
+            equations.add(&[(twice.clone(), -residual)], 2.0);
+            for (terms, residual) in [(terms, residual), (second, 0.3), (twice, -residual)] {
+                for &(row, by_row) in &terms {
+                    right[row] -= 2.0 * by_row * residual;
+                    for &(column, by_column) in &terms {
+                        dense[(row, column)] += 2.0 * by_row * by_column;
+                    }
                 }
             }
         }

@@ -55,7 +55,8 @@ impl State {
     pub(super) fn level_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
         let named = |camera: &&CameraLabels| flight.survey.place(&camera.name).is_some();
         let places = flight.cameras.iter().filter(named).count();
-        if places + flight.survey.placed_landmarks().count() >= ENOUGH_PLACES {
+        let names: Vec<_> = flight.cameras.iter().map(|camera| &camera.name).collect();
+        if places + flight.survey.telling_landmarks(&names) >= ENOUGH_PLACES {
             return;
         }
         for (camera, start) in self.cameras.iter().zip(self.starts()) {

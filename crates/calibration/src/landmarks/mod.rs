@@ -17,7 +17,7 @@ use thiserror::Error;
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection, OverImage};
 use crate::label_noise::LabelNoise;
 use crate::lens::{LensFreedom, LensUncertainty};
-use crate::survey::{LandmarkPlace, SurveyedPlace};
+use crate::survey::{ENOUGH_FOR_POSE, LandmarkPlace, SurveyedPlace};
 use adjustment::Adjusted;
 
 /// Something in a picture of which is known where it is.
@@ -176,9 +176,6 @@ impl LandmarkResult {
     }
 }
 
-/// Fewest landmarks of a camera that nobody has surveyed: three are seen alike from up to four
-/// places.
-const LEAST: usize = 4;
 /// Of one whose place is known: one leaves it turning about the line to it.
 const LEAST_SURVEYED: usize = 2;
 
@@ -194,7 +191,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
         (picture.landmarks.len(), LEAST_SURVEYED)
     } else {
         // Directions turn the camera and place it nowhere.
-        (picture.landmarks.iter().filter(with_places).count(), LEAST)
+        (picture.landmarks.iter().filter(with_places).count(), ENOUGH_FOR_POSE)
     };
     if given < needed {
         return Err(LandmarkError::TooFew { camera: camera.clone(), given, needed, is_surveyed });

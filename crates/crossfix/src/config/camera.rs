@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, ensure};
-use crossfix_calibration::intrinsics_from_yaml;
+use crossfix_calibration::{intrinsics_from_camchain, intrinsics_from_yaml};
 use crossfix_geometry::{Camera, ImageSize, Intrinsics, Pixel, PixelCovariance, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 #[cfg(feature = "centre")]
@@ -433,11 +433,17 @@ fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<C
     found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
 }
 
+/// Reads a lens file; of a file of several cameras, Kalibr's, the one behind `#`.
 fn read_lens(path: &Path) -> anyhow::Result<Intrinsics> {
-    let text = std::fs::read_to_string(path)
-        .with_context(|| format!("key `intrinsics`: cannot read {}", path.display()))?;
-    intrinsics_from_yaml(&text)
-        .with_context(|| format!("the intrinsics file {} has an error", path.display()))
+    let named = path.to_str().filter(|_| !path.exists()).and_then(|path| path.rsplit_once('#'));
+    let file = named.map_or(path, |(file, _)| Path::new(file));
+    let text = std::fs::read_to_string(file)
+        .with_context(|| format!("key `intrinsics`: cannot read {}", file.display()))?;
+    let read = match named {
+        Some((_, camera)) => intrinsics_from_camchain(&text, camera),
+        None => intrinsics_from_yaml(&text),
+    };
+    read.with_context(|| format!("the intrinsics file {} has an error", file.display()))
 }
 
 impl PoseConfig {

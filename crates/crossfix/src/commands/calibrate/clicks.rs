@@ -55,11 +55,9 @@ pub fn read(
     for (index, record) in reader.deserialize::<Row>().enumerate() {
         let place = || format!("the landmarks {}, row {}", path.display(), index + 2);
         let row = record.with_context(wrong)?;
-        let own = row
-            .camera
-            .clone()
-            .or_else(|| camera.cloned())
-            .with_context(|| format!("{}: no column `camera`, and no --camera", place()))?;
+        let own = row.camera.clone().or_else(|| camera.cloned()).with_context(|| {
+            format!("{}: whose picture it is (column `camera`) is not said", place())
+        })?;
         if camera.is_some_and(|wanted| *wanted != own) {
             continue;
         }
@@ -73,7 +71,8 @@ pub fn read(
         );
         known.push(landmark);
     }
-    ensure!(!cameras.is_empty(), "the landmarks {} have no rows of that camera", path.display());
+    let of = camera.map_or_else(String::new, |camera| format!(" of camera `{camera}`"));
+    ensure!(!cameras.is_empty(), "the landmarks {} have no rows{of}", path.display());
     Ok(cameras)
 }
 
@@ -88,11 +87,15 @@ pub fn together(
             let click = Click { camera: camera.clone(), pixel, sd_px: click_sd_px };
             let known = together.iter_mut().find(|known| known.name == name);
             match (known, at) {
-                (Some(known), LandmarkPlace::Place { position, .. }) => {
+                (Some(known), at)
+                    if [known.at, at]
+                        .iter()
+                        .any(|at| matches!(at, LandmarkPlace::Place { .. })) =>
+                {
                     ensure!(
-                        matches!(known.at, LandmarkPlace::Place { position: other, .. } if other == position),
-                        "landmark `{name}` of camera `{camera}` has another place than that of camera \
-                         `{}`: call it otherwise",
+                        known.at == at,
+                        "landmark `{name}` of camera `{camera}` has another place, or deviation of it, \
+                         than that of camera `{}`: call it otherwise",
                         known.clicks[0].camera
                     );
                     known.clicks.push(click);
@@ -222,9 +225,11 @@ mod tests {
         let pictures: Vec<(&str, usize)> =
             landmarks.iter().map(|l| (l.name.as_str(), l.clicks.len())).collect();
         assert_eq!(pictures, [("mast", 2), ("sun", 1), ("sun", 1)]);
-        let moved = format!("{head}{}", rows.replace("30,40,1,2,3", "30,40,1,2,4"));
-        let error = together(clicks(&moved, None).unwrap()).unwrap_err().to_string();
-        assert!(error.contains("`mast`") && error.contains("another place"), "{error}");
+        for other in ["30,40,1,2,4,0.1", "30,40,1,2,3,0.2"] {
+            let otherwise = format!("{head}{}", rows.replace("30,40,1,2,3,0.1", other));
+            let error = together(clicks(&otherwise, None).unwrap()).unwrap_err().to_string();
+            assert!(error.contains("`mast`") && error.contains("another place"), "{error}");
+        }
     }
 
     #[test]
@@ -233,7 +238,7 @@ mod tests {
         let wrong = |rows: &str, camera: Option<&str>| {
             format!("{:#}", clicks(&format!("{head}{rows}"), camera).unwrap_err())
         };
-        assert!(wrong("mast,1,2,3,4,5,0.1\n", None).contains("--camera"));
+        assert!(wrong("mast,1,2,3,4,5,0.1\n", None).contains("`camera`"));
         let twice = wrong("mast,1,2,3,4,5,0.1\nmast,1,2,3,4,5,0.1\n", Some("north"));
         assert!(twice.contains("row 3") && twice.contains("twice"), "{twice}");
         let no_sd = wrong("mast,1,2,3,4,5,\n", Some("north"));

@@ -11,14 +11,15 @@ use crossfix_message::{
 };
 
 use super::log::{self, LogKind, LogTime, Reading};
-use super::remarks::Rests;
+use super::remarks::{self, Rests};
 use super::survey::{self, Distance};
 use super::{Lens, clicks, report};
 use crate::commands::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
 
-/// From the flight of one target: with the log of its own receiver, or with where cameras stand.
+/// From the flight of one target: with the log of its own receiver, with where cameras stand, or with
+/// landmarks in their pictures.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  crossfix calibrate flight REC.mcap --log drone.csv --log-kind rtk -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --positions survey.csv -o my-site/calibration.toml\n  crossfix calibrate flight REC.mcap --landmarks points.csv -o my-site/calibration.toml"
@@ -102,7 +103,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let of = (&names[..], "the recording");
     let survey = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
-    let rests = if survey.tells_size() { Rests::OnSurvey } else { Rests::OnLogAlone };
+    let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
+    let rests = if log.is_none() || survey.tells_size(&calibrated) {
+        Rests::OnSurvey
+    } else {
+        Rests::OnLogAlone
+    };
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
@@ -111,6 +117,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         output::line(report::render(&result, rests));
     }
+    ensure!(
+        !remarks::most_lie_beside(&result.landmarks),
+        "nothing is written: most landmarks lie beside where the flight has them"
+    );
     let wrong = report::take_out_wrong(&mut result);
     for wrong in &wrong {
         tracing::warn!("camera `{wrong}` is wrong and is not written");

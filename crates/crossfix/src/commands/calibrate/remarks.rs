@@ -72,23 +72,30 @@ fn of_log(result: &FlightResult) -> Option<String> {
     })
 }
 
+/// Whether most landmarks lie beside where the flight has them.
+pub fn most_lie_beside(landmarks: &[LandmarkMisfit]) -> bool {
+    let beside = landmarks.iter().filter(|misfit| misfit.deviations > BESIDE).count();
+    2 * beside > landmarks.len()
+}
+
 fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
     let beside: Vec<&LandmarkMisfit> =
         landmarks.iter().filter(|misfit| misfit.deviations > BESIDE).collect();
     if beside.is_empty() {
         return None;
     }
-    if 2 * beside.len() > landmarks.len() {
+    if most_lie_beside(landmarks) {
         return Some(
-            "Most landmarks lie beside where the flight has them: places counted from another origin \
-             than the log's or the survey's, or pictures taken before a camera was moved."
+            "Most landmarks lie beside where the flight has them: their places or the log's are in feet, \
+             count from another origin or have a wrong sign, or pictures were taken before a camera was \
+             moved. Of few landmarks one wrong place may do that."
                 .to_owned(),
         );
     }
     let name = |misfit: &&LandmarkMisfit| format!("`{}` of `{}`", misfit.landmark, misfit.camera);
     let names: Vec<String> = beside.iter().map(name).collect();
     Some(format!(
-        "Beside where the flight and the other landmarks have it, and all but left out: {}. A wrong \
+        "Beside where the flight and the other landmarks have it, and so counted for less: {}. A wrong \
          click, or another's place.",
         names.join(", ")
     ))
