@@ -10,6 +10,10 @@ use crossfix_message::{CameraName, Timestamp};
 /// cameras it costs 0.1 s.
 const ASKED_EVERY_S: f64 = 10.0;
 
+/// What is found within so long is of one knock, s: the fusion's memory is of 100 s with targets, and
+/// there are some without.
+const SAME_KNOCK_S: f64 = 300.0;
+
 /// What has been found of each camera that has been watched beside others.
 #[derive(Debug, Default)]
 pub struct PoseWatch {
@@ -22,8 +26,10 @@ pub struct PoseWatch {
 pub struct CameraWatch {
     /// At last; `None` if nothing has told since it was calibrated anew.
     pub now: Option<PoseFinding>,
-    /// When most spoke for its having been moved.
+    /// When most spoke for its having been moved, ...
     pub worst: PoseFinding,
+    /// ... and when that was.
+    worst_at: Timestamp,
     /// When it was first sure that it had.
     pub moved_at: Option<Timestamp>,
     /// The longest that it was watched within the fusion's memory, s.
@@ -31,8 +37,8 @@ pub struct CameraWatch {
 }
 
 impl CameraWatch {
-    fn new(found: PoseFinding) -> Self {
-        Self { now: None, worst: found, moved_at: None, watched_s: 0.0 }
+    fn new(found: PoseFinding, time: Timestamp) -> Self {
+        Self { now: None, worst: found, worst_at: time, moved_at: None, watched_s: 0.0 }
     }
 
     fn take(&mut self, found: PoseFinding, time: Timestamp) {
@@ -45,7 +51,7 @@ impl CameraWatch {
             (finding.is_moved, finding.or_else.is_empty(), finding.log_odds)
         };
         if rank(&found) > rank(&self.worst) {
-            self.worst = found.clone();
+            (self.worst, self.worst_at) = (found.clone(), time);
         }
         self.watched_s = self.watched_s.max(found.watched_s);
         self.now = Some(found);
@@ -76,19 +82,22 @@ impl PoseWatch {
         self.cameras.values_mut().for_each(|camera| camera.now = None);
         for (name, found) in fusion.pose_findings() {
             let camera =
-                self.cameras.entry(name).or_insert_with(|| CameraWatch::new(found.clone()));
+                self.cameras.entry(name).or_insert_with(|| CameraWatch::new(found.clone(), now));
             camera.take(found, now);
         }
     }
 
     /// Whether a camera has been moved, by all that has been found: not one that for a moment might have
-    /// been in the place of another, which was then found to have been alone.
+    /// been in the place of another, which about then was found to have been alone.
     pub fn has_moved(&self, name: &CameraName) -> bool {
-        let is_alone = |other: &CameraName| {
-            self.cameras.get(other).is_some_and(|camera| camera.worst.is_moved_alone())
-        };
         self.cameras.get(name).is_some_and(|camera| {
-            camera.worst.is_moved && !camera.worst.or_else.iter().any(is_alone)
+            let took_its_place = |other: &CameraName| {
+                self.cameras.get(other).is_some_and(|other| {
+                    other.worst.is_moved_alone()
+                        && other.worst_at.seconds_since(camera.worst_at).abs() < SAME_KNOCK_S
+                })
+            };
+            camera.worst.is_moved && !camera.worst.or_else.iter().any(took_its_place)
         })
     }
 
@@ -119,5 +128,51 @@ impl fmt::Display for Turn<'_> {
             write!(f, "{} `{other}`", if k == 0 { ", or it was" } else { " or" })?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is found at so many seconds of a camera for which the odds are sure.
+    fn found(watch: &mut PoseWatch, name: &str, at_s: f64, or_else: &[&str]) {
+        let finding = PoseFinding {
+            watched_s: 60.0,
+            turn: nalgebra::Vector3::new(0.002, 0.0, 0.0),
+            turn_sd: 1e-4,
+            log_odds: 9.0,
+            is_moved: true,
+            or_else: or_else.iter().map(|name| name.parse().unwrap()).collect(),
+        };
+        let time = Timestamp::EPOCH.plus_seconds(at_s);
+        let name: CameraName = name.parse().unwrap();
+        let camera =
+            watch.cameras.entry(name).or_insert_with(|| CameraWatch::new(finding.clone(), time));
+        camera.take(finding, time);
+    }
+
+    fn moved(watch: &PoseWatch) -> Vec<&str> {
+        watch.cameras.keys().filter(|name| watch.has_moved(name)).map(CameraName::as_str).collect()
+    }
+
+    #[test]
+    fn who_might_have_been_in_anothers_place_is_acquitted_when_that_is_found_alone() {
+        let mut watch = PoseWatch::default();
+        found(&mut watch, "east", 100.0, &["north"]);
+        found(&mut watch, "north", 100.0, &["east"]);
+        assert_eq!(moved(&watch), ["east", "north"]);
+        found(&mut watch, "north", 120.0, &[]);
+        assert_eq!(moved(&watch), ["north"]);
+    }
+
+    #[test]
+    fn a_knock_of_an_hour_later_is_another() {
+        let mut watch = PoseWatch::default();
+        found(&mut watch, "north", 100.0, &[]);
+        found(&mut watch, "east", 3700.0, &["north"]);
+        assert_eq!(moved(&watch), ["east", "north"]);
+        found(&mut watch, "south", 200.0, &[]);
+        assert_eq!(moved(&watch), ["east", "north", "south"]);
     }
 }

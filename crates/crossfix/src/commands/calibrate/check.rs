@@ -233,7 +233,12 @@ impl Figures {
                  wrong"
                     .to_owned(),
             ),
-            Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (Verdict::Fits, String::new()),
+            Some(watch) if watch.watched_s >= LEAST_WATCHED_S => (
+                Verdict::Fits,
+                watch.moved_at.map_or_else(String::new, |at| {
+                    format!("at {at} it might have been moved in the place of another, which was")
+                }),
+            ),
             _ => (
                 Verdict::Unchecked,
                 format!("too few targets that two others see, in {} frames", seen.frames),
@@ -258,7 +263,8 @@ fn render(figures: &[Figures]) -> String {
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     for camera in figures {
         let verdict = match camera.verdict {
-            Verdict::Fits => "fits",
+            Verdict::Fits if camera.why.is_empty() => "fits",
+            Verdict::Fits => "fits: ",
             Verdict::Moved => "MOVED: ",
             Verdict::Apart => "APART: ",
             Verdict::Unchecked => "unchecked: ",
