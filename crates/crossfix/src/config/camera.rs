@@ -31,8 +31,9 @@ pub struct CameraFile {
     /// place of `intrinsics` and `pose`, and times are corrected by its clock after `clock`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<PathBuf>,
-    /// Intrinsics (YAML of OpenCV or ROS). May be absent with a recording, which has its own; if
-    /// both this and `pose` are there, they replace the recorded calibration.
+    /// Intrinsics (YAML of OpenCV, ROS or Kalibr: `camchain.yaml#cam1` of several cameras). May be absent
+    /// with a recording, which has its own; if both this and `pose` are there, they replace the recorded
+    /// calibration.
     pub intrinsics: Option<PathBuf>,
     /// Where it stands and looks.
     pub pose: Option<PoseConfig>,
