@@ -167,6 +167,7 @@ impl FrameSource for AviSource {
             return Ok(Some(Frame {
                 index,
                 capture: CaptureTime { time, sd_s },
+                live: None,
                 width,
                 height,
                 pixels,

@@ -50,11 +50,52 @@ pub enum VideoError {
         /// What is wrong.
         what: String,
     },
+    /// No address of a stream.
+    #[error("it is no address of a stream, rtsp://HOST/PATH: {what}")]
+    Address {
+        /// What is wrong; never the address, which may hold a password.
+        what: String,
+    },
+    /// A stream cannot be had, or breaks off.
+    #[error("{url}: {what}")]
+    Stream {
+        /// Where it is, without who asks.
+        url: String,
+        /// What is wrong.
+        what: String,
+    },
+    /// A stream that should run sends nothing.
+    #[error("{url} has sent no frame for {seconds:.1} s")]
+    Silent {
+        /// Where it is, without who asks.
+        url: String,
+        /// For how long, s.
+        seconds: f64,
+    },
+    /// This host's clock, by which a live source's frames are timed, was set: it has to begin anew.
+    #[error("this host's clock was set by {by_s:+.1} s")]
+    HostClockSet {
+        /// Forward by, s.
+        by_s: f64,
+    },
+    /// A live source ended.
+    #[error("the stream has ended")]
+    Ended,
+    /// One frame of a stream cannot be decoded; the ones after it may.
+    #[error("frame {index} of {url} cannot be decoded: {what}")]
+    StreamFrame {
+        /// Where it is, without who asks.
+        url: String,
+        /// Number of the frame, from 0.
+        index: u64,
+        /// What is wrong.
+        what: String,
+    },
 }
 
 impl VideoError {
     /// Whether only one frame is lost and the source goes on.
     pub fn is_one_frame(&self) -> bool {
-        matches!(self, Self::Frame { .. })
+        matches!(self, Self::Frame { .. } | Self::StreamFrame { .. })
     }
 }

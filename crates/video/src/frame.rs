@@ -1,3 +1,5 @@
+use std::time::Instant;
+
 use crossfix_message::Timestamp;
 
 /// Red, green and blue's part in brightness (BT.601).
@@ -12,6 +14,30 @@ pub struct CaptureTime {
     pub time: Timestamp,
     /// Its standard deviation, s.
     pub sd_s: f64,
+}
+
+/// How a frame of a live source came.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Arrival {
+    /// When its last byte was here.
+    pub at: Instant,
+    /// Whose clock its capture time is by.
+    pub timed_by: TimedBy,
+}
+
+/// Whose clock a live frame's capture time is by.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TimedBy {
+    /// The camera's own, as it says itself.
+    Camera,
+    /// This host's: the frame's arrival, less what it takes to come here. The camera has not said
+    /// yet what its clock shows, or is not to be asked.
+    Arrival,
+    /// This host's, as the camera's clock shows another time altogether.
+    ArrivalAgainstCamera {
+        /// By how much the camera's clock is ahead of this host's, s.
+        camera_ahead_s: f64,
+    },
 }
 
 /// The samples of an image, row by row, colours interleaved.
@@ -34,6 +60,8 @@ pub struct Frame {
     pub index: u64,
     /// When it was captured.
     pub capture: CaptureTime,
+    /// How it came, if the source is live.
+    pub live: Option<Arrival>,
     /// Columns.
     pub width: usize,
     /// Rows.
@@ -72,6 +100,7 @@ mod tests {
         let of = |pixels| Frame {
             index: 0,
             capture: CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 },
+            live: None,
             width: 1,
             height: 1,
             pixels,

@@ -1,7 +1,8 @@
-//! Frames with their capture times, from files: PNG and JPEG sequences, Y4M,
-//! MP4 with H.264, AVI with Motion JPEG. Nothing but cargo dependencies.
+//! Frames with their capture times, from files (PNG and JPEG sequences, Y4M,
+//! MP4 with H.264, AVI with Motion JPEG) and from network cameras (RTSP with
+//! H.264 or Motion JPEG). Nothing but cargo dependencies.
 //!
-//! The seam is [`FrameSource`]. [`open`] finds the right one for a path; a camera of one's own is
+//! The seam is [`FrameSource`]; [`Live`] keeps one that may break off. [`open`] finds the right one for a path; a camera of one's own is
 //! another:
 //!
 //! ```
@@ -22,6 +23,7 @@
 //!             index,
 //!             // When it was exposed, and how well that is known.
 //!             capture: CaptureTime { time, sd_s: 0.001 },
+//!             live: None,
 //!             width: 64,
 //!             height: 48,
 //!             pixels: Pixels::Gray8(vec![128; 64 * 48]),
@@ -42,7 +44,10 @@
 mod avi;
 mod error;
 mod frame;
+mod h264;
+mod live;
 mod mp4;
+mod rtsp;
 mod sequence;
 mod still;
 mod y4m_file;
@@ -51,8 +56,14 @@ use std::path::Path;
 
 pub use avi::AviSource;
 pub use error::VideoError;
-pub use frame::{CaptureTime, Frame, Pixels};
+pub use frame::{Arrival, CaptureTime, Frame, Pixels, TimedBy};
+pub use h264::{H264Encoder, decoding_time};
+pub use live::{Live, LiveCounts, Sight};
 pub use mp4::Mp4Source;
+pub use rtsp::{
+    Latency, Login, Mount, RtspCamera, RtspOptions, RtspServer, RtspSource, RtspTransport,
+    StreamAddress,
+};
 pub use sequence::SequenceSource;
 pub use still::decode_still;
 pub use y4m_file::Y4mSource;

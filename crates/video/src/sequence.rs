@@ -60,6 +60,6 @@ impl FrameSource for SequenceSource {
         let bytes = std::fs::read(path).map_err(|error| frame(error.to_string()))?;
         let (width, height, pixels) = decode_still(&bytes).map_err(frame)?;
         let capture = self.clock.at(index as f64 / self.clock.fallback_rate_hz);
-        Ok(Some(Frame { index, capture, width, height, pixels }))
+        Ok(Some(Frame { index, capture, live: None, width, height, pixels }))
     }
 }

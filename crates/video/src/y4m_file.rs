@@ -120,6 +120,6 @@ impl FrameSource for Y4mSource {
         let index = self.next;
         self.next += 1;
         let capture = self.clock.at(index as f64 / self.rate_hz);
-        Ok(Some(Frame { index, capture, width, height, pixels }))
+        Ok(Some(Frame { index, capture, live: None, width, height, pixels }))
     }
 }

@@ -1,17 +1,13 @@
 mod index;
 
-use std::cmp::Reverse;
-use std::collections::{BinaryHeap, VecDeque};
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use openh264::OpenH264API;
-use openh264::decoder::{DecodedYUV, Decoder, DecoderConfig, Flush};
-use openh264::formats::YUVSource;
-
 use self::index::Sample;
-use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
+use crate::h264::{H264Decoder, Picture};
+use crate::{Frame, FrameClock, FrameSource, Pixels, VideoError};
 
 /// An MP4 file with H.264, decoded to its brightness plane.
 pub struct Mp4Source {
@@ -21,10 +17,7 @@ pub struct Mp4Source {
     /// Parameter sets, repeated before every key frame.
     headers: Vec<u8>,
     length_bytes: usize,
-    decoder: Decoder,
-    /// Composition times of the samples that have not come out yet; pictures come out in the order
-    /// of display, so the smallest is the next picture's.
-    pending: BinaryHeap<Reverse<i64>>,
+    decoder: H264Decoder,
     ready: VecDeque<Frame>,
     failed: VecDeque<String>,
     /// Frames that lie beyond the file's end, as long as that has not been said.
@@ -48,9 +41,7 @@ impl Mp4Source {
             index::read(&mut file).map_err(damaged)?;
         let headers =
             parameters.iter().flat_map(|unit| [&[0, 0, 0, 1][..], &unit[..]].concat()).collect();
-        let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
-        let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
-            .map_err(|error| damaged(in_words(&error)))?;
+        let decoder = H264Decoder::new().map_err(damaged)?;
         Ok(Self {
             file,
             path: path.to_owned(),
@@ -58,7 +49,6 @@ impl Mp4Source {
             headers,
             length_bytes,
             decoder,
-            pending: BinaryHeap::new(),
             ready: VecDeque::new(),
             failed: VecDeque::new(),
             missing,
@@ -98,40 +88,31 @@ impl Mp4Source {
                 return;
             }
         };
-        self.pending.push(Reverse(sample.shown_at));
-        match self.decoder.decode(&unit) {
-            Ok(Some(picture)) => {
-                let time = self.pending.pop();
-                let frame = frame_of(&picture, time, self.timescale, &self.clock);
-                self.collect(frame);
-            }
+        match self.decoder.decode(&unit, sample.shown_at) {
+            Ok(Some(picture)) => self.collect(Ok(picture)),
             Ok(None) => {}
-            Err(error) => {
-                self.pending.retain(|Reverse(time)| *time != sample.shown_at);
-                self.failed.push_back(in_words(&error));
-            }
+            Err(what) => self.failed.push_back(what),
         }
     }
 
-    fn collect(&mut self, frame: Result<Frame, String>) {
-        match frame {
-            Ok(frame) => self.ready.push_back(frame),
+    fn collect(&mut self, picture: Result<Picture, String>) {
+        match picture {
+            Ok(Picture { shown_at, width, height, brightness }) => self.ready.push_back(Frame {
+                index: 0,
+                capture: self.clock.at(shown_at as f64 / self.timescale),
+                live: None,
+                width,
+                height,
+                pixels: Pixels::Gray8(brightness),
+            }),
             Err(what) => self.failed.push_back(what),
         }
     }
 
     fn finish(&mut self) {
-        // Pictures that the decoder still holds back.
-        let rest = self.decoder.flush_remaining().map(|pictures| {
-            let frame = |picture| {
-                let time = self.pending.pop();
-                frame_of(&picture, time, self.timescale, &self.clock)
-            };
-            pictures.into_iter().map(frame).collect::<Vec<_>>()
-        });
-        match rest {
-            Ok(frames) => frames.into_iter().for_each(|frame| self.collect(frame)),
-            Err(error) => self.failed.push_back(in_words(&error)),
+        match self.decoder.finish() {
+            Ok(pictures) => pictures.into_iter().for_each(|picture| self.collect(picture)),
+            Err(what) => self.failed.push_back(what),
         }
         let missing = std::mem::take(&mut self.missing);
         if missing > 0 {
@@ -139,41 +120,6 @@ impl Mp4Source {
                 .push_back(format!("the file ends before it and the {} after it", missing - 1));
         }
     }
-}
-
-/// What the decoder says, in words for people: it counts its errors.
-fn in_words(error: &openh264::Error) -> String {
-    let text = error.to_string();
-    let number: String = text
-        .split("Native:")
-        .nth(1)
-        .unwrap_or("")
-        .chars()
-        .take_while(char::is_ascii_digit)
-        .collect();
-    let number = if number.is_empty() { String::new() } else { format!(" (OpenH264 {number})") };
-    format!("it is damaged, or builds on one that is{number}")
-}
-
-fn frame_of(
-    picture: &DecodedYUV<'_>,
-    time: Option<Reverse<i64>>,
-    timescale: f64,
-    clock: &FrameClock,
-) -> Result<Frame, String> {
-    let (width, height) = picture.dimensions();
-    let (stride, _, _) = picture.strides();
-    if width == 0 || height == 0 || (width * height) as u64 > MAX_PIXELS || stride < width {
-        return Err(format!("its size is {width}x{height}"));
-    }
-    let rows = picture.y().chunks(stride).take(height);
-    let samples: Vec<u8> = rows.flat_map(|row| &row[..width.min(row.len())]).copied().collect();
-    if samples.len() != width * height {
-        return Err("its brightness plane is cut off".to_owned());
-    }
-    let Reverse(time) = time.ok_or("it has no time")?;
-    let capture = clock.at(time as f64 / timescale);
-    Ok(Frame { index: 0, capture, width, height, pixels: Pixels::Gray8(samples) })
 }
 
 impl FrameSource for Mp4Source {

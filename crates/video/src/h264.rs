@@ -1,0 +1,177 @@
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::time::{Duration, Instant};
+
+use openh264::OpenH264API;
+use openh264::decoder::{DecodedYUV, Decoder, DecoderConfig, Flush};
+use openh264::encoder::{
+    Encoder, EncoderConfig, FrameRate, IntraFramePeriod, QpRange, RateControlMode, UsageType,
+};
+use openh264::formats::{YUVSlices, YUVSource};
+
+use crate::MAX_PIXELS;
+
+/// A decoded picture's brightness, row by row.
+#[derive(Debug)]
+pub(crate) struct Picture {
+    /// When it is to be shown, in the units of its source.
+    pub(crate) shown_at: i64,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    pub(crate) brightness: Vec<u8>,
+}
+
+/// Decodes H.264 to brightness, every picture with its own time.
+pub(crate) struct H264Decoder {
+    decoder: Decoder,
+    /// Times of the units whose pictures have not come out yet; pictures come out in the order of
+    /// display, so the smallest is the next picture's.
+    pending: BinaryHeap<Reverse<i64>>,
+}
+
+impl H264Decoder {
+    pub(crate) fn new() -> Result<Self, String> {
+        let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
+        let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
+            .map_err(|error| in_words(&error))?;
+        Ok(Self { decoder, pending: BinaryHeap::new() })
+    }
+
+    /// Decodes an access unit in Annex B; `None` if its picture comes out later.
+    pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Option<Picture>, String> {
+        self.pending.push(Reverse(shown_at));
+        match self.decoder.decode(unit) {
+            Ok(Some(picture)) => picture_of(&picture, self.pending.pop()).map(Some),
+            Ok(None) => Ok(None),
+            Err(error) => {
+                self.pending.retain(|Reverse(time)| *time != shown_at);
+                Err(in_words(&error))
+            }
+        }
+    }
+
+    /// The pictures that the decoder still holds back.
+    pub(crate) fn finish(&mut self) -> Result<Vec<Result<Picture, String>>, String> {
+        let pictures = self.decoder.flush_remaining().map_err(|error| in_words(&error))?;
+        let picture = |picture| picture_of(&picture, self.pending.pop());
+        Ok(pictures.into_iter().map(picture).collect())
+    }
+}
+
+/// How coarse pictures are encoded, by H.264's count, 0 to 51: as a good camera does. From 30 on faint
+/// targets are lost in blocks.
+const COARSENESS: u8 = 24;
+
+/// Encodes brightness as H.264, with a picture that builds on no other once a second.
+///
+/// For scenes that are played as cameras play.
+pub struct H264Encoder {
+    encoder: Encoder,
+    /// Colourless: the middle of both colours.
+    grey: Vec<u8>,
+}
+
+impl H264Encoder {
+    /// An encoder for so many frames a second.
+    ///
+    /// # Errors
+    /// What the encoder says.
+    pub fn new(rate_hz: f64) -> Result<Self, String> {
+        let config = EncoderConfig::new()
+            .max_frame_rate(FrameRate::from_hz(rate_hz as f32))
+            .rate_control_mode(RateControlMode::Off)
+            .usage_type(UsageType::CameraVideoRealTime)
+            .intra_frame_period(IntraFramePeriod::from_num_frames(rate_hz.ceil().max(1.0) as u32))
+            .qp(QpRange::new(COARSENESS, COARSENESS))
+            // A small thing that moves slowly is none of the background.
+            .background_detection(false)
+            .adaptive_quantization(false)
+            .skip_frames(false)
+            .num_threads(1);
+        let encoder = Encoder::with_api_config(OpenH264API::from_source(), config)
+            .map_err(|error| error.to_string())?;
+        Ok(Self { encoder, grey: Vec::new() })
+    }
+
+    /// A picture as an access unit in Annex B. Width and height are even.
+    ///
+    /// # Errors
+    /// What is wrong with the picture, or what the encoder says.
+    pub fn encode(
+        &mut self,
+        brightness: &[u8],
+        width: usize,
+        height: usize,
+    ) -> Result<Vec<u8>, String> {
+        if !(width.is_multiple_of(2) && height.is_multiple_of(2))
+            || brightness.len() != width * height
+        {
+            return Err(format!("{} samples are no picture of {width}x{height}", brightness.len()));
+        }
+        self.grey.resize(width * height / 4, 128);
+        let planes = (brightness, &self.grey[..], &self.grey[..]);
+        let picture = YUVSlices::new(planes, (width, height), (width, width / 2, width / 2));
+        self.encoder
+            .encode(&picture)
+            .map(|stream| stream.to_vec())
+            .map_err(|error| error.to_string())
+    }
+}
+
+/// What it takes to decode an image of a size on this machine: the median of a moving, noisy scene.
+///
+/// # Errors
+/// What encoder or decoder say.
+pub fn decoding_time(width: usize, height: usize) -> Result<Duration, String> {
+    const PICTURES: usize = 12;
+    let (mut encoder, mut decoder) = (H264Encoder::new(PICTURES as f64)?, H264Decoder::new()?);
+    let mut times = Vec::new();
+    // Any noise will do, of four levels.
+    let mut noise = 1_u32;
+    for number in 0..PICTURES {
+        let picture: Vec<u8> = (0..width * height)
+            .map(|at| {
+                noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                let slope = (at % width + number * 3) / 8 % 64;
+                96 + slope as u8 + (noise >> 30) as u8
+            })
+            .collect();
+        let unit = encoder.encode(&picture, width, height)?;
+        let begun = Instant::now();
+        decoder.decode(&unit, number as i64)?;
+        times.push(begun.elapsed());
+    }
+    times.sort_unstable();
+    Ok(times[PICTURES / 2])
+}
+
+/// What the decoder says, in words for people: it counts its errors.
+fn in_words(error: &openh264::Error) -> String {
+    let text = error.to_string();
+    let number: String = text
+        .split("Native:")
+        .nth(1)
+        .unwrap_or("")
+        .chars()
+        .take_while(char::is_ascii_digit)
+        .collect();
+    let number = if number.is_empty() { String::new() } else { format!(" (OpenH264 {number})") };
+    format!("it is damaged, or builds on one that is{number}")
+}
+
+fn picture_of(picture: &DecodedYUV<'_>, time: Option<Reverse<i64>>) -> Result<Picture, String> {
+    let (width, height) = picture.dimensions();
+    let (stride, _, _) = picture.strides();
+    if width == 0 || height == 0 || (width * height) as u64 > MAX_PIXELS || stride < width {
+        return Err(format!("its size is {width}x{height}"));
+    }
+    let mut brightness = Vec::with_capacity(width * height);
+    for row in picture.y().chunks(stride).take(height) {
+        brightness.extend_from_slice(&row[..width.min(row.len())]);
+    }
+    if brightness.len() != width * height {
+        return Err("its brightness plane is cut off".to_owned());
+    }
+    let Reverse(shown_at) = time.ok_or("it has no time")?;
+    Ok(Picture { shown_at, width, height, brightness })
+}

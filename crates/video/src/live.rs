@@ -1,0 +1,225 @@
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use crate::{Frame, FrameSource, VideoError};
+
+/// A camera that sends nothing for so long is opened anew. Half of it would open one anew that is
+/// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
+const SILENCE: Duration = Duration::from_secs(2);
+/// The longest silence that is borne: cameras that send a frame in half a minute are none for this.
+const LONGEST_SILENCE: Duration = Duration::from_secs(32);
+/// The first pause before a camera is opened anew; each is twice as long as the one before, up to the
+/// longest: a camera that starts again takes half a minute, and is not to be pestered.
+const FIRST_PAUSE: Duration = Duration::from_millis(500);
+const LONGEST_PAUSE: Duration = Duration::from_secs(8);
+/// Frames that may wait to be looked at; when there are more, the oldest is left out. What has waited
+/// longer is of no use to who wants to know where something is now.
+const WAITING: usize = 4;
+/// Troubles that may wait to be heard.
+const TROUBLES: usize = 64;
+
+/// What a live camera shows at the moment.
+#[derive(Debug)]
+pub enum Sight {
+    /// The next frame.
+    Frame(Frame),
+    /// One frame cannot be decoded, or the camera is lost; it is opened anew by itself.
+    Trouble(VideoError),
+    /// Nothing yet.
+    Nothing,
+}
+
+/// What became of a live camera's frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LiveCounts {
+    /// How often the camera was opened.
+    pub opened: u64,
+    /// Frames that came and were never looked at, as newer ones were here.
+    pub left_out: u64,
+}
+
+/// A live camera that is opened anew whenever it breaks off or falls silent, on a thread of its own,
+/// until this is dropped.
+///
+/// Frames are numbered through; where the camera was opened anew one number is left out.
+///
+/// ```
+/// use std::time::Duration;
+/// use crossfix_video::{Live, Sight, VideoError};
+///
+/// // A camera that nobody has switched on.
+/// let live = Live::start(|_silence| {
+///     Err(VideoError::Stream { url: "rtsp://nowhere/".into(), what: "nobody answers".into() })
+/// });
+/// assert!(matches!(live.next(Duration::from_secs(5)), Sight::Trouble(_)));
+/// assert!(matches!(live.next(Duration::ZERO), Sight::Nothing));
+/// ```
+#[derive(Debug)]
+pub struct Live {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    frames: VecDeque<Frame>,
+    troubles: VecDeque<VideoError>,
+    counts: LiveCounts,
+    ended: bool,
+}
+
+impl Shared {
+    fn locked(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether nobody wants it any more.
+    fn ended(&self) -> bool {
+        self.locked().ended
+    }
+
+    fn give(&self, frame: Frame) {
+        let mut state = self.locked();
+        state.frames.push_back(frame);
+        if state.frames.len() > WAITING {
+            state.frames.pop_front();
+            state.counts.left_out += 1;
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    fn complain(&self, trouble: VideoError) {
+        let mut state = self.locked();
+        if state.troubles.len() < TROUBLES {
+            state.troubles.push_back(trouble);
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Waits that long, or until nobody wants it any more.
+    fn pause(&self, length: Duration) {
+        let until = Instant::now() + length;
+        let mut state = self.locked();
+        while !state.ended {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            let waited = self.changed.wait_timeout(state, left);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+impl Live {
+    /// Keeps what `open` opens; it is told how long the camera may be silent.
+    pub fn start(
+        mut open: impl FnMut(Duration) -> Result<Box<dyn FrameSource>, VideoError> + Send + 'static,
+    ) -> Self {
+        let shared = Arc::new(Shared::default());
+        let kept = Arc::clone(&shared);
+        std::thread::spawn(move || keep(&kept, &mut open));
+        Self { shared }
+    }
+
+    /// What it shows; waits for that long at most. Troubles come before frames.
+    pub fn next(&self, patience: Duration) -> Sight {
+        let until = Instant::now() + patience;
+        let mut state = self.shared.locked();
+        loop {
+            if let Some(trouble) = state.troubles.pop_front() {
+                return Sight::Trouble(trouble);
+            }
+            if let Some(frame) = state.frames.pop_front() {
+                return Sight::Frame(frame);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Sight::Nothing;
+            }
+            let waited = self.shared.changed.wait_timeout(state, left);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// What became of its frames so far.
+    pub fn counts(&self) -> LiveCounts {
+        self.shared.locked().counts
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        self.shared.locked().ended = true;
+        self.shared.changed.notify_all();
+    }
+}
+
+/// Opens a camera again and again.
+fn keep(
+    shared: &Shared,
+    open: &mut dyn FnMut(Duration) -> Result<Box<dyn FrameSource>, VideoError>,
+) {
+    let (mut pause, mut silence) = (FIRST_PAUSE, SILENCE);
+    let mut number = 0;
+    while !shared.ended() {
+        shared.locked().counts.opened += 1;
+        // What a camera sends may be made to hurt: whoever reads it may fail, but the camera is opened
+        // anew.
+        let watched = catch_unwind(AssertUnwindSafe(|| match open(silence) {
+            Ok(mut source) => watch(shared, source.as_mut(), number),
+            Err(trouble) => {
+                shared.complain(trouble);
+                0
+            }
+        }));
+        let frames = watched.unwrap_or_else(|_| {
+            shared.complain(VideoError::Ended);
+            0
+        });
+        if frames > 0 {
+            // One number is left out, so that the gap is seen.
+            number += frames + 1;
+            pause = FIRST_PAUSE;
+        }
+        // One that shows a single frame, or none, may be slow.
+        silence = if frames > 1 { SILENCE } else { (silence * 2).min(LONGEST_SILENCE) };
+        shared.pause(pause);
+        pause = (pause * 2).min(LONGEST_PAUSE);
+    }
+}
+
+/// Hands on what a source shows, from a number on, until it ends or nobody wants it; says how many
+/// frames there were.
+fn watch(shared: &Shared, source: &mut dyn FrameSource, first: u64) -> u64 {
+    let mut frames = 0;
+    while !shared.ended() {
+        match source.next_frame() {
+            Ok(Some(frame)) => {
+                frames = frame.index + 1;
+                shared.give(Frame { index: first + frame.index, ..frame });
+            }
+            Ok(None) => {
+                shared.complain(VideoError::Ended);
+                return frames;
+            }
+            Err(trouble) => {
+                let goes_on = trouble.is_one_frame();
+                shared.complain(trouble);
+                if !goes_on {
+                    return frames;
+                }
+            }
+        }
+    }
+    frames
+}

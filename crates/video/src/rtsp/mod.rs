@@ -1,0 +1,376 @@
+//! Streams of network cameras.
+
+mod address;
+mod packets;
+mod server;
+mod stream_clock;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crossfix_message::Timestamp;
+use futures_util::StreamExt;
+use retina::client::{
+    Credentials, Demuxed, PlayOptions, Session, SessionGroup, SessionOptions, SetupOptions,
+    TcpTransportOptions, Transport, UdpTransportOptions,
+};
+use retina::codec::{CodecItem, FrameFormat, VideoFrame};
+use retina::rtcp::{ReceivedCompoundPacket, TypedPacketRef};
+use tokio::runtime::Runtime;
+
+pub use self::address::{Login, StreamAddress};
+pub use self::server::{Mount, RtspServer};
+
+use self::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock};
+use crate::h264::{H264Decoder, Picture};
+use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
+
+/// How long a camera may take to answer before it is given up.
+const ANSWER: Duration = Duration::from_secs(5);
+/// How long it may take to take leave of it.
+const FAREWELL: Duration = Duration::from_millis(200);
+/// A stream that comes slowly may pause for so many of its longest intervals.
+const INTERVALS: u32 = 3;
+/// The intervals of which the longest is taken.
+const REMEMBERED_INTERVALS: usize = 8;
+/// Seconds from the beginning of NTP's count, in 1900, to 1970.
+const NTP_TO_UNIX_S: i64 = 2_208_988_800;
+
+/// How a stream is brought here.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum RtspTransport {
+    /// Within the connection: nothing is lost, what is lost on the way is sent again and comes late.
+    #[default]
+    Tcp,
+    /// In datagrams: what is lost is lost, with all that builds on it.
+    Udp,
+}
+
+/// A stream to watch and how.
+#[derive(Clone, Debug)]
+pub struct RtspOptions {
+    /// Where it is.
+    pub address: StreamAddress,
+    /// Who asks, if the camera wants to know.
+    pub login: Option<Login>,
+    /// How it comes.
+    pub transport: RtspTransport,
+    /// Whether what the camera says of its clock is believed; else frames are timed by their arrival.
+    pub heeds_reports: bool,
+    /// What it takes from the exposure to the arrival.
+    pub latency: Latency,
+}
+
+/// What it takes from the exposure of a frame to its arrival.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Latency {
+    /// The mean, s.
+    pub mean_s: f64,
+    /// How well that is known: its standard deviation, s. What cameras say of their clocks is no
+    /// better, as some say when they sent a frame and not when they took it.
+    pub sd_s: f64,
+}
+
+impl Default for Latency {
+    /// What cameras of many makes take: 50 to 300 ms.
+    fn default() -> Self {
+        Self { mean_s: 0.1, sd_s: 0.1 }
+    }
+}
+
+/// A network camera, whose stream can be opened again and again.
+#[derive(Clone, Debug)]
+pub struct RtspCamera {
+    options: RtspOptions,
+    memory: ClockMemory,
+}
+
+impl RtspCamera {
+    /// A camera that is watched so.
+    pub fn new(options: RtspOptions) -> Self {
+        Self { options, memory: ClockMemory::default() }
+    }
+
+    /// Asks for its stream. `silence` is how long it may send nothing; a stream whose frames come
+    /// slowly may pause for three of their intervals.
+    ///
+    /// # Errors
+    /// [`VideoError::Stream`] if nobody answers, it refuses, or it has no video that can be decoded.
+    pub fn open(&self, silence: Duration) -> Result<RtspSource, VideoError> {
+        RtspSource::open(&self.options, self.memory.clone(), silence)
+    }
+}
+
+/// A network camera's stream, H.264 or Motion JPEG, over RTSP, until it ends or falls silent.
+///
+/// Capture times are by the camera's clock as its sender reports tell it (RFC 3550, 6.4.1), and by
+/// arrival until the first of them comes, which takes some seconds.
+pub struct RtspSource {
+    runtime: Runtime,
+    /// Is there until this is dropped.
+    stream: Option<Demuxed>,
+    sessions: Arc<SessionGroup>,
+    stream_id: usize,
+    codec: Codec,
+    url: String,
+    clock: StreamClock,
+    host: HostClock,
+    begun: Instant,
+    /// How long it may be silent.
+    silence: Duration,
+    /// When the last frame came.
+    last: Option<Instant>,
+    /// The last intervals between frames.
+    intervals: VecDeque<Duration>,
+    /// When the units came whose pictures have not come out yet.
+    arrivals: BTreeMap<i64, Instant>,
+    /// A packet was lost: what comes builds on it until the next picture that builds on none.
+    torn: bool,
+    next: u64,
+}
+
+enum Codec {
+    H264(Box<H264Decoder>),
+    MotionJpeg,
+}
+
+impl RtspSource {
+    fn open(
+        options: &RtspOptions,
+        memory: ClockMemory,
+        silence: Duration,
+    ) -> Result<Self, VideoError> {
+        let url = options.address.to_string();
+        let wrong = |what: String| VideoError::Stream { url: url.clone(), what };
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .map_err(|error| wrong(error.to_string()))?;
+        let sessions = Arc::new(SessionGroup::default());
+        let opened = runtime.block_on(async {
+            tokio::time::timeout(ANSWER, connect(options, &sessions)).await.unwrap_or_else(|_| {
+                Err(format!("it does not answer within {} s", ANSWER.as_secs()))
+            })
+        });
+        let (stream, stream_id, codec) = opened.map_err(wrong)?;
+        let host = HostClock::read();
+        Ok(Self {
+            runtime,
+            stream: Some(stream),
+            sessions,
+            stream_id,
+            codec,
+            url,
+            clock: StreamClock::new(host, options.latency, options.heeds_reports, memory),
+            host,
+            begun: Instant::now(),
+            silence,
+            last: None,
+            intervals: VecDeque::new(),
+            arrivals: BTreeMap::new(),
+            torn: false,
+            next: 0,
+        })
+    }
+
+    /// How long to wait for what comes next.
+    fn patience(&self) -> Duration {
+        let slowest = self.intervals.iter().max().copied().unwrap_or_default();
+        self.silence.max(slowest * INTERVALS)
+    }
+
+    /// Notes when a frame has come.
+    fn note_arrival(&mut self, at: Instant) {
+        if let Some(last) = self.last.replace(at) {
+            self.intervals.push_back(at.saturating_duration_since(last));
+            if self.intervals.len() > REMEMBERED_INTERVALS {
+                self.intervals.pop_front();
+            }
+        }
+    }
+
+    /// The next packet of frames or reports.
+    fn receive(&mut self) -> Result<Option<CodecItem>, VideoError> {
+        let patience = self.patience();
+        // What the camera says of its clock is no frame.
+        let silent = self.last.unwrap_or(self.begun).elapsed();
+        let left = patience.saturating_sub(silent);
+        let Some(stream) = &mut self.stream else {
+            return Ok(None);
+        };
+        let item = self
+            .runtime
+            .block_on(async { tokio::time::timeout(left, stream.next()).await })
+            .map_err(|_| VideoError::Silent {
+                url: self.url.clone(),
+                seconds: patience.as_secs_f64(),
+            })?;
+        item.transpose().map_err(|error| VideoError::Stream {
+            url: self.url.clone(),
+            what: first_line(&error.to_string()),
+        })
+    }
+
+    /// The frame that a unit of the stream holds; `None` if its picture comes out later.
+    fn frame(&mut self, unit: &VideoFrame) -> Result<Option<Frame>, VideoError> {
+        let at = unit.end_ctx().received();
+        self.note_arrival(at);
+        let Some((ticks, width, height, pixels)) = self.decode(unit, at)? else {
+            return Ok(None);
+        };
+        let index = self.next;
+        self.next += 1;
+        let at = self.arrivals.remove(&ticks).unwrap_or(at);
+        self.arrivals.retain(|&waiting, _| waiting > ticks);
+        let stream_s = ticks as f64 / f64::from(unit.timestamp().clock_rate().get());
+        let (capture, timed_by) = self.clock.time(stream_s, self.host.since_s(at));
+        let set_by_s = self.host.set_by_s(&HostClock::read());
+        if timed_by != TimedBy::Camera && set_by_s.abs() > SET_S {
+            return Err(VideoError::HostClockSet { by_s: set_by_s });
+        }
+        let live = Some(Arrival { at, timed_by });
+        Ok(Some(Frame { index, capture, live, width, height, pixels }))
+    }
+
+    /// The time by the stream's count, the size and the pixels of the picture that a unit lets out.
+    fn decode(
+        &mut self,
+        unit: &VideoFrame,
+        at: Instant,
+    ) -> Result<Option<(i64, usize, usize, Pixels)>, VideoError> {
+        self.torn |= unit.loss() > 0;
+        self.torn &= !unit.is_random_access_point();
+        let ticks = unit.timestamp().timestamp();
+        self.arrivals.insert(ticks, at);
+        let decoded = match &mut self.codec {
+            _ if self.torn => Err("packets were lost on the way".to_owned()),
+            Codec::H264(decoder) => decoder.decode(unit.data(), ticks).map(|picture| {
+                picture.map(|Picture { shown_at, width, height, brightness }| {
+                    (shown_at, width, height, Pixels::Gray8(brightness))
+                })
+            }),
+            Codec::MotionJpeg => decode_still(unit.data())
+                .map(|(width, height, pixels)| Some((ticks, width, height, pixels))),
+        };
+        decoded.map_err(|what| {
+            let index = self.next;
+            self.next += 1;
+            VideoError::StreamFrame { url: self.url.clone(), index, what }
+        })
+    }
+
+    /// Heeds what the camera says of its clock.
+    fn heed(&mut self, reports: &ReceivedCompoundPacket) {
+        let of_stream = reports.stream_id() == self.stream_id;
+        let Some(time) = reports.rtp_timestamp().filter(|_| of_stream) else {
+            return;
+        };
+        for report in reports.pkts() {
+            if let Ok(Some(TypedPacketRef::SenderReport(report))) = report.as_typed() {
+                let stream_s = time.timestamp() as f64 / f64::from(time.clock_rate().get());
+                self.clock.report(stream_s, unix_time(report.ntp_timestamp().0));
+            }
+        }
+    }
+}
+
+/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count.
+fn unix_time(ntp: u64) -> Timestamp {
+    let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
+    let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
+    Timestamp::from_nanos((seconds - NTP_TO_UNIX_S) * 1_000_000_000 + nanos)
+}
+
+/// What is to be said of an error of the protocol: the details of the connection follow in further
+/// lines.
+fn first_line(text: &str) -> String {
+    text.lines().next().unwrap_or_default().to_owned()
+}
+
+/// What a refusal means to people.
+fn refusal(error: &retina::Error) -> String {
+    let said = first_line(&error.to_string());
+    match error.status_code() {
+        Some(401 | 403) => "the camera refuses: user or password are wrong".to_owned(),
+        Some(404 | 454) => "the camera is there but has no stream at this path".to_owned(),
+        Some(461) => {
+            format!("the camera does not send this way, try the other `transport` ({said})")
+        }
+        Some(503 | 453) => format!("the camera has no room for one more who watches ({said})"),
+        _ => said,
+    }
+}
+
+async fn connect(
+    options: &RtspOptions,
+    sessions: &Arc<SessionGroup>,
+) -> Result<(Demuxed, usize, Codec), String> {
+    let credentials = options.login.as_ref().map(|login| Credentials {
+        username: login.user().to_owned(),
+        password: login.password().to_owned(),
+    });
+    let session = SessionOptions::default()
+        .creds(credentials)
+        .session_group(Arc::clone(sessions))
+        .user_agent("crossfix".to_owned());
+    let mut session = Session::describe(options.address.url().clone(), session)
+        .await
+        .map_err(|error| refusal(&error))?;
+    let offered: Vec<String> = session
+        .streams()
+        .iter()
+        .map(|stream| format!("{} {}", stream.media(), stream.encoding_name()))
+        .collect();
+    let found = session.streams().iter().position(|stream| {
+        stream.media() == "video" && matches!(stream.encoding_name(), "h264" | "jpeg")
+    });
+    let stream_id = found.ok_or_else(|| {
+        format!(
+            "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264",
+            offered.join(", ")
+        )
+    })?;
+    let codec = match session.streams()[stream_id].encoding_name() {
+        "h264" => Codec::H264(Box::new(H264Decoder::new()?)),
+        _ => Codec::MotionJpeg,
+    };
+    let transport = match options.transport {
+        RtspTransport::Tcp => Transport::Tcp(TcpTransportOptions::default()),
+        RtspTransport::Udp => Transport::Udp(UdpTransportOptions::default()),
+    };
+    let setup = SetupOptions::default().transport(transport).frame_format(FrameFormat::SIMPLE);
+    session.setup(stream_id, setup).await.map_err(|error| refusal(&error))?;
+    let playing = session.play(PlayOptions::default()).await.map_err(|error| refusal(&error))?;
+    let stream = playing.demuxed().map_err(|error| refusal(&error))?;
+    Ok((stream, stream_id, codec))
+}
+
+impl Drop for RtspSource {
+    /// Tells the camera that nobody watches any more: many have room for a few only.
+    fn drop(&mut self) {
+        let _guard = self.runtime.enter();
+        drop(self.stream.take());
+        self.runtime.block_on(async {
+            // A camera that is gone does not answer.
+            let _ = tokio::time::timeout(FAREWELL, self.sessions.await_teardown()).await;
+        });
+    }
+}
+
+impl FrameSource for RtspSource {
+    fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        while let Some(item) = self.receive()? {
+            match item {
+                CodecItem::VideoFrame(unit) => {
+                    if let Some(frame) = self.frame(&unit)? {
+                        return Ok(Some(frame));
+                    }
+                }
+                CodecItem::Rtcp(reports) => self.heed(&reports),
+                _ => {}
+            }
+        }
+        Ok(None)
+    }
+}

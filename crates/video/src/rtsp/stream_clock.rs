@@ -1,0 +1,333 @@
+//! What a stream's frames have to do with UTC.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Instant, SystemTime};
+
+use crossfix_message::Timestamp;
+
+use crate::{CaptureTime, Latency, TimedBy};
+
+/// Sender reports of this long tell what the camera's clock shows, s. They come every five seconds
+/// or so and each may be some milliseconds off; over a minute a quartz stays a straight line.
+const REPORTS_S: f64 = 60.0;
+/// A clock that is this far from what it showed before was set, s: more than a busy camera is late in
+/// reporting, and than a quartz loses between two reports.
+pub(super) const SET_S: f64 = 0.25;
+/// A camera's clock that is farther from the host's is not on UTC, or the host's is not, s. A network
+/// that stalls holds frames for as long; half of it would refuse cameras on bad networks.
+const FARTHEST_S: f64 = 2.0;
+/// The quickest arrival of this long is taken for one that nothing held up, s. A quartz drifts by a
+/// millisecond in it; half as long, and a stall of some seconds would be taken for the camera's.
+const ARRIVALS_S: f64 = 30.0;
+/// What was known of a camera's clock against the host's is good for so long after a stream broke off,
+/// s: two quartzes part by 30 ms in it.
+const REMEMBERED_S: f64 = 600.0;
+
+/// A camera's clock as its last reports tell it.
+#[derive(Clone, Debug, Default)]
+struct Reports {
+    /// Stream time, s, and what the camera's clock showed then beyond the line of the first report, s.
+    told: VecDeque<(f64, f64)>,
+    /// The clock's time at the stream's time 0, by the first report.
+    zero: Option<Timestamp>,
+}
+
+impl Reports {
+    /// Takes a report in.
+    fn add(&mut self, stream_s: f64, told: Timestamp) {
+        let zero = *self.zero.get_or_insert(told.plus_seconds(-stream_s));
+        let beyond = told.seconds_since(zero.plus_seconds(stream_s));
+        let was_set = !self.told.is_empty() && (beyond - self.beyond(stream_s)).abs() > SET_S;
+        if was_set {
+            *self = Self { told: VecDeque::new(), zero: Some(told.plus_seconds(-stream_s)) };
+        }
+        self.told.push_back((stream_s, if was_set { 0.0 } else { beyond }));
+        while self.told.front().is_some_and(|(first, _)| stream_s - first > REPORTS_S) {
+            self.told.pop_front();
+        }
+    }
+
+    /// What the clock shows beyond the first report's line at a stream time, s: a straight line through
+    /// the reports, level as long as they span less than a fifth of what they may.
+    fn beyond(&self, stream_s: f64) -> f64 {
+        let n = self.told.len().max(1) as f64;
+        let mean = |of: fn(&(f64, f64)) -> f64| self.told.iter().map(of).sum::<f64>() / n;
+        let (mid, level) = (mean(|(s, _)| *s), mean(|(_, beyond)| *beyond));
+        let spread: f64 = self.told.iter().map(|(s, _)| (s - mid).powi(2)).sum();
+        let span = self.told.back().map_or(0.0, |(last, _)| last - self.told[0].0);
+        if span < REPORTS_S / 5.0 || spread == 0.0 {
+            return level;
+        }
+        let slope = self.told.iter().map(|(s, b)| (s - mid) * (b - level)).sum::<f64>() / spread;
+        level + slope * (stream_s - mid)
+    }
+
+    /// The camera's clock at a stream time.
+    fn time(&self, stream_s: f64) -> Option<Timestamp> {
+        Some(self.zero?.plus_seconds(stream_s).plus_seconds(self.beyond(stream_s)))
+    }
+}
+
+/// The quickest arrivals of late.
+#[derive(Clone, Debug, Default)]
+struct Arrivals {
+    /// Arrival and how much later than its stream time it was, s, each quicker than all after it: the
+    /// first is the quickest.
+    quickest: VecDeque<(f64, f64)>,
+}
+
+impl Arrivals {
+    fn add(&mut self, stream_s: f64, arrived_s: f64) {
+        let late = arrived_s - stream_s;
+        while self.quickest.back().is_some_and(|(_, other)| *other >= late) {
+            self.quickest.pop_back();
+        }
+        self.quickest.push_back((arrived_s, late));
+        while self.quickest.front().is_some_and(|(at, _)| arrived_s - at > ARRIVALS_S) {
+            self.quickest.pop_front();
+        }
+    }
+
+    /// When a frame of that stream time would have come, had nothing held it up, s.
+    fn unhindered_s(&self, stream_s: f64) -> Option<f64> {
+        self.quickest.front().map(|(_, late)| stream_s + late)
+    }
+}
+
+/// What is known of a camera's clock beyond a stream that broke off: the next one begins without a
+/// report.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ClockMemory(Arc<Mutex<Option<Ahead>>>);
+
+/// By how much the camera's clock at the exposure is ahead of the host's at the arrival, s, when that
+/// was found, and by which reading of the host's clock.
+#[derive(Clone, Copy, Debug)]
+struct Ahead {
+    by_s: f64,
+    at: Timestamp,
+    host: HostClock,
+}
+
+/// This host's clock, read once: what is done to it later changes nothing.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct HostClock {
+    wall: Timestamp,
+    read: Instant,
+}
+
+impl HostClock {
+    pub(crate) fn read() -> Self {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let nanos = i64::try_from(now.as_nanos()).unwrap_or(i64::MAX);
+        Self { wall: Timestamp::from_nanos(nanos), read: Instant::now() }
+    }
+
+    /// An instant, s since it was read; 0 for one before.
+    pub(crate) fn since_s(&self, instant: Instant) -> f64 {
+        instant.saturating_duration_since(self.read).as_secs_f64()
+    }
+
+    /// By how much it was set forward from this reading to a later one, s.
+    pub(crate) fn set_by_s(&self, later: &Self) -> f64 {
+        later.wall.seconds_since(self.wall) - self.since_s(later.read)
+    }
+}
+
+impl ClockMemory {
+    fn locked(&self) -> MutexGuard<'_, Option<Ahead>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What was found last, if it is not too long ago and the host's clock has not been set since.
+    fn ahead_s(&self, now: Timestamp, host: &HostClock) -> Option<f64> {
+        let holds = |ahead: &Ahead| {
+            now.seconds_since(ahead.at).abs() <= REMEMBERED_S
+                && ahead.host.set_by_s(host).abs() <= SET_S
+        };
+        self.locked().filter(holds).map(|ahead| ahead.by_s)
+    }
+}
+
+/// Tells when a stream's frames were captured: by what the camera says of its clock, and before it
+/// has, or where that cannot be true, by when they come.
+///
+/// Streams count time from an instant of their own; a camera says from time to time (RTCP sender
+/// reports) what its clock showed when the count stood where.
+#[derive(Clone, Debug)]
+pub(crate) struct StreamClock {
+    host: HostClock,
+    latency: Latency,
+    heeds_reports: bool,
+    reports: Reports,
+    arrivals: Arrivals,
+    memory: ClockMemory,
+}
+
+impl StreamClock {
+    /// A clock of a stream whose arrivals count from when the host's clock was read.
+    pub(crate) fn new(
+        host: HostClock,
+        latency: Latency,
+        heeds_reports: bool,
+        memory: ClockMemory,
+    ) -> Self {
+        let (reports, arrivals) = (Reports::default(), Arrivals::default());
+        Self { host, latency, heeds_reports, reports, arrivals, memory }
+    }
+
+    /// The camera says that its clock showed `told` at a stream time.
+    pub(crate) fn report(&mut self, stream_s: f64, told: Timestamp) {
+        if self.heeds_reports && told > Timestamp::EPOCH {
+            self.reports.add(stream_s, told);
+        }
+    }
+
+    /// When a frame of a stream time that came `arrived_s` after the beginning was captured, by the
+    /// camera's clock or by this host's.
+    pub(crate) fn time(&mut self, stream_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
+        self.arrivals.add(stream_s, arrived_s);
+        let unhindered = self.arrivals.unhindered_s(stream_s).unwrap_or(arrived_s);
+        let arrival = self.host.wall.plus_seconds(unhindered);
+        let Latency { mean_s, sd_s } = self.latency;
+        let by_arrival = CaptureTime { time: arrival.plus_seconds(-mean_s), sd_s };
+        let Some(time) = self.reports.time(stream_s) else {
+            let remembered = self.memory.ahead_s(arrival, &self.host);
+            return remembered
+                .filter(|_| self.heeds_reports)
+                .map_or((by_arrival, TimedBy::Arrival), |by_s| {
+                    (CaptureTime { time: arrival.plus_seconds(by_s), sd_s }, TimedBy::Camera)
+                });
+        };
+        let camera_ahead_s = time.seconds_since(arrival);
+        if camera_ahead_s.abs() > FARTHEST_S {
+            return (by_arrival, TimedBy::ArrivalAgainstCamera { camera_ahead_s });
+        }
+        *self.memory.locked() = Some(Ahead { by_s: camera_ahead_s, at: arrival, host: self.host });
+        (CaptureTime { time, sd_s }, TimedBy::Camera)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HOST_S: f64 = 1.8e9;
+    const LATENCY: Latency = Latency { mean_s: 0.1, sd_s: 0.1 };
+
+    fn host() -> Timestamp {
+        Timestamp::from_seconds(HOST_S)
+    }
+
+    fn clock(memory: &ClockMemory) -> StreamClock {
+        let host = HostClock { wall: host(), read: Instant::now() };
+        StreamClock::new(host, LATENCY, true, memory.clone())
+    }
+
+    /// A camera whose count began 7 s before the host's, at 30 frames a second, whose frames take 80 ms
+    /// and up to 50 ms more; the frame's stream time, arrival and true capture time, s after the host's.
+    fn frame(n: u32) -> (f64, f64, f64) {
+        let exposed = f64::from(n) / 30.0 + 0.5;
+        (exposed + 7.0, exposed + 0.08 + 0.05 * f64::from(n * 7 % 11) / 10.0, exposed)
+    }
+
+    fn error_s(found: CaptureTime, exposed_s: f64) -> f64 {
+        found.time.seconds_since(host().plus_seconds(exposed_s))
+    }
+
+    #[test]
+    fn before_a_report_frames_are_timed_by_the_quickest_arrival() {
+        let mut clock = clock(&ClockMemory::default());
+        for n in 0..90 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            let (found, by) = clock.time(stream_s, arrived_s);
+            assert_eq!(by, TimedBy::Arrival);
+            // 80 ms where 100 are taken: once the quickest has come, evenly.
+            assert!(n < 11 || (error_s(found, exposed_s) + 0.02).abs() < 1e-6, "{n}");
+            assert!(error_s(found, exposed_s).abs() < found.sd_s);
+        }
+    }
+
+    #[test]
+    fn reports_are_followed_through_noise_and_drift() {
+        let mut clock = clock(&ClockMemory::default());
+        // The camera's clock is 30 ms ahead and gains 40 microseconds a second; its reports are
+        // 2 ms off in turn.
+        let shows = |exposed_s: f64| exposed_s + 0.03 + 40e-6 * exposed_s;
+        let mut worst: f64 = 0.0;
+        for n in 0..9000 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            if n % 150 == 0 {
+                let off = if n % 300 == 0 { 0.002 } else { -0.002 };
+                clock.report(stream_s, host().plus_seconds(shows(exposed_s) + off));
+            }
+            let (found, by) = clock.time(stream_s, arrived_s);
+            assert_eq!(by, TimedBy::Camera);
+            if n > 1800 {
+                worst = worst.max(error_s(found, shows(exposed_s)).abs());
+            }
+        }
+        assert!(worst < 0.0015, "{worst}");
+    }
+
+    #[test]
+    fn a_clock_that_is_set_is_followed_and_one_of_another_time_is_not_believed() {
+        let mut clock = clock(&ClockMemory::default());
+        let mut found = Vec::new();
+        for n in 0..900 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            // Right, then a second ahead, then an hour, then right again.
+            let ahead_s = [0.0, 1.0, 3600.0, 0.0][n as usize / 225];
+            if n % 75 == 0 {
+                clock.report(stream_s, host().plus_seconds(exposed_s + ahead_s));
+            }
+            let (time, by) = clock.time(stream_s, arrived_s);
+            found.push((error_s(time, exposed_s), by));
+        }
+        let near = |n: usize, error_s: f64| (found[n].0 - error_s).abs() < 1e-6;
+        assert!(near(100, 0.0) && near(300, 1.0) && near(800, 0.0), "{found:?}");
+        let TimedBy::ArrivalAgainstCamera { camera_ahead_s } = found[600].1 else {
+            panic!("{:?}", found[600])
+        };
+        assert!((camera_ahead_s - 3599.92).abs() < 0.01 && near(600, -0.02), "{camera_ahead_s}");
+        assert_eq!(found[800].1, TimedBy::Camera);
+    }
+
+    #[test]
+    fn a_stream_that_begins_again_is_timed_by_what_was_known() {
+        let memory = ClockMemory::default();
+        let mut before = clock(&memory);
+        for n in 0..60 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            before.report(stream_s, host().plus_seconds(exposed_s + 0.03));
+            before.time(stream_s, arrived_s);
+        }
+        let mut after = clock(&memory);
+        let mut last = None;
+        for n in 120..150 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            let (found, by) = after.time(stream_s + 1e4, arrived_s);
+            assert_eq!(by, TimedBy::Camera);
+            last = Some(error_s(found, exposed_s + 0.03));
+        }
+        assert!(last.unwrap().abs() < 1e-6, "{last:?}");
+        // Where the host's clock has been set since, nothing is known.
+        let set = HostClock { wall: host().plus_seconds(3600.0), read: Instant::now() };
+        let mut set = StreamClock::new(set, LATENCY, true, memory);
+        assert_eq!(set.time(0.0, 0.1).1, TimedBy::Arrival);
+    }
+
+    #[test]
+    fn whatever_a_camera_says_times_are_times() {
+        let strange = [0.0, -1e18, 1e18, f64::NAN, f64::INFINITY];
+        for told in [Timestamp::EPOCH, Timestamp::MIN, Timestamp::from_nanos(i64::MAX)] {
+            for stream_s in strange {
+                let mut clock = clock(&ClockMemory::default());
+                clock.report(stream_s, told);
+                clock.report(1.0, told);
+                let (found, _) = clock.time(stream_s, 0.1);
+                assert!(found.sd_s.is_finite());
+            }
+        }
+    }
+}

@@ -1,0 +1,315 @@
+//! Network cameras that do what cameras do, on this machine alone.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+use std::io::Write;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crossfix_message::Timestamp;
+use crossfix_video::{
+    Frame, H264Encoder, Latency, Live, Login, Mount, Pixels, RtspCamera, RtspOptions, RtspServer,
+    RtspTransport, Sight, StreamAddress, TimedBy, VideoError,
+};
+
+const WIDTH: usize = 320;
+const HEIGHT: usize = 240;
+const RATE_HZ: f64 = 30.0;
+
+fn now() -> Timestamp {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+    Timestamp::from_nanos(now.as_nanos() as i64)
+}
+
+/// A picture whose bright square says which it is.
+fn picture(number: u64, width: usize, height: usize) -> Vec<u8> {
+    let (x, y) = (8 + number as usize % 32 * 9, 8 + number as usize / 32 % 20 * 11);
+    let bright = |at: usize| {
+        let (column, row) = (at % width, at / width);
+        (x..x + 8).contains(&column) && (y..y + 8).contains(&row)
+    };
+    (0..width * height).map(|at| if bright(at) { 230 } else { 40 }).collect()
+}
+
+/// The number that a picture shows, modulo 640.
+fn shown(frame: &Frame) -> u64 {
+    let Pixels::Gray8(samples) = &frame.pixels else { panic!("it is no brightness") };
+    let lit = samples.iter().enumerate().filter(|(_, s)| **s > 130).map(|(at, _)| at);
+    let places: Vec<(usize, usize)> = lit.map(|at| (at % frame.width, at / frame.width)).collect();
+    let mean = |of: fn(&(usize, usize)) -> usize| {
+        places.iter().map(of).sum::<usize>() as f64 / places.len() as f64
+    };
+    let [x, y] = [mean(|p| p.0) - 3.5, mean(|p| p.1) - 3.5];
+    ((y - 8.0) / 11.0).round() as u64 * 32 + ((x - 8.0) / 9.0).round() as u64
+}
+
+/// A camera that runs on a thread of its own until it is dropped. What it does beyond playing
+/// pictures, `each` does before every frame, which it is told with the time of its capture; if that
+/// says no, the frame is not sent.
+struct Camera {
+    begun: Timestamp,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    server: RtspServer,
+}
+
+impl Camera {
+    fn start(
+        login: Option<Login>,
+        rate_hz: f64,
+        mut each: impl FnMut(&Mount, u64, Timestamp) -> bool + Send + 'static,
+    ) -> Self {
+        let mut server = RtspServer::bind("127.0.0.1:0".parse().unwrap(), login).unwrap();
+        let mount = server.mount("north");
+        let (begun, start, stop) = (now(), Instant::now(), Arc::new(AtomicBool::new(false)));
+        let stopped = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || {
+            let mut encoder = H264Encoder::new(rate_hz).unwrap();
+            for number in 0.. {
+                let due = start + Duration::from_secs_f64(number as f64 / rate_hz);
+                std::thread::sleep(due.saturating_duration_since(Instant::now()));
+                if stopped.load(Ordering::Relaxed) {
+                    return;
+                }
+                let unit = encoder.encode(&picture(number, WIDTH, HEIGHT), WIDTH, HEIGHT).unwrap();
+                let captured = begun.plus_seconds(number as f64 / rate_hz);
+                if each(&mount, number, captured) {
+                    mount.send(&unit, ticks(number, rate_hz));
+                }
+            }
+        });
+        Self { begun, stop, thread: Some(thread), server }
+    }
+
+    /// One that says every half second what its clock shows, the first time after a second.
+    fn with_clock(ahead_s: f64) -> Self {
+        Self::start(None, RATE_HZ, move |mount, number, captured| {
+            if number >= 30 && number % 15 == 0 {
+                mount.report(captured.plus_seconds(ahead_s), ticks(number, RATE_HZ));
+            }
+            true
+        })
+    }
+
+    fn options(&self, path: &str) -> RtspOptions {
+        let url = format!("rtsp://{}/{path}", self.server.address());
+        RtspOptions {
+            address: StreamAddress::parse(&url).unwrap().0,
+            login: None,
+            transport: RtspTransport::Tcp,
+            heeds_reports: true,
+            latency: Latency::default(),
+        }
+    }
+
+    fn watched(&self) -> Live {
+        watched(self.options("north"))
+    }
+
+    /// When the frame with a number was captured.
+    fn captured(&self, number: u64) -> Timestamp {
+        self.begun.plus_seconds(number as f64 / RATE_HZ)
+    }
+}
+
+impl Drop for Camera {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let ended = self.thread.take().unwrap().join();
+        assert!(ended.is_ok() || std::thread::panicking(), "the camera has failed");
+    }
+}
+
+fn ticks(number: u64, rate_hz: f64) -> u32 {
+    // A count that turns over in the first second.
+    ((number as f64 / rate_hz * 90_000.0).round() as u32).wrapping_sub(45_000)
+}
+
+fn watched(options: RtspOptions) -> Live {
+    let camera = RtspCamera::new(options);
+    Live::start(move |silence| Ok(Box::new(camera.open(silence)?)))
+}
+
+/// What comes within a time.
+fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
+    let (mut frames, mut troubles) = (Vec::new(), Vec::new());
+    let until = Instant::now() + Duration::from_secs_f64(seconds);
+    while Instant::now() < until {
+        match live.next(until.saturating_duration_since(Instant::now())) {
+            Sight::Frame(frame) => frames.push(frame),
+            Sight::Trouble(trouble) => troubles.push(trouble),
+            Sight::Nothing => {}
+        }
+    }
+    (frames, troubles)
+}
+
+/// What is said first when a camera is opened.
+fn refused(options: RtspOptions) -> String {
+    match watched(options).next(Duration::from_secs(10)) {
+        Sight::Trouble(trouble) => trouble.to_string(),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn every_frame_comes_once_and_at_its_time() {
+    let camera = Camera::with_clock(0.0);
+    let live = camera.watched();
+    let (frames, troubles) = within(&live, 4.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.len() > 80, "{}", frames.len());
+    let numbers: Vec<u64> = frames.iter().map(shown).collect();
+    assert!(numbers.windows(2).all(|n| n[1] == n[0] + 1), "{numbers:?}");
+    assert!(frames.iter().zip(0..).all(|(frame, index)| frame.index == index));
+    let by = |frame: &Frame| frame.live.unwrap().timed_by;
+    let (by_arrival, by_camera): (Vec<&Frame>, Vec<&Frame>) =
+        frames.iter().partition(|frame| by(frame) == TimedBy::Arrival);
+    assert!(by_arrival.len() > 5 && by_camera.len() > 50, "{}", by_arrival.len());
+    let error_s = |frame: &Frame| frame.capture.time.seconds_since(camera.captured(shown(frame)));
+    for frame in by_arrival {
+        // Nothing takes 100 ms here.
+        assert!((-0.101..0.0).contains(&error_s(frame)), "{}", error_s(frame));
+    }
+    for frame in by_camera {
+        assert!(error_s(frame).abs() < 1e-4, "{}", error_s(frame));
+    }
+}
+
+#[test]
+fn a_camera_of_another_time_is_timed_by_arrival_and_it_is_said_how_far_off_it_is() {
+    let camera = Camera::with_clock(3600.0);
+    let live = camera.watched();
+    let (frames, _) = within(&live, 2.5);
+    let last = frames.last().unwrap();
+    let TimedBy::ArrivalAgainstCamera { camera_ahead_s } = last.live.unwrap().timed_by else {
+        panic!("{:?}", last.live)
+    };
+    assert!((camera_ahead_s - 3600.0).abs() < 0.1, "{camera_ahead_s}");
+    let error_s = last.capture.time.seconds_since(camera.captured(shown(last)));
+    assert!((-0.101..0.0).contains(&error_s), "{error_s}");
+}
+
+#[test]
+fn who_is_refused_is_told_why() {
+    let camera = Camera::start(Some(Login::new("eye", "secret")), RATE_HZ, |_, _, _| true);
+    let wrong =
+        RtspOptions { login: Some(Login::new("eye", "hunter2")), ..camera.options("north") };
+    let said = refused(wrong);
+    assert!(said.contains("user or password are wrong") && !said.contains("hunter2"), "{said}");
+    assert!(refused(camera.options("north")).contains("password"));
+    let login = Some(Login::new("eye", "secret"));
+    let nowhere = RtspOptions { login: login.clone(), ..camera.options("south") };
+    assert!(refused(nowhere).contains("no stream at this path"));
+    let udp = RtspOptions {
+        login: login.clone(),
+        transport: RtspTransport::Udp,
+        ..camera.options("north")
+    };
+    assert!(refused(udp).contains("try the other `transport`"));
+    let welcome = RtspOptions { login, ..camera.options("north") };
+    assert!(!within(&watched(welcome), 1.5).0.is_empty());
+    let nobody = {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let url = format!("rtsp://{}/north", listener.local_addr().unwrap());
+        RtspOptions { address: StreamAddress::parse(&url).unwrap().0, ..camera.options("north") }
+    };
+    let said = refused(nobody);
+    assert!(said.contains("Connection refused"), "{said}");
+}
+
+#[test]
+fn a_camera_that_falls_silent_or_hangs_up_is_opened_anew() {
+    for silent in [true, false] {
+        let camera = Camera::start(None, RATE_HZ, move |mount, number, _| {
+            if !silent && number == 45 {
+                mount.hang_up();
+            }
+            // Its connection stays, nothing comes for three seconds.
+            !(silent && (45..135).contains(&number))
+        });
+        let live = camera.watched();
+        let (frames, troubles) = within(&live, 7.0);
+        let said: Vec<String> = troubles.iter().map(ToString::to_string).collect();
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(said[0].contains(if silent { "no frame for 2.0 s" } else { "ended" }), "{said:?}");
+        assert_eq!(live.counts().opened, 2);
+        let gap = frames.windows(2).find(|f| f[1].index != f[0].index + 1).unwrap();
+        assert_eq!(gap[1].index, gap[0].index + 2, "the gap is seen");
+        let missed_s = (shown(&gap[1]) - shown(&gap[0])) as f64 / RATE_HZ;
+        // The pause before it is opened, and up to a second to a picture that builds on none.
+        let most_s = if silent { 3.0 + 1.2 } else { 0.5 + 1.2 };
+        assert!(missed_s < most_s, "{missed_s}");
+        assert!(shown(frames.last().unwrap()) > 150);
+    }
+}
+
+#[test]
+fn a_camera_that_sends_a_frame_in_three_seconds_is_watched_all_the_same() {
+    let camera = Camera::start(None, 1.0 / 3.0, |_, _, _| true);
+    let live = camera.watched();
+    let (frames, troubles) = within(&live, 26.0);
+    assert!(frames.len() >= 4, "{}: {troubles:?}", frames.len());
+    let late = frames.last().unwrap().live.unwrap().at;
+    assert!(late.elapsed() < Duration::from_secs(4));
+}
+
+#[test]
+fn what_cannot_be_decoded_is_counted_and_the_rest_is_seen() {
+    let camera = Camera::start(None, RATE_HZ, |mount, number, _| {
+        if number == 40 {
+            let noise = |n: u32| (n.wrapping_mul(2_654_435_761) >> 13) as u8 | 2;
+            let noise: Vec<u8> = (0..5000).map(noise).collect();
+            mount.send(&[&[0, 0, 0, 1, 0x41][..], &noise].concat(), ticks(number, RATE_HZ));
+        }
+        number != 40
+    });
+    let (frames, troubles) = within(&camera.watched(), 3.5);
+    assert!(troubles.iter().all(VideoError::is_one_frame), "{troubles:?}");
+    assert!(!troubles.is_empty());
+    assert!(shown(frames.last().unwrap()) > 80);
+}
+
+#[test]
+fn another_resolution_in_mid_stream_is_seen_as_it_is() {
+    let mut encoder = H264Encoder::new(RATE_HZ).unwrap();
+    let camera = Camera::start(None, RATE_HZ, move |mount, number, _| {
+        if number >= 45 {
+            let unit = encoder.encode(&picture(number, 640, 480), 640, 480).unwrap();
+            mount.send(&unit, ticks(number, RATE_HZ));
+        }
+        number < 45
+    });
+    let (frames, troubles) = within(&camera.watched(), 3.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    let sizes: Vec<usize> = frames.iter().map(|frame| frame.width).collect();
+    assert_eq!((sizes[0], *sizes.last().unwrap()), (320, 640));
+    assert!(shown(frames.last().unwrap()) > 70);
+}
+
+#[test]
+fn who_looks_too_slowly_sees_the_newest() {
+    let camera = Camera::with_clock(0.0);
+    let live = camera.watched();
+    std::thread::sleep(Duration::from_secs(2));
+    let Sight::Frame(first) = live.next(Duration::ZERO) else { panic!("nothing came") };
+    assert!(now().seconds_since(camera.captured(shown(&first))) < 0.3);
+    assert!(live.counts().left_out > 20, "{:?}", live.counts());
+}
+
+#[test]
+fn what_is_no_request_or_no_answer_ends_nothing_but_the_connection() {
+    let camera = Camera::with_clock(0.0);
+    for garbage in [&b"GET / HTTP/1.1\r\n\r\n"[..], b"\xff\xfe\x00", b"$\x00\xff\xff", b"PLAY"] {
+        let mut peer = std::net::TcpStream::connect(camera.server.address()).unwrap();
+        peer.write_all(garbage).unwrap();
+    }
+    assert!(!within(&camera.watched(), 1.5).0.is_empty());
+    let mute = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("rtsp://{}/north", mute.local_addr().unwrap());
+    let address = StreamAddress::parse(&url).unwrap().0;
+    let said = refused(RtspOptions { address, ..camera.options("north") });
+    assert!(said.contains("does not answer within 5 s"), "{said}");
+}
