@@ -64,6 +64,12 @@ pub enum VideoError {
         /// What is wrong.
         what: String,
     },
+    /// A camera does not let whoever asks watch.
+    #[error("{url}: the camera refuses: user or password are wrong")]
+    Refused {
+        /// Where it is, without who asks.
+        url: String,
+    },
     /// A stream that should run sends nothing.
     #[error("{url} has sent no frame for {seconds:.1} s")]
     Silent {

@@ -21,6 +21,9 @@ pub struct CaptureTime {
 pub struct Arrival {
     /// When its last byte was here.
     pub at: Instant,
+    /// Its time by the stream's own count, s, from an instant that nobody knows: even, whatever becomes
+    /// of the clocks. After the stream was opened anew it counts from another.
+    pub stream_s: f64,
     /// Whose clock its capture time is by.
     pub timed_by: TimedBy,
 }
@@ -30,6 +33,9 @@ pub struct Arrival {
 pub enum TimedBy {
     /// The camera's own, as it says itself.
     Camera,
+    /// The camera's own, as it was known before the stream broke off, and by the frame's arrival: it has
+    /// not said anew what its clock shows.
+    Remembered,
     /// This host's: the frame's arrival, less what it takes to come here. The camera has not said
     /// yet what its clock shows, or is not to be asked.
     Arrival,

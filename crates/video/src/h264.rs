@@ -3,13 +3,17 @@ use std::collections::BinaryHeap;
 use std::time::{Duration, Instant};
 
 use openh264::OpenH264API;
-use openh264::decoder::{DecodedYUV, Decoder, DecoderConfig, Flush};
+use openh264::decoder::{DecodeOptions, DecodedYUV, Decoder, DecoderConfig, Flush};
 use openh264::encoder::{
     Encoder, EncoderConfig, FrameRate, IntraFramePeriod, QpRange, RateControlMode, UsageType,
 };
 use openh264::formats::{YUVSlices, YUVSource};
 
 use crate::MAX_PIXELS;
+use crate::rtsp::units;
+
+/// No decoder holds back more pictures than this: H.264 allows 16.
+const MOST_PENDING: usize = 32;
 
 /// A decoded picture's brightness, row by row.
 #[derive(Debug)]
@@ -22,25 +26,51 @@ pub(crate) struct Picture {
 }
 
 /// Decodes H.264 to brightness, every picture with its own time.
+///
+/// A decoder may hold pictures back until it is sure that none is to be shown before them, and in most
+/// profiles it is never sure. Of a live stream that has shown no picture which builds on later ones,
+/// each comes out at once, with the time of its own unit.
 pub(crate) struct H264Decoder {
     decoder: Decoder,
+    /// Whether pictures come out in another order than that of the units.
+    reorders: bool,
     /// Times of the units whose pictures have not come out yet; pictures come out in the order of
     /// display, so the smallest is the next picture's.
     pending: BinaryHeap<Reverse<i64>>,
 }
 
 impl H264Decoder {
-    pub(crate) fn new() -> Result<Self, String> {
-        let config = DecoderConfig::new().flush_after_decode(Flush::NoFlush);
-        let decoder = Decoder::with_api_config(OpenH264API::from_source(), config)
+    /// A decoder of a file, whose pictures may come late.
+    pub(crate) fn of_file() -> Result<Self, String> {
+        Self::new(true)
+    }
+
+    /// A decoder of a live stream.
+    pub(crate) fn of_stream() -> Result<Self, String> {
+        Self::new(false)
+    }
+
+    fn new(reorders: bool) -> Result<Self, String> {
+        let decoder = Decoder::with_api_config(OpenH264API::from_source(), DecoderConfig::new())
             .map_err(|error| in_words(&error))?;
-        Ok(Self { decoder, pending: BinaryHeap::new() })
+        Ok(Self { decoder, reorders, pending: BinaryHeap::new() })
     }
 
     /// Decodes an access unit in Annex B; `None` if its picture comes out later.
     pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Option<Picture>, String> {
         self.pending.push(Reverse(shown_at));
-        match self.decoder.decode(unit) {
+        if self.pending.len() > MOST_PENDING {
+            // Units without a picture: nothing will come out of the first of them.
+            self.pending.pop();
+        }
+        self.reorders |= units(unit).any(builds_on_later);
+        let flush = if self.reorders { Flush::NoFlush } else { Flush::Flush };
+        if !self.reorders {
+            // What gave no picture before gives none now.
+            self.pending.retain(|Reverse(time)| *time == shown_at);
+        }
+        let options = DecodeOptions::new().flush_after_decode(flush);
+        match self.decoder.decode_with_options(unit, options) {
             Ok(Some(picture)) => picture_of(&picture, self.pending.pop()).map(Some),
             Ok(None) => Ok(None),
             Err(error) => {
@@ -55,6 +85,22 @@ impl H264Decoder {
         let pictures = self.decoder.flush_remaining().map_err(|error| in_words(&error))?;
         let picture = |picture| picture_of(&picture, self.pending.pop());
         Ok(pictures.into_iter().map(picture).collect())
+    }
+}
+
+/// Whether a unit without its start code is a part of a picture that builds on later ones (a B slice).
+fn builds_on_later(unit: &[u8]) -> bool {
+    let is_slice = unit.first().is_some_and(|head| matches!(head & 0x1f, 1 | 5));
+    let mut bits = unit.iter().skip(1).flat_map(|byte| (0..8).rev().map(move |n| byte >> n & 1));
+    // Two numbers in Exp-Golomb's code: where the slice begins, and its kind (H.264, 7.3.3 and 9.1).
+    let mut number = || {
+        let zeros = bits.by_ref().take(32).take_while(|bit| *bit == 0).count();
+        let rest = bits.by_ref().take(zeros);
+        rest.fold(1_u64, |number, bit| number << 1 | u64::from(bit)) - 1
+    };
+    is_slice && {
+        number();
+        number() % 5 == 1
     }
 }
 
@@ -124,7 +170,8 @@ impl H264Encoder {
 /// What encoder or decoder say.
 pub fn decoding_time(width: usize, height: usize) -> Result<Duration, String> {
     const PICTURES: usize = 12;
-    let (mut encoder, mut decoder) = (H264Encoder::new(PICTURES as f64)?, H264Decoder::new()?);
+    let (mut encoder, mut decoder) =
+        (H264Encoder::new(PICTURES as f64)?, H264Decoder::of_stream()?);
     let mut times = Vec::new();
     // Any noise will do, of four levels.
     let mut noise = 1_u32;

@@ -7,13 +7,22 @@ use crate::{Frame, FrameSource, VideoError};
 
 /// A camera that sends nothing for so long is opened anew. Half of it would open one anew that is
 /// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
-const SILENCE: Duration = Duration::from_secs(2);
+pub(crate) const SILENCE: Duration = Duration::from_secs(2);
 /// The longest silence that is borne: cameras that send a frame in half a minute are none for this.
 const LONGEST_SILENCE: Duration = Duration::from_secs(32);
 /// The first pause before a camera is opened anew; each is twice as long as the one before, up to the
 /// longest: a camera that starts again takes half a minute, and is not to be pestered.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(8);
+/// A camera that was watched for less than this before it broke off is not steady: it is asked as if it
+/// had never been there.
+const STEADY: Duration = Duration::from_secs(5);
+/// The pause before one is asked again that has refused: many makes lock out who asks too often with a
+/// wrong password.
+const REFUSED_PAUSE: Duration = Duration::from_secs(60);
+/// How long whoever wants it no more waits until it has taken leave of the camera: an interval between
+/// two frames, and the farewell.
+const LEAVE: Duration = Duration::from_millis(400);
 /// Frames that may wait to be looked at; when there are more, the oldest is left out. What has waited
 /// longer is of no use to who wants to know where something is now.
 const WAITING: usize = 4;
@@ -34,7 +43,7 @@ pub enum Sight {
 /// What became of a live camera's frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LiveCounts {
-    /// How often the camera was opened.
+    /// How often the camera was there when it was asked.
     pub opened: u64,
     /// Frames that came and were never looked at, as newer ones were here.
     pub left_out: u64,
@@ -72,7 +81,10 @@ struct State {
     frames: VecDeque<Frame>,
     troubles: VecDeque<VideoError>,
     counts: LiveCounts,
+    /// Nobody wants it any more, ...
     ended: bool,
+    /// ... and it has taken leave of the camera.
+    left: bool,
 }
 
 impl Shared {
@@ -159,8 +171,19 @@ impl Live {
 
 impl Drop for Live {
     fn drop(&mut self) {
-        self.shared.locked().ended = true;
+        let mut state = self.shared.locked();
+        state.ended = true;
         self.shared.changed.notify_all();
+        // A camera that is not told that nobody watches any more has no room for the next.
+        let until = Instant::now() + LEAVE;
+        while !state.left {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            let waited = self.shared.changed.wait_timeout(state, left);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
     }
 }
 
@@ -172,54 +195,54 @@ fn keep(
     let (mut pause, mut silence) = (FIRST_PAUSE, SILENCE);
     let mut number = 0;
     while !shared.ended() {
-        shared.locked().counts.opened += 1;
+        let (begun, mut frames) = (Instant::now(), 0);
         // What a camera sends may be made to hurt: whoever reads it may fail, but the camera is opened
         // anew.
-        let watched = catch_unwind(AssertUnwindSafe(|| match open(silence) {
-            Ok(mut source) => watch(shared, source.as_mut(), number),
-            Err(trouble) => {
-                shared.complain(trouble);
-                0
-            }
+        let watched = catch_unwind(AssertUnwindSafe(|| -> Result<(), VideoError> {
+            let mut source = open(silence)?;
+            shared.locked().counts.opened += 1;
+            watch(shared, source.as_mut(), number, &mut frames)
         }));
-        let frames = watched.unwrap_or_else(|_| {
-            shared.complain(VideoError::Ended);
-            0
-        });
+        let trouble = watched.unwrap_or(Ok(())).err().unwrap_or(VideoError::Ended);
+        // A stream that is there and shows a single frame, or none, may be slow.
+        let may_be_slow = matches!(trouble, VideoError::Silent { .. }) && frames < 2;
+        silence = if may_be_slow { (silence * 2).min(LONGEST_SILENCE) } else { SILENCE };
         if frames > 0 {
             // One number is left out, so that the gap is seen.
             number += frames + 1;
+        }
+        if frames > 0 && begun.elapsed() >= STEADY {
             pause = FIRST_PAUSE;
         }
-        // One that shows a single frame, or none, may be slow.
-        silence = if frames > 1 { SILENCE } else { (silence * 2).min(LONGEST_SILENCE) };
+        if matches!(trouble, VideoError::Refused { .. }) {
+            pause = REFUSED_PAUSE;
+        }
+        shared.complain(trouble);
         shared.pause(pause);
         pause = (pause * 2).min(LONGEST_PAUSE);
     }
+    shared.locked().left = true;
+    shared.changed.notify_all();
 }
 
-/// Hands on what a source shows, from a number on, until it ends or nobody wants it; says how many
-/// frames there were.
-fn watch(shared: &Shared, source: &mut dyn FrameSource, first: u64) -> u64 {
-    let mut frames = 0;
+/// Hands on what a source shows, from a number on, until it ends or nobody wants it; counts the
+/// frames.
+fn watch(
+    shared: &Shared,
+    source: &mut dyn FrameSource,
+    first: u64,
+    frames: &mut u64,
+) -> Result<(), VideoError> {
     while !shared.ended() {
         match source.next_frame() {
             Ok(Some(frame)) => {
-                frames = frame.index + 1;
+                *frames = frame.index + 1;
                 shared.give(Frame { index: first + frame.index, ..frame });
             }
-            Ok(None) => {
-                shared.complain(VideoError::Ended);
-                return frames;
-            }
-            Err(trouble) => {
-                let goes_on = trouble.is_one_frame();
-                shared.complain(trouble);
-                if !goes_on {
-                    return frames;
-                }
-            }
+            Ok(None) => return Ok(()),
+            Err(trouble) if trouble.is_one_frame() => shared.complain(trouble),
+            Err(trouble) => return Err(trouble),
         }
     }
-    frames
+    Ok(())
 }

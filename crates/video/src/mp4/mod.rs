@@ -41,7 +41,7 @@ impl Mp4Source {
             index::read(&mut file).map_err(damaged)?;
         let headers =
             parameters.iter().flat_map(|unit| [&[0, 0, 0, 1][..], &unit[..]].concat()).collect();
-        let decoder = H264Decoder::new().map_err(damaged)?;
+        let decoder = H264Decoder::of_file().map_err(damaged)?;
         Ok(Self {
             file,
             path: path.to_owned(),

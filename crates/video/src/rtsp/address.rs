@@ -68,9 +68,13 @@ impl StreamAddress {
 }
 
 impl fmt::Display for StreamAddress {
-    /// Without what follows a `?`: some makes want the password there.
+    /// Without what follows a `?`, and without a path that holds a password: some makes want it there.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut url = self.0.clone();
+        let path = url.path().to_ascii_lowercase();
+        if ["pass", "pwd"].iter().any(|word| path.contains(word)) {
+            url.set_path("...");
+        }
         if url.query().is_some() {
             url.set_query(Some("..."));
         }
@@ -98,6 +102,9 @@ mod tests {
         let shown = format!("{address} {address:?} {login:?}");
         assert!(!shown.contains("p@ss") && !shown.contains("p%40") && !shown.contains("hunter2"));
         assert!(shown.contains("rtsp://10.0.0.5:8554/live?..."), "{shown}");
+        let (address, _) =
+            StreamAddress::parse("rtsp://h/user=a&password=hunter2&channel=1").unwrap();
+        assert_eq!(address.to_string(), "rtsp://h/...");
         for wrong in ["", "10.0.0.5/live", "http://10.0.0.5/", "rtsp:///live"] {
             assert!(StreamAddress::parse(wrong).is_err(), "{wrong}");
         }

@@ -20,10 +20,12 @@ use retina::rtcp::{ReceivedCompoundPacket, TypedPacketRef};
 use tokio::runtime::Runtime;
 
 pub use self::address::{Login, StreamAddress};
+pub(crate) use self::packets::units;
 pub use self::server::{Mount, RtspServer};
 
 use self::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock};
 use crate::h264::{H264Decoder, Picture};
+use crate::live::SILENCE;
 use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
 /// How long a camera may take to answer before it is given up.
@@ -34,6 +36,11 @@ const FAREWELL: Duration = Duration::from_millis(200);
 const INTERVALS: u32 = 3;
 /// The intervals of which the longest is taken.
 const REMEMBERED_INTERVALS: usize = 8;
+/// A stream of which nothing could be decoded for so long is opened anew: longer than any camera takes
+/// from one picture that builds on none to the next.
+const UNDECODED: Duration = Duration::from_secs(30);
+/// Units whose pictures may be held back.
+const MOST_ARRIVALS: usize = 64;
 /// Seconds from the beginning of NTP's count, in 1900, to 1970.
 const NTP_TO_UNIX_S: i64 = 2_208_988_800;
 
@@ -60,6 +67,13 @@ pub struct RtspOptions {
     pub heeds_reports: bool,
     /// What it takes from the exposure to the arrival.
     pub latency: Latency,
+}
+
+impl RtspOptions {
+    /// What is wrong with the stream.
+    fn wrong(&self, what: String) -> VideoError {
+        VideoError::Stream { url: self.address.to_string(), what }
+    }
 }
 
 /// What it takes from the exposure of a frame to its arrival.
@@ -119,8 +133,10 @@ pub struct RtspSource {
     begun: Instant,
     /// How long it may be silent.
     silence: Duration,
-    /// When the last frame came.
+    /// When the last frame came, ...
     last: Option<Instant>,
+    /// ... and the last that could be decoded.
+    pictured: Instant,
     /// The last intervals between frames.
     intervals: VecDeque<Duration>,
     /// When the units came whose pictures have not come out yet.
@@ -142,18 +158,24 @@ impl RtspSource {
         silence: Duration,
     ) -> Result<Self, VideoError> {
         let url = options.address.to_string();
-        let wrong = |what: String| VideoError::Stream { url: url.clone(), what };
+        let wrong = |what: String| options.wrong(what);
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
             .map_err(|error| wrong(error.to_string()))?;
         let sessions = Arc::new(SessionGroup::default());
         let opened = runtime.block_on(async {
-            tokio::time::timeout(ANSWER, connect(options, &sessions)).await.unwrap_or_else(|_| {
-                Err(format!("it does not answer within {} s", ANSWER.as_secs()))
-            })
+            let connected = tokio::time::timeout(ANSWER, connect(options, &sessions)).await;
+            let connected = connected.unwrap_or_else(|_| {
+                Err(wrong(format!("it does not answer within {} s", ANSWER.as_secs())))
+            });
+            if connected.is_err() {
+                // It may have given a place to whoever does not come.
+                let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
+            }
+            connected
         });
-        let (stream, stream_id, codec) = opened.map_err(wrong)?;
+        let (stream, stream_id, codec) = opened?;
         let host = HostClock::read();
         Ok(Self {
             runtime,
@@ -167,6 +189,7 @@ impl RtspSource {
             begun: Instant::now(),
             silence,
             last: None,
+            pictured: Instant::now(),
             intervals: VecDeque::new(),
             arrivals: BTreeMap::new(),
             torn: false,
@@ -176,8 +199,8 @@ impl RtspSource {
 
     /// How long to wait for what comes next.
     fn patience(&self) -> Duration {
-        let slowest = self.intervals.iter().max().copied().unwrap_or_default();
-        self.silence.max(slowest * INTERVALS)
+        let slowest = self.intervals.iter().max();
+        slowest.map_or(self.silence, |slowest| SILENCE.max(*slowest * INTERVALS))
     }
 
     /// Notes when a frame has come.
@@ -216,11 +239,21 @@ impl RtspSource {
     fn frame(&mut self, unit: &VideoFrame) -> Result<Option<Frame>, VideoError> {
         let at = unit.end_ctx().received();
         self.note_arrival(at);
+        if at.saturating_duration_since(self.pictured) > UNDECODED {
+            return Err(VideoError::Stream {
+                url: self.url.clone(),
+                what: format!("nothing of {} s could be decoded", UNDECODED.as_secs()),
+            });
+        }
         let Some((ticks, width, height, pixels)) = self.decode(unit, at)? else {
+            while self.arrivals.len() > MOST_ARRIVALS {
+                self.arrivals.pop_first();
+            }
             return Ok(None);
         };
         let index = self.next;
         self.next += 1;
+        self.pictured = at;
         let at = self.arrivals.remove(&ticks).unwrap_or(at);
         self.arrivals.retain(|&waiting, _| waiting > ticks);
         let stream_s = ticks as f64 / f64::from(unit.timestamp().clock_rate().get());
@@ -229,7 +262,7 @@ impl RtspSource {
         if timed_by != TimedBy::Camera && set_by_s.abs() > SET_S {
             return Err(VideoError::HostClockSet { by_s: set_by_s });
         }
-        let live = Some(Arrival { at, timed_by });
+        let live = Some(Arrival { at, stream_s, timed_by });
         Ok(Some(Frame { index, capture, live, width, height, pixels }))
     }
 
@@ -239,8 +272,8 @@ impl RtspSource {
         unit: &VideoFrame,
         at: Instant,
     ) -> Result<Option<(i64, usize, usize, Pixels)>, VideoError> {
-        self.torn |= unit.loss() > 0;
-        self.torn &= !unit.is_random_access_point();
+        let is_whole = unit.loss() == 0;
+        self.torn = !is_whole || self.torn && !unit.is_random_access_point();
         let ticks = unit.timestamp().timestamp();
         self.arrivals.insert(ticks, at);
         let decoded = match &mut self.codec {
@@ -254,6 +287,7 @@ impl RtspSource {
                 .map(|(width, height, pixels)| Some((ticks, width, height, pixels))),
         };
         decoded.map_err(|what| {
+            self.arrivals.remove(&ticks);
             let index = self.next;
             self.next += 1;
             VideoError::StreamFrame { url: self.url.clone(), index, what }
@@ -269,17 +303,21 @@ impl RtspSource {
         for report in reports.pkts() {
             if let Ok(Some(TypedPacketRef::SenderReport(report))) = report.as_typed() {
                 let stream_s = time.timestamp() as f64 / f64::from(time.clock_rate().get());
-                self.clock.report(stream_s, unix_time(report.ntp_timestamp().0));
+                if let Some(told) = unix_time(report.ntp_timestamp().0) {
+                    self.clock.report(stream_s, told);
+                }
             }
         }
     }
 }
 
-/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count.
-fn unix_time(ntp: u64) -> Timestamp {
+/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count; `None` where a camera says
+/// that it knows none. The count begins again in 2036 (RFC 4330, 3).
+fn unix_time(ntp: u64) -> Option<Timestamp> {
     let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
+    let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
     let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
-    Timestamp::from_nanos((seconds - NTP_TO_UNIX_S) * 1_000_000_000 + nanos)
+    (ntp != 0).then(|| Timestamp::from_nanos((seconds - NTP_TO_UNIX_S) * 1_000_000_000 + nanos))
 }
 
 /// What is to be said of an error of the protocol: the details of the connection follow in further
@@ -289,23 +327,25 @@ fn first_line(text: &str) -> String {
 }
 
 /// What a refusal means to people.
-fn refusal(error: &retina::Error) -> String {
-    let said = first_line(&error.to_string());
-    match error.status_code() {
-        Some(401 | 403) => "the camera refuses: user or password are wrong".to_owned(),
+fn refusal(options: &RtspOptions, error: &retina::Error) -> VideoError {
+    // Of an address, what follows a `?` may be a password.
+    let query = options.address.url().query().map(|query| format!("?{query}"));
+    let said = first_line(&error.to_string()).replace(query.as_deref().unwrap_or("\n"), "?...");
+    options.wrong(match error.status_code() {
+        Some(401 | 403) => return VideoError::Refused { url: options.address.to_string() },
         Some(404 | 454) => "the camera is there but has no stream at this path".to_owned(),
         Some(461) => {
             format!("the camera does not send this way, try the other `transport` ({said})")
         }
         Some(503 | 453) => format!("the camera has no room for one more who watches ({said})"),
         _ => said,
-    }
+    })
 }
 
 async fn connect(
     options: &RtspOptions,
     sessions: &Arc<SessionGroup>,
-) -> Result<(Demuxed, usize, Codec), String> {
+) -> Result<(Demuxed, usize, Codec), VideoError> {
     let credentials = options.login.as_ref().map(|login| Credentials {
         username: login.user().to_owned(),
         password: login.password().to_owned(),
@@ -316,23 +356,26 @@ async fn connect(
         .user_agent("crossfix".to_owned());
     let mut session = Session::describe(options.address.url().clone(), session)
         .await
-        .map_err(|error| refusal(&error))?;
+        .map_err(|error| refusal(options, &error))?;
     let offered: Vec<String> = session
         .streams()
         .iter()
         .map(|stream| format!("{} {}", stream.media(), stream.encoding_name()))
         .collect();
+    let refusal = |error: retina::Error| refusal(options, &error);
     let found = session.streams().iter().position(|stream| {
         stream.media() == "video" && matches!(stream.encoding_name(), "h264" | "jpeg")
     });
     let stream_id = found.ok_or_else(|| {
-        format!(
+        options.wrong(format!(
             "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264",
             offered.join(", ")
-        )
+        ))
     })?;
     let codec = match session.streams()[stream_id].encoding_name() {
-        "h264" => Codec::H264(Box::new(H264Decoder::new()?)),
+        "h264" => {
+            Codec::H264(Box::new(H264Decoder::of_stream().map_err(|what| options.wrong(what))?))
+        }
         _ => Codec::MotionJpeg,
     };
     let transport = match options.transport {
@@ -340,9 +383,9 @@ async fn connect(
         RtspTransport::Udp => Transport::Udp(UdpTransportOptions::default()),
     };
     let setup = SetupOptions::default().transport(transport).frame_format(FrameFormat::SIMPLE);
-    session.setup(stream_id, setup).await.map_err(|error| refusal(&error))?;
-    let playing = session.play(PlayOptions::default()).await.map_err(|error| refusal(&error))?;
-    let stream = playing.demuxed().map_err(|error| refusal(&error))?;
+    session.setup(stream_id, setup).await.map_err(refusal)?;
+    let playing = session.play(PlayOptions::default()).await.map_err(refusal)?;
+    let stream = playing.demuxed().map_err(refusal)?;
     Ok((stream, stream_id, codec))
 }
 
@@ -372,5 +415,21 @@ impl FrameSource for RtspSource {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_of_ntp_are_read_before_and_after_their_count_begins_again() {
+        let of = |seconds: u64| unix_time(seconds << 32 | 1 << 31).map(Timestamp::seconds);
+        assert_eq!(of(2_208_988_800), Some(0.5));
+        // 2026-01-01, and 2036-02-07 06:28:17.
+        assert_eq!(of(3_976_214_400), Some(1_767_225_600.5));
+        assert_eq!(of(1), Some(2_085_978_497.5));
+        assert_eq!(unix_time(0), None);
+        assert!(unix_time(u64::MAX).is_some());
     }
 }

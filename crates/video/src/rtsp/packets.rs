@@ -16,7 +16,7 @@ const KEY: u8 = 5;
 const NTP_TO_UNIX_S: u64 = 2_208_988_800;
 
 /// The units of an Annex B stream, without start codes.
-pub(super) fn units(stream: &[u8]) -> impl Iterator<Item = &[u8]> {
+pub(crate) fn units(stream: &[u8]) -> impl Iterator<Item = &[u8]> {
     let mut starts: Vec<(usize, usize)> = Vec::new();
     let mut at = 0;
     while at + 3 <= stream.len() {

@@ -11,6 +11,8 @@ use crate::{CaptureTime, Latency, TimedBy};
 /// Sender reports of this long tell what the camera's clock shows, s. They come every five seconds
 /// or so and each may be some milliseconds off; over a minute a quartz stays a straight line.
 const REPORTS_S: f64 = 60.0;
+/// Reports that are kept: more in a minute come from no camera, and would be work for each image.
+const MOST_REPORTS: usize = 64;
 /// A clock that is this far from what it showed before was set, s: more than a busy camera is late in
 /// reporting, and than a quartz loses between two reports.
 pub(super) const SET_S: f64 = 0.25;
@@ -23,6 +25,10 @@ const ARRIVALS_S: f64 = 30.0;
 /// What was known of a camera's clock against the host's is good for so long after a stream broke off,
 /// s: two quartzes part by 30 ms in it.
 const REMEMBERED_S: f64 = 600.0;
+
+/// How well frames are timed by what is remembered, s: the first of a stream come as late as the
+/// quickest before them, or later by what a camera takes to begin.
+const REMEMBERED_SD_S: f64 = 0.1;
 
 /// A camera's clock as its last reports tell it.
 #[derive(Clone, Debug, Default)]
@@ -43,7 +49,9 @@ impl Reports {
             *self = Self { told: VecDeque::new(), zero: Some(told.plus_seconds(-stream_s)) };
         }
         self.told.push_back((stream_s, if was_set { 0.0 } else { beyond }));
-        while self.told.front().is_some_and(|(first, _)| stream_s - first > REPORTS_S) {
+        while self.told.len() > MOST_REPORTS
+            || self.told.front().is_some_and(|(first, _)| stream_s - first > REPORTS_S)
+        {
             self.told.pop_front();
         }
     }
@@ -162,6 +170,8 @@ pub(crate) struct StreamClock {
     reports: Reports,
     arrivals: Arrivals,
     memory: ClockMemory,
+    /// Stream time and arrival of the last frame, s.
+    last: Option<(f64, f64)>,
 }
 
 impl StreamClock {
@@ -173,12 +183,12 @@ impl StreamClock {
         memory: ClockMemory,
     ) -> Self {
         let (reports, arrivals) = (Reports::default(), Arrivals::default());
-        Self { host, latency, heeds_reports, reports, arrivals, memory }
+        Self { host, latency, heeds_reports, reports, arrivals, memory, last: None }
     }
 
     /// The camera says that its clock showed `told` at a stream time.
     pub(crate) fn report(&mut self, stream_s: f64, told: Timestamp) {
-        if self.heeds_reports && told > Timestamp::EPOCH {
+        if self.heeds_reports {
             self.reports.add(stream_s, told);
         }
     }
@@ -186,6 +196,14 @@ impl StreamClock {
     /// When a frame of a stream time that came `arrived_s` after the beginning was captured, by the
     /// camera's clock or by this host's.
     pub(crate) fn time(&mut self, stream_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
+        if let Some((stream_before_s, arrived_before_s)) = self.last.replace((stream_s, arrived_s))
+        {
+            let passed_s = stream_s - stream_before_s;
+            // It counts from another instant. A network may hold up what it likes: late is late alone.
+            if passed_s < 0.0 || passed_s - (arrived_s - arrived_before_s) > FARTHEST_S {
+                (self.reports, self.arrivals) = (Reports::default(), Arrivals::default());
+            }
+        }
         self.arrivals.add(stream_s, arrived_s);
         let unhindered = self.arrivals.unhindered_s(stream_s).unwrap_or(arrived_s);
         let arrival = self.host.wall.plus_seconds(unhindered);
@@ -193,11 +211,13 @@ impl StreamClock {
         let by_arrival = CaptureTime { time: arrival.plus_seconds(-mean_s), sd_s };
         let Some(time) = self.reports.time(stream_s) else {
             let remembered = self.memory.ahead_s(arrival, &self.host);
-            return remembered
-                .filter(|_| self.heeds_reports)
-                .map_or((by_arrival, TimedBy::Arrival), |by_s| {
-                    (CaptureTime { time: arrival.plus_seconds(by_s), sd_s }, TimedBy::Camera)
-                });
+            return remembered.filter(|_| self.heeds_reports).map_or(
+                (by_arrival, TimedBy::Arrival),
+                |by_s| {
+                    let time = arrival.plus_seconds(by_s);
+                    (CaptureTime { time, sd_s: REMEMBERED_SD_S }, TimedBy::Remembered)
+                },
+            );
         };
         let camera_ahead_s = time.seconds_since(arrival);
         if camera_ahead_s.abs() > FARTHEST_S {
@@ -307,7 +327,7 @@ mod tests {
         for n in 120..150 {
             let (stream_s, arrived_s, exposed_s) = frame(n);
             let (found, by) = after.time(stream_s + 1e4, arrived_s);
-            assert_eq!(by, TimedBy::Camera);
+            assert_eq!(by, TimedBy::Remembered);
             last = Some(error_s(found, exposed_s + 0.03));
         }
         assert!(last.unwrap().abs() < 1e-6, "{last:?}");
@@ -315,6 +335,44 @@ mod tests {
         let set = HostClock { wall: host().plus_seconds(3600.0), read: Instant::now() };
         let mut set = StreamClock::new(set, LATENCY, true, memory);
         assert_eq!(set.time(0.0, 0.1).1, TimedBy::Arrival);
+    }
+
+    #[test]
+    fn a_count_that_begins_anew_in_mid_stream_moves_no_time() {
+        for jump_s in [-1e5, -3.0, 3.0, 1e5] {
+            let mut clock = clock(&ClockMemory::default());
+            for n in 0..600 {
+                let (stream_s, arrived_s, exposed_s) = frame(n);
+                let stream_s = stream_s + if n < 300 { 0.0 } else { jump_s };
+                if n % 75 == 0 && n != 300 {
+                    clock.report(stream_s, host().plus_seconds(exposed_s));
+                }
+                let (found, by) = clock.time(stream_s, arrived_s);
+                let is_told = !(300..375).contains(&n);
+                let expected = if is_told { TimedBy::Camera } else { TimedBy::Remembered };
+                assert_eq!(by, expected, "{jump_s} s, frame {n}");
+                // By what was known of the camera until it says more, as soon as the quickest has come.
+                let known_s = if is_told { 1e-6 } else { 0.051 };
+                assert!(error_s(found, exposed_s).abs() < known_s, "{jump_s} s, frame {n}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_network_holds_up_is_timed_by_the_camera_all_the_same() {
+        let (mut clock, mut came_s) = (clock(&ClockMemory::default()), 0.0_f64);
+        for n in 0..600 {
+            let (stream_s, arrived_s, exposed_s) = frame(n);
+            // From the tenth second on everything comes three seconds late, and then at once.
+            let held_s = if (300..450).contains(&n) { f64::from(n - 300) * 0.02 } else { 0.0 };
+            if n % 300 == 0 {
+                clock.report(stream_s, host().plus_seconds(exposed_s));
+            }
+            came_s = (arrived_s + held_s).max(came_s + 1e-3);
+            let (found, by) = clock.time(stream_s, came_s);
+            assert_eq!(by, TimedBy::Camera);
+            assert!(error_s(found, exposed_s).abs() < 1e-6, "frame {n}");
+        }
     }
 
     #[test]
