@@ -189,6 +189,7 @@ pub(crate) fn read(
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty {
             pose: Some(PoseUncertainty::new(*pose)),
+            clock_source: frame.clock_source(),
             clock_walk: *clock_walk,
             lasting: *lasting,
             axes: *camera.pose().rotation(),

@@ -1,6 +1,7 @@
 //! What is uncertain of a camera as a whole, beside the noise of each bearing.
 
 use crossfix_geometry::{BearingModel, tangent_basis};
+use crossfix_message::ClockSource;
 use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
 /// Variances that differ by less than this share of them are one: what turning them leaves is far
@@ -157,6 +158,8 @@ pub(crate) struct CameraUncertainty {
     /// Whether the clock's error is taken for noise of each bearing: where the velocity is not
     /// known yet, what it shifts the bearings by is not either.
     pub(crate) clock_is_noise: bool,
+    /// What sets the clock that the capture time is by.
+    pub(crate) clock_source: ClockSource,
     /// What the clock wanders by beside its offset and its drift, s^2/s.
     pub(crate) clock_walk: f64,
     /// The part of its bearings' noise that lasts.
@@ -174,6 +177,7 @@ impl CameraUncertainty {
             pose: None,
             pose_scale: 1.0,
             clock_is_noise: false,
+            clock_source: ClockSource::Unspecified,
             clock_walk: 0.0,
             lasting: LastingNoise::NONE,
             axes: Rotation3::identity(),
@@ -273,6 +277,7 @@ mod tests {
             pose: Some(PoseUncertainty::new(pose)),
             clock_is_noise: false,
             pose_scale: 1.0,
+            clock_source: ClockSource::Ntp,
             clock_walk: 0.0,
             lasting: LastingNoise::NONE,
             axes: Rotation3::identity(),

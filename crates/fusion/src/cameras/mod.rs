@@ -26,6 +26,8 @@ use std::collections::btree_map::Entry;
 
 use crossfix_message::{CameraName, Timestamp};
 
+use crossfix_message::ClockSource;
+
 use crate::Exposure;
 use calibration::Calibrations;
 use noise::WhiteNoise;
@@ -49,13 +51,17 @@ const DOUBTED_NOISE: f64 = 2.0;
 /// A clock whose variance (logarithm) and offset (in its deviations) change by less than this
 /// changes no track.
 const NOTICED_CLOCK: f64 = 0.1;
+/// By how much larger in variance another clock is taken to be than the one before: so much that
+/// what a track holds of the one says nothing of the other.
+const ANOTHER_CLOCK: f64 = 1e24;
 /// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and
 /// what is known of a clock must not be divided by next to nothing.
 const RIGHT_CLOCK_S: f64 = 1e-9;
 
-/// The deviation and the offset of a clock that the tracks know of, s.
+/// The clock that the tracks know of: what sets it, its deviation and its offset, s.
 #[derive(Clone, Copy, Debug)]
 struct ToldClock {
+    source: ClockSource,
     sd_s: f64,
     offset_s: f64,
 }
@@ -142,9 +148,17 @@ impl CameraState {
 
     /// How its clock has changed since the tracks were told, by an exposure; `None` if little.
     pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
-        let now =
-            ToldClock { sd_s: exposure.uncertainty.time_sd_s, offset_s: exposure.correction_s };
+        let now = ToldClock {
+            source: exposure.uncertainty.clock_source,
+            sd_s: exposure.uncertainty.time_sd_s,
+            offset_s: exposure.correction_s,
+        };
         let told = *self.told_clock.get_or_insert(now);
+        if told.source != now.source {
+            // Tracks hold the error of the clock before, and nothing of this one's.
+            self.told_clock = Some(now);
+            return Some(ClockChange { ahead: 0.0, ratio: ANOTHER_CLOCK });
+        }
         let ratio = (now.sd_s / told.sd_s).powi(2);
         let ahead = (now.offset_s - told.offset_s) / told.sd_s;
         let known = told.sd_s > RIGHT_CLOCK_S && now.sd_s > RIGHT_CLOCK_S;

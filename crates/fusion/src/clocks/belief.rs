@@ -243,12 +243,40 @@ impl Belief {
     }
 
     /// A camera says that its clock is worse than it was: standard deviations of offset (s) and
-    /// drift (s/s). It may be off by so much from where it stood.
-    pub(super) fn reopen(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) {
+    /// drift (s/s). What is believed of it stands, and may be that much off.
+    pub(super) fn reopen(&mut self, camera: &CameraName, deviations: [f64; 2]) {
+        let stood = self.forget(camera, deviations);
+        let place = self.cameras.get(camera).and_then(|clock| clock.place);
+        for (place, [offset, drift]) in place.into_iter().zip(stood) {
+            (self.mean[place], self.mean[place + 1]) = (offset, drift);
+        }
+        self.settle();
+    }
+
+    /// A camera goes by another clock, of these standard deviations of offset (s) and drift (s/s).
+    pub(super) fn replace(&mut self, camera: &CameraName, deviations: [f64; 2]) {
+        let is_reference = self.cameras.get(camera).is_some_and(|clock| clock.place.is_none());
+        let stood = self.reference_offset_and_drift();
+        if is_reference {
+            // The others were known against the clock before.
+            self.doubt(camera);
+        }
+        self.forget(camera, deviations);
+        if is_reference {
+            let now = self.reference_offset_and_drift();
+            let others: Vec<usize> = self.clock_places().collect();
+            for i in 0..2 {
+                self.site[i] -= now[i];
+                others.iter().for_each(|&k| self.mean[k + i] += stood[i]);
+            }
+        }
+        self.settle();
+    }
+
+    /// Gives a clock other deviations and forgets all that was learnt of it; returns what was believed.
+    fn forget(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) -> Option<[f64; 2]> {
         let site = self.reference_offset_and_drift();
-        let Some(clock) = self.cameras.get_mut(camera) else {
-            return;
-        };
+        let clock = self.cameras.get_mut(camera)?;
         (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let place = clock.place;
         self.settle();
@@ -257,10 +285,7 @@ impl Belief {
         }
         let stood = place.map(|place| [self.mean[place], self.mean[place + 1]]);
         self.doubt(camera);
-        for (place, [offset, drift]) in place.into_iter().zip(stood) {
-            (self.mean[place], self.mean[place + 1]) = (offset, drift);
-        }
-        self.settle();
+        stood
     }
 
     /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.

@@ -17,7 +17,7 @@ mod window_update;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_geometry::SightLine;
-use crossfix_message::{CameraName, Timestamp};
+use crossfix_message::{CameraName, ClockSource, Timestamp};
 use nalgebra::{Matrix2, Matrix6};
 
 use self::belief::Belief;
@@ -70,6 +70,8 @@ pub struct ClockEstimate {
 struct Reported {
     /// The standard deviation that its camera reports, which the belief begins with, s.
     sd_s: f64,
+    /// What sets it, as its camera says.
+    source: ClockSource,
     /// It may have jumped, ...
     suspected: bool,
     /// ... but the open windows tell of it.
@@ -77,8 +79,8 @@ struct Reported {
 }
 
 impl Reported {
-    fn new(sd_s: f64) -> Self {
-        Self { sd_s, suspected: false, cleared: false }
+    fn new(sd_s: f64, source: ClockSource) -> Self {
+        Self { sd_s, source, suspected: false, cleared: false }
     }
 }
 
@@ -145,7 +147,8 @@ impl ClockEstimator {
     }
 
     /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only
-    /// one counts that makes the clock much worse than it was: its source of time is lost.
+    /// one counts that makes the clock much worse than it was, as its source of time is lost, and one
+    /// that is of another clock: that of a network camera which has said only now what its own shows.
     pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
         let reported_sd_s = reported.time_sd_s;
         if !self.config.estimate {
@@ -157,17 +160,23 @@ impl ClockEstimator {
         let deviations = if uncertain { [reported_sd_s, self.config.drift_sd] } else { [0.0, 0.0] };
         let Some(before) = self.reported.get_mut(camera) else {
             self.needed |= uncertain;
-            self.reported.insert(camera.clone(), Reported::new(reported_sd_s));
+            self.reported
+                .insert(camera.clone(), Reported::new(reported_sd_s, reported.clock_source));
             let pose = reported.pose.map(|pose| *pose.covariance());
             let walk = if uncertain { reported.clock_walk } else { 0.0 };
             self.belief.add(camera, deviations, walk, pose);
             self.forget_provisional();
             return;
         };
-        if uncertain && reported_sd_s >= WORSE * before.sd_s {
-            self.needed = true;
-            before.sd_s = reported_sd_s;
-            self.belief.reopen(camera, deviations);
+        let is_another = reported.clock_source != before.source;
+        if is_another || uncertain && reported_sd_s >= WORSE * before.sd_s {
+            self.needed |= uncertain;
+            (before.sd_s, before.source) = (reported_sd_s, reported.clock_source);
+            if is_another {
+                self.belief.replace(camera, deviations);
+            } else {
+                self.belief.reopen(camera, deviations);
+            }
             self.forget_provisional();
             self.suspect(camera);
         }
@@ -417,5 +426,40 @@ mod tests {
             assert!((sd_s(&clocks, &word, said) - expected).abs() < 0.01 * expected, "{said}");
         }
         assert!(clocks.is_needed());
+    }
+
+    #[test]
+    fn of_another_clock_nothing_is_known_but_what_is_said() {
+        let [late, other] = ["a", "b"].map(|name| name.parse::<CameraName>().unwrap());
+        let by = |clock_source, sd_s| CameraUncertainty {
+            clock_source,
+            ..CameraUncertainty::of_time(sd_s)
+        };
+        // The camera that is heard first is the one that the others are held against.
+        for late_is_first in [false, true] {
+            let mut clocks = ClockEstimator::new(Clocks::default());
+            let mut first =
+                [(&other, by(ClockSource::Ntp, 0.01)), (&late, by(ClockSource::Arrival, 0.1))];
+            if late_is_first {
+                first.reverse();
+            }
+            first.iter().for_each(|(camera, said)| clocks.see(camera, said));
+            let of = |clocks: &ClockEstimator, camera| clocks.estimate(camera).unwrap();
+            let sd_s = of(&clocks, &late).sd_s;
+            assert!((sd_s - 0.1).abs() < 0.01, "{sd_s}");
+            // Its own clock is good, and its offset is not that of the arrivals.
+            clocks.see(&late, &by(ClockSource::Camera, 0.02));
+            for (camera, sd_s) in [(&late, 0.02), (&other, 0.01)] {
+                let estimate = of(&clocks, camera);
+                assert!(estimate.offset_s.abs() < 1e-9, "{camera}: {estimate:?}");
+                assert!(estimate.sd_s < 1.1 * sd_s, "{camera}: {estimate:?}");
+            }
+            // What the two are apart is no better known than the new one is.
+            let apart_s = of(&clocks, &late).relative_sd_s.hypot(of(&clocks, &other).relative_sd_s);
+            assert!(apart_s > 0.01, "{apart_s}");
+            clocks.see(&late, &by(ClockSource::Arrival, 0.1));
+            let sd_s = of(&clocks, &late).sd_s;
+            assert!((sd_s - 0.1).abs() < 0.01, "{sd_s}");
+        }
     }
 }

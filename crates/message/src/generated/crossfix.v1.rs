@@ -7,7 +7,7 @@ pub struct Version {
     /// Grows when an older reader would misunderstand the message.
     #[prost(uint32, tag = "1")]
     pub major: u32,
-    /// Grows when fields are added.
+    /// Grows when fields or values are added.
     #[prost(uint32, tag = "2")]
     pub minor: u32,
 }
@@ -424,6 +424,10 @@ pub enum ClockSource {
     Gnss = 5,
     /// A simulator's own time.
     Simulated = 6,
+    /// The camera's own clock, as it says itself what it shows; what sets it nobody has said.
+    Camera = 7,
+    /// Not synchronised: when the image came to the host, less what it takes to come there.
+    Arrival = 8,
 }
 impl ClockSource {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -439,6 +443,8 @@ impl ClockSource {
             Self::Ptp => "CLOCK_SOURCE_PTP",
             Self::Gnss => "CLOCK_SOURCE_GNSS",
             Self::Simulated => "CLOCK_SOURCE_SIMULATED",
+            Self::Camera => "CLOCK_SOURCE_CAMERA",
+            Self::Arrival => "CLOCK_SOURCE_ARRIVAL",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -451,6 +457,8 @@ impl ClockSource {
             "CLOCK_SOURCE_PTP" => Some(Self::Ptp),
             "CLOCK_SOURCE_GNSS" => Some(Self::Gnss),
             "CLOCK_SOURCE_SIMULATED" => Some(Self::Simulated),
+            "CLOCK_SOURCE_CAMERA" => Some(Self::Camera),
+            "CLOCK_SOURCE_ARRIVAL" => Some(Self::Arrival),
             _ => None,
         }
     }
