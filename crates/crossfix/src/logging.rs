@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 
 use clap::{Args, ValueEnum};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::{Directive, LevelFilter};
 
 /// How logs look.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -47,6 +48,10 @@ pub fn start(args: &LoggingArgs) {
     // Zenoh warns about what we chose on purpose (no gossip) and about peers that are not up yet.
     let filter = format!("{level},zenoh=error,zenoh_transport=error,zenoh_link_tcp=error");
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(filter));
+    // What the reader of streams says of cameras that do as they please is in its errors, and what it
+    // says in detail may hold how one logs in to them, whoever asks for it.
+    let quiet = Directive::from(LevelFilter::ERROR);
+    let filter = filter.add_directive("retina=error".parse().unwrap_or(quiet));
     let builder = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_ansi(std::io::stderr().is_terminal())

@@ -30,6 +30,7 @@ mod recorded;
 mod repeats;
 #[cfg(feature = "centre")]
 mod scenario;
+mod service;
 mod shutdown;
 
 use std::process::ExitCode;

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use crate::service;
 use crate::shutdown::Shutdown;
 
 /// Seconds since the Unix epoch by this machine's clock.
@@ -45,6 +46,7 @@ impl Pace {
                 if left.is_zero() {
                     break;
                 }
+                service::alive();
                 std::thread::sleep(left.min(POLL));
             }
         }

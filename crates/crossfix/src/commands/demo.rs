@@ -1,5 +1,5 @@
 use std::collections::BTreeMap;
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -14,7 +14,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::commands::evaluate::{Question, evaluate, render};
 use crate::commands::view::save_recording;
-use crate::config::{self, CameraFile, ClockConfig, FusionFile, PoseConfig, SourceConfig};
+use crate::config::{
+    self, CameraFile, ClockConfig, ClockSourceName, FusionFile, PoseConfig, SourceConfig,
+    StreamConfig,
+};
 use crate::output;
 use crate::pace::wall_seconds;
 use crate::shutdown::{LEAVE, Shutdown};
@@ -33,7 +36,9 @@ const SETTLING_S: f64 = 1.5;
 /// Renders what three cameras see of two UAVs, runs an agent a camera, the fusion centre and the
 /// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix demo --duration 20 --output demo-output")]
+#[command(
+    after_help = "Examples:\n  crossfix demo --duration 20 --output demo-output\n  crossfix demo --live"
+)]
 pub struct Args {
     /// Seed of sky and noise.
     #[arg(long, default_value_t = 1, value_name = "N")]
@@ -44,6 +49,10 @@ pub struct Args {
     /// The folder to write recording, picture, configurations and logs to.
     #[arg(short, long, default_value = "demo-output", value_name = "DIR")]
     output: PathBuf,
+    /// Let the cameras be network cameras: agents that know nothing of the scene watch their streams
+    /// (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
+    #[arg(long)]
+    live: bool,
     /// Open the live viewer (Rerun), where one is installed.
     #[arg(long)]
     view: bool,
@@ -126,6 +135,16 @@ struct Files {
     cameras: BTreeMap<CameraName, PathBuf>,
     recording: PathBuf,
     picture: PathBuf,
+    /// The cameras' streams, where they are network cameras.
+    streams: Option<Streams>,
+}
+
+/// Network cameras.
+struct Streams {
+    address: SocketAddr,
+    scene: PathBuf,
+    /// The recording of what is true.
+    truth: PathBuf,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -141,7 +160,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     scene.duration_s = args.duration;
     let world = scene.build()?;
     let network = free_network(&world)?;
-    let files = write_files(&args.output, &scene, &world, &network)?;
+    let streams = args.live.then(|| free_streams(&args.output)).transpose()?;
+    let files = write_files(&args.output, &scene, &world, &network, streams)?;
     if play(args, &files, &network, &shutdown)? == Ending::Interrupted {
         let recording = files.recording.display();
         output::line(format!(
@@ -151,13 +171,17 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
     tracing::info!("drawing the picture");
     save_recording(&files.recording, &files.picture)?;
-    let question = Question { skip_s: 1.0 + SETTLING_S, ..Question::default() };
+    let truth = files.streams.as_ref().map(|streams| streams.truth.clone());
+    let question = Question { skip_s: 1.0 + SETTLING_S, truth, ..Question::default() };
     let evaluation = evaluate(&files.recording, &question)?;
     if args.json {
         return output::json(&evaluation);
     }
     output::line(format!("\n{}\n", render(&evaluation)));
     output::line(format!("recording       {}", files.recording.display()));
+    if let Some(streams) = &files.streams {
+        output::line(format!("truth           {}", streams.truth.display()));
+    }
     output::line(format!("picture         {}", files.picture.display()));
     output::line(format!("configurations  {}", files.folder.display()));
     output::line(format!(
@@ -204,24 +228,35 @@ fn play(
     link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on)
         .context("the fusion centre did not come up")?;
     let start_at = wall_seconds() + RUN_UP_S;
+    let begin = format!("{start_at:.6}");
     let mut agents = Vec::new();
     for (name, file) in &files.cameras {
-        let begin = format!("{start_at:.6}");
         let arguments = ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
         agents.push(start(name.as_str(), &arguments)?);
+    }
+    // Agents end with their scene; what watches a stream goes on when that has ended.
+    let (mut players, mut watchers) = (agents, Vec::new());
+    if let Some(Streams { address, scene, truth }) = &files.streams {
+        let (scene, address, truth) = (text(scene), address.to_string(), text(truth));
+        let arguments =
+            ["simulate", &scene, "--rtsp", &address, "--start-at", &begin, "-o", &truth];
+        watchers = std::mem::replace(&mut players, vec![start("cameras", &arguments)?]);
     }
 
     let bar = progress_bar(args.duration);
     let mut interrupted = false;
     let mut tracks = BTreeMap::new();
-    while !agents.is_empty() {
+    while !players.is_empty() {
         let mut running = Vec::new();
-        for mut agent in agents {
-            if agent.runs(&files.folder)? {
-                running.push(agent);
+        for mut player in players {
+            if player.runs(&files.folder)? {
+                running.push(player);
             }
         }
-        agents = running;
+        players = running;
+        for watcher in &mut watchers {
+            watcher.runs(&files.folder)?;
+        }
         if shutdown.requested() {
             interrupted = true;
             break;
@@ -236,10 +271,11 @@ fn play(
     bar.finish_and_clear();
     if interrupted {
         // All at once: who is asked to stop waits for nobody.
-        agents.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);
+        players.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);
     }
-    for agent in agents {
-        agent.stop()?;
+    watchers.iter_mut().for_each(Component::ask_to_stop);
+    for component in players.into_iter().chain(watchers) {
+        component.stop()?;
     }
     fusion.stop()?;
     recorder.stop()?;
@@ -320,6 +356,16 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     })
 }
 
+/// Network cameras at a port of this machine that nobody uses now.
+fn free_streams(folder: &Path) -> anyhow::Result<Streams> {
+    let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
+    Ok(Streams {
+        address: listener.local_addr()?,
+        scene: folder.join("scene.toml"),
+        truth: folder.join("truth.mcap"),
+    })
+}
+
 fn write(path: &Path, text: &str) -> anyhow::Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
@@ -330,6 +376,7 @@ fn write_files(
     scene: &Scene,
     world: &World,
     network: &NetworkConfig,
+    streams: Option<Streams>,
 ) -> anyhow::Result<Files> {
     std::fs::create_dir_all(folder.join("logs"))
         .with_context(|| format!("cannot make {}", folder.display()))?;
@@ -340,6 +387,7 @@ fn write_files(
         cameras: BTreeMap::new(),
         recording: folder.join("demo.mcap"),
         picture: folder.join("demo.rrd"),
+        streams,
     };
     write(&folder.join("scene.toml"), &toml::to_string(scene)?)?;
     write(&files.network, &toml::to_string(network)?)?;
@@ -356,15 +404,21 @@ fn write_files(
             calibration: None,
             intrinsics: Some(format!("{name}.yaml").into()),
             pose: Some(PoseConfig::of(camera.camera().pose())),
-            source: SourceConfig::Simulation {
-                scene: "scene.toml".into(),
-                publish_truth: index == 0,
+            source: match &files.streams {
+                Some(Streams { address, .. }) => SourceConfig::Stream(StreamConfig::open_to_all(
+                    format!("rtsp://{address}/{name}"),
+                )),
+                None => SourceConfig::Simulation {
+                    scene: "scene.toml".into(),
+                    publish_truth: index == 0,
+                },
             },
             clock: ClockConfig {
-                source: config::ClockSourceName::Simulated,
+                source: files.streams.is_none().then_some(ClockSourceName::Simulated),
                 offset_s: clock.offset_s,
                 drift_ppm: clock.drift_ppm,
-                sd_s: 1e-4,
+                // Of a network camera nobody knows that well how late it reports.
+                sd_s: files.streams.is_none().then_some(1e-4),
             },
             preview: Default::default(),
             boxes: Vec::new(),

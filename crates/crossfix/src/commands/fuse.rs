@@ -12,6 +12,7 @@ use crate::config::{self, FusionFile};
 use crate::lookout::Lookout;
 use crate::network::{self, rivalry};
 use crate::output;
+use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
@@ -81,7 +82,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let alive = station.link.declare_alive(Channel::FusionAlive)?;
     tracing::info!("the fusion centre of `{site}` is up, run {}", station.link.run());
 
+    service::ready("fusing");
     station.work(&subscription, &shutdown)?;
+    service::stopping();
     station.finish(&mut subscription, &shutdown)?;
     let frames = station.centre.frames();
     let Station { link, tracks, smoothed, events, health, lookout, .. } = station;
@@ -100,6 +103,7 @@ impl Station {
             }
             if healthy_at.elapsed() >= HEALTH_PERIOD {
                 healthy_at = Instant::now();
+                service::alive();
                 self.lookout.look(healthy_at);
                 self.centre.remind(healthy_at);
                 self.say_health(subscription, false)?;

@@ -4,9 +4,11 @@ use clap::Subcommand;
 
 pub mod agent;
 pub mod check;
+pub mod doctor;
 pub mod info;
 pub mod numbers;
 pub mod record;
+pub mod sources;
 pub mod track;
 
 #[cfg(feature = "centre")]
@@ -38,10 +40,12 @@ pub enum Command {
     #[cfg(all(feature = "centre", feature = "viewer"))]
     Demo(demo::Args),
     Agent(agent::Args),
+    Sources(sources::Args),
     Track(track::Args),
     Record(record::Args),
     Info(info::Args),
     Check(check::Args),
+    Doctor(doctor::Args),
     #[cfg(feature = "viewer")]
     View(view::Args),
     #[cfg(feature = "centre")]
@@ -87,10 +91,12 @@ impl Command {
             #[cfg(all(feature = "centre", feature = "viewer"))]
             Self::Demo(args) => demo::run(&args),
             Self::Agent(args) => agent::run(&args),
+            Self::Sources(args) => sources::run(&args),
             Self::Track(args) => track::run(&args),
             Self::Record(args) => record::run(&args),
             Self::Info(args) => info::run(&args),
             Self::Check(args) => check::run(&args),
+            Self::Doctor(args) => doctor::run(&args),
             #[cfg(feature = "viewer")]
             Self::View(args) => view::run(&args),
             #[cfg(feature = "centre")]

@@ -1,6 +1,8 @@
+mod live;
 mod scenario;
 
 use std::io::{BufWriter, Write};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
@@ -16,25 +18,39 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::commands::agent::truth_frame;
+use crate::commands::numbers;
 use crate::config;
 use crate::import::imported;
 use crate::output::{self, Draft};
+use crate::pace::wall_seconds;
+use crate::shutdown::Shutdown;
 
-/// Turn a scene into a recording of bearings with truth, or into video files; or write a scenario.
+/// Turn a scene into a recording of bearings with truth, into video files or into live streams; or
+/// write a scenario.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos\n  crossfix simulate --scenario crowd --targets 50 --cameras 8 --clutter 5"
+    after_help = "Examples:\n  crossfix simulate configs/demo/scene.toml -o recordings/two-uavs.mcap\n  crossfix simulate configs/demo/scene.toml --video videos\n  crossfix simulate configs/demo/scene.toml --rtsp 127.0.0.1:8554\n  crossfix simulate --scenario crowd --targets 50 --cameras 8 --clutter 5"
 )]
 pub struct Args {
     /// The scene (TOML).
     #[arg(required_unless_present = "scenario", conflicts_with = "scenario")]
     scene: Option<PathBuf>,
     /// The recording (MCAP) to write: bearings as cameras would measure them, calibrations, truth.
-    #[arg(short, long, value_name = "FILE", required_unless_present_any = ["video", "scenario"])]
+    /// With --rtsp, at the times at which they are played.
+    #[arg(short, long, value_name = "FILE", required_unless_present_any = ["video", "scenario", "rtsp"])]
     output: Option<PathBuf>,
     /// The folder to write a rendered video (Y4M) of each camera to.
     #[arg(long, value_name = "DIR")]
     video: Option<PathBuf>,
+    /// Play the scene's cameras as live streams at this address, rtsp://ADDRESS/CAMERA, until its end.
+    #[arg(long, value_name = "ADDRESS")]
+    rtsp: Option<SocketAddr>,
+    /// When the streams' scene begins, seconds since the Unix epoch. Default: a second from now.
+    #[arg(long, value_name = "SECONDS", value_parser = numbers::wall_time, requires = "rtsp")]
+    start_at: Option<f64>,
+    /// Stop when stdin ends.
+    #[arg(long, hide = true)]
+    stop_with_stdin: bool,
     /// Standard deviation of a bearing in the recording, pixels per axis.
     #[arg(long, default_value_t = 0.3, value_name = "PIXELS")]
     noise_px: f64,
@@ -43,7 +59,7 @@ pub struct Args {
     sets: Vec<String>,
     /// The folder to write a scenario (passive-bearings/1) to, of a site that the options below
     /// describe: a ring of cameras about 600 m by 600 m.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["output", "video", "sets"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["output", "video", "sets", "rtsp"])]
     scenario: Option<PathBuf>,
     #[command(flatten)]
     site: scenario::SiteArgs,
@@ -68,8 +84,13 @@ fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
         (0.01..100.0).contains(&noise),
         "--noise-px is {noise}: it must be from 0.01 to 100 px"
     );
+    let begins = match (args.rtsp, args.start_at) {
+        (Some(_), Some(wall_s)) => Timestamp::from_seconds(wall_s),
+        (Some(_), None) => Timestamp::from_seconds(wall_seconds() + live::RUN_UP_S),
+        (None, _) => Timestamp::EPOCH,
+    };
     if let Some(path) = &args.output {
-        let messages = record(&world, path, noise, scene.seed)?;
+        let messages = record(&world, path, noise, scene.seed, begins)?;
         output::line(format!("{messages} messages written to {}", path.display()));
     }
     if let Some(folder) = &args.video {
@@ -84,31 +105,37 @@ fn simulate(args: &Args, path: &Path) -> anyhow::Result<()> {
             output::line(format!("{} frames written to {}", camera.frames(), path.display()));
         }
     }
+    if let Some(address) = args.rtsp {
+        live::play(&world, address, begins, &Shutdown::listen().with_stdin(args.stop_with_stdin))?;
+    }
     Ok(())
 }
 
-fn record(world: &World, path: &Path, noise_px: f64, seed: u64) -> anyhow::Result<u64> {
+/// Records a scene that begins at a time.
+fn record(
+    world: &World,
+    path: &Path,
+    noise_px: f64,
+    seed: u64,
+    begins: Timestamp,
+) -> anyhow::Result<u64> {
     let site: SiteName = "simulation".parse()?;
     let mut entries = Vec::new();
     for (index, camera) in world.cameras().iter().enumerate() {
-        let calibration = CameraCalibration::new(camera.name(), camera.camera(), Timestamp::EPOCH)
-            .with_pose_sd(0.0, 0.0);
+        let calibration =
+            CameraCalibration::new(camera.name(), camera.camera(), begins).with_pose_sd(0.0, 0.0);
         let key = Key::new(site.clone(), Channel::Calibration(camera.name().clone()));
-        entries.push(imported(key, Timestamp::EPOCH, calibration.encode()));
+        entries.push(imported(key, begins, calibration.encode()));
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(index as u64);
         for frame in 0..camera.frames() {
-            entries.push(exposure(world, camera, frame, noise_px, &site, &mut rng)?);
+            entries.push(exposure(world, camera, frame, noise_px, &site, &mut rng, begins)?);
         }
     }
     for step in 0..(world.duration_s() * 10.0) as u32 {
         let t = f64::from(step) / 10.0;
         let key = Key::new(site.clone(), Channel::Truth);
-        entries.push(imported(
-            key,
-            Timestamp::from_seconds(t),
-            truth_frame(world, t, 0.0).encode(),
-        ));
+        entries.push(imported(key, begins.plus_seconds(t), truth_frame(world, t, begins).encode()));
     }
     entries.sort_by_key(|entry| entry.data_time);
     let draft = Draft::new(path, &[])?;
@@ -130,6 +157,7 @@ fn exposure(
     noise_px: f64,
     site: &SiteName,
     rng: &mut ChaCha8Rng,
+    begins: Timestamp,
 ) -> anyhow::Result<Entry> {
     let t = camera.true_time(frame);
     let mut tracks = Vec::new();
@@ -155,7 +183,7 @@ fn exposure(
             ..Default::default()
         });
     }
-    let time = Timestamp::from_seconds(t);
+    let time = begins.plus_seconds(t);
     let message = BearingFrame {
         camera: camera.name().to_string(),
         sequence: frame,

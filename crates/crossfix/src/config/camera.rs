@@ -6,12 +6,12 @@ use crossfix_geometry::{Camera, ImageSize, Intrinsics, Pixel, PixelCovariance, P
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
-use crossfix_video::FrameClock;
-use crossfix_vision::{PixelBox, TrackerConfig};
+use crossfix_video::{FrameClock, Latency, RtspOptions};
+use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
-use super::Kind;
+use super::{Kind, StreamConfig};
 use crate::calibrated::Calibrated;
 use crate::recorded;
 
@@ -100,6 +100,8 @@ pub enum SourceConfig {
         #[serde(default)]
         publish_truth: bool,
     },
+    /// A network camera's live stream.
+    Stream(StreamConfig),
     /// The recorded bearings of this camera.
     Recording {
         /// The recording (MCAP).
@@ -119,27 +121,27 @@ fn thirty() -> f64 {
 }
 
 /// What capture times are worth, and how they are corrected.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClockConfig {
-    /// `frame-count` (default), `host`, `ntp`, `ptp`, `gnss` or `simulated`.
-    pub source: ClockSourceName,
-    /// What the camera's clock shows too much at the start, s.
+    /// What sets the camera's clock: `ntp`, `ptp`, `gnss`, `host` (nothing does), `simulated`;
+    /// `frame-count` (default of files), where there is none; `camera` (default of streams), where
+    /// nobody has said; `arrival`, where a stream's own times are not to be believed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub source: Option<ClockSourceName>,
+    /// What the camera's clock shows too much at the start, s: of a stream, also how much later than
+    /// the exposure the instant is that the camera reports.
     pub offset_s: f64,
     /// How much too fast it runs, millionths.
     pub drift_ppm: f64,
-    /// Standard deviation of a corrected capture time, s. Default 0.001.
-    pub sd_s: f64,
-}
-
-impl Default for ClockConfig {
-    fn default() -> Self {
-        Self { source: ClockSourceName::FrameCount, offset_s: 0.0, drift_ppm: 0.0, sd_s: 1e-3 }
-    }
+    /// Standard deviation of a corrected capture time, s. Default 0.001, of a stream 0.1: some cameras
+    /// report when an image was sent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sd_s: Option<f64>,
 }
 
 /// A clock's source as people write it.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ClockSourceName {
     FrameCount,
@@ -148,6 +150,8 @@ pub enum ClockSourceName {
     Ptp,
     Gnss,
     Simulated,
+    Camera,
+    Arrival,
 }
 
 impl From<ClockSourceName> for ClockSource {
@@ -159,6 +163,8 @@ impl From<ClockSourceName> for ClockSource {
             ClockSourceName::Ptp => Self::Ptp,
             ClockSourceName::Gnss => Self::Gnss,
             ClockSourceName::Simulated => Self::Simulated,
+            ClockSourceName::Camera => Self::Camera,
+            ClockSourceName::Arrival => Self::Arrival,
         }
     }
 }
@@ -192,7 +198,16 @@ impl CameraFile {
                 *path = folder.join(&*path);
             }
             SourceConfig::Simulation { scene, .. } => *scene = folder.join(&*scene),
+            SourceConfig::Stream(stream) => {
+                stream.password_file = stream.password_file.take().map(|file| folder.join(file));
+                if file.boxes.is_empty() && file.tracker.detector.is_none() {
+                    // Nobody knows where targets will be in what has not been filmed yet.
+                    file.tracker.detector = Some(DetectorConfig::default());
+                }
+            }
         }
+        file.clock.source = Some(file.clock.source.unwrap_or_else(|| file.usual_clock().0));
+        file.clock.sd_s = Some(file.clock_sd_s());
         Ok(file)
     }
 
@@ -249,10 +264,10 @@ impl CameraFile {
     fn check(&self) -> anyhow::Result<()> {
         self.tracker.validate().context("section [tracker]")?;
         let clock = &self.clock;
+        let sd_s = self.clock_sd_s();
         ensure!(
-            (0.0..10.0).contains(&clock.sd_s),
-            "key `clock.sd_s` is {}: it must be from 0 to 10 s",
-            clock.sd_s
+            (0.0..10.0).contains(&sd_s),
+            "key `clock.sd_s` is {sd_s}: it must be from 0 to 10 s"
         );
         ensure!(
             clock.offset_s.is_finite() && clock.drift_ppm.abs() < 1e5,
@@ -286,6 +301,7 @@ impl CameraFile {
         let (rate_hz, start_s, speed) = match self.source {
             SourceConfig::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
             SourceConfig::Recording { speed, .. } => (thirty(), 0.0, speed),
+            SourceConfig::Stream(ref stream) => return stream.check(),
             SourceConfig::Simulation { .. } => return Ok(()),
         };
         ensure!(
@@ -363,6 +379,10 @@ impl CameraFile {
                 ("source.path", path)
             }
             SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
+            SourceConfig::Stream(_) => {
+                self.stream()?;
+                return Ok(());
+            }
         };
         ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
         Ok(())
@@ -402,7 +422,7 @@ impl CameraFile {
                 let named = |camera: &&SceneCamera| camera.name == self.name;
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }
-            SourceConfig::Recording { .. } => Ok(None),
+            SourceConfig::Recording { .. } | SourceConfig::Stream(_) => Ok(None),
         }
     }
 
@@ -412,8 +432,35 @@ impl CameraFile {
             SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => {
                 speed == 0.0
             }
-            SourceConfig::Simulation { .. } => false,
+            SourceConfig::Simulation { .. } | SourceConfig::Stream(_) => false,
         }
+    }
+
+    /// What sets the clock that its capture times are by.
+    pub fn clock_source(&self) -> ClockSource {
+        self.clock.source.unwrap_or_else(|| self.usual_clock().0).into()
+    }
+
+    /// Standard deviation of a corrected capture time, s.
+    pub fn clock_sd_s(&self) -> f64 {
+        self.clock.sd_s.unwrap_or_else(|| self.usual_clock().1)
+    }
+
+    /// What sets the clock of such a source, and its standard deviation, s, where nobody has said.
+    fn usual_clock(&self) -> (ClockSourceName, f64) {
+        match self.source {
+            SourceConfig::Stream(_) => (ClockSourceName::Camera, Latency::default().sd_s),
+            _ => (ClockSourceName::FrameCount, 1e-3),
+        }
+    }
+
+    /// The stream that it watches, if it watches one.
+    pub fn stream(&self) -> anyhow::Result<Option<RtspOptions>> {
+        let SourceConfig::Stream(stream) = &self.source else {
+            return Ok(None);
+        };
+        let by_arrival = self.clock_source() == ClockSource::Arrival;
+        Ok(Some(stream.options(by_arrival.then(|| self.clock_sd_s()))?))
     }
 
     /// The boxes of targets to take up.

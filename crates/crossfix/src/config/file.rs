@@ -107,9 +107,28 @@ fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A parser's message, which shows the line, without what logs in: all between `//` and `@`, and what
+/// is given as a password.
+fn without_passwords(message: &str) -> String {
+    let of_line = |line: &str| {
+        let mut line = line.to_owned();
+        if let Some(begin) = line.find("//").map(|at| at + 2)
+            && let Some(end) = line.rfind('@').filter(|end| *end > begin)
+        {
+            line.replace_range(begin..end, "...");
+        }
+        let password = line.find("password").filter(|_| !line.contains("password_file"));
+        if let Some(begin) = password.and_then(|at| Some(at + line[at..].find('=')? + 1)) {
+            line.replace_range(begin.., " ...");
+        }
+        line
+    };
+    message.lines().map(of_line).collect::<Vec<_>>().join("\n")
+}
+
 /// The parser's message with the nearest known key, where it names an unknown one.
 fn explain(error: &toml::de::Error) -> anyhow::Error {
-    let message = error.to_string();
+    let message = without_passwords(&error.to_string());
     let quoted: Vec<&str> = error.message().split('`').skip(1).step_by(2).collect();
     if !error.message().starts_with("unknown field")
         && !error.message().starts_with("unknown variant")
@@ -137,6 +156,20 @@ mod tests {
         assert!(error.contains("latenes_s"), "{error}");
         assert!(error.contains("line 2"), "{error}");
         assert!(error.contains("did you mean `lateness_s`?"), "{error}");
+    }
+
+    #[test]
+    fn an_error_in_a_line_with_a_password_does_not_show_it() {
+        let inline =
+            "source = { kind = \"stream\", url = \"rtsp://eye:hunter2@h/\", transprt = \"udp\" }";
+        let open = "url = \"rtsp://eye:hunter2@10.0.0.5/live";
+        let key = "[source]\nkind = \"stream\"\nurl = \"rtsp://h/\"\npassword = \"hunter2\"";
+        for text in [inline, open, key] {
+            let text = format!("name = \"n\"\nnetwork = \"n.toml\"\n{text}");
+            let error =
+                format!("{:?}", parse::<crate::config::CameraFile>(&text, &[]).unwrap_err());
+            assert!(!error.contains("hunter2"), "{error}");
+        }
     }
 
     #[test]

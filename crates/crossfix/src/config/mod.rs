@@ -5,9 +5,11 @@ mod file;
 #[cfg(feature = "centre")]
 mod fusion;
 mod site;
+mod stream;
 
 pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
 pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use site::{Site, load_cameras, load_network};
+pub use stream::StreamConfig;

@@ -35,7 +35,7 @@ fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("cannot read {}", path.display()))?;
         let keys =
-            toml::from_str(&text).with_context(|| format!("{} is no TOML", path.display()))?;
+            super::parse(&text, &[]).with_context(|| format!("{} is no TOML", path.display()))?;
         Ok((path, keys))
     };
     files.into_iter().map(read).collect()

@@ -1,27 +1,33 @@
+mod live;
 #[cfg(feature = "centre")]
 mod simulated;
 mod start;
+mod stream_health;
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
+use crossfix_correlation::Plane;
 use crossfix_message::{BearingFrame, Channel, Counter, Health, Payload, Timestamp};
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
-use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
+use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource, RtspCamera};
 use crossfix_vision::ImageTracker;
 
 use self::start::Start;
+use self::stream_health::StreamHealth;
 use crate::calibrated::Calibrated;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
 use crate::network;
 use crate::output;
+use crate::pace::wall_seconds;
 #[cfg(not(feature = "centre"))]
 use crate::parts;
 use crate::recorded::{self, Lacks};
 use crate::repeats::Repeats;
+use crate::service;
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
 #[cfg(feature = "centre")]
@@ -82,6 +88,8 @@ struct Agent {
     behind: Duration,
     scene_begins: Timestamp,
     now: Timestamp,
+    /// How its stream does, if it watches one.
+    stream: Option<StreamHealth>,
     repeats: Repeats,
     shutdown: Shutdown,
 }
@@ -92,7 +100,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let camera = file.camera(&args.config)?;
     let network = config::load_network(&file.network)?;
     let identity =
-        CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock.source.into() };
+        CameraIdentity { name: file.name.clone(), camera, clock_source: file.clock_source() };
     let calibrated = file.calibrated()?;
     let begins = source_begins(&file, calibrated.as_ref())?;
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
@@ -100,6 +108,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
     agent.calibrated = calibrated;
+    service::ready(&format!("camera {}", file.name));
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
         return agent.finish(Ok(()));
     };
@@ -114,6 +123,7 @@ fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::
         SourceConfig::Recording { path, .. } => first_bearing(path, calibrated),
         SourceConfig::Video { start_s, .. } => Ok(Timestamp::from_seconds(*start_s)),
         SourceConfig::Simulation { .. } => Ok(Timestamp::EPOCH),
+        SourceConfig::Stream(_) => Ok(Timestamp::from_seconds(wall_seconds())),
     }
 }
 
@@ -122,7 +132,7 @@ fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::
 fn corrected(own: CaptureTime, start: Timestamp, clock: &ClockConfig) -> CaptureTime {
     let own_s = own.time.seconds_since(start);
     let true_s = (own_s - clock.offset_s) / (1.0 + clock.drift_ppm * 1e-6);
-    CaptureTime { time: start.plus_seconds(true_s), sd_s: clock.sd_s }
+    CaptureTime { time: start.plus_seconds(true_s), ..own }
 }
 
 impl Agent {
@@ -153,6 +163,7 @@ impl Agent {
             behind: Duration::ZERO,
             scene_begins: Timestamp::EPOCH,
             now: Timestamp::EPOCH,
+            stream: None,
             repeats: Repeats::default(),
             shutdown,
         })
@@ -166,7 +177,9 @@ impl Agent {
         network: &NetworkConfig,
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
-        let start = if args.no_wait {
+        // Life waits for nobody.
+        let is_live = matches!(file.source, SourceConfig::Stream(_));
+        let start = if args.no_wait || is_live {
             self.appear()?;
             Some(Start::now())
         } else {
@@ -211,11 +224,18 @@ impl Agent {
         match &file.source {
             SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
             SourceConfig::Video { path, rate_hz, speed, .. } => {
-                let clock =
-                    FrameClock { start: begins, fallback_rate_hz: *rate_hz, sd_s: file.clock.sd_s };
+                let clock = FrameClock {
+                    start: begins,
+                    fallback_rate_hz: *rate_hz,
+                    sd_s: file.clock_sd_s(),
+                };
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
+            SourceConfig::Stream(_) => match file.stream()? {
+                Some(options) => self.watch_stream(file, RtspCamera::new(options), begins),
+                None => Ok(()),
+            },
             #[cfg(feature = "centre")]
             SourceConfig::Simulation { scene, publish_truth } => {
                 self.play_scene(file, scene, *publish_truth, start)
@@ -234,6 +254,7 @@ impl Agent {
             self.calibrated_at = Some(Instant::now());
         }
         if due(self.healthy_at, HEALTH_PERIOD) {
+            service::alive();
             self.repeats.remind(Instant::now());
             self.say_health(false)?;
             self.healthy_at = Some(Instant::now());
@@ -241,12 +262,14 @@ impl Agent {
         Ok(())
     }
 
-    fn say_health(&self, ended: bool) -> anyhow::Result<()> {
-        let counters = [
+    fn say_health(&mut self, ended: bool) -> anyhow::Result<()> {
+        let mut counters = vec![
             ("bad_frames", self.bad_frames),
             ("behind_ms", u64::try_from(self.behind.as_millis()).unwrap_or(u64::MAX)),
             ("unseen_bearings", self.unseen_bearings),
         ];
+        counters.extend(self.stream.as_mut().map(StreamHealth::counters).unwrap_or_default());
+        counters.sort_unstable();
         let health = Health {
             component: self.identity.name.to_string(),
             time_ns: self.now.nanos(),
@@ -272,7 +295,8 @@ impl Agent {
                 self.behind.as_secs_f64()
             )
         });
-        behind.into_iter().collect()
+        let stream = self.stream.as_ref().map(|stream| stream.problems(Instant::now()));
+        behind.into_iter().chain(stream.unwrap_or_default()).collect()
     }
 
     /// Notes how far behind the source the agent is.
@@ -330,7 +354,8 @@ impl Agent {
                 }
             };
             self.check_size(&frame)?;
-            let capture = corrected(frame.capture, begins, &file.clock);
+            let own = CaptureTime { sd_s: file.clock_sd_s(), ..frame.capture };
+            let capture = corrected(own, begins, &file.clock);
             let since_s = capture.time.seconds_since(begins);
             if !pace.wait(since_s, &self.shutdown) {
                 return Ok(());
@@ -347,19 +372,33 @@ impl Agent {
             let (message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
             self.unseen_bearings += unseen;
             self.publish(message)?;
-            let rate = file.preview.rate_hz;
-            let due = shown.is_none_or(|last| capture.time.seconds_since(last) * rate >= 1.0);
-            if rate > 0.0 && due {
-                shown = Some(capture.time);
-                let preview = self.identity.preview(&image, capture, file.preview.divisor as usize);
-                if let Some(mut preview) = preview {
-                    if let Some(calibrated) = &self.calibrated {
-                        calibrated.apply_to_preview(&mut preview);
-                    }
-                    self.previews.put(preview.encode())?;
-                }
-            }
+            self.show(file, &mut shown, &image, capture)?;
         }
+    }
+
+    /// Shows people an image, if it is time for one after the one shown last.
+    fn show(
+        &self,
+        file: &CameraFile,
+        shown: &mut Option<Timestamp>,
+        image: &Plane,
+        capture: CaptureTime,
+    ) -> anyhow::Result<()> {
+        let rate = file.preview.rate_hz;
+        // A clock that was set back shows no reason to wait.
+        let since = |last: Timestamp| capture.time.seconds_since(last).abs();
+        if rate <= 0.0 || shown.is_some_and(|last| since(last) * rate < 1.0) {
+            return Ok(());
+        }
+        *shown = Some(capture.time);
+        let preview = self.identity.preview(image, capture, file.preview.divisor as usize);
+        if let Some(mut preview) = preview {
+            if let Some(calibrated) = &self.calibrated {
+                calibrated.apply_to_preview(&mut preview);
+            }
+            self.previews.put(preview.encode())?;
+        }
+        Ok(())
     }
 
     /// Pixels of another size than the intrinsics' would become wrong bearings without a word.
@@ -415,7 +454,8 @@ impl Agent {
 
     /// Says that nothing more will come, and closes; fails if the source ended by an error, or
     /// showed less than it hid.
-    fn finish(self, seen: anyhow::Result<()>) -> anyhow::Result<()> {
+    fn finish(mut self, seen: anyhow::Result<()>) -> anyhow::Result<()> {
+        service::stopping();
         self.say_health(true)?;
         let name = self.identity.name.clone();
         let (frames, bad) = (self.frames, self.bad_frames);

@@ -45,6 +45,7 @@ impl FrameSource for SimulatedSource {
         Ok(Some(Frame {
             index: rendered.index,
             capture: CaptureTime { time: self.start.plus_seconds(rendered.own_s), sd_s: 0.0 },
+            live: None,
             width: rendered.width,
             height: rendered.height,
             pixels: Pixels::Gray8(rendered.brightness),
@@ -106,7 +107,7 @@ impl TruthPublisher {
             if !pace.wait(t, shutdown) {
                 return;
             }
-            let frame = truth_frame(&self.world, t, self.start);
+            let frame = truth_frame(&self.world, t, Timestamp::from_seconds(self.start));
             if let Err(error) = self.publisher.put(frame.encode()) {
                 tracing::warn!("truth is not published any more: {error}");
                 return;
@@ -115,15 +116,15 @@ impl TruthPublisher {
     }
 }
 
-/// The truth of a scene at a time from its start, which lies `start` seconds after the Unix epoch.
-pub fn truth_frame(world: &World, t: f64, start: f64) -> TruthFrame {
+/// The truth of a scene so many seconds after its beginning.
+pub fn truth_frame(world: &World, t: f64, begins: Timestamp) -> TruthFrame {
     let targets = world.truth(t).into_iter().map(|state| TrueState {
         id: state.id,
         position: Some(state.position.into()),
         velocity: Some(state.velocity.into()),
     });
     TruthFrame {
-        time_ns: Timestamp::from_seconds(start).plus_seconds(t).nanos(),
+        time_ns: begins.plus_seconds(t).nanos(),
         targets: targets.collect(),
         ..Default::default()
     }

@@ -9,6 +9,7 @@ use super::{Agent, BEHIND};
 use crate::config::{CameraFile, SourceConfig};
 use crate::lookout::Lookout;
 use crate::pace::{Pace, wall_seconds};
+use crate::service;
 
 const POLL: Duration = Duration::from_millis(50);
 /// A recorder that is there hears an agent without a fusion centre after this long.
@@ -105,6 +106,7 @@ impl Agent {
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
             lookout.look(Instant::now());
+            service::alive();
             let [fusion, recording] = [Channel::FusionAlive, Channel::RecorderAlive]
                 .map(|channel| lookout.is_here(&channel));
             if fusion && (recording || !recorder) && has_ears(self)? {
@@ -147,6 +149,7 @@ impl Agent {
             CAMERA_PATIENCE.as_secs()
         );
         while !self.shutdown.requested() {
+            service::alive();
             if begun.elapsed() >= CAMERA_PATIENCE {
                 tracing::warn!(
                     "camera `{}` begins without cameras that are not there",

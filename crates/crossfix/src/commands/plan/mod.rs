@@ -131,7 +131,7 @@ fn cameras(site: &Path, clock_sd_s: Option<f64>) -> anyhow::Result<Vec<PlannedCa
             name: file.name.to_string(),
             camera: file.described(&path)?,
             rate_hz,
-            clock_sd_s: clock_sd_s.unwrap_or(file.clock.sd_s),
+            clock_sd_s: clock_sd_s.unwrap_or_else(|| file.clock_sd_s()),
         })
     };
     config::load_cameras(site)?.into_iter().map(planned).collect()

@@ -14,6 +14,7 @@ use crate::config;
 use crate::lookout::Lookout;
 use crate::network;
 use crate::output;
+use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
 /// What was flushed survives a crash of the machine's programs; health is said as often.
@@ -60,6 +61,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());
 
+    service::ready(&format!("recording to {}", path.display()));
     let recorded = work(&mut recorder, &mut subscription, &mut lookout, &health, &shutdown)
         .context("recording has stopped; the rest of the site goes on");
     drop((subscription, alive, health, lookout));
@@ -105,11 +107,13 @@ fn work(
         }
         if said_at.elapsed() >= PERIOD {
             said_at = Instant::now();
+            service::alive();
             lookout.look(said_at);
             say(&recorder.health(subscription.refused(), false)?, publisher)?;
             recorder.flush()?;
         }
     }
+    service::stopping();
     while !shutdown.overdue(LAST_WORDS)
         && let Some(received) = subscription.next(POLL)
     {

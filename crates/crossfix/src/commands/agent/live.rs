@@ -1,0 +1,138 @@
+//! What a network camera shows, as long as somebody wants it.
+
+use std::time::{Duration, Instant};
+
+use crossfix_message::{ClockSource, Timestamp};
+use crossfix_video::{Arrival, CaptureTime, Frame, Live, RtspCamera, Sight, TimedBy, VideoError};
+use crossfix_vision::ImageTracker;
+
+use super::stream_health::StreamHealth;
+use super::{Agent, corrected};
+use crate::config::CameraFile;
+use crate::eye::brightness;
+use crate::pace::wall_seconds;
+
+/// How often an agent that sees nothing looks whether it is to stop.
+const POLL: Duration = Duration::from_millis(200);
+
+/// A count and arrivals that part by so much between two frames are of a stream that counts anew, s.
+const ANOTHER_COUNT_S: f64 = 2.0;
+/// The tracker's shortest time between two frames, s: for it time goes on.
+const SHORTEST_S: f64 = 1e-3;
+
+/// Follows targets in a stream.
+struct Watch<'a> {
+    file: &'a CameraFile,
+    begins: Timestamp,
+    tracker: ImageTracker,
+    /// The tracker's time goes on evenly whatever becomes of the clocks: the last frame's, its stream
+    /// time, s, and its arrival.
+    tracked: Option<(Timestamp, f64, Instant)>,
+    shown: Option<Timestamp>,
+}
+
+impl Watch<'_> {
+    /// A frame's time for the tracker.
+    fn even_time(&mut self, live: Arrival) -> Timestamp {
+        let time = self.tracked.map_or(self.begins, |(before, stream_s, at)| {
+            let passed_s = live.stream_s - stream_s;
+            let arrived_s = live.at.saturating_duration_since(at).as_secs_f64();
+            // A stream that was opened anew counts from another instant.
+            let goes_on = passed_s > 0.0 && (passed_s - arrived_s).abs() < ANOTHER_COUNT_S;
+            before.plus_seconds(if goes_on { passed_s } else { arrived_s.max(SHORTEST_S) })
+        });
+        self.tracked = Some((time, live.stream_s, live.at));
+        time
+    }
+}
+
+impl Agent {
+    /// Follows what a network camera shows until it is asked to stop. A camera that is lost is asked
+    /// again, and that it is lost is said.
+    pub(super) fn watch_stream(
+        &mut self,
+        file: &CameraFile,
+        camera: RtspCamera,
+        begins: Timestamp,
+    ) -> anyhow::Result<()> {
+        let mut tracker = ImageTracker::new(file.tracker.clone())?;
+        for place in file.boxes() {
+            tracker.take_up(place);
+        }
+        let mut watch = Watch { file, begins, tracker, tracked: None, shown: None };
+        let heeds_reports = file.clock_source() != ClockSource::Arrival;
+        self.stream = Some(StreamHealth::new(heeds_reports));
+        let live = Live::start(move |silence| Ok(Box::new(camera.open(silence)?)));
+        while !self.shutdown.requested() {
+            match live.next(POLL) {
+                Sight::Frame(frame) => self.follow(&mut watch, &frame)?,
+                Sight::Trouble(trouble) => {
+                    self.bad_frames += u64::from(trouble.is_one_frame());
+                    self.note_trouble(&trouble);
+                }
+                Sight::Nothing => {}
+            }
+            if let Some(stream) = &mut self.stream {
+                stream.note_counts(live.counts());
+            }
+            self.keep_up()?;
+        }
+        Ok(())
+    }
+
+    /// Says what is wrong with the stream: that it is lost whenever it is, why it stays so now and then.
+    fn note_trouble(&mut self, trouble: &VideoError) {
+        let Some(stream) = &mut self.stream else { return };
+        let is_news = !trouble.is_one_frame() && !stream.is_lost();
+        stream.note_trouble(trouble);
+        let name = &self.identity.name;
+        let text = || format!("camera `{name}`: {trouble}; going on");
+        if is_news {
+            tracing::warn!("{}", text());
+        } else {
+            let kind = if trouble.is_one_frame() { "bad frame" } else { "lost" };
+            self.repeats.warn(kind, Instant::now(), text);
+        }
+    }
+
+    /// Follows targets in one frame and says where they are.
+    fn follow(&mut self, watch: &mut Watch<'_>, frame: &Frame) -> anyhow::Result<()> {
+        if let Err(error) = self.check_size(frame) {
+            // It may come back; the others see on.
+            self.bad_frames += 1;
+            self.repeats.warn("size", Instant::now(), || format!("{error:#}"));
+            if let Some(stream) = &mut self.stream {
+                stream.note_size(format!("{error:#}"));
+            }
+            return Ok(());
+        }
+        let (Some(image), Some(live)) = (brightness(frame), frame.live) else {
+            return Ok(());
+        };
+        let declared_s = watch.file.clock_sd_s();
+        let of_camera = |sd_s: f64| {
+            corrected(CaptureTime { sd_s, ..frame.capture }, watch.begins, &watch.file.clock)
+        };
+        let (is_by_camera, capture) = match live.timed_by {
+            TimedBy::Camera => (true, of_camera(declared_s)),
+            TimedBy::Remembered => (true, of_camera(declared_s.max(frame.capture.sd_s))),
+            TimedBy::Arrival | TimedBy::ArrivalAgainstCamera { .. } => (false, frame.capture),
+        };
+        let time = watch.even_time(live);
+        let tracks = watch.tracker.step(&image, time);
+        let (mut message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
+        if !is_by_camera {
+            message.clock_source = ClockSource::Arrival.into();
+        }
+        self.unseen_bearings += unseen;
+        self.publish(message)?;
+        if let Some(stream) = &mut self.stream {
+            if stream.is_lost() {
+                tracing::info!("camera `{}` sees again", self.identity.name);
+            }
+            let wall = Timestamp::from_seconds(wall_seconds());
+            stream.note_frame(capture.time, live, Instant::now(), wall);
+        }
+        self.show(watch.file, &mut watch.shown, &image, capture)
+    }
+}

@@ -1,0 +1,305 @@
+//! What keeps a part of a site from working, before it has to.
+
+mod clock;
+
+use std::fmt;
+use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use crossfix_geometry::Camera;
+use crossfix_transport::NetworkConfig;
+use crossfix_video::decoding_time;
+use serde::Serialize;
+
+use super::sources::{Tried, try_out};
+use crate::config::{self, CameraFile, Kind, load_network};
+use crate::output;
+
+/// How long a camera is watched, s: until it has said what its clock shows.
+const WATCHED_S: f64 = 8.0;
+/// How long an endpoint may take to answer.
+const ANSWER: Duration = Duration::from_secs(2);
+/// Decoding may take this share of the time between two images: the rest is for finding and following.
+const DECODING_SHARE: f64 = 0.25;
+/// Images that come so many of their intervals apart have been held up.
+const HELD_UP: f64 = 4.0;
+/// A share of images that may be lost.
+const BEARABLE_LOSS: f64 = 0.001;
+/// An image that is here longer after the time that the camera says is of another time, s.
+const LATEST_S: f64 = 0.5;
+
+/// Find out what keeps a camera host or a site from working, and how to mend it.
+///
+/// Of a camera's file: the camera and what it sends, its clock and this host's, the decoder, the port.
+/// Of the network's or the fusion centre's: who can be reached.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix doctor -c configs/site/north.toml\n  crossfix doctor -c configs/site/network.toml"
+)]
+pub struct Args {
+    /// A file of the site (TOML): a camera's, the fusion centre's, the network's.
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// How something is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Verdict {
+    Pass,
+    Warn,
+    Fail,
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Self::Pass => "pass",
+            Self::Warn => "WARN",
+            Self::Fail => "FAIL",
+        })
+    }
+}
+
+/// What was found of one thing.
+#[derive(Clone, Debug, Serialize)]
+struct Finding {
+    what: String,
+    verdict: Verdict,
+    found: String,
+    /// What to do; nothing of what passes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mend: Option<String>,
+}
+
+impl Finding {
+    fn new(what: impl Into<String>, verdict: Verdict, found: impl Into<String>) -> Self {
+        Self { what: what.into(), verdict, found: found.into(), mend: None }
+    }
+
+    fn mend(self, how: impl Into<String>) -> Self {
+        let mend = (self.verdict != Verdict::Pass).then(|| how.into());
+        Self { mend, ..self }
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let keys: toml::Table = config::load(&args.config, &[], Kind::Camera)?;
+    let findings = match Kind::of(&keys) {
+        Some(Kind::Camera) => of_camera(&args.config)?,
+        Some(Kind::Network) => of_network(&load_network(&args.config)?),
+        Some(Kind::Fusion) => {
+            let network = keys.get("network").and_then(toml::Value::as_str);
+            let network = network
+                .with_context(|| format!("{}: key `network` is missing", args.config.display()))?;
+            let folder = args.config.parent().unwrap_or(Path::new("."));
+            of_network(&load_network(&folder.join(network))?)
+        }
+        _ => anyhow::bail!(
+            "{} is no file of a camera, a fusion centre or a network",
+            args.config.display()
+        ),
+    };
+    if args.json {
+        output::json(&findings)?;
+    } else {
+        findings.iter().for_each(print);
+    }
+    let failed: Vec<&str> = findings
+        .iter()
+        .filter(|finding| finding.verdict == Verdict::Fail)
+        .map(|finding| finding.what.as_str())
+        .collect();
+    ensure!(failed.is_empty(), "not ready: {}", failed.join(", "));
+    Ok(())
+}
+
+fn print(finding: &Finding) {
+    let Finding { what, verdict, found, mend } = finding;
+    output::line(format!("{verdict:4}  {what:14} {found}"));
+    if let Some(mend) = mend {
+        output::line(format!("      {:14} -> {mend}", ""));
+    }
+}
+
+fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
+    let file = CameraFile::load(path, &[])?;
+    let camera = file.camera(path)?;
+    let mut findings = vec![Finding::new("files", Verdict::Pass, path.display().to_string())];
+    match file.stream()? {
+        Some(options) => {
+            let (tried, _) = try_out(options, WATCHED_S);
+            findings.extend(of_stream(&tried, &camera, file.clock.offset_s));
+        }
+        None => findings.push(match file.check_pictures(&camera) {
+            Ok(()) => Finding::new("pictures", Verdict::Pass, "can be read"),
+            Err(error) => Finding::new("pictures", Verdict::Fail, format!("{error:#}")),
+        }),
+    }
+    findings.push(clock::host_clock());
+    let network = load_network(&file.network)?;
+    findings.push(match network.cameras.get(&file.name) {
+        Some(endpoint) => of_own_endpoint(endpoint),
+        None => {
+            let found = format!("camera `{}` has no endpoint in the network's file", file.name);
+            Finding::new("endpoint", Verdict::Fail, found).mend("give it a line in [cameras]")
+        }
+    });
+    findings.extend(network.routers.iter().map(|router| of_endpoint("router", router)));
+    Ok(findings)
+}
+
+/// What a watched stream says of its camera, whose clock is declared to be so far ahead.
+fn of_stream(tried: &Tried, camera: &Camera, ahead_s: f64) -> Vec<Finding> {
+    if tried.frames == 0 {
+        let found = tried.troubles.first().cloned().unwrap_or_else(|| "sends nothing".to_owned());
+        let mend = "try it by `crossfix sources`, or any player: ffplay, vlc";
+        return vec![Finding::new("camera", Verdict::Fail, found).mend(mend)];
+    }
+    let sends = format!("{}x{}, {:.2} a second", tried.width, tried.height, tried.rate_hz);
+    let size = camera.model().intrinsics().size;
+    let fits = (tried.width, tried.height) == (size.width as usize, size.height as usize);
+    let lens = Finding::new(
+        "lens",
+        if fits { Verdict::Pass } else { Verdict::Fail },
+        format!("the intrinsics are for {}x{}", size.width, size.height),
+    );
+    vec![
+        Finding::new("camera", Verdict::Pass, sends),
+        lens.mend(
+            "calibrate at the size of the video, or set the camera to that of the intrinsics",
+        ),
+        of_way(tried),
+        of_camera_clock(tried, ahead_s),
+        of_decoder(tried),
+    ]
+}
+
+/// What becomes of images on the way.
+fn of_way(tried: &Tried) -> Finding {
+    let lost = tried.bad_frames + tried.left_out;
+    let share = lost as f64 / (tried.frames + lost) as f64;
+    let held_up = tried.longest_interval_s * tried.rate_hz > HELD_UP;
+    let is_good = share <= BEARABLE_LOSS && !held_up && tried.troubles.is_empty();
+    let verdict = if is_good { Verdict::Pass } else { Verdict::Warn };
+    let trouble = tried.troubles.first().map(|trouble| format!("{trouble}; "));
+    let found = trouble.unwrap_or_default()
+        + &format!(
+            "{} could not be decoded, {} came too fast, never more than {:.0} ms apart",
+            tried.bad_frames,
+            tried.left_out,
+            tried.longest_interval_s * 1e3
+        );
+    Finding::new("way", verdict, found)
+        .mend("a cable in the place of radio; fewer bits a second; transport = \"tcp\"")
+}
+
+fn of_camera_clock(tried: &Tried, declared_s: f64) -> Finding {
+    let server = "set the camera to a time server, the same for all";
+    match (tried.camera_ahead_s, tried.arrival_after_capture_s) {
+        (Some(ahead_s), _) => {
+            let found = format!("{ahead_s:+.1} s from this host's: it is not believed");
+            Finding::new("camera clock", Verdict::Warn, found).mend(server)
+        }
+        (None, Some(delay_s)) => {
+            let delay_s = delay_s + declared_s;
+            let mut found =
+                format!("images are here {:.0} ms after the time it says", delay_s * 1e3);
+            if declared_s != 0.0 {
+                found += ", clock.offset_s taken off";
+            }
+            let is_possible = (0.0..LATEST_S).contains(&delay_s);
+            let verdict = if is_possible { Verdict::Pass } else { Verdict::Warn };
+            Finding::new("camera clock", verdict, found)
+                .mend(format!("{server}; or declare what it is ahead: clock.offset_s"))
+        }
+        (None, None) => Finding::new(
+            "camera clock",
+            Verdict::Warn,
+            "the camera does not say what it shows: images are timed by their arrival",
+        )
+        .mend(format!("{server}, and have it send RTCP sender reports")),
+    }
+}
+
+fn of_decoder(tried: &Tried) -> Finding {
+    let (width, height) = (tried.width & !1, tried.height & !1);
+    let time_s = match decoding_time(width, height) {
+        Ok(time) => time.as_secs_f64(),
+        Err(what) => return Finding::new("decoder", Verdict::Warn, what),
+    };
+    let share = time_s * tried.rate_hz;
+    let verdict = if share < DECODING_SHARE {
+        Verdict::Pass
+    } else if share < 1.0 {
+        Verdict::Warn
+    } else {
+        Verdict::Fail
+    };
+    let found = format!(
+        "{:.1} ms an image of {width}x{height}, {:.0} % of a core",
+        time_s * 1e3,
+        share * 100.0
+    );
+    Finding::new("decoder", verdict, found).mend(
+        "with nasm installed at build time H.264 is decoded twice as fast: apt-get install nasm, \
+         cargo clean -p openh264-sys2, build again",
+    )
+}
+
+/// The host and port of an endpoint.
+fn address(endpoint: &str) -> &str {
+    endpoint.strip_prefix("tcp/").unwrap_or(endpoint)
+}
+
+/// Whether this host can listen where it is to.
+fn of_own_endpoint(endpoint: &str) -> Finding {
+    match TcpListener::bind(address(endpoint)) {
+        Ok(_) => Finding::new("endpoint", Verdict::Pass, format!("{endpoint} is free")),
+        Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {
+            let found = format!("{endpoint} is in use: the agent runs already, or another program");
+            Finding::new("endpoint", Verdict::Warn, found).mend("stop it, or give another port")
+        }
+        Err(error) => Finding::new("endpoint", Verdict::Fail, format!("{endpoint}: {error}"))
+            .mend("it must be an address of this host, with a port above 1023"),
+    }
+}
+
+/// Whether somebody listens at an endpoint.
+fn of_endpoint(who: &str, endpoint: &str) -> Finding {
+    let connect = || -> std::io::Result<()> {
+        let mut last = std::io::Error::other("it has no address");
+        for address in address(endpoint).to_socket_addrs()? {
+            match TcpStream::connect_timeout(&address, ANSWER) {
+                Ok(_) => return Ok(()),
+                Err(error) => last = error,
+            }
+        }
+        Err(last)
+    };
+    match connect() {
+        Ok(()) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
+        Err(error) => Finding::new(who, Verdict::Fail, format!("{endpoint}: {error}")).mend(
+            match error.kind() {
+                std::io::ErrorKind::ConnectionRefused => "the host is there: start it on it",
+                std::io::ErrorKind::TimedOut => "is that its address, and is the port open?",
+                _ => "is that its address?",
+            },
+        ),
+    }
+}
+
+fn of_network(network: &NetworkConfig) -> Vec<Finding> {
+    let cameras = network.cameras.iter();
+    let mut findings: Vec<Finding> =
+        cameras.map(|(name, endpoint)| of_endpoint(name.as_str(), endpoint)).collect();
+    findings.push(of_endpoint("fusion centre", &network.fusion));
+    findings.extend(network.routers.iter().map(|router| of_endpoint("router", router)));
+    findings.push(clock::host_clock());
+    findings
+}
