@@ -2,6 +2,8 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::time::{Duration, Instant};
 
+use h264_reader::nal::sps::SeqParameterSet;
+use h264_reader::nal::{Nal, RefNal};
 use openh264::OpenH264API;
 use openh264::decoder::{DecodeOptions, DecodedYUV, Decoder, DecoderConfig, Flush};
 use openh264::encoder::{
@@ -28,8 +30,9 @@ pub(crate) struct Picture {
 /// Decodes H.264 to brightness, every picture with its own time.
 ///
 /// A decoder may hold pictures back until it is sure that none is to be shown before them, and in most
-/// profiles it is never sure. Of a live stream that has shown no picture which builds on later ones,
-/// each comes out at once, with the time of its own unit.
+/// profiles it is never sure. Of a live stream that neither says that its pictures come in another order
+/// than they are shown in nor has shown one which builds on later ones, each comes out at once, with the
+/// time of its own unit.
 pub(crate) struct H264Decoder {
     decoder: Decoder,
     /// Whether pictures come out in another order than that of the units.
@@ -63,7 +66,9 @@ impl H264Decoder {
             // Units without a picture: nothing will come out of the first of them.
             self.pending.pop();
         }
-        self.reorders |= units(unit).any(builds_on_later);
+        // Holding back from the middle of a stream on spoils the pictures up to the next that builds on
+        // no other, so what the stream says of itself counts first.
+        self.reorders |= units(unit).any(|unit| says_it_reorders(unit) || builds_on_later(unit));
         let flush = if self.reorders { Flush::NoFlush } else { Flush::Flush };
         if !self.reorders {
             // What gave no picture before gives none now.
@@ -86,6 +91,15 @@ impl H264Decoder {
         let picture = |picture| picture_of(&picture, self.pending.pop());
         Ok(pictures.into_iter().map(picture).collect())
     }
+}
+
+/// Whether a unit without its start code says that pictures come in another order than they are shown in
+/// (a sequence's parameters, where they speak of it at all: H.264, E.2.1).
+fn says_it_reorders(unit: &[u8]) -> bool {
+    let is_sequence = unit.first().is_some_and(|head| head & 0x1f == 7);
+    let sequence = || SeqParameterSet::from_bits(RefNal::new(unit, &[], true).rbsp_bits()).ok();
+    let restrictions = || sequence()?.vui_parameters?.bitstream_restrictions;
+    is_sequence && restrictions().is_some_and(|said| said.max_num_reorder_frames > 0)
 }
 
 /// Whether a unit without its start code is a part of a picture that builds on later ones (a B slice).
