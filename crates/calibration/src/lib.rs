@@ -31,9 +31,9 @@ mod survey;
 pub use calibrated_camera::{BearingError, CalibratedCamera, ClockCorrection, OverImage};
 pub use comparison::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 pub use flight::{
-    Axis, CameraLabels, CameraResult, ClockKnot, ClockResult, FlightError, FlightLog, FlightResult,
-    Label, LandmarkMisfit, LogErrors, LogFit, LogSample, MovedAt, Refusal, WouldFit,
-    calibrate_flight,
+    Axis, CameraLabels, CameraResult, ClockKnot, ClockResult, FittedLabel, FittedSample,
+    FlightError, FlightLog, FlightResult, Label, LandmarkMisfit, LogErrors, LogFit, LogSample,
+    MovedAt, Refusal, WouldFit, calibrate_flight,
 };
 pub use intrinsics::{
     IntrinsicsError, intrinsics_from_camchain, intrinsics_from_yaml, intrinsics_to_yaml,

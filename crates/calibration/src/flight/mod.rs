@@ -10,6 +10,7 @@ mod begin;
 mod clicked;
 mod course;
 mod datum;
+mod fitted;
 mod gauge;
 mod halves;
 mod linear;
@@ -40,6 +41,7 @@ use settle::settle;
 use crate::survey::Survey;
 
 pub use clicked::LandmarkMisfit;
+pub use fitted::{FittedLabel, FittedSample};
 pub use model::{CameraLabels, FlightLog, Label, LogErrors, LogSample};
 pub use moved::MovedAt;
 pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult, LogFit};

@@ -2,6 +2,7 @@
 
 use nalgebra::Vector2;
 
+use super::fitted::FittedLabel;
 use super::linear::median;
 
 /// Residuals over this time are averaged, s: labels err alike for as long.
@@ -26,14 +27,13 @@ struct Block {
     mean: Vector2<f64>,
 }
 
-fn blocks(residuals: &[(f64, Vector2<f64>)]) -> Vec<Block> {
-    let number = |time_s: f64| (time_s / BLOCK_S).floor();
-    let same = |a: &(f64, Vector2<f64>), b: &(f64, Vector2<f64>)| number(a.0) == number(b.0);
-    let block = |chunk: &[(f64, Vector2<f64>)]| Block {
-        time_s: chunk[0].0,
-        mean: chunk.iter().map(|(_, residual)| residual).sum::<Vector2<f64>>() / chunk.len() as f64,
+fn blocks(labels: &[FittedLabel]) -> Vec<Block> {
+    let number = |label: &FittedLabel| (label.own_time_s / BLOCK_S).floor();
+    let block = |chunk: &[FittedLabel]| Block {
+        time_s: chunk[0].own_time_s,
+        mean: chunk.iter().map(|label| label.beside_px).sum::<Vector2<f64>>() / chunk.len() as f64,
     };
-    residuals.chunk_by(same).map(block).collect()
+    labels.chunk_by(|a, b| number(a) == number(b)).map(block).collect()
 }
 
 /// The medians of some blocks, axis by axis, and the mean distance from them an axis, pixels.
@@ -46,10 +46,10 @@ fn middle(blocks: &[Block]) -> (Vector2<f64>, f64) {
 
 /// The moment that divides residuals, in the order of their times, best into two parts of one median
 /// each, so that a bird at the beginning or the end is no part; `None` of too few.
-pub(super) fn likeliest(residuals: &[(f64, Vector2<f64>)]) -> Option<MovedAt> {
+pub(super) fn likeliest(labels: &[FittedLabel]) -> Option<MovedAt> {
     /// A normal deviate's standard deviation by the mean of its size.
     const BY_MEAN: f64 = 1.253;
-    let blocks = blocks(residuals);
+    let blocks = blocks(labels);
     let last = blocks.len().checked_sub(LEAST_BLOCKS)?;
     let divided = (LEAST_BLOCKS..=last).map(|k| {
         let ((one, left), (other, right)) = (middle(&blocks[..k]), middle(&blocks[k..]));
@@ -63,27 +63,36 @@ pub(super) fn likeliest(residuals: &[(f64, Vector2<f64>)]) -> Option<MovedAt> {
 
 #[cfg(test)]
 mod tests {
+    use crossfix_geometry::Pixel;
+    use nalgebra::Point3;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
 
-    /// Two minutes of residuals of half a pixel, with something added at a time.
-    fn residuals(added: impl Fn(f64) -> f64) -> Vec<(f64, Vector2<f64>)> {
+    /// Two minutes of labels half a pixel beside, with something added at a time.
+    fn labels(added: impl Fn(f64) -> f64) -> Vec<FittedLabel> {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
-        let residual = |k: u32| {
+        let label = |k: u32| {
             let time_s = f64::from(k) * 0.04;
-            (time_s, Vector2::new(0.5 * normal() + added(time_s), 0.5 * normal()))
+            FittedLabel {
+                own_time_s: time_s,
+                time_s,
+                pixel: Pixel::new(0.0, 0.0),
+                beside_px: Vector2::new(0.5 * normal() + added(time_s), 0.5 * normal()),
+                motion_px_per_s: Vector2::zeros(),
+                place: Point3::origin(),
+            }
         };
-        (0..3000).map(residual).collect()
+        (0..3000).map(label).collect()
     }
 
     #[test]
     fn a_knock_is_found_wherever_it_is() {
         for at_s in [15.0, 60.0, 100.0] {
-            let moved = likeliest(&residuals(|t| if t > at_s { 6.0 } else { 0.0 })).unwrap();
+            let moved = likeliest(&labels(|t| if t > at_s { 6.0 } else { 0.0 })).unwrap();
             assert!((moved.time_s - at_s).abs() < 1.5, "{moved:?}");
             assert!(moved.by_px > 2.0 && moved.deviations > 2.5, "{at_s}: {moved:?}");
         }
@@ -93,7 +102,7 @@ mod tests {
     fn a_bird_at_either_end_is_no_knock() {
         for from_s in [0.0, 3.0, 117.0] {
             let bird = (from_s..from_s + 2.5, 200.0);
-            let moved = likeliest(&residuals(|t| if bird.0.contains(&t) { bird.1 } else { 0.0 }));
+            let moved = likeliest(&labels(|t| if bird.0.contains(&t) { bird.1 } else { 0.0 }));
             let moved = moved.unwrap();
             assert!(moved.by_px < 2.0 && moved.deviations < 2.5, "{from_s}: {moved:?}");
         }

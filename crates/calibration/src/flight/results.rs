@@ -2,15 +2,15 @@
 
 use crossfix_geometry::{Camera, Intrinsics, Pose};
 use crossfix_message::{CameraName, Datum};
-use nalgebra::{DMatrix, Matrix6, Vector2, Vector3};
+use nalgebra::{DMatrix, Matrix6};
 
 use super::adjustment::{self, Adjusted, Flight, Priors, State};
 use super::clicked::LandmarkMisfit;
 use super::datum::Followers;
+use super::fitted::{self, FittedLabel, FittedSample};
 use super::gauge::Gauge;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::moved::{self, MovedAt};
-use super::settle::residuals;
 use super::{Refusal, halves};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
@@ -48,6 +48,8 @@ pub struct CameraResult {
     pub halves_ratio: Option<f64>,
     /// The moment at which its residuals change most.
     pub moved: Option<MovedAt>,
+    /// Its labels where the target's way reaches them, in order of its own time.
+    pub fitted: Vec<FittedLabel>,
     /// The focal length against the lens file's.
     pub focal_ratio: f64,
     /// Its standard deviation.
@@ -96,6 +98,8 @@ pub struct FlightResult {
     pub jerk: f64,
     /// How the log fits; `None` without one.
     pub log: Option<LogFit>,
+    /// The log's places at times of the way; none without a log.
+    pub samples: Vec<FittedSample>,
     /// How each landmark fits, in each camera's picture.
     pub landmarks: Vec<LandmarkMisfit>,
 }
@@ -140,13 +144,10 @@ pub(super) fn results(
         let start = starts[index] - state.order().chain();
         let at = Block { covariance: adjusted.covariance.others(), start };
         let prior = &priors.cameras[index];
-        let residuals = residuals(flight, state, index);
-        let within = |residual: &Vector2<f64>| residual.norm() < 4.0 * prior.noise.sd_px();
-        let squares: Vec<f64> = residuals
-            .iter()
-            .filter(|(_, residual)| within(residual))
-            .map(|(_, residual)| adjustment::square(*residual))
-            .collect();
+        let fitted = fitted::labels(flight, state, index);
+        let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
+        let used = fitted.iter().filter(within);
+        let squares: Vec<f64> = used.map(|label| adjustment::square(label.beside_px)).collect();
         // Cameras that one half saw too little of are no better than the others.
         let ratio = ratios[index].unwrap_or(typical).max(1.0).powi(2);
         let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
@@ -163,17 +164,20 @@ pub(super) fn results(
             used: squares.len(),
             residual_px: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
             halves_ratio: ratios[index],
-            moved: moved::likeliest(&residuals),
+            moved: moved::likeliest(&fitted),
+            fitted,
             focal_ratio: camera.intrinsics.fx / prior.lens.fx,
             focal_ratio_sd: at.covariance_of(POSE_AND_CLOCK, POSE_AND_CLOCK).sqrt(),
         });
     }
+    let samples = flight.log.map_or_else(Vec::new, |log| fitted::samples(log, state));
     Some(FlightResult {
         cameras,
         datum,
         refused: Vec::new(),
         jerk: priors.jerk,
-        log: flight.log.map(|log| log_fit(log, state)),
+        log: flight.log.map(|log| log_fit(log, &samples)),
+        samples,
         landmarks: state.landmark_misfits(flight),
     })
 }
@@ -193,16 +197,9 @@ fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
 /// What lies beside the way by more than so many deviations is left out: of normal ones one in 2000.
 const LEFT_OUT: f64 = 4.2;
 
-fn log_fit(log: &FlightLog, state: &State) -> LogFit {
-    let mut squares: Vec<f64> = log
-        .samples
-        .iter()
-        .filter_map(|sample| {
-            let weights = state.way.weights(sample.time_s)?;
-            let bias = Vector3::from_fn(|axis, _| state.bias[axis].at(sample.time_s));
-            Some((state.way.place(&weights) + bias - sample.position).norm_squared() / 3.0)
-        })
-        .collect();
+fn log_fit(log: &FlightLog, samples: &[FittedSample]) -> LogFit {
+    let mut squares: Vec<f64> =
+        samples.iter().map(|sample| sample.residual().norm_squared() / 3.0).collect();
     squares.sort_unstable_by(f64::total_cmp);
     // The median of the mean of three squares is 0.789 of their variance.
     let typical = squares.get(squares.len() / 2).copied().unwrap_or_default() / 0.789;
