@@ -146,6 +146,13 @@ impl CalibratedCamera {
         Some((bearing.covariance().trace() / 2.0).sqrt())
     }
 
+    /// What the lens alone may turn a bearing by, at the calibration's range: root mean square over
+    /// the pixels that have one, rad per axis.
+    pub fn lens_sd_rad(&self) -> f64 {
+        let exact = Self { pose_covariance: Matrix6::zeros(), ..self.clone() };
+        exact.over_image().sd_rad
+    }
+
     /// How well targets are pointed at over the whole image, at the calibration's range.
     pub fn over_image(&self) -> OverImage {
         let pixels = grid(self.camera.model().intrinsics().size);

@@ -41,6 +41,12 @@ impl Calibrated {
         Ok(Self { site, camera })
     }
 
+    /// All that the site's file says of it.
+    #[cfg(feature = "centre")]
+    pub fn calibrated_camera(&self) -> &CalibratedCamera {
+        &self.camera
+    }
+
     /// Lens and pose.
     pub fn camera(&self) -> &Camera {
         &self.camera.camera

@@ -23,6 +23,8 @@ mod output;
 mod pace;
 mod parts;
 #[cfg(feature = "centre")]
+mod planned;
+#[cfg(feature = "centre")]
 mod pose_watch;
 #[cfg(feature = "centre")]
 mod recalibration;

@@ -19,7 +19,7 @@ use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{TrackChange, Tracker};
 use smoothing::Smoothing;
 
-use crate::uncertainty::{LastingNoise, PoseUncertainty};
+use crate::uncertainty::{LastingNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig, messages};
 
@@ -106,7 +106,7 @@ impl Fusion {
         self.buffer.expect(&calibration.name);
         let is_declared = calibration.pose_covariance.is_some();
         let declared = calibration.pose_covariance;
-        let pose_covariance = declared.unwrap_or_else(PoseUncertainty::of_careful_survey);
+        let pose_covariance = declared.unwrap_or_else(pose_covariance_of_careful_survey);
         let lasting = calibration.lasting_noise.map_or(LastingNoise::NONE, |noise| LastingNoise {
             sd_rad: noise.sd_rad,
             time_s: noise.time_s,

@@ -86,4 +86,5 @@ pub use counters::Counters;
 pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
 pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};
+pub use uncertainty::pose_covariance_of_careful_survey;
 pub use unmet::{UnmetLines, WhyNothing};

@@ -129,18 +129,18 @@ impl PoseUncertainty {
         Matrix6::from_diagonal(&[rotation, rotation, rotation, position, position, position].into())
     }
 
-    /// Covariance of a pose of which nobody has said how sure it is: what a careful survey reaches,
-    /// 1 mrad and 5 cm an axis. A camera of which half as much were assumed would be believed
-    /// before the others are.
-    pub(crate) fn of_careful_survey() -> Matrix6<f64> {
-        const ROTATION_SD_RAD: f64 = 1e-3;
-        const POSITION_SD_M: f64 = 0.05;
-        Self::diagonal(ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2))
-    }
-
     pub(crate) fn covariance(&self) -> &Matrix6<f64> {
         &self.covariance
     }
+}
+
+/// Covariance of a pose of which nobody has said how sure it is, rotation (rad) before position (m):
+/// what a careful survey reaches, 1 mrad and 5 cm an axis. A camera of which half as much were assumed
+/// would be believed before the others are.
+pub fn pose_covariance_of_careful_survey() -> Matrix6<f64> {
+    const ROTATION_SD_RAD: f64 = 1e-3;
+    const POSITION_SD_M: f64 = 0.05;
+    PoseUncertainty::diagonal(ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2))
 }
 
 /// What all bearings of an exposure have in common: the uncertainty of its time and of the

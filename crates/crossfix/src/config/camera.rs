@@ -255,6 +255,12 @@ impl CameraFile {
             .with_context(|| format!("the configuration file {} has an error", path.display()))
     }
 
+    /// What the file declares of its pose's deviations: of the rotation, rad, and the position, m.
+    #[cfg(feature = "centre")]
+    pub fn declared_pose_sd(&self) -> Option<(f64, f64)> {
+        self.pose.as_ref().and_then(PoseConfig::deviations)
+    }
+
     /// The camera as the site's calibration has it, where the file names one.
     pub fn calibrated(&self) -> anyhow::Result<Option<Calibrated>> {
         let load = |path: &PathBuf| Calibrated::load(path, &self.name).context("key `calibration`");

@@ -173,6 +173,7 @@ pub fn advise(
 #[cfg(test)]
 mod tests {
     use crossfix_geometry::{Distortion, ImageSize, Intrinsics};
+    use nalgebra::Matrix6;
 
     use super::super::TargetSize;
     use super::*;
@@ -189,15 +190,22 @@ mod tests {
         };
         let pose = Pose::looking_at(position.into(), Point3::new(0.0, 0.0, 50.0)).unwrap();
         let camera = Camera::new(lens, pose).unwrap();
-        PlannedCamera { name: "first".to_owned(), camera, rate_hz: 30.0, clock_sd_s: 0.0 }
+        let (turn, shift): (f64, f64) = (3e-4, 0.05);
+        let variances = [turn, turn, turn, shift, shift, shift].map(|sd| sd * sd);
+        PlannedCamera {
+            name: "first".to_owned(),
+            camera,
+            rate_hz: 30.0,
+            clock_sd_s: 0.0,
+            pixel_sd_px: 0.5,
+            pose_covariance: Matrix6::from_diagonal(&variances.into()),
+            lens_sd_rad: 0.0,
+        }
     }
 
     fn assumptions() -> Assumptions {
         Assumptions {
             window_s: 1.0,
-            pixel_sd_px: 0.5,
-            rotation_sd_rad: 3e-4,
-            position_sd_m: 0.05,
             speed_mps: 15.0,
             velocity_prior_sd_mps: Some(15.0),
             target: None,

@@ -3,7 +3,9 @@
 use std::ops::AddAssign;
 
 use crossfix_geometry::{SightLine, tangent_basis};
-use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3x2, Matrix6, Point3, Unit, Vector3, Vector6};
+use nalgebra::{
+    Matrix2, Matrix2x3, Matrix2x6, Matrix3x2, Matrix6, Point3, Rotation3, Unit, Vector3, Vector6,
+};
 
 /// Information whose scaled eigenvalues fall below this share of the mean is singular but for
 /// rounding.
@@ -188,22 +190,44 @@ impl AddAssign<&FisherInformation> for FisherInformation {
 /// bearings do not average them away.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CommonErrors {
-    /// Standard deviation of the camera's rotation about each axis, rad.
-    pub rotation_sd_rad: f64,
-    /// Standard deviation of a displacement of the camera against the target on each axis, m.
-    pub displacement_sd_m: f64,
+    /// A root D of the covariance D D' of the camera's turn about the world's axes (rad) and its
+    /// displacement against the target (m).
+    root: Matrix6<f64>,
 }
 
 impl CommonErrors {
-    /// Errors of the camera's rotation (rad per axis), position (m per axis) and clock (s).
-    ///
-    /// A wrong clock shows a target of `speed_mps` where it was or will be: for a direction of
-    /// flight that nobody knows beforehand, a displacement of `speed * clock / root 3` on each
-    /// axis.
-    pub fn new(rotation_sd_rad: f64, position_sd_m: f64, clock_sd_s: f64, speed_mps: f64) -> Self {
-        let flown = speed_mps * clock_sd_s / 3.0_f64.sqrt();
-        Self { rotation_sd_rad, displacement_sd_m: position_sd_m.hypot(flown) }
+    /// Errors of a pose: its covariance, rotation about the camera's axes (rad) before position (m).
+    pub fn of_pose(world_from_camera: &Rotation3<f64>, covariance: &Matrix6<f64>) -> Self {
+        let mut turned = Matrix6::identity();
+        turned.fixed_view_mut::<3, 3>(0, 0).copy_from(world_from_camera.matrix());
+        Self { root: turned * root(covariance) }
     }
+
+    /// The same deviation about each axis (rad), and along each (m).
+    pub fn isotropic(rotation_sd_rad: f64, displacement_sd_m: f64) -> Self {
+        let sd = |k| if k < 3 { rotation_sd_rad } else { displacement_sd_m };
+        Self { root: Matrix6::from_diagonal(&Vector6::from_fn(|k, _| sd(k))) }
+    }
+
+    /// With errors beside these, of which they know nothing.
+    pub fn and(&self, other: &Self) -> Self {
+        let sum = |errors: &Self| errors.root * errors.root.transpose();
+        Self { root: root(&(sum(self) + sum(other))) }
+    }
+
+    /// What a wrong clock (s) does: it shows a target of `speed_mps` where it was or will be; for a
+    /// direction of flight that nobody knows beforehand, a displacement of `speed * clock / root 3`
+    /// on each axis.
+    pub fn of_clock(clock_sd_s: f64, speed_mps: f64) -> Self {
+        Self::isotropic(0.0, speed_mps * clock_sd_s / 3.0_f64.sqrt())
+    }
+}
+
+/// The symmetric root of a covariance, of which a part may be nothing.
+fn root(covariance: &Matrix6<f64>) -> Matrix6<f64> {
+    let eigen = covariance.symmetric_eigen();
+    let roots = eigen.eigenvalues.map(|variance| variance.max(0.0).sqrt());
+    eigen.eigenvectors * Matrix6::from_diagonal(&roots) * eigen.eigenvectors.transpose()
 }
 
 /// The information of one camera's bearings about a target *and* about the camera's own errors.
@@ -236,17 +260,16 @@ impl CameraInformation {
 
     /// What remains about the target where the camera's errors are not known but for their priors.
     ///
-    /// The Schur complement `A - B (C + P^-1)^-1 B'`, written with the roots D of P,
-    /// `D (I + D C D)^-1 D`, so that errors of zero are allowed.
+    /// The Schur complement `A - B (C + P^-1)^-1 B'`, written with a root D of `P = D D'`,
+    /// `B D (I + D' C D)^-1 D' B'`, so that errors of zero are allowed.
     pub fn marginal(&self, errors: &CommonErrors) -> FisherInformation {
-        let (turn, shift) = (errors.rotation_sd_rad, errors.displacement_sd_m);
-        let roots = Matrix6::from_diagonal(&Vector6::new(turn, turn, turn, shift, shift, shift));
-        let unexplained = Matrix6::identity() + roots * self.errors * roots;
+        let root = &errors.root;
+        let unexplained = Matrix6::identity() + root.transpose() * self.errors * root;
         // At least the identity: it has an inverse unless a number is not finite.
         let Some(factor) = unexplained.cholesky() else {
             return FisherInformation::default();
         };
-        let lost = self.cross * roots;
+        let lost = self.cross * root;
         FisherInformation(self.target.0 - lost * factor.solve(&lost.transpose()))
     }
 }
@@ -372,14 +395,12 @@ mod tests {
         let none = CommonErrors::default();
         assert!((position_sd(400, &none) / position_sd(40_000, &none) - 10.0).abs() < 0.1);
         // Each axis is seen by two cameras: the floor is root(3/2) of one camera's error at 100 m.
-        for errors in
-            [CommonErrors::new(5e-4, 0.0, 0.0, 0.0), CommonErrors::new(0.0, 0.05, 0.0, 0.0)]
-        {
+        for errors in [CommonErrors::isotropic(5e-4, 0.0), CommonErrors::isotropic(0.0, 0.05)] {
             let sd = position_sd(1_000_000, &errors);
             assert!((sd / (0.05 * 1.5_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
         }
         // A clock of 10 ms at 15 m/s: 0.15 m, shared among three axes.
-        let sd = position_sd(1_000_000, &CommonErrors::new(0.0, 0.0, 0.01, 15.0));
+        let sd = position_sd(1_000_000, &CommonErrors::of_clock(0.01, 15.0));
         assert!((sd / (0.15 / 2.0_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
     }
 
@@ -387,6 +408,7 @@ mod tests {
         #[test]
         fn the_marginal_is_the_block_of_the_whole_inverse(
             x in -80.0..80.0, y in 20.0..150.0, z in -40.0..40.0, rotation in 1e-5..1e-2, shift in 0.01..1.0,
+            about in proptest::array::uniform3(-2.0..2.0), tied in -0.9..0.9,
         ) {
             let line = LineGeometry::between(Point3::origin(), Point3::new(x, y, z)).unwrap();
             let noise = BearingNoise::new(&Matrix2::new(4e-6, 1e-6, 1e-6, 2e-6)).unwrap();
@@ -397,14 +419,22 @@ mod tests {
             // Something is known of the target besides, or the whole would have no inverse.
             let known = Matrix6::from_diagonal(&Vector6::new(0.1, 0.1, 0.1, 0.01, 0.01, 0.01));
             let mut whole = nalgebra::SMatrix::<f64, 12, 12>::zeros();
-            let priors = [rotation, rotation, rotation, shift, shift, shift].map(|sd: f64| sd.powi(-2));
+            // A pose's own: turns about its axes and displacements, two of them tied.
+            let pose: Rotation3<f64> = Rotation3::new(about.into());
+            let sd: Vector6<f64> = [rotation, 2.0 * rotation, rotation, shift, shift, 3.0 * shift].into();
+            let mut covariance = Matrix6::from_diagonal(&sd.component_mul(&sd));
+            covariance[(0, 4)] = tied * rotation * shift;
+            covariance[(4, 0)] = covariance[(0, 4)];
+            let mut turned = Matrix6::identity();
+            turned.fixed_view_mut::<3, 3>(0, 0).copy_from(pose.matrix());
+            let of_world: Matrix6<f64> = turned * covariance * turned.transpose();
             whole.fixed_view_mut::<6, 6>(0, 0).copy_from(&(camera.target.0 + known));
             whole.fixed_view_mut::<6, 6>(0, 6).copy_from(&camera.cross);
             whole.fixed_view_mut::<6, 6>(6, 0).copy_from(&camera.cross.transpose());
-            let errors = camera.errors + Matrix6::from_diagonal(&Vector6::from(priors));
+            let errors = camera.errors + of_world.try_inverse().unwrap();
             whole.fixed_view_mut::<6, 6>(6, 6).copy_from(&errors);
             let expected = whole.try_inverse().unwrap().fixed_view::<6, 6>(0, 0).into_owned();
-            let mut marginal = camera.marginal(&CommonErrors { rotation_sd_rad: rotation, displacement_sd_m: shift });
+            let mut marginal = camera.marginal(&CommonErrors::of_pose(&pose, &covariance));
             marginal += &FisherInformation(known);
             let ours = marginal.covariance().unwrap();
             prop_assert!((ours - expected).norm() < 1e-6 * expected.norm());

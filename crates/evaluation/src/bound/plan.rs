@@ -23,6 +23,29 @@ pub struct PlannedCamera {
     pub rate_hz: f64,
     /// Standard deviation of its capture times, the same for all of a window, s.
     pub clock_sd_s: f64,
+    /// Standard deviation of a place in its images, pixels per axis, independent from frame to frame.
+    pub pixel_sd_px: f64,
+    /// Covariance of its pose: rotation about its own axes (rad), then position (m).
+    pub pose_covariance: Matrix6<f64>,
+    /// What its lens may turn the bearings of a place in the image by, rad per axis.
+    pub lens_sd_rad: f64,
+}
+
+impl PlannedCamera {
+    /// What all of its bearings of one target have in common: pose, lens and clock, of a target that
+    /// flies at a speed.
+    fn errors(&self, speed_mps: f64) -> CommonErrors {
+        CommonErrors::of_pose(self.camera.pose().rotation(), &self.pose_covariance)
+            .and(&CommonErrors::isotropic(self.lens_sd_rad, 0.0))
+            .and(&CommonErrors::of_clock(self.clock_sd_s, speed_mps))
+    }
+
+    /// The same camera if pose, lens and clock were known exactly.
+    #[must_use]
+    pub fn exact(&self) -> Self {
+        let pose_covariance = Matrix6::zeros();
+        Self { pose_covariance, lens_sd_rad: 0.0, clock_sd_s: 0.0, ..self.clone() }
+    }
 }
 
 /// What is to be seen, and how large it must be for that.
@@ -39,12 +62,6 @@ pub struct TargetSize {
 pub struct Assumptions {
     /// How long a target has been seen, s; it flies straight for so long.
     pub window_s: f64,
-    /// Standard deviation of a place in the image, pixels per axis, independent from frame to frame.
-    pub pixel_sd_px: f64,
-    /// Standard deviation of a camera's rotation, rad per axis.
-    pub rotation_sd_rad: f64,
-    /// Standard deviation of a camera's position, m per axis.
-    pub position_sd_m: f64,
     /// How fast a target flies, m/s: what an error of the clock is worth.
     pub speed_mps: f64,
     /// What is known of a target's velocity beforehand: standard deviation, m/s per axis; none is
@@ -124,7 +141,7 @@ pub(super) struct Observer<'a> {
     times: TimeOffsets,
     reach_m: f64,
     errors: CommonErrors,
-    assumptions: &'a Assumptions,
+    noise: PixelCovariance,
 }
 
 impl<'a> Observer<'a> {
@@ -137,18 +154,12 @@ impl<'a> Observer<'a> {
     ) -> Self {
         let count = (assumptions.window_s * planned.rate_hz).floor().max(1.0) as usize;
         let times = (0..count).map(|n| -(n as f64 + phase) / planned.rate_hz).collect();
-        let Assumptions { rotation_sd_rad, position_sd_m, speed_mps, .. } = *assumptions;
         Self {
             camera: &planned.camera,
             times,
             reach_m: assumptions.reach_m(&planned.camera).unwrap_or(f64::INFINITY),
-            errors: CommonErrors::new(
-                rotation_sd_rad,
-                position_sd_m,
-                planned.clock_sd_s,
-                speed_mps,
-            ),
-            assumptions,
+            errors: planned.errors(assumptions.speed_mps),
+            noise: PixelCovariance::isotropic(planned.pixel_sd_px),
         }
     }
 
@@ -158,8 +169,7 @@ impl<'a> Observer<'a> {
         if range > self.reach_m {
             return None;
         }
-        let covariance = PixelCovariance::isotropic(self.assumptions.pixel_sd_px);
-        let sight_line = self.camera.sight_line_to(point, covariance)?;
+        let sight_line = self.camera.sight_line_to(point, self.noise)?;
         let line = LineGeometry::of(&sight_line, range)?;
         let mut information = CameraInformation::default();
         information.add_all(&line, &BearingNoise::new(&sight_line.covariance)?, &self.times);
@@ -234,9 +244,6 @@ mod tests {
     fn assumptions() -> Assumptions {
         Assumptions {
             window_s: 1.0,
-            pixel_sd_px: 0.5,
-            rotation_sd_rad: 0.0,
-            position_sd_m: 0.0,
             speed_mps: 15.0,
             velocity_prior_sd_mps: Some(15.0),
             target: None,
@@ -256,7 +263,15 @@ mod tests {
         };
         let pose = Pose::looking_at(position.into(), target.into()).unwrap();
         let camera = Camera::new(lens, pose).unwrap();
-        PlannedCamera { name: String::new(), camera, rate_hz: 30.0, clock_sd_s: 0.0 }
+        PlannedCamera {
+            name: String::new(),
+            camera,
+            rate_hz: 30.0,
+            clock_sd_s: 0.0,
+            pixel_sd_px: 0.5,
+            pose_covariance: Matrix6::zeros(),
+            lens_sd_rad: 0.0,
+        }
     }
 
     /// One cube of 2 m round a point.
@@ -329,18 +344,29 @@ mod tests {
     #[test]
     fn what_a_camera_does_wrong_all_the_time_stays() {
         let target = [0.0, 0.0, 50.0];
-        let mut cameras =
-            [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
-        let sd = |cameras: &[PlannedCamera], assumptions: &Assumptions| {
-            cell(cameras, target, assumptions).accuracy.unwrap().position_sd_m
+        let cameras = [planned([-100.0, 0.0, 50.0], target), planned([0.0, -100.0, 50.0], target)];
+        let sd = |change: fn(&mut PlannedCamera)| {
+            let mut cameras = cameras.clone();
+            cameras.iter_mut().for_each(change);
+            cell(&cameras, target, &assumptions()).accuracy.unwrap().position_sd_m
         };
-        let exact = sd(&cameras, &assumptions());
-        let turned = Assumptions { rotation_sd_rad: 1e-3, ..assumptions() };
+        let exact = sd(|_| ());
         // 0.1 m on two axes, on the third over root 2.
         let floor = 0.1 * 2.5_f64.sqrt();
-        assert!((sd(&cameras, &turned) / floor.hypot(exact) - 1.0).abs() < 0.01);
-        cameras.iter_mut().for_each(|camera| camera.clock_sd_s = 0.01);
+        let by_turns = sd(|camera| {
+            camera.pose_covariance.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(1e-6);
+        });
+        assert!((by_turns / floor.hypot(exact) - 1.0).abs() < 0.01);
+        let by_lens = sd(|camera| camera.lens_sd_rad = 1e-3);
+        assert!((by_lens / by_turns - 1.0).abs() < 1e-6);
         let floor = 0.15 / 3.0_f64.sqrt() * 2.5_f64.sqrt();
-        assert!((sd(&cameras, &assumptions()) / floor.hypot(exact) - 1.0).abs() < 0.01);
+        let by_clocks = sd(|camera| camera.clock_sd_s = 0.01);
+        assert!((by_clocks / floor.hypot(exact) - 1.0).abs() < 0.01);
+        // A turn about the optical axis moves nothing on it, one about the camera's y axis moves it
+        // sideways: cameras have axes of their own.
+        let about_axis = sd(|camera| camera.pose_covariance[(2, 2)] = 1e-6);
+        assert!((about_axis / exact - 1.0).abs() < 1e-6);
+        let sideways = sd(|camera| camera.pose_covariance[(1, 1)] = 1e-6);
+        assert!((sideways / (0.1 * 2.0_f64.sqrt()).hypot(exact) - 1.0).abs() < 0.01);
     }
 }

@@ -81,6 +81,10 @@ pub struct Contribution {
     pub reach_m: Option<f64>,
     /// Standard deviation of one bearing on the optical axis, rad.
     pub bearing_sd_rad: f64,
+    /// Of its rotation, rad per axis, ...
+    pub rotation_sd_rad: f64,
+    /// ... and its position, m per axis (root mean square).
+    pub position_sd_m: f64,
     /// Share of the volume that it sees.
     pub sees: f64,
     /// The figures of the volume without it.
@@ -103,12 +107,17 @@ pub fn contributions(
             .collect();
         let lens = camera.camera.model().intrinsics();
         let seen = cells.iter().filter(|cell| cell.cameras.contains(&index)).count();
+        let per_axis = |first: usize| {
+            (camera.pose_covariance.fixed_view::<3, 3>(first, first).trace() / 3.0).sqrt()
+        };
         Contribution {
             name: camera.name.clone(),
             rate_hz: camera.rate_hz,
             clock_sd_s: camera.clock_sd_s,
             reach_m: assumptions.reach_m(&camera.camera),
-            bearing_sd_rad: assumptions.pixel_sd_px / (lens.fx * lens.fy).sqrt(),
+            bearing_sd_rad: camera.pixel_sd_px / (lens.fx * lens.fy).sqrt(),
+            rotation_sd_rad: per_axis(0),
+            position_sd_m: per_axis(3),
             sees: seen as f64 / cells.len().max(1) as f64,
             without: Summary::of(&predict(&others, volume, assumptions)),
         }

@@ -10,7 +10,7 @@ use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
-use super::log::{self, LogKind, LogTime, Reading};
+use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
 use super::survey::{self, Distance};
 use super::{Lens, clicks, report};
@@ -28,7 +28,7 @@ pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
-    /// latitude_deg, longitude_deg, height_m; or GPX.
+    /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA (named .nmea or .log).
     #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks"])]
     log: Option<PathBuf>,
     /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log or
@@ -38,6 +38,13 @@ pub struct Args {
     /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
     #[arg(long, default_value = "file", value_enum, value_name = "TIME")]
     time: LogTime,
+    /// What the log's heights count from, where they are beside degrees.
+    #[arg(long, default_value = "ellipsoid", value_enum, value_name = "FROM")]
+    height: LogHeight,
+    /// How far the sea is above the WGS84 ellipsoid there, m, where the log does not say (with --height
+    /// sea).
+    #[arg(long, value_name = "METRES", value_parser = numbers::number, allow_hyphen_values = true)]
+    geoid: Option<f64>,
     /// How far the receiver is above what cameras see as the target's middle, m.
     #[arg(long, default_value_t = 0.0, value_name = "METRES", value_parser = numbers::number, allow_hyphen_values = true)]
     antenna: f64,
@@ -88,6 +95,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         errors,
         anchor: args.anchor,
         is_gps_time: args.time == LogTime::Gps,
+        height: args.height,
+        geoid_m: args.geoid,
         antenna_m: args.antenna,
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
@@ -112,10 +121,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
+    let figures = report::figures(&result, &survey, rests);
     if args.json {
-        output::json(&report::figures(&result, rests))?;
+        output::json(&figures)?;
     } else {
-        output::line(report::render(&result, rests));
+        output::line(report::render(&result, &figures));
     }
     ensure!(
         !remarks::most_lie_beside(&result.landmarks),

@@ -1,6 +1,7 @@
 mod check;
 mod clicks;
 mod compare;
+mod cost;
 mod flight;
 mod landmarks;
 mod log;

@@ -1,9 +1,10 @@
 //! What a calibration has found, for people and for programs.
 
-use crossfix_calibration::{CameraResult, FlightResult, LandmarkMisfit};
+use crossfix_calibration::{CalibratedCamera, CameraResult, FlightResult, LandmarkMisfit, Survey};
 use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
+use super::cost::Cost;
 use super::remarks::{self, Rests};
 use super::verdict;
 use crate::output;
@@ -23,8 +24,12 @@ pub struct Figures {
     landmarks: Vec<LandmarkFigures>,
     /// What a person should know.
     remarks: Vec<String>,
+    /// How surveyed places and distances fit.
+    survey: Vec<SurveyFigures>,
     /// Absent of one camera alone.
     datum: Option<DatumFigures>,
+    /// What a target will be known to; absent where no two cameras see one.
+    cost: Option<Cost>,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
 }
@@ -58,6 +63,46 @@ impl LandmarkFigures {
         };
         let deviations = format!("{:.1}", self.deviations);
         vec![self.landmark.clone(), self.camera.clone(), beside(0), beside(1), deviations]
+    }
+}
+
+#[derive(Debug, Serialize)]
+struct SurveyFigures {
+    /// A camera's name, or two of whom the distance was taped.
+    of: String,
+    /// Where the flight has it beside the survey, east, north, up, m; one number of a distance.
+    beside_m: Vec<f64>,
+    /// The most of these in the survey's deviations.
+    deviations: f64,
+}
+
+impl SurveyFigures {
+    fn all(result: &FlightResult, survey: &Survey) -> Vec<Self> {
+        let centre = |name: &CameraName| {
+            let found = result.cameras.iter().find(|camera| camera.name == *name)?;
+            Some(found.camera.pose().position())
+        };
+        let places = survey.places.iter().filter_map(|place| {
+            let beside = centre(&place.camera)? - place.position;
+            let deviations = beside.component_div(&place.sd_m).amax();
+            Some(Self {
+                of: place.camera.to_string(),
+                beside_m: beside.as_slice().to_vec(),
+                deviations,
+            })
+        });
+        let distances = survey.distances.iter().filter_map(|taped| {
+            let [first, second] = &taped.between;
+            let beside = (centre(second)? - centre(first)?).norm() - taped.metres;
+            let deviations = beside.abs() / taped.sd_m;
+            Some(Self { of: format!("{first} to {second}"), beside_m: vec![beside], deviations })
+        });
+        places.chain(distances).collect()
+    }
+
+    fn row(&self) -> Vec<String> {
+        let metres: Vec<String> = self.beside_m.iter().map(|m| format!("{m:+.3}")).collect();
+        vec![self.of.clone(), metres.join(", "), format!("{:.1}", self.deviations)]
     }
 }
 
@@ -115,6 +160,8 @@ struct CameraFigures {
     pointing_sd_mrad: f64,
     focal_ratio: f64,
     focal_ratio_sd: f64,
+    /// The share of the image where the lens is known well enough for bearings.
+    image_share: f64,
     clock_ahead_s: f64,
     clock_sd_s: f64,
     clock_rate: f64,
@@ -165,6 +212,7 @@ impl From<&CameraResult> for CameraFigures {
             pointing_sd_mrad,
             focal_ratio: camera.focal_ratio,
             focal_ratio_sd: camera.focal_ratio_sd,
+            image_share: CalibratedCamera::from(camera).over_image().share,
             clock_ahead_s: middle.ahead_s,
             clock_sd_s: middle.sd_s,
             clock_rate: clock.rate,
@@ -177,7 +225,7 @@ impl From<&CameraResult> for CameraFigures {
 }
 
 /// The figures for a program.
-pub fn figures(result: &FlightResult, rests: Rests) -> Figures {
+pub fn figures(result: &FlightResult, survey: &Survey, rests: Rests) -> Figures {
     Figures {
         cameras: result.cameras.iter().map(CameraFigures::from).collect(),
         refused: result
@@ -189,13 +237,15 @@ pub fn figures(result: &FlightResult, rests: Rests) -> Figures {
         log_left_out: result.log.map(|log| log.left_out),
         landmarks: result.landmarks.iter().map(LandmarkFigures::from).collect(),
         remarks: remarks::of(result, rests),
+        survey: SurveyFigures::all(result, survey),
         datum: result.datum.as_ref().map(DatumFigures::from),
+        cost: Cost::of(result),
         jerk: result.jerk,
     }
 }
 
 /// The figures for people.
-pub fn render(result: &FlightResult, rests: Rests) -> String {
+pub fn render(result: &FlightResult, figures: &Figures) -> String {
     let head = [
         "camera",
         "labels used",
@@ -209,11 +259,11 @@ pub fn render(result: &FlightResult, rests: Rests) -> String {
         "wander [ms]",
         "read-out [ms]",
         "focal length",
+        "image",
         "halves",
         "verdict",
     ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
-    let figures = figures(result, rests);
     for camera in &figures.cameras {
         rows.push(vec![
             camera.name.clone(),
@@ -228,6 +278,7 @@ pub fn render(result: &FlightResult, rests: Rests) -> String {
             format!("{:.1}", camera.clock_wander_ms),
             format!("{:.1} ± {:.1}", camera.readout_ms, camera.readout_sd_ms),
             format!("{:+.2} %", 100.0 * (camera.focal_ratio - 1.0)),
+            format!("{:.0} %", 100.0 * camera.image_share),
             output::number(camera.halves_ratio, 1),
             camera.verdict.clone(),
         ]);
@@ -252,7 +303,16 @@ pub fn render(result: &FlightResult, rests: Rests) -> String {
         rows.extend(figures.landmarks.iter().map(LandmarkFigures::row));
         format!("\n\n{}", output::table(&rows))
     };
-    let datum = figures.datum.map_or_else(String::new, |datum| format!("\n\n{datum}"));
+    let survey = if figures.survey.is_empty() {
+        String::new()
+    } else {
+        let head = ["survey", "beside it [m]", "deviations"].map(str::to_owned).to_vec();
+        let rows: Vec<_> =
+            std::iter::once(head).chain(figures.survey.iter().map(SurveyFigures::row)).collect();
+        format!("\n\n{}", output::table(&rows))
+    };
+    let datum = figures.datum.as_ref().map_or_else(String::new, |datum| format!("\n\n{datum}"));
+    let cost = figures.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
     let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
-    format!("{}{refused}{landmarks}{log}{datum}{remarks}", output::table(&rows))
+    format!("{}{refused}{survey}{landmarks}{log}{datum}{cost}{remarks}", output::table(&rows))
 }

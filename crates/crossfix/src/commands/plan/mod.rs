@@ -3,7 +3,7 @@ mod geojson;
 mod picture;
 mod report;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use crossfix_evaluation::bound::{Assumptions, PlannedCamera, TargetSize, Volume};
@@ -14,9 +14,7 @@ use self::report::Report;
 use crate::commands::numbers::{self, not_negative, positive, triple};
 use crate::config;
 use crate::output::{self, Draft};
-
-/// Frames a second of a camera whose file does not say.
-const DEFAULT_RATE_HZ: f64 = 30.0;
+use crate::planned;
 
 /// Predict how well a site's cameras can do over a volume, and where one more would help most.
 ///
@@ -44,15 +42,18 @@ pub struct Args {
     /// How long a target has been seen, flying straight, seconds (at most 60).
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = window)]
     window: f64,
-    /// Standard deviation of a target's place in the image, pixels per axis.
-    #[arg(long, default_value_t = 0.5, value_name = "PIXELS", value_parser = positive)]
-    pixel_sd: f64,
-    /// Standard deviation of the cameras' rotation, degrees per axis.
-    #[arg(long, default_value_t = 0.02, value_name = "DEGREES", value_parser = not_negative)]
-    rotation_sd_deg: f64,
-    /// Standard deviation of the cameras' positions, metres per axis.
-    #[arg(long, default_value_t = 0.05, value_name = "METRES", value_parser = not_negative)]
-    position_sd: f64,
+    /// Standard deviation of a target's place in the image, pixels per axis. Default: what each
+    /// camera's calibration has found of its labels; 0.5 without.
+    #[arg(long, value_name = "PIXELS", value_parser = positive)]
+    pixel_sd: Option<f64>,
+    /// Standard deviation of the cameras' rotation, degrees per axis. Default: each camera's own, from
+    /// its calibration or file; a careful survey's 0.057 (1 mrad) where nobody has said.
+    #[arg(long, value_name = "DEGREES", value_parser = not_negative)]
+    rotation_sd_deg: Option<f64>,
+    /// Standard deviation of the cameras' positions, metres per axis. Default: each camera's own, or a
+    /// careful survey's 0.05.
+    #[arg(long, value_name = "METRES", value_parser = not_negative)]
+    position_sd: Option<f64>,
     /// Standard deviation of the cameras' clocks, seconds. Default: each camera's own, from its
     /// file.
     #[arg(long, value_name = "SECONDS", value_parser = not_negative)]
@@ -98,9 +99,6 @@ impl Args {
         let some = |value: f64| (value > 0.0).then_some(value);
         Assumptions {
             window_s: self.window,
-            pixel_sd_px: self.pixel_sd,
-            rotation_sd_rad: self.rotation_sd_deg.to_radians(),
-            position_sd_m: self.position_sd,
             speed_mps: self.speed,
             velocity_prior_sd_mps: some(self.velocity_prior_sd),
             target: some(self.target_size)
@@ -119,26 +117,35 @@ impl Args {
     }
 }
 
-fn cameras(site: &Path, clock_sd_s: Option<f64>) -> anyhow::Result<Vec<PlannedCamera>> {
-    let planned = |(path, file): (PathBuf, config::CameraFile)| {
-        let rate_hz = file.rate_hz()?.unwrap_or(DEFAULT_RATE_HZ);
-        ensure!(
-            (0.01..=1000.0).contains(&rate_hz),
-            "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
-            path.display()
-        );
-        Ok(PlannedCamera {
-            name: file.name.to_string(),
-            camera: file.described(&path)?,
-            rate_hz,
-            clock_sd_s: clock_sd_s.unwrap_or_else(|| file.clock_sd_s()),
-        })
-    };
-    config::load_cameras(site)?.into_iter().map(planned).collect()
+impl Args {
+    /// The site's cameras, with what the options say in the place of what their files do.
+    fn cameras(&self) -> anyhow::Result<Vec<PlannedCamera>> {
+        let planned = |(path, file): (PathBuf, config::CameraFile)| {
+            let rate_hz = file.rate_hz()?;
+            if let Some(rate_hz) = rate_hz {
+                ensure!(
+                    (0.01..=1000.0).contains(&rate_hz),
+                    "{}: {rate_hz} frames a second: it must be from 0.01 to 1000",
+                    path.display()
+                );
+            }
+            let mut camera = planned::of_file(&file, &path, rate_hz)?;
+            camera.clock_sd_s = self.clock_sd.unwrap_or(camera.clock_sd_s);
+            camera.pixel_sd_px = self.pixel_sd.unwrap_or(camera.pixel_sd_px);
+            let rotation_sd_rad = self.rotation_sd_deg.map(f64::to_radians);
+            for (first, sd) in [(0, rotation_sd_rad), (3, self.position_sd)] {
+                if let Some(sd) = sd {
+                    planned::hold(&mut camera.pose_covariance, first, sd);
+                }
+            }
+            Ok(camera)
+        };
+        config::load_cameras(&self.site)?.into_iter().map(planned).collect()
+    }
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let cameras = cameras(&args.site, args.clock_sd)?;
+    let cameras = args.cameras()?;
     let volume = args.volume(&cameras)?;
     let report = Report::new(&cameras, &volume, args.assumptions());
     if args.json {

@@ -78,17 +78,13 @@ pub fn assumed(report: &Report) -> String {
     );
     format!(
         "{} cells of {} m from {} to {} m (east, north, up)\n\
-         {target}, and fly straight at {} m/s; SD at the end of {} s of bearings, a lower bound\n\
-         SD in the image {} px, of the cameras' rotation {:.3} deg and position {} m",
+         {target}, and fly straight at {} m/s; SD at the end of {} s of bearings, a lower bound",
         report.whole.cells,
         report.step_m,
         place(report.min_m),
         place(report.max_m),
         taken.speed_mps,
         taken.window_s,
-        taken.pixel_sd_px,
-        taken.rotation_sd_rad.to_degrees(),
-        taken.position_sd_m,
     )
 }
 
@@ -130,10 +126,12 @@ fn camera_table(report: &Report) -> String {
         "rate [1/s]",
         "clock SD [ms]",
         "bearing SD [mrad]",
+        "rotation SD [mrad]",
+        "position SD [m]",
         "reach [m]",
         "sees",
         "without it: with a fix",
-        "position SD [m]: 50 %",
+        "target's SD [m]: 50 %",
     ];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     rows.extend(report.cameras.iter().map(|camera| {
@@ -142,6 +140,8 @@ fn camera_table(report: &Report) -> String {
             format!("{:.0}", camera.rate_hz),
             format!("{:.1}", 1e3 * camera.clock_sd_s),
             format!("{:.2}", 1e3 * camera.bearing_sd_rad),
+            format!("{:.2}", 1e3 * camera.rotation_sd_rad),
+            format!("{:.3}", camera.position_sd_m),
             output::number(camera.reach_m, 0),
             percent(camera.sees),
             percent(camera.without.fixed),

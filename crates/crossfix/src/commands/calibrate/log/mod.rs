@@ -1,15 +1,15 @@
 //! A drone's log as people have it.
 
-use std::fs::File;
-use std::io::BufReader;
+mod columns;
+mod gpx;
+mod nmea;
+
 use std::path::Path;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::Context;
 use crossfix_calibration::{FlightLog, LogErrors, LogSample};
 use crossfix_geometry::{Geodetic, LocalFrame};
-use csv::StringRecord;
 use nalgebra::Point3;
-use time::OffsetDateTime;
 
 /// What wrote a log, and so how good it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -44,6 +44,17 @@ pub enum LogTime {
     Gps,
 }
 
+/// What a log's heights count from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum LogHeight {
+    /// The WGS84 ellipsoid, as the anchor's does.
+    Ellipsoid,
+    /// The sea, which is above the ellipsoid by what the log or --geoid says.
+    Sea,
+    /// Where the drone took off, at the anchor's height.
+    Takeoff,
+}
+
 /// How a log's times and places are to be read.
 #[derive(Clone, Copy, Debug)]
 pub struct Reading {
@@ -52,6 +63,10 @@ pub struct Reading {
     pub anchor: Option<Geodetic>,
     /// Whether its times are GPS's.
     pub is_gps_time: bool,
+    /// What heights beside degrees count from.
+    pub height: LogHeight,
+    /// How far the sea is above the ellipsoid there, m; the log's own word without.
+    pub geoid_m: Option<f64>,
     /// How far the receiver is above what cameras see as the target's middle, m.
     pub antenna_m: f64,
 }
@@ -69,20 +84,35 @@ struct Row {
 #[derive(Clone, Copy, Debug)]
 enum Place {
     Local(Point3<f64>),
-    Geodetic(Geodetic),
+    /// With how far the sea, from which the height counts, is above the ellipsoid there, m, where the
+    /// log says both.
+    Geodetic {
+        place: Geodetic,
+        geoid_m: Option<f64>,
+    },
 }
 
-/// Reads a log: GPX by its name, CSV otherwise.
+/// Reads a log: GPX and NMEA by the file's name, columns otherwise.
 pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
-    let is_gpx = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gpx"));
-    let rows = if is_gpx { read_gpx(path) } else { read_csv(path) };
-    let rows = rows.with_context(|| format!("cannot read the log {}", path.display()))?;
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    let rows = match extension.as_str() {
+        "gpx" => gpx::read(path),
+        "nmea" | "nma" | "ubx" | "log" => nmea::read(path),
+        _ => columns::read(path),
+    };
+    let wrong = || format!("cannot read the log {}", path.display());
+    let rows = rows.with_context(wrong)?;
+    let rows: Vec<Row> = rows
+        .into_iter()
+        .map(|row| reading.placed(row))
+        .collect::<Result<_, _>>()
+        .with_context(wrong)?;
     let frame = reading.anchor.or_else(|| first_place(&rows)).map(LocalFrame::at);
     let sample = |row: &Row| {
         let mut position = match (row.place, &frame) {
-            (Place::Geodetic(place), Some(frame)) => frame.local(place),
+            (Place::Geodetic { place, .. }, Some(frame)) => frame.local(place),
             (Place::Local(position), _) => position,
-            (Place::Geodetic(_), None) => return None,
+            (Place::Geodetic { .. }, None) => return None,
         };
         position.z -= reading.antenna_m;
         let ahead_s = if reading.is_gps_time { GPS_AHEAD_S } else { 0.0 };
@@ -94,10 +124,29 @@ pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
     Ok(FlightLog { samples, errors: reading.errors })
 }
 
+impl Reading {
+    /// A row whose height is above the ellipsoid.
+    fn placed(&self, row: Row) -> anyhow::Result<Row> {
+        let Place::Geodetic { place, geoid_m } = row.place else { return Ok(row) };
+        let raise_m = match self.height {
+            // A log that names the geoid counts from the sea.
+            LogHeight::Ellipsoid => geoid_m.unwrap_or(0.0),
+            LogHeight::Sea => self.geoid_m.or(geoid_m).context(
+                "it does not say how far the sea, from which its heights count, is above the ellipsoid: \
+                 --geoid METRES (in Europe 30 to 60)",
+            )?,
+            LogHeight::Takeoff => self.anchor.map_or(0.0, |anchor| anchor.height()),
+        };
+        let (latitude, longitude) = (place.latitude_deg(), place.longitude_deg());
+        let place = Geodetic::from_degrees(latitude, longitude, place.height() + raise_m)?;
+        Ok(Row { place: Place::Geodetic { place, geoid_m: None }, ..row })
+    }
+}
+
 /// The place that a log without an anchor begins at, said.
 fn first_place(rows: &[Row]) -> Option<Geodetic> {
     let place = rows.iter().find_map(|row| match row.place {
-        Place::Geodetic(place) => Some(place),
+        Place::Geodetic { place, .. } => Some(place),
         Place::Local(_) => None,
     })?;
     tracing::info!(
@@ -109,72 +158,6 @@ fn first_place(rows: &[Row]) -> Option<Geodetic> {
     Some(place)
 }
 
-const LOCAL: [&str; 4] = ["time_s", "east_m", "north_m", "up_m"];
-const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_m"];
-
-/// Columns of either form, whatever others there are.
-fn read_csv(path: &Path) -> anyhow::Result<Vec<Row>> {
-    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
-    let head = reader.headers()?.clone();
-    let columns = |names: [&str; 4]| {
-        let found = names.map(|name| head.iter().position(|column| column == name));
-        let [Some(time), Some(x), Some(y), Some(z)] = found else { return None };
-        Some([time, x, y, z])
-    };
-    let (columns, is_geodetic) = match (columns(LOCAL), columns(GEODETIC)) {
-        (Some(local), _) => (local, false),
-        (None, Some(geodetic)) => (geodetic, true),
-        (None, None) => bail!(
-            "it has the columns {}: it needs {}, or {}",
-            head.iter().collect::<Vec<_>>().join(", "),
-            LOCAL.join(", "),
-            GEODETIC.join(", ")
-        ),
-    };
-    let mut rows = Vec::new();
-    for (index, record) in reader.records().enumerate() {
-        let record = record?;
-        let row = csv_row(&record, columns, is_geodetic);
-        rows.push(row.with_context(|| format!("row {}", index + 2))?);
-    }
-    ensure!(!rows.is_empty(), "it has no rows");
-    Ok(rows)
-}
-
-fn csv_row(record: &StringRecord, columns: [usize; 4], is_geodetic: bool) -> anyhow::Result<Row> {
-    let number = |column: usize| record.get(column)?.parse::<f64>().ok().filter(|n| n.is_finite());
-    let [Some(time_s), Some(x), Some(y), Some(z)] = columns.map(number) else {
-        bail!("not four numbers");
-    };
-    let place = if is_geodetic {
-        Place::Geodetic(Geodetic::from_degrees(x, y, z)?)
-    } else {
-        Place::Local(Point3::new(x, y, z))
-    };
-    Ok(Row { time_s, place })
-}
-
-/// All tracks' points that have a time and a height.
-fn read_gpx(path: &Path) -> anyhow::Result<Vec<Row>> {
-    let file = gpx::read(BufReader::new(File::open(path)?))?;
-    let points = file.tracks.iter().flat_map(|track| &track.segments).flat_map(|part| &part.points);
-    let (mut rows, mut bare) = (Vec::new(), 0_u64);
-    for point in points {
-        let (Some(time), Some(height)) = (point.time, point.elevation) else {
-            bare += 1;
-            continue;
-        };
-        let nanos = OffsetDateTime::from(time).unix_timestamp_nanos();
-        let place = Geodetic::from_degrees(point.point().y(), point.point().x(), height)?;
-        rows.push(Row { time_s: nanos as f64 * 1e-9, place: Place::Geodetic(place) });
-    }
-    if bare > 0 {
-        tracing::warn!("{}: {bare} points have no time or no height", path.display());
-    }
-    ensure!(!rows.is_empty(), "it has no track with times and heights");
-    Ok(rows)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -183,6 +166,8 @@ mod tests {
         errors: LogErrors { sd_m: 1.0, drift_sd_m: 1.0, drift_time_s: 200.0 },
         anchor: None,
         is_gps_time: false,
+        height: LogHeight::Ellipsoid,
+        geoid_m: None,
         antenna_m: 0.0,
     };
 
@@ -233,5 +218,60 @@ mod tests {
         assert!(wrong("t,lat,lon\n1,2,3\n").contains("latitude_deg"), "{}", wrong("t,lat,lon\n"));
         let bad = "time_s,latitude_deg,longitude_deg,height_m\n1,48,11,490\n2,480,11,490\n";
         assert!(wrong(bad).contains("row 3"), "{}", wrong(bad));
+    }
+
+    /// Two seconds over midnight, the second without a date; one of them damaged, one without a fix.
+    const NMEA: &str = "$GPRMC,235959.50,A,4821.2280,N,01147.1660,E,0.0,0.0,230926,,,A*5E\r\n\
+        $GPGGA,235959.50,4821.2280,N,01147.1660,E,4,12,0.8,440.0,M,46.5,M,1.0,0001*7C\r\n\
+        $GPGGA,000000.00,4821.2280,N,01147.1660,E,4,12,0.8,441.0,M,46.5,M,1.0,0001*00\r\n\
+        $GPGGA,000000.25,4821.2280,N,01147.1660,E,0,00,,,M,,M,,*4A\r\n\
+        noise\r\n\
+        $GPGGA,000000.50,4821.2280,N,01147.1660,E,4,12,0.8,442.0,M,46.5,M,1.0,0001*7E\r\n";
+
+    #[test]
+    fn nmea_sentences_are_a_log() {
+        let text: String =
+            NMEA.lines().map(|line| format!("{}\r\n", with_checksum(line))).collect();
+        let samples = log("drone.nmea", &text, &READING).unwrap().samples;
+        assert_eq!(samples.len(), 2);
+        // 2026-09-24 00:00:00.5 UTC.
+        assert_eq!(samples[1].time_s, 1_790_208_000.5);
+        assert!((samples[1].time_s - samples[0].time_s - 1.0).abs() < 1e-6);
+        assert!((samples[1].position.z - 2.0).abs() < 1e-3);
+        let anchor = Geodetic::from_degrees(48.3538, 11.786_1, 486.5).unwrap();
+        let reading = Reading { anchor: Some(anchor), ..READING };
+        let first = log("drone.nmea", &text, &reading).unwrap().samples[0];
+        assert!(first.position.z.abs() < 1e-3, "440 m above a sea that is 46.5 m up: {first:?}");
+        let undated = text.split_once('\n').unwrap().1;
+        let error = format!("{:#}", log("drone.nmea", undated, &READING).unwrap_err());
+        assert!(error.contains("no date"), "{error}");
+    }
+
+    /// The checksum made anew, but where it is meant to be wrong.
+    fn with_checksum(line: &str) -> String {
+        let Some((body, sum)) = line.strip_prefix('$').and_then(|line| line.rsplit_once('*'))
+        else {
+            return line.to_owned();
+        };
+        if sum == "00" {
+            return line.to_owned();
+        }
+        let sum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+        format!("${body}*{sum:02X}")
+    }
+
+    #[test]
+    fn heights_count_from_the_sea_or_the_take_off() {
+        let anchor = Geodetic::from_degrees(48.3538, 11.7861, 500.0).unwrap();
+        let up = |height, geoid_m| {
+            let reading = Reading { anchor: Some(anchor), height, geoid_m, ..READING };
+            log("drone.csv", SECOND, &reading).map(|log| log.samples[0].position.z)
+        };
+        let near = |up: f64, metres: f64| assert!((up - metres).abs() < 1e-6, "{up}");
+        near(up(LogHeight::Ellipsoid, None).unwrap(), -10.0);
+        near(up(LogHeight::Sea, Some(46.5)).unwrap(), 36.5);
+        near(up(LogHeight::Takeoff, None).unwrap(), 490.0);
+        let error = format!("{:#}", up(LogHeight::Sea, None).unwrap_err());
+        assert!(error.contains("--geoid"), "{error}");
     }
 }

@@ -1,0 +1,95 @@
+//! What a target will cost: how well a calibrated site can know one, and how much of that the
+//! calibration takes.
+
+use crossfix_calibration::{CalibratedCamera, FlightResult, SiteCalibration};
+use crossfix_evaluation::bound::{Assumptions, PlannedCamera, Summary, Volume, predict};
+use nalgebra::Point3;
+use serde::Serialize;
+
+use crate::planned;
+
+/// The air that was flown through, without this share of the places at either end of each axis:
+/// take-off and landing are no watched volume.
+const LEFT_OUT_SHARE: f64 = 0.025;
+/// A side of the volume is no shorter than this, m: a flight in a plane has air about it.
+const LEAST_SIDE_M: f64 = 2.0;
+/// A target is seen for so long, s, flies straight and this fast, m/s, as in `plan`.
+const WINDOW_S: f64 = 1.0;
+const SPEED_MPS: f64 = 15.0;
+const VELOCITY_PRIOR_MPS: f64 = 15.0;
+
+/// How well a target's position is known in the air that the flight went through.
+#[derive(Debug, Serialize)]
+pub struct Cost {
+    /// The box's sides, east, north, up, m.
+    sides_m: [f64; 3],
+    /// The share of it with a fix.
+    fixed: f64,
+    /// Standard deviation in the middle of the box's cells, m, ...
+    median_sd_m: f64,
+    /// ... and what nine tenths of them are better than.
+    worst_tenth_sd_m: f64,
+    /// The first of these if poses, lenses and clocks were exact.
+    median_sd_of_exact_cameras_m: f64,
+}
+
+impl Cost {
+    /// `None` where no two cameras see what was flown through.
+    pub fn of(result: &FlightResult) -> Option<Self> {
+        let site = SiteCalibration::from(result);
+        let planned = |camera: &CalibratedCamera| planned::of_calibrated(camera, 0.0);
+        let cameras: Vec<PlannedCamera> = site.cameras().iter().map(planned).collect();
+        let volume = flown_through(result)?;
+        let assumptions = Assumptions {
+            window_s: WINDOW_S,
+            speed_mps: SPEED_MPS,
+            velocity_prior_sd_mps: Some(VELOCITY_PRIOR_MPS),
+            target: None,
+            max_range_m: None,
+        };
+        let exact: Vec<PlannedCamera> = cameras.iter().map(PlannedCamera::exact).collect();
+        let [found, of_exact] =
+            [cameras, exact].map(|cameras| Summary::of(&predict(&cameras, &volume, &assumptions)));
+        Some(Self {
+            sides_m: (volume.max() - volume.min()).into(),
+            fixed: found.fixed,
+            median_sd_m: found.position_sd_median_m?,
+            worst_tenth_sd_m: found.position_sd_90_m?,
+            median_sd_of_exact_cameras_m: of_exact.position_sd_median_m?,
+        })
+    }
+}
+
+impl std::fmt::Display for Cost {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let [east, north, up] = self.sides_m;
+        write!(
+            f,
+            "a target in the air that was flown through ({east:.0} x {north:.0} x {up:.0} m, {:.0} % of it \
+             with a fix) will be known to {:.3} m in its middle and to {:.3} m in nine tenths, after {WINDOW_S} s; \
+             by exact cameras to {:.3} m",
+            100.0 * self.fixed,
+            self.median_sd_m,
+            self.worst_tenth_sd_m,
+            self.median_sd_of_exact_cameras_m,
+        )
+    }
+}
+
+/// The box that the target's places fill.
+fn flown_through(result: &FlightResult) -> Option<Volume> {
+    let places =
+        || result.cameras.iter().flat_map(|camera| &camera.fitted).map(|label| label.place);
+    let ends = [0, 1, 2].map(|axis| {
+        let mut along: Vec<f64> = places().map(|place| place[axis]).collect();
+        along.sort_unstable_by(f64::total_cmp);
+        let last = along.len().checked_sub(1)?;
+        let beyond = (LEFT_OUT_SHARE * last as f64) as usize;
+        let (low, high) = (along[beyond], along[last - beyond]);
+        let wider = (0.5 * (LEAST_SIDE_M - (high - low))).max(0.0);
+        Some([low - wider, high + wider])
+    });
+    let [Some(east), Some(north), Some(up)] = ends else { return None };
+    let corner = |k: usize| Point3::new(east[k], north[k], up[k]);
+    Volume::new(corner(0), corner(1), None).ok()
+}

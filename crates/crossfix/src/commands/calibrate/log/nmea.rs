@@ -1,0 +1,140 @@
+//! Logs as receivers speak them: NMEA 0183, of which two sentences are wanted.
+//!
+//! By hand, as no kept crate serves: `nmea` wants a `serde_with` that Zenoh's cannot share, and
+//! `nmea-parser` forgets what lies between two seconds.
+
+use std::path::Path;
+
+use anyhow::{Context, ensure};
+use crossfix_geometry::Geodetic;
+use time::{Date, Month};
+
+use super::{Place, Row};
+
+/// Seconds of a day.
+const DAY_S: f64 = 86_400.0;
+/// Two digits of a year are of this century: receivers are not older.
+const CENTURY: i32 = 2000;
+
+/// The places that a receiver was sure of (GGA), with the days that other sentences (RMC) say: one is as
+/// old as the other to less than half a day. Other sentences and bytes are passed over.
+pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
+    let bytes = std::fs::read(path)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let (mut places, mut dated_s, mut damaged) = (Vec::new(), None, 0_u64);
+    for line in text.lines().map(str::trim).filter(|line| line.starts_with('$')) {
+        let Some(sentence) = Sentence::of(line) else {
+            damaged += 1;
+            continue;
+        };
+        match sentence.kind() {
+            "GGA" => places.extend(sentence.place()),
+            "RMC" => dated_s = sentence.moment_s().or(dated_s),
+            _ => continue,
+        }
+        if let Some(dated_s) = dated_s {
+            place_in_day(&mut places, dated_s);
+        }
+    }
+    if damaged > 0 {
+        tracing::warn!("{}: {damaged} sentences are damaged", path.display());
+    }
+    ensure!(!places.is_empty(), "it has no place that the receiver was sure of (GGA)");
+    places.into_iter().map(Found::row).collect()
+}
+
+/// The fields of a sentence, its talker and kind before them.
+struct Sentence<'a>(Vec<&'a str>);
+
+impl<'a> Sentence<'a> {
+    /// `None` if its checksum is not that of its bytes, or it has none.
+    fn of(line: &'a str) -> Option<Self> {
+        let (body, sum) = line.strip_prefix('$')?.rsplit_once('*')?;
+        let stated = u8::from_str_radix(sum.trim_end(), 16).ok()?;
+        let found = body.bytes().fold(0, |sum, byte| sum ^ byte);
+        (stated == found).then(|| Self(body.split(',').collect()))
+    }
+
+    /// What follows the talker's two letters.
+    fn kind(&self) -> &str {
+        self.0[0].get(2..).unwrap_or_default()
+    }
+
+    fn number(&self, field: usize) -> Option<f64> {
+        self.0.get(field)?.parse().ok().filter(|number: &f64| number.is_finite())
+    }
+
+    /// `hhmmss.ss`, in seconds of the day.
+    fn of_day_s(&self, field: usize) -> Option<f64> {
+        let text = self.0.get(field)?;
+        let part = |from: usize, to: usize| text.get(from..to)?.parse::<u32>().ok();
+        let (hours, minutes) = (part(0, 2)?, part(2, 4)?);
+        let seconds: f64 = text.get(4..)?.parse().ok()?;
+        let is_time = hours < 24 && minutes < 60 && (0.0..61.0).contains(&seconds);
+        is_time.then(|| f64::from(60 * (60 * hours + minutes)) + seconds)
+    }
+
+    /// `dddmm.mmmm` and the letter of the half, in degrees.
+    fn degrees(&self, field: usize, [positive, negative]: [&str; 2]) -> Option<f64> {
+        let value = self.number(field)?;
+        let degrees = (value / 100.0).trunc();
+        let size = degrees + (value - 100.0 * degrees) / 60.0;
+        match *self.0.get(field + 1)? {
+            half if half == positive => Some(size),
+            half if half == negative => Some(-size),
+            _ => None,
+        }
+    }
+
+    /// A GGA's place: time, latitude, longitude, quality, satellites, dilution, height above the sea,
+    /// its unit, and how far the sea is above the ellipsoid.
+    fn place(&self) -> Option<Found> {
+        /// Dead reckoning, what was typed in, and a simulation are no places.
+        const SURE: [f64; 5] = [1.0, 2.0, 3.0, 4.0, 5.0];
+        SURE.contains(&self.number(6)?).then_some(())?;
+        Some(Found {
+            of_day_s: self.of_day_s(1)?,
+            time_s: None,
+            place: [self.degrees(2, ["N", "S"])?, self.degrees(4, ["E", "W"])?, self.number(9)?],
+            geoid_m: self.number(11),
+        })
+    }
+
+    /// An RMC's time and date `ddmmyy`, in seconds after 1970.
+    fn moment_s(&self) -> Option<f64> {
+        let text = self.0.get(9)?;
+        let part = |from: usize| text.get(from..from + 2)?.parse::<u8>().ok();
+        let (day, month, year) = (part(0)?, Month::try_from(part(2)?).ok()?, part(4)?);
+        let date = Date::from_calendar_date(CENTURY + i32::from(year), month, day).ok()?;
+        Some(date.midnight().assume_utc().unix_timestamp() as f64 + self.of_day_s(1)?)
+    }
+}
+
+/// A place whose day may not be known yet.
+#[derive(Clone, Copy, Debug)]
+struct Found {
+    of_day_s: f64,
+    time_s: Option<f64>,
+    /// Degrees and metres above the sea.
+    place: [f64; 3],
+    geoid_m: Option<f64>,
+}
+
+impl Found {
+    fn row(self) -> anyhow::Result<Row> {
+        let time_s = self.time_s.context(
+            "it has no date: let the receiver send RMC sentences as well, or make columns of it",
+        )?;
+        let [latitude, longitude, height] = self.place;
+        let place = Geodetic::from_degrees(latitude, longitude, height)?;
+        Ok(Row { time_s, place: Place::Geodetic { place, geoid_m: self.geoid_m } })
+    }
+}
+
+/// Gives those of the newest places that have no day yet that which brings them nearest to a moment.
+fn place_in_day(places: &mut [Found], moment_s: f64) {
+    for found in places.iter_mut().rev().take_while(|found| found.time_s.is_none()) {
+        let days = ((moment_s - found.of_day_s) / DAY_S).round();
+        found.time_s = Some(found.of_day_s + days * DAY_S);
+    }
+}
