@@ -103,11 +103,15 @@ pub struct CameraComparison {
     /// By how much more the second's clock is corrected than the first's, beside what all are, s;
     /// `None` where one was not calibrated.
     pub later_s: Option<f64>,
+    /// Pixels over the image, and where the second shows what the first shows there, beside that.
+    pub pixels: Vec<(Pixel, Pixel)>,
 }
 
 /// A pixel of a camera in both calibrations.
 #[derive(Clone, Copy)]
 struct Sight {
+    /// The pixel.
+    pixel: Pixel,
     /// Where a target is that it shows by the first.
     target: Point3<f64>,
     /// Where the second has the camera, ...
@@ -165,6 +169,7 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
     let sight = |pixel| {
         let target = direction(one, pixel)?.into_inner() * one.range_m;
         Some(Sight {
+            pixel,
             target: one.camera.pose().position() + target,
             from: other.camera.pose().position(),
             direction: direction(other, pixel)?,
@@ -226,5 +231,11 @@ fn camera(
         deviations: mean(&|sight| (angle(sight) / sight.said_rad).powi(2) / 2.0),
         focal_ratio: focal(other) / focal(one),
         later_s,
+        pixels: sights
+            .iter()
+            .filter_map(|sight| {
+                Some((sight.pixel, other.camera.project(moved.applied(sight.target))?))
+            })
+            .collect(),
     }
 }

@@ -17,6 +17,11 @@ impl LabelNoise {
         self.white_px.hypot(self.lasting_px)
     }
 
+    /// Correlation of two labels so many seconds apart.
+    pub fn correlation(&self, apart_s: f64) -> f64 {
+        (self.lasting_px / self.sd_px()).powi(2) * (-apart_s / self.lasting_s).exp()
+    }
+
     /// The deviation of white noise of labels `frame_s` apart that over seconds averages out as
     /// slowly as this does, pixels: `w^2 + c^2 (1 + a) / (1 - a)` with `a = exp(-frame / T)`.
     pub fn white_equivalent_px(&self, frame_s: f64) -> f64 {

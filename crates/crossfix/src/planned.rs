@@ -38,13 +38,13 @@ pub fn of_file(
         rate_hz: rate_hz.unwrap_or(DEFAULT_RATE_HZ),
         clock_sd_s,
         pixel_sd_px: DEFAULT_PIXEL_SD_PX,
+        lasting_noise_rad: 0.0,
         pose_covariance,
         lens_sd_rad: 0.0,
     })
 }
 
 /// A camera by its calibration; its clock is off by the calibration's deviation and by its own, s.
-/// What of the labels' noise lasts is taken as white noise that averages out as slowly.
 pub fn of_calibrated(camera: &CalibratedCamera, clock_sd_s: f64) -> PlannedCamera {
     let found_s = camera.clock.knots_s.get(camera.clock.knots_s.len() / 2).map_or(0.0, |k| k[2]);
     PlannedCamera {
@@ -52,7 +52,8 @@ pub fn of_calibrated(camera: &CalibratedCamera, clock_sd_s: f64) -> PlannedCamer
         camera: camera.camera.clone(),
         rate_hz: camera.frame_s.recip(),
         clock_sd_s: clock_sd_s.hypot(found_s),
-        pixel_sd_px: camera.noise.white_equivalent_px(camera.frame_s),
+        pixel_sd_px: camera.noise.white_px,
+        lasting_noise_rad: camera.noise.lasting_px / camera.camera.model().intrinsics().fx,
         pose_covariance: camera.pose_covariance,
         lens_sd_rad: camera.lens_sd_rad(),
     }

@@ -70,11 +70,6 @@ impl LabelNoise {
         Whitening { kept, sd_px: (variance * (1.0 - kept * kept) * caution).sqrt() }
     }
 
-    /// Correlation of two labels so many seconds apart.
-    fn correlation(&self, apart_s: f64) -> f64 {
-        (self.lasting_px / self.sd_px()).powi(2) * (-apart_s / self.lasting_s).exp()
-    }
-
     /// By how much the variance is made larger so that the mean of many labels, each whitened by the
     /// one before, is not better known than it is.
     pub(super) fn caution(&self, frame_s: f64) -> f64 {

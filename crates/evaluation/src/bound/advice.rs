@@ -198,6 +198,7 @@ mod tests {
             rate_hz: 30.0,
             clock_sd_s: 0.0,
             pixel_sd_px: 0.5,
+            lasting_noise_rad: 0.0,
             pose_covariance: Matrix6::from_diagonal(&variances.into()),
             lens_sd_rad: 0.0,
         }

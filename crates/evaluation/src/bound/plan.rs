@@ -25,6 +25,9 @@ pub struct PlannedCamera {
     pub clock_sd_s: f64,
     /// Standard deviation of a place in its images, pixels per axis, independent from frame to frame.
     pub pixel_sd_px: f64,
+    /// What its bearings of one target err by alike for about as long as a window, standard deviation,
+    /// rad per axis: a tracker sits beside a target's middle for a while.
+    pub lasting_noise_rad: f64,
     /// Covariance of its pose: rotation about its own axes (rad), then position (m).
     pub pose_covariance: Matrix6<f64>,
     /// What its lens may turn the bearings of a place in the image by, rad per axis.
@@ -32,11 +35,11 @@ pub struct PlannedCamera {
 }
 
 impl PlannedCamera {
-    /// What all of its bearings of one target have in common: pose, lens and clock, of a target that
-    /// flies at a speed.
+    /// What all of its bearings of one target have in common: pose, lens, clock (of a target that flies
+    /// at a speed) and the noise that lasts.
     fn errors(&self, speed_mps: f64) -> CommonErrors {
         CommonErrors::of_pose(self.camera.pose().rotation(), &self.pose_covariance)
-            .and(&CommonErrors::isotropic(self.lens_sd_rad, 0.0))
+            .and(&CommonErrors::isotropic(self.lens_sd_rad.hypot(self.lasting_noise_rad), 0.0))
             .and(&CommonErrors::of_clock(self.clock_sd_s, speed_mps))
     }
 
@@ -269,6 +272,7 @@ mod tests {
             rate_hz: 30.0,
             clock_sd_s: 0.0,
             pixel_sd_px: 0.5,
+            lasting_noise_rad: 0.0,
             pose_covariance: Matrix6::zeros(),
             lens_sd_rad: 0.0,
         }

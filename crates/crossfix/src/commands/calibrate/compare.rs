@@ -5,6 +5,7 @@ use anyhow::Context;
 use crossfix_calibration::{CameraComparison, SiteComparison, SiteMove, compare_sites};
 use serde::Serialize;
 
+use super::plots;
 use crate::calibrated;
 use crate::output;
 
@@ -24,6 +25,9 @@ pub struct Args {
     /// Print JSON.
     #[arg(long)]
     json: bool,
+    /// Draw where each camera's images differ into this folder (SVG).
+    #[arg(long, value_name = "FOLDER")]
+    plots: Option<PathBuf>,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -31,6 +35,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let comparison = compare_sites(&first, &second).with_context(|| {
         format!("{} and {} have no camera in common", args.first.display(), args.second.display())
     })?;
+    if let Some(folder) = &args.plots {
+        let sheets = plots::of_comparison(&comparison, &second, folder)?;
+        tracing::info!("{sheets} sheets drawn in {}", folder.display());
+    }
     let figures = Figures::from(&comparison);
     if args.json {
         output::json(&figures)

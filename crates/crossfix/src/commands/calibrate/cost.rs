@@ -25,7 +25,7 @@ pub struct Cost {
     sides_m: [f64; 3],
     /// The share of it with a fix.
     fixed: f64,
-    /// Standard deviation in the middle of the box's cells, m, ...
+    /// Standard deviation, m, than which half of the cells with a fix are better, ...
     median_sd_m: f64,
     /// ... and what nine tenths of them are better than.
     worst_tenth_sd_m: f64,
@@ -66,8 +66,8 @@ impl std::fmt::Display for Cost {
         write!(
             f,
             "a target in the air that was flown through ({east:.0} x {north:.0} x {up:.0} m, {:.0} % of it \
-             with a fix) will be known to {:.3} m in its middle and to {:.3} m in nine tenths, after {WINDOW_S} s; \
-             by exact cameras to {:.3} m",
+             with a fix) will be known to {:.3} m in half of it and to {:.3} m in nine tenths, after {WINDOW_S} s; \
+             by exact cameras to {:.3} m in half of it",
             100.0 * self.fixed,
             self.median_sd_m,
             self.worst_tenth_sd_m,

@@ -13,7 +13,7 @@ use crossfix_message::{
 use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
 use super::survey::{self, Distance};
-use super::{Lens, clicks, report};
+use super::{Lens, clicks, plots, report};
 use crate::commands::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
@@ -85,6 +85,9 @@ pub struct Args {
     /// Print JSON.
     #[arg(long)]
     json: bool,
+    /// Draw how each camera's labels lie beside the flight into this folder (SVG).
+    #[arg(long, value_name = "FOLDER")]
+    plots: Option<PathBuf>,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -126,6 +129,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         output::json(&figures)?;
     } else {
         output::line(report::render(&result, &figures));
+    }
+    if let Some(folder) = &args.plots {
+        let sheets = plots::of_flight(&result, folder)?;
+        tracing::info!("{sheets} sheets drawn in {}", folder.display());
     }
     ensure!(
         !remarks::most_lie_beside(&result.landmarks),

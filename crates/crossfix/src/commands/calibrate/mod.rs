@@ -5,6 +5,7 @@ mod cost;
 mod flight;
 mod landmarks;
 mod log;
+mod plots;
 mod remarks;
 mod report;
 mod survey;

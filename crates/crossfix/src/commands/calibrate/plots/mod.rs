@@ -1,0 +1,91 @@
+//! Figures of a calibration (SVG): a sheet for each camera.
+
+mod image;
+mod panel;
+mod residuals;
+
+use std::path::Path;
+
+use anyhow::{Context, anyhow};
+use crossfix_calibration::{
+    CalibratedCamera, CameraComparison, CameraResult, FlightResult, SiteCalibration, SiteComparison,
+};
+use crossfix_message::CameraName;
+use plotters::prelude::*;
+
+use panel::{Area, Failure};
+
+/// A sheet's panels: columns and rows.
+const PANELS: (usize, usize) = (3, 2);
+/// A panel's sides, px.
+const PANEL_PX: (u32, u32) = (560, 400);
+
+/// Draws what a flight has shown of each camera into a folder; returns how many sheets.
+pub fn of_flight(result: &FlightResult, folder: &Path) -> anyhow::Result<usize> {
+    make(folder)?;
+    for camera in &result.cameras {
+        draw(folder, &camera.name, PANELS, |panels| of_camera(camera, panels))?;
+    }
+    Ok(result.cameras.len())
+}
+
+fn of_camera(camera: &CameraResult, panels: &[Area<'_>]) -> Result<(), Failure> {
+    let [over_time, over_image, motion, histogram, correlation, pointing] = panels else {
+        return Err("a sheet has six panels".into());
+    };
+    residuals::over_time(camera, over_time)?;
+    image::mean_residuals(camera, over_image)?;
+    residuals::along_and_across(camera, motion)?;
+    residuals::histogram(camera, histogram)?;
+    residuals::autocorrelation(camera, correlation)?;
+    image::pointing(&CalibratedCamera::from(camera), pointing)
+}
+
+/// Draws how two calibrations differ into a folder, and what the second knows of each camera; returns
+/// how many sheets.
+pub fn of_comparison(
+    comparison: &SiteComparison,
+    second: &SiteCalibration,
+    folder: &Path,
+) -> anyhow::Result<usize> {
+    make(folder)?;
+    for camera in &comparison.cameras {
+        draw(folder, &camera.name, (2, 1), |panels| compared(camera, second, panels))?;
+    }
+    Ok(comparison.cameras.len())
+}
+
+fn compared(
+    camera: &CameraComparison,
+    second: &SiteCalibration,
+    panels: &[Area<'_>],
+) -> Result<(), Failure> {
+    let ([apart, pointing], Some(calibrated)) = (panels, second.camera(&camera.name)) else {
+        return Err("a sheet of two panels is of a camera that both have".into());
+    };
+    image::apart(camera, calibrated, apart)?;
+    image::pointing(calibrated, pointing)
+}
+
+fn make(folder: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))
+}
+
+/// Draws a camera's sheet.
+fn draw(
+    folder: &Path,
+    camera: &CameraName,
+    (columns, rows): (usize, usize),
+    panels: impl FnOnce(&[Area<'_>]) -> Result<(), Failure>,
+) -> anyhow::Result<()> {
+    let path = folder.join(format!("{camera}.svg"));
+    let size = (PANEL_PX.0 * columns as u32, PANEL_PX.1 * rows as u32);
+    let drawn = || -> Result<(), Failure> {
+        let area = SVGBackend::new(&path, size).into_drawing_area();
+        area.fill(&WHITE)?;
+        panels(&area.split_evenly((rows, columns)))?;
+        area.present()?;
+        Ok(())
+    };
+    drawn().map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))
+}

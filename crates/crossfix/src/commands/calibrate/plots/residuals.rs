@@ -1,0 +1,140 @@
+//! How labels lie beside the target's way: over time, along its motion, and as the noise that was found.
+
+use crossfix_calibration::{CameraResult, FittedLabel};
+use plotters::prelude::*;
+
+use super::panel::{
+    Area, FIRST, Failure, SECOND, Words, curve, dots, frame, legend, nothing, span, thinned,
+};
+
+/// Residuals are shown to so many deviations: what lies farther is another thing's, and is counted.
+const SHOWN: f64 = 5.0;
+/// A target that crosses less of the image than this says nothing of clocks, pixels/s.
+const LEAST_MOTION_PX_PER_S: f64 = 20.0;
+/// Medians over this time, s: labels err alike for up to a second or two.
+const BLOCK_S: f64 = 3.0;
+/// Bars of a histogram.
+const BARS: usize = 50;
+/// Correlations are shown for as long as labels may err alike, s.
+const LONGEST_LAG_S: f64 = 3.0;
+/// Lags at which they are counted.
+const LAGS: usize = 40;
+
+/// The residuals of both axes over the camera's own time.
+pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+    let shown = SHOWN * camera.noise.sd_px();
+    let beyond = camera.fitted.iter().filter(|label| label.beside_px.amax() > shown).count();
+    let title = format!("{}: labels beside the way ({beyond} farther off)", camera.name);
+    let Some(time) = span(camera.fitted.iter().map(|label| label.own_time_s)) else {
+        return nothing(area, &title, "too few labels");
+    };
+    let words = Words { title, x: "its own time [s]", y: "px" };
+    let mut chart = frame(area, &words, (time, -shown..shown))?;
+    for (axis, colour) in [(0, FIRST), (1, SECOND)] {
+        let points = thinned(&camera.fitted).map(|label| (label.own_time_s, label.beside_px[axis]));
+        dots(&mut chart, points.filter(|(_, px)| px.abs() < shown), colour)?;
+    }
+    legend(area, ["right of it", "below it"])
+}
+
+/// Where a clock is seen: how far labels lie ahead along the target's motion, beside how far across,
+/// which is none.
+pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+    let title = "along and across the motion, medians of 3 s".to_owned();
+    let medians = |time_of: fn(&FittedLabel, f64) -> Option<f64>| -> Vec<(f64, f64)> {
+        let moving: Vec<(f64, f64)> = camera
+            .fitted
+            .iter()
+            .filter_map(|label| {
+                Some((label.own_time_s, 1e3 * time_of(label, LEAST_MOTION_PX_PER_S)?))
+            })
+            .collect();
+        let block = |(time_s, _): &(f64, f64)| (time_s / BLOCK_S).floor();
+        moving.chunk_by(|a, b| block(a) == block(b)).filter_map(median_of).collect()
+    };
+    let (along, across) = (medians(FittedLabel::ahead_s), medians(FittedLabel::across_s));
+    let Some(time) = span(along.iter().map(|(time_s, _)| *time_s)) else {
+        return nothing(area, &title, "the target hardly moves in the image");
+    };
+    let mut sizes: Vec<f64> = along.iter().chain(&across).map(|(_, ms)| ms.abs()).collect();
+    sizes.sort_unstable_by(f64::total_cmp);
+    // But for a fiftieth, that a turn or another thing makes.
+    let shown = (1.3 * sizes[(sizes.len() - 1) * 49 / 50]).max(1.0);
+    let words = Words { title, x: "its own time [s]", y: "ms" };
+    let mut chart = frame(area, &words, (time, -shown..shown))?;
+    for (points, colour) in [(along, FIRST), (across, SECOND)] {
+        let points = points.into_iter().filter(|(_, ms)| ms.abs() < shown);
+        chart.draw_series(points.map(|at| Circle::new(at, 2, colour.filled())))?;
+    }
+    legend(area, ["ahead along it: a clock", "across it: no clock"])
+}
+
+/// The middle time and value of some.
+fn median_of(block: &[(f64, f64)]) -> Option<(f64, f64)> {
+    let mut values: Vec<f64> = block.iter().map(|(_, value)| *value).collect();
+    values.sort_unstable_by(f64::total_cmp);
+    Some((block.get(block.len() / 2)?.0, values[values.len() / 2]))
+}
+
+/// The residuals of both axes in deviations, beside the normal curve that they are taken for.
+pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+    let noise = camera.noise;
+    let title = format!("in deviations of {:.2} px, and a normal curve", noise.sd_px());
+    let width = 2.0 * SHOWN / BARS as f64;
+    let mut bars = [0.0; BARS];
+    let share = 0.5 / camera.fitted.len().max(1) as f64;
+    for label in &camera.fitted {
+        for axis in [0, 1] {
+            let place = (label.beside_px[axis] / noise.sd_px() + SHOWN) / width;
+            if let Some(bar) = bars.get_mut(place.max(0.0) as usize).filter(|_| place >= 0.0) {
+                *bar += share / width;
+            }
+        }
+    }
+    let normal = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
+    let most = bars.iter().copied().fold(normal(0.0), f64::max);
+    let words = Words { title, x: "deviations", y: "density" };
+    let mut chart = frame(area, &words, (-SHOWN..SHOWN, 0.0..1.1 * most))?;
+    let low = |bar: usize| bar as f64 * width - SHOWN;
+    chart.draw_series(bars.iter().enumerate().map(|(bar, height)| {
+        Rectangle::new([(low(bar), 0.0), (low(bar + 1), *height)], FIRST.mix(0.4).filled())
+    }))?;
+    curve(&mut chart, (0..=BARS).map(|bar| (low(bar), normal(low(bar)))), SECOND)
+}
+
+/// How alike two labels err by the time between them, beside what was found.
+pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
+    let noise = camera.noise;
+    let title = format!(
+        "two labels err alike: new each time {:.2} px, lasting {:.2} px for {:.2} s",
+        noise.white_px, noise.lasting_px, noise.lasting_s
+    );
+    let within = |label: &&FittedLabel| label.beside_px.amax() < SHOWN * noise.sd_px();
+    let labels: Vec<FittedLabel> = camera.fitted.iter().filter(within).copied().collect();
+    let step_s = (LONGEST_LAG_S / LAGS as f64).max(camera.frame_s);
+    let (mut products, mut counts) = ([0.0; LAGS], [0_u32; LAGS]);
+    let (mut squares, mut count) = (0.0, 0_u32);
+    for (first, label) in labels.iter().enumerate() {
+        squares += label.beside_px.norm_squared();
+        count += 1;
+        for other in &labels[first + 1..] {
+            let lag = ((other.own_time_s - label.own_time_s) / step_s).round() as usize;
+            if lag >= LAGS {
+                break;
+            }
+            products[lag] += label.beside_px.dot(&other.beside_px);
+            counts[lag] += 1;
+        }
+    }
+    let variance = squares / f64::from(count.max(1));
+    let words = Words { title, x: "time between them [s]", y: "correlation" };
+    let longest_s = step_s * LAGS as f64;
+    let mut chart = frame(area, &words, (0.0..longest_s, -0.3..1.0))?;
+    let found = (1..LAGS)
+        .filter(|lag| counts[*lag] > 0)
+        .map(|lag| (lag as f64 * step_s, products[lag] / f64::from(counts[lag]) / variance));
+    chart.draw_series(found.map(|at| Circle::new(at, 3, FIRST.filled())))?;
+    let model = (1..=LAGS).map(|lag| lag as f64 * step_s).map(|s| (s, noise.correlation(s)));
+    curve(&mut chart, model, SECOND)?;
+    legend(area, ["found", "taken for"])
+}
