@@ -22,8 +22,12 @@ pub struct Recalibration {
 impl Recalibration {
     /// Reads the file.
     pub fn load(path: &Path) -> anyhow::Result<Self> {
-        let site = calibrated::load(path)?;
-        Ok(Self { site, left_out: Cell::new(0) })
+        calibrated::load(path).map(Self::of)
+    }
+
+    /// By a calibration that is in no file yet.
+    pub fn of(site: SiteCalibration) -> Self {
+        Self { site, left_out: Cell::new(0) }
     }
 
     /// The entry as it would have been recorded with this calibration. What cannot be read stays

@@ -86,6 +86,28 @@ fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
         .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
 }
 
+/// Lays a calibration's flight out: the site, the residuals and the legend on the left, images on the
+/// right.
+pub(crate) fn send_flight(
+    stream: &RecordingStream,
+    cameras: &[String],
+    extent: &Extent,
+) -> Result<(), ViewError> {
+    let (site, site_path) = site_view();
+    let below: [ContainerLike; 2] = [
+        TimeSeriesView::new("labels beside the way [px]").with_origin("/plots/residual").into(),
+        TextDocumentView::new("legend").with_origin("/legend").into(),
+    ];
+    let left = Vertical::new([site, Horizontal::new(below).into()]).with_row_shares([3.2, 1.0]);
+    let images = cameras.iter().map(|name| image_view(name).0);
+    let columns = if cameras.len() <= 3 { 1 } else { 2 };
+    let right = Grid::new(images.collect::<Vec<_>>()).with_grid_columns(columns);
+    let root =
+        Horizontal::new([ContainerLike::from(left), right.into()]).with_column_shares([1.9, 1.0]);
+    let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &[])
+}
+
 /// Lays a volume out: the site on the left, the scale of colours and the words on the right.
 pub(crate) fn send_volume(
     stream: &RecordingStream,

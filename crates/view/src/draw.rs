@@ -26,7 +26,7 @@ pub(crate) const ENLARGED_UP_TO_M: f64 = 0.5;
 /// Arrows show the way of this time, s.
 const ARROW_S: f64 = 1.0;
 
-fn f32s(v: &Vector3<f64>) -> [f32; 3] {
+pub(crate) fn f32s(v: &Vector3<f64>) -> [f32; 3] {
     [v.x as f32, v.y as f32, v.z as f32]
 }
 
@@ -199,11 +199,15 @@ fn label(track: &Track, speed: f64, height: f64) -> String {
 /// Half axes and turn of a track's ellipsoid of position.
 fn ellipsoid(track: &Track) -> Option<([f32; 3], Quaternion)> {
     let covariance: &[f64; 36] = track.covariance.as_slice().try_into().ok()?;
-    let block = Matrix3::from_fn(|row, column| covariance[6 * row + column]);
-    if !block.iter().all(|v| v.is_finite()) {
+    ellipsoid_of(&Matrix3::from_fn(|row, column| covariance[6 * row + column]))
+}
+
+/// Half axes and turn of the ellipsoid of a covariance, m^2.
+pub(crate) fn ellipsoid_of(covariance: &Matrix3<f64>) -> Option<([f32; 3], Quaternion)> {
+    if !covariance.iter().all(|v| v.is_finite()) {
         return None;
     }
-    let SymmetricEigen { eigenvalues, mut eigenvectors } = block.symmetric_eigen();
+    let SymmetricEigen { eigenvalues, mut eigenvectors } = covariance.symmetric_eigen();
     if eigenvectors.determinant() < 0.0 {
         eigenvectors.column_mut(0).neg_mut();
     }

@@ -33,6 +33,7 @@ mod colour;
 mod draw;
 mod extent;
 mod eye;
+mod flight;
 mod ground;
 mod image;
 mod legend;
@@ -43,6 +44,7 @@ mod sink;
 mod tracking;
 mod volume;
 
+pub use flight::{FlightCamera, FlightPicture, LoggedPlace, SeenTarget};
 pub use picture::Picture;
 pub use rerun::RecordingStream;
 pub use sink::{ViewError, ViewerWatch, connect, save, save_without_end, spawn_viewer};

@@ -3,19 +3,21 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_calibration::{
-    CameraLabels, Label, LensFreedom, SiteCalibration, SurveyedLandmark, calibrate_flight,
+    CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration, SurveyedLandmark,
+    calibrate_flight,
 };
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
+use super::hold_out::{HeldOut, HoldOut};
 use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
 use super::survey::{self, Distance};
-use super::{Lens, clicks, plots, report};
+use super::{Lens, clicks, picture, plots, report};
 use crate::commands::numbers;
-use crate::output;
+use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
 /// From the flight of one target: with the log of its own receiver, with where cameras stand, or with
@@ -88,6 +90,12 @@ pub struct Args {
     /// Draw how each camera's labels lie beside the flight into this folder (SVG).
     #[arg(long, value_name = "FOLDER")]
     plots: Option<PathBuf>,
+    /// Write cameras, flight, log and labels as a picture for Rerun (.rrd).
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    /// Calibrate by one part of the recording, and fuse the other by that: what it is worth.
+    #[arg(long, value_enum, value_name = "PART")]
+    hold_out: Option<HoldOut>,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -110,11 +118,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for Moment { camera, time_s } in &args.to {
         cut(&mut cameras, camera, |label| label.time_s < *time_s)?;
     }
+    let held_out = args.hold_out.map(|which| HeldOut::take_out(which, &mut cameras));
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let landmarks = landmarks(args, &cameras)?;
     let of = (&names[..], "the recording");
     let survey = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
+    let worth = held_out
+        .map(|part| part.fused(&args.recording, SiteCalibration::from(&result), log.as_ref()))
+        .transpose()?;
     let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
     let rests = if log.is_none() || survey.tells_size(&calibrated) {
         Rests::OnSurvey
@@ -124,21 +136,24 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
-    let figures = report::figures(&result, &survey, rests);
+    let figures = report::figures(&result, &survey, rests, worth);
     if args.json {
         output::json(&figures)?;
     } else {
         output::line(report::render(&result, &figures));
     }
-    if let Some(folder) = &args.plots {
-        let sheets = plots::of_flight(&result, folder)?;
-        tracing::info!("{sheets} sheets drawn in {}", folder.display());
-    }
+    args.draw(&result)?;
+    take_out_wrong(&mut result)?;
+    args.write(&result)
+}
+
+/// Leaves no camera in a calibration that is wrong, and refuses one that is wrong as a whole.
+fn take_out_wrong(result: &mut FlightResult) -> anyhow::Result<()> {
     ensure!(
         !remarks::most_lie_beside(&result.landmarks),
         "nothing is written: most landmarks lie beside where the flight has them"
     );
-    let wrong = report::take_out_wrong(&mut result);
+    let wrong = report::take_out_wrong(result);
     for wrong in &wrong {
         tracing::warn!("camera `{wrong}` is wrong and is not written");
     }
@@ -148,27 +163,51 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         wrong.len() <= result.cameras.len(),
         "nothing is written: most cameras are wrong, so the log or the survey is hardly of this flight"
     );
-    let inputs: Vec<&Path> = [
-        Some(&args.recording),
-        args.log.as_ref(),
-        args.positions.as_ref(),
-        args.landmarks.as_ref(),
-    ]
-    .into_iter()
-    .flatten()
-    .map(PathBuf::as_path)
-    .collect();
-    let from: Vec<String> = inputs.iter().map(|path| path.display().to_string()).collect();
-    let text = format!(
-        "# Written by crossfix calibrate flight from {}.\n{}",
-        from.join(" and "),
-        SiteCalibration::from(&result).to_toml()
-    );
-    output::write_file(&args.output, &inputs, text.as_bytes())?;
-    if !args.json {
-        output::line(format!("\nwritten to {}", args.output.display()));
-    }
     Ok(())
+}
+
+impl Args {
+    fn inputs(&self) -> Vec<&Path> {
+        let files = [
+            Some(&self.recording),
+            self.log.as_ref(),
+            self.positions.as_ref(),
+            self.landmarks.as_ref(),
+        ];
+        files.into_iter().flatten().map(PathBuf::as_path).collect()
+    }
+
+    fn draw(&self, result: &FlightResult) -> anyhow::Result<()> {
+        if let Some(folder) = &self.plots {
+            let sheets = plots::of_flight(result, folder)?;
+            tracing::info!("{sheets} sheets drawn in {}", folder.display());
+        }
+        if let Some(path) = &self.save {
+            let draft = Draft::new(path, &self.inputs())?;
+            picture::draw(result, draft.path())?;
+            draft.keep()?;
+            tracing::info!(
+                "picture written to {0}; look at it with: rerun --bind 127.0.0.1 {0}",
+                path.display()
+            );
+        }
+        Ok(())
+    }
+
+    fn write(&self, result: &FlightResult) -> anyhow::Result<()> {
+        let inputs = self.inputs();
+        let from: Vec<String> = inputs.iter().map(|path| path.display().to_string()).collect();
+        let text = format!(
+            "# Written by crossfix calibrate flight from {}.\n{}",
+            from.join(" and "),
+            SiteCalibration::from(result).to_toml()
+        );
+        output::write_file(&self.output, &inputs, text.as_bytes())?;
+        if !self.json {
+            output::line(format!("\nwritten to {}", self.output.display()));
+        }
+        Ok(())
+    }
 }
 
 /// What was clicked in the pictures of the recording's cameras.

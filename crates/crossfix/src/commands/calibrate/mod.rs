@@ -3,8 +3,11 @@ mod clicks;
 mod compare;
 mod cost;
 mod flight;
+mod hold_out;
 mod landmarks;
 mod log;
+#[cfg_attr(not(feature = "viewer"), path = "no_picture.rs")]
+mod picture;
 mod plots;
 mod remarks;
 mod report;

@@ -5,6 +5,7 @@ use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
 use super::cost::Cost;
+use super::hold_out::Worth;
 use super::remarks::{self, Rests};
 use super::verdict;
 use crate::output;
@@ -30,6 +31,8 @@ pub struct Figures {
     datum: Option<DatumFigures>,
     /// What a target will be known to; absent where no two cameras see one.
     cost: Option<Cost>,
+    /// What it is worth on the part that was held out; absent where none was.
+    held_out: Option<Worth>,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
 }
@@ -225,7 +228,12 @@ impl From<&CameraResult> for CameraFigures {
 }
 
 /// The figures for a program.
-pub fn figures(result: &FlightResult, survey: &Survey, rests: Rests) -> Figures {
+pub fn figures(
+    result: &FlightResult,
+    survey: &Survey,
+    rests: Rests,
+    held_out: Option<Worth>,
+) -> Figures {
     Figures {
         cameras: result.cameras.iter().map(CameraFigures::from).collect(),
         refused: result
@@ -240,6 +248,7 @@ pub fn figures(result: &FlightResult, survey: &Survey, rests: Rests) -> Figures 
         survey: SurveyFigures::all(result, survey),
         datum: result.datum.as_ref().map(DatumFigures::from),
         cost: Cost::of(result),
+        held_out,
         jerk: result.jerk,
     }
 }
@@ -313,6 +322,11 @@ pub fn render(result: &FlightResult, figures: &Figures) -> String {
     };
     let datum = figures.datum.as_ref().map_or_else(String::new, |datum| format!("\n\n{datum}"));
     let cost = figures.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
+    let held_out =
+        figures.held_out.as_ref().map_or_else(String::new, |worth| format!("\n\n{worth}"));
     let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
-    format!("{}{refused}{survey}{landmarks}{log}{datum}{cost}{remarks}", output::table(&rows))
+    format!(
+        "{}{refused}{survey}{landmarks}{log}{datum}{cost}{held_out}{remarks}",
+        output::table(&rows)
+    )
 }

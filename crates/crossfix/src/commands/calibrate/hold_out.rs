@@ -1,0 +1,254 @@
+//! A part of a flight that the calibration does not see, fused by it: what it is worth on another flight.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::Path;
+
+use crossfix_calibration::{CameraLabels, FlightLog, Label, SiteCalibration};
+use crossfix_evaluation::{Estimate, Sightings, TrackHistory};
+use crossfix_fusion::{FusionConfig, Output};
+use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, decode};
+use crossfix_recording::Entry;
+use nalgebra::Matrix3;
+use serde::Serialize;
+
+use crate::centre::Centre;
+use crate::output;
+use crate::recalibration::{Recalibration, Reordered};
+use crate::recorded::{self, Lacks};
+
+/// Which part of a recording is held out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum HoldOut {
+    /// The second half.
+    Half,
+    /// Every other ten seconds.
+    Blocks,
+}
+
+/// A block's length, s.
+const BLOCK_S: f64 = 10.0;
+/// A place of the log is asked for where so many cameras see the target.
+const LEAST_CAMERAS: usize = 3;
+/// Farther than this from the log a track is of something else, m.
+const CUTOFF_M: f64 = 5.0;
+
+/// The part of a recording that is held out, by the cameras' own clocks.
+#[derive(Clone, Copy, Debug)]
+pub struct HeldOut {
+    which: HoldOut,
+    from_s: f64,
+    to_s: f64,
+}
+
+impl HeldOut {
+    /// Takes the part out of what cameras saw.
+    pub fn take_out(which: HoldOut, cameras: &mut [CameraLabels]) -> Self {
+        let times = || cameras.iter().flat_map(|camera| &camera.labels).map(|label| label.time_s);
+        let from_s = times().fold(f64::INFINITY, f64::min);
+        let to_s = times().fold(f64::NEG_INFINITY, f64::max);
+        let held_out = Self { which, from_s, to_s };
+        for camera in cameras {
+            camera.labels.retain(|Label { time_s, .. }| !held_out.holds(*time_s));
+        }
+        held_out
+    }
+
+    fn holds(&self, own_s: f64) -> bool {
+        match self.which {
+            HoldOut::Half => own_s >= f64::midpoint(self.from_s, self.to_s),
+            HoldOut::Blocks => ((own_s - self.from_s) / BLOCK_S).rem_euclid(2.0) >= 1.0,
+        }
+    }
+
+    /// Whether an entry of a recording is of this part, or of no time.
+    fn has(&self, entry: &Entry) -> bool {
+        !matches!(entry.key.channel, Channel::Bearings(_))
+            || decode::<BearingFrame>(&entry.data).is_ok_and(|frame| {
+                self.holds(Timestamp::from_nanos(frame.capture_time_ns).seconds())
+            })
+    }
+
+    /// Fuses it by a calibration that has not seen it.
+    pub fn fused(
+        &self,
+        recording: &Path,
+        site: SiteCalibration,
+        log: Option<&FlightLog>,
+    ) -> anyhow::Result<Worth> {
+        let mut run = Run::empty()?;
+        let mut calibrations = BTreeMap::new();
+        let mut lacks = Lacks::default();
+        recorded::for_each(recording, &mut lacks, |_, entry| {
+            if let Channel::Calibration(name) = &entry.key.channel {
+                calibrations.entry(name.clone()).or_insert(entry);
+            }
+            Ok(())
+        })?;
+        let recalibration = Recalibration::of(site);
+        for entry in calibrations.into_values() {
+            run.take(recalibration.applied(entry));
+        }
+        let mut reordered = Reordered::new(recalibration);
+        let mut take = |entry: Entry| {
+            run.take(entry);
+            Ok(())
+        };
+        recorded::for_each(recording, &mut lacks, |_, entry| {
+            if self.has(&entry) && !matches!(entry.key.channel, Channel::Calibration(_)) {
+                reordered.take(entry, &mut take)?;
+            }
+            Ok(())
+        })?;
+        reordered.finish(&mut take)?;
+        let outputs = run.centre.flush();
+        run.note(outputs);
+        Ok(run.worth(log))
+    }
+}
+
+/// What fusing it takes and shows.
+struct Run {
+    centre: Centre,
+    history: TrackHistory,
+    sightings: Sightings,
+    /// Each camera's innovations squared by what was said of them: their sum and number.
+    innovations: BTreeMap<String, (f64, u32)>,
+}
+
+impl Run {
+    fn empty() -> anyhow::Result<Self> {
+        Ok(Self {
+            centre: Centre::new(FusionConfig::default(), None)?,
+            history: TrackHistory::default(),
+            sightings: Sightings::default(),
+            innovations: BTreeMap::new(),
+        })
+    }
+
+    fn take(&mut self, entry: Entry) {
+        if let Ok(frame) = decode::<BearingFrame>(&entry.data)
+            && matches!(entry.key.channel, Channel::Bearings(_))
+        {
+            self.sightings.add(&frame);
+        }
+        let outputs = self.centre.take(&entry.key.channel, &entry.data, "");
+        self.note(outputs);
+    }
+
+    fn note(&mut self, outputs: Vec<Output>) {
+        for output in outputs {
+            let Output::Tracks(frame) = output else { continue };
+            self.history.add(&frame);
+            self.note_innovations(&frame);
+        }
+    }
+
+    /// Those of the exposure that made the frame.
+    fn note_innovations(&mut self, frame: &TrackFrame) {
+        let residuals = frame.tracks.iter().flat_map(|track| &track.residuals);
+        for residual in residuals.filter(|residual| residual.camera == frame.camera) {
+            let (sum, count) = self.innovations.entry(residual.camera.clone()).or_default();
+            *sum += residual.nis;
+            *count += 1;
+        }
+    }
+
+    fn worth(&self, log: Option<&FlightLog>) -> Worth {
+        let mean = |(camera, (sum, count)): (&String, &(f64, u32))| {
+            (camera.clone(), sum / f64::from(*count))
+        };
+        Worth {
+            against_log: log.map(|log| self.against(log)),
+            mean_nis: self.innovations.iter().map(mean).collect(),
+        }
+    }
+
+    /// The tracks beside the log, whose own errors are added to what tracks say.
+    fn against(&self, log: &FlightLog) -> AgainstLog {
+        let variance = log.errors.sd_m.powi(2) + log.errors.drift_sd_m.powi(2);
+        let cutoff_m = CUTOFF_M + 3.0 * variance.sqrt();
+        let times: Vec<Timestamp> =
+            log.samples.iter().map(|sample| Timestamp::from_seconds(sample.time_s)).collect();
+        let cameras = self.sightings.cameras_at(&times);
+        let seen = log.samples.iter().zip(&times).zip(cameras);
+        let (mut places, mut distances_m, mut nees) = (0, Vec::new(), Vec::new());
+        for ((sample, &time), _) in seen.filter(|(_, cameras)| *cameras >= LEAST_CAMERAS) {
+            places += 1;
+            let beside = |estimate: &Estimate| estimate.state.position() - sample.position;
+            let tracks = self.history.at(time);
+            let nearest =
+                tracks.iter().min_by(|a, b| beside(a).norm().total_cmp(&beside(b).norm()));
+            let Some(track) = nearest.filter(|track| beside(track).norm() < cutoff_m) else {
+                continue;
+            };
+            let stated = track.state.position_covariance() + Matrix3::identity() * variance;
+            distances_m.push(beside(track).norm());
+            nees.extend(
+                stated.cholesky().map(|root| beside(track).dot(&root.solve(&beside(track)))),
+            );
+        }
+        AgainstLog {
+            places,
+            found: distances_m.len() as f64 / f64::from(places.max(1)),
+            median_m: quantile(&mut distances_m, 0.5),
+            worst_twentieth_m: quantile(&mut distances_m, 0.95),
+            median_nees: quantile(&mut nees, 0.5),
+        }
+    }
+}
+
+/// What a share of some values lies below.
+fn quantile(values: &mut [f64], share: f64) -> Option<f64> {
+    values.sort_unstable_by(f64::total_cmp);
+    let last = values.len().checked_sub(1)?;
+    values.get((share * last as f64).round() as usize).copied()
+}
+
+/// What a calibration is worth on what it has not seen.
+#[derive(Debug, Serialize)]
+pub struct Worth {
+    against_log: Option<AgainstLog>,
+    /// Each camera's mean innovation squared by what was said of it; two is honest.
+    mean_nis: BTreeMap<String, f64>,
+}
+
+/// By quantiles, as logs have glitches of their own.
+#[derive(Debug, Serialize)]
+struct AgainstLog {
+    /// The log's places at which three cameras see the target.
+    places: u32,
+    /// The share of them with a track.
+    found: f64,
+    /// What half of the tracks lie nearer to the log than, m, ...
+    median_m: Option<f64>,
+    /// ... and what all but a twentieth do.
+    worst_twentieth_m: Option<f64>,
+    /// Errors squared by what tracks and log say of them together: 2.37 of honest ones.
+    median_nees: Option<f64>,
+}
+
+impl fmt::Display for Worth {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("what was held out, fused by it:")?;
+        match &self.against_log {
+            Some(AgainstLog { places: 0, .. }) => {
+                f.write_str(" at no place of the log do three cameras see the target;")?;
+            }
+            Some(log) => write!(
+                f,
+                " tracks at {:.1} % of {} places of the log, half of them within {} m and 95 % within {} m \
+                 of it, NEES {} in the median (2.4 is honest);",
+                100.0 * log.found,
+                log.places,
+                output::number(log.median_m, 3),
+                output::number(log.worst_twentieth_m, 3),
+                output::number(log.median_nees, 1),
+            )?,
+            None => {}
+        }
+        let cameras: Vec<String> =
+            self.mean_nis.iter().map(|(camera, nis)| format!("{camera} {nis:.1}")).collect();
+        write!(f, " innovations squared by what is said of them (2): {}", cameras.join(", "))
+    }
+}
