@@ -4,12 +4,12 @@
 
 mod common;
 
-use common::{Truth, cameras, flight, labels, log, pointing_error_mrad};
+use common::{Truth, cameras, flight, flight_of, labels, labels_of, log, pointing_error_mrad, way};
 use crossfix_calibration::{
-    Axis, FlightError, FlightLog, Refusal, Survey, WouldFit, calibrate_flight,
+    Axis, FlightError, FlightLog, Refusal, Survey, SurveyedPlace, WouldFit, calibrate_flight,
 };
 use crossfix_geometry::{Camera, Intrinsics, Pixel};
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -187,5 +187,113 @@ fn fifteen_seconds_of_a_log_are_refused_or_said_to_be_weak() {
                 assert!(spread > 0.5, "{}: {spread} m", camera.name);
             }
         }
+    }
+}
+
+/// Another drone's way, through the same air.
+fn other_way(t: f64) -> Point3<f64> {
+    Point3::new(
+        25.0 * (0.09 * t).cos() - 20.0,
+        20.0 * (0.13 * t + 1.0).sin(),
+        40.0 + 10.0 * (0.19 * t).sin(),
+    )
+}
+
+#[test]
+fn a_second_drone_is_left_out_however_long_it_is_followed() {
+    let alone = flight(13);
+    let alone = calibrate_flight(&alone.1, Some(&alone.2), &Survey::default()).unwrap();
+    for share in [0.3, 1.0] {
+        let (truths, mut seen, log) = flight(13);
+        let mut random = ChaCha8Rng::seed_from_u64(14);
+        for (truth, camera) in truths.iter().zip(&mut seen) {
+            let second = labels_of(truth, other_way, &mut random).labels;
+            let followed = (share * second.len() as f64) as usize;
+            camera.labels.extend(&second[..followed]);
+            camera.labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+        }
+        let result = calibrate_flight(&seen, Some(&log), &Survey::default()).unwrap();
+        assert_eq!(result.cameras.len(), 3, "{:?}", result.refused);
+        for (index, truth) in truths.iter().enumerate() {
+            let [with, without] =
+                [&result, &alone].map(|result| pointing_error_mrad(truth, result, index));
+            assert!(with < without + 0.05, "{}: {with} and {without} mrad", truth.name);
+            let found = &result.cameras[index];
+            assert_eq!(found.labels, seen[index].labels.len());
+            assert!(found.used <= alone.cameras[index].labels, "{} labels", found.used);
+        }
+    }
+}
+
+#[test]
+fn a_flight_that_hovers_or_goes_straight_says_that_it_tells_no_pose() {
+    let hovers =
+        |t: f64| Point3::new(2.0 + 0.3 * (0.5 * t).sin(), 3.0, 30.0 + 0.2 * (0.3 * t).cos());
+    let straight = |t: f64| Point3::new(0.5 * t - 30.0, 0.1 * t, 30.0);
+    let flights: [fn(f64) -> Point3<f64>; 2] = [hovers, straight];
+    for (way, seed) in flights.into_iter().flat_map(|way| (20..23).map(move |seed| (way, seed))) {
+        let (_, labels, log) = flight_of(way, seed);
+        match calibrate_flight(&labels, Some(&log), &Survey::default()) {
+            Err(error) => assert!(matches!(error, FlightError::NoCamera { .. }), "{error}"),
+            Ok(result) => {
+                for camera in &result.cameras {
+                    let turn = camera.pose_covariance.fixed_view::<3, 3>(0, 0).trace().sqrt();
+                    // What the command's verdict refuses.
+                    assert!(turn > 0.05, "{} by seed {seed}: {turn} rad", camera.name);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_flight_at_one_height_does_with_a_log() {
+    let (truths, labels, log) = flight_of(|t| Point3::new(way(t).x, way(t).y, 30.0), 24);
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
+    for (truth, found) in truths.iter().zip(&result.cameras) {
+        let off = (found.camera.pose().position() - truth.camera.pose().position()).norm();
+        assert!(off < 0.1, "{}: {off} m", truth.name);
+    }
+}
+
+#[test]
+fn a_log_of_one_place_a_second_does() {
+    let (truths, labels, log) = flight(25);
+    let samples = log.samples.into_iter().step_by(5).collect();
+    let log = FlightLog { samples, errors: log.errors };
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
+    for (index, truth) in truths.iter().enumerate() {
+        let error = pointing_error_mrad(truth, &result, index);
+        assert!(error < 0.4, "{}: {error} mrad", truth.name);
+    }
+}
+
+#[test]
+fn heights_over_another_sea_move_the_site_from_its_survey_as_a_whole() {
+    let (truths, labels, _) = flight(26);
+    let raised = Vector3::new(0.0, 0.0, 20.0);
+    let log = log(&mut ChaCha8Rng::seed_from_u64(26), |place| place + raised);
+    let place = |truth: &Truth| SurveyedPlace {
+        camera: truth.name.parse().unwrap(),
+        position: truth.camera.pose().position(),
+        sd_m: Vector3::repeat(0.05),
+    };
+    let survey = Survey { places: truths.iter().map(place).collect(), ..Survey::default() };
+    let result = calibrate_flight(&labels, Some(&log), &survey).unwrap();
+    for (truth, found) in truths.iter().zip(&result.cameras) {
+        let beside = found.camera.pose().position() - truth.camera.pose().position();
+        assert!((beside - raised).norm() < 0.2, "{}: {beside}", truth.name);
+    }
+}
+
+#[test]
+fn north_east_down_turns_the_cameras_over() {
+    let (_, labels, _) = flight(27);
+    let log =
+        log(&mut ChaCha8Rng::seed_from_u64(27), |place| Point3::new(place.y, place.x, -place.z));
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
+    for camera in &result.cameras {
+        // Its image's rows go up: what the command's verdict refuses.
+        assert!(camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5, "{}", camera.name);
     }
 }

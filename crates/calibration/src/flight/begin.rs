@@ -58,11 +58,8 @@ impl Begun {
     pub(super) fn by_log(cameras: &[CameraLabels], log: &FlightLog) -> Result<Self, FlightError> {
         let mut begun = Self::new(Course::of(log).ok_or(FlightError::NoSolution)?);
         for camera in cameras {
-            let start = usable(camera)
-                .and_then(|()| placed_against(camera, &begun.course))
-                .and_then(|(state, misfit)| proven(camera, &begun.course, state, misfit))
-                .map_err(|why| with_cure(camera, &begun.course, cameras, why));
-            begun.take(camera, start);
+            let (own, start) = target_of(camera, &begun.course);
+            begun.take(&own, start.map_err(|why| with_cure(camera, &begun.course, cameras, why)));
         }
         begun.leave_lonely_out(true);
         if begun.cameras.is_empty() {
@@ -242,9 +239,7 @@ fn placed_against(camera: &CameraLabels, course: &Course) -> Result<(CameraState
         state.clock.offset_s,
         misfit * 1e3
     );
-    let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
-    let range_m = course.middle_distance(state.centre);
-    if misfit <= MOST_MISFIT_RAD + of_errors / range_m {
+    if fits(misfit, &state, course) {
         return Ok((state, misfit));
     }
     Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, would_fit: None })
@@ -265,6 +260,40 @@ fn proven(
         return Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, would_fit });
     }
     Ok(state)
+}
+
+/// What of a camera's labels is the log's target, and its start: it may have followed others as well.
+fn target_of(
+    camera: &CameraLabels,
+    course: &Course,
+) -> (CameraLabels, Result<CameraState, Refusal>) {
+    let started =
+        |camera: &CameraLabels| usable(camera).and_then(|()| placed_against(camera, course));
+    let start = started(camera);
+    let own = match &start {
+        Ok((state, _)) => Some(start::without_others(camera, state, course)),
+        Err(Refusal::Misfit { .. }) => start::among_others(camera, course, frame_time(camera)),
+        Err(_) => None,
+    };
+    let fewer = own.filter(|own| own.labels.len() < camera.labels.len());
+    let (own, start) = match fewer.map(|own| (started(&own), own)) {
+        Some((Ok(start), own)) => (own, Ok(start)),
+        _ => (camera.clone(), start),
+    };
+    let start = start.and_then(|(state, misfit)| proven(&own, course, state, misfit));
+    tracing::debug!(
+        "camera `{}`: {} of {} labels are of the log's target",
+        own.name,
+        own.labels.len(),
+        camera.labels.len()
+    );
+    (own, start)
+}
+
+/// Whether a start lies near enough to a course to be begun with.
+fn fits(misfit: f64, state: &CameraState, course: &Course) -> bool {
+    let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
+    misfit <= MOST_MISFIT_RAD + of_errors / course.middle_distance(state.centre)
 }
 
 /// Why a camera does not fit a log, with what would make it fit.

@@ -163,6 +163,11 @@ pub fn calibrate_flight(
     let settled = settle(&flight, begun.priors(), state);
     let (adjusted, priors) = settled.ok_or(FlightError::NoSolution)?;
     let mut result = results(&flight, adjusted, &priors).ok_or(FlightError::NoSolution)?;
+    for found in &mut result.cameras {
+        // What was of something else counts, too.
+        let given = cameras.iter().find(|camera| camera.name == found.name);
+        found.labels = given.map_or(found.labels, |camera| camera.labels.len());
+    }
     result.refused = begun.refused;
     Ok(result)
 }

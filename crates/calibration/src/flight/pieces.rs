@@ -11,6 +11,8 @@ const STEP: f64 = 0.03;
 const FRAMES: f64 = 10.0;
 /// The longest pieces that hold this share of all labels are taken: a third may be of other things.
 const SHARE: f64 = 0.67;
+/// A piece of fewer labels does not say by itself whether it is of the target.
+const LEAST: usize = 30;
 
 /// A piece under way: where each of its labels is among all.
 struct Piece {
@@ -43,6 +45,18 @@ pub(super) fn longest(camera: &CameraLabels, frame_s: f64) -> Vec<Label> {
     }
     taken.sort_unstable();
     taken.into_iter().map(|index| labels[index]).collect()
+}
+
+/// Labels in pieces of one thing each, the longest first, and those of pieces that are too short to say.
+pub(super) fn of_one_thing(camera: &CameraLabels, frame_s: f64) -> (Vec<Vec<Label>>, Vec<Label>) {
+    let step_px = STEP * f64::from(camera.intrinsics.size.width);
+    let mut pieces: Vec<Vec<Label>> = cut(&camera.labels, step_px, frame_s)
+        .into_iter()
+        .map(|piece| piece.labels.into_iter().map(|index| camera.labels[index]).collect())
+        .collect();
+    pieces.sort_by_key(|piece: &Vec<Label>| std::cmp::Reverse(piece.len()));
+    let short = pieces.split_off(pieces.partition_point(|piece| piece.len() >= LEAST));
+    (pieces, short.concat())
 }
 
 fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {

@@ -68,6 +68,73 @@ pub(super) fn find(
     Some((state, misfit))
 }
 
+/// Of several things that a camera has followed so many are tried for the target, those that it followed
+/// longest.
+const THINGS: usize = 6;
+/// A piece whose labels lie within this of the course, in the median, is of the target, rad: from a start by
+/// a piece of a few seconds, and where a lens file is 50 pixels off in a corner, ...
+const NEAR_RAD: f64 = 0.1;
+/// ... and of a start by all that are near already.
+const NEARER_RAD: f64 = 0.02;
+
+/// What is left out is of another thing if the target was seen in the same frame for this share of it: the
+/// parts of a flight that a wrong lens makes fit lie beside the others in time.
+const AT_ONCE: f64 = 0.5;
+
+/// What of a camera's labels is the target's, where most are of something else: begun with one piece,
+/// joined by those that lie near. `None`: no piece is of the target, or all may be.
+pub(super) fn among_others(
+    camera: &CameraLabels,
+    course: &Course,
+    frame_s: f64,
+) -> Option<CameraLabels> {
+    let (pieces, _) = pieces::of_one_thing(camera, frame_s);
+    let ones = pieces.iter().take(THINGS).filter_map(|piece| {
+        let own = rays(camera, piece);
+        let mut found = best_of(&own, &own, course, frame_s)?;
+        let mut labels = piece.clone();
+        for near_rad in [NEAR_RAD, NEARER_RAD, NEARER_RAD] {
+            let near = |piece: &&Vec<Label>| found.lies_near(camera, piece, course, near_rad);
+            labels = pieces.iter().filter(near).flatten().copied().collect();
+            found = refined(found, &rays(camera, &labels), course, frame_s)?;
+        }
+        (found.misfit < NEARER_RAD).then_some(labels)
+    });
+    let own = of_labels(camera, ones.max_by_key(Vec::len)?);
+    let is_own = |label: &Label| at_once(&own.labels, label.time_s, 0.5 * frame_s);
+    let left_out = camera.labels.len() - own.labels.len();
+    let at_once = camera.labels.iter().filter(|label| is_own(label)).count() - own.labels.len();
+    (at_once as f64 > AT_ONCE * left_out as f64).then_some(own)
+}
+
+/// Whether some of the labels, in the order of their times, are of a time.
+fn at_once(labels: &[Label], time_s: f64, within_s: f64) -> bool {
+    let next = labels.partition_point(|label| label.time_s < time_s - within_s);
+    labels.get(next).is_some_and(|label| label.time_s < time_s + within_s)
+}
+
+/// A camera's labels without the pieces that lie far beside the course by a start: they are of something
+/// else.
+pub(super) fn without_others(
+    camera: &CameraLabels,
+    state: &CameraState,
+    course: &Course,
+) -> CameraLabels {
+    let (pieces, mut labels) = pieces::of_one_thing(camera, frame_time(camera));
+    let CameraState { rotation, centre, clock, .. } = state;
+    let (rotation, centre) = (*rotation, *centre);
+    let start = Candidate { rotation, centre, offset_s: clock.offset_s, misfit: 0.0 };
+    let near = |piece: &&Vec<Label>| start.lies_near(camera, piece, course, NEAR_RAD);
+    labels.extend(pieces.iter().filter(near).flatten());
+    of_labels(camera, labels)
+}
+
+fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> CameraLabels {
+    labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
+    let CameraLabels { name, intrinsics, freedom, .. } = camera;
+    CameraLabels { name: name.clone(), intrinsics: *intrinsics, freedom: *freedom, labels }
+}
+
 /// The best pose over all offsets that begins with a linear solution of some rays, refined by all.
 fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<Candidate> {
     let mut found: Vec<Candidate> =
@@ -174,6 +241,22 @@ impl Candidate {
         let (rotation, centre) = map.pose()?;
         let misfit = linear::typical(angles(pairs, &rotation, centre));
         Some(Self { rotation, centre, offset_s, misfit })
+    }
+
+    /// Whether most labels of a piece lie near a course, or at no time of it.
+    fn lies_near(
+        &self,
+        camera: &CameraLabels,
+        piece: &[Label],
+        course: &Course,
+        near_rad: f64,
+    ) -> bool {
+        let at = |ray: &Ray| {
+            let weights = course.weights(ray.time_s + self.offset_s)?;
+            Some((ray.direction, course.way.place(&weights)))
+        };
+        let seen: Vec<Seen> = rays(camera, piece).iter().filter_map(at).collect();
+        seen.is_empty() || linear::median(angles(&seen, &self.rotation, self.centre)) < near_rad
     }
 }
 

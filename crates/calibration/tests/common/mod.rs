@@ -57,9 +57,18 @@ pub fn cameras() -> Vec<Truth> {
     places.into_iter().enumerate().map(truth).collect()
 }
 
-/// What it labels: errors of 0.1 pixels that are new in every frame, and of 0.4 that last for half
-/// a second.
+/// What it labels of [`way`].
 pub fn labels(truth: &Truth, random: &mut ChaCha8Rng) -> CameraLabels {
+    labels_of(truth, way, random)
+}
+
+/// What it labels of a way: errors of 0.1 pixels that are new in every frame, and of 0.4 that last for
+/// half a second.
+pub fn labels_of(
+    truth: &Truth,
+    way: impl Fn(f64) -> Point3<f64>,
+    random: &mut ChaCha8Rng,
+) -> CameraLabels {
     let mut normal = || -> f64 { StandardNormal.sample(random) };
     let kept = (-FRAME_S / 0.5_f64).exp();
     let mut lasting = [normal(), normal()].map(|n| 0.4 * n);
@@ -83,22 +92,35 @@ pub fn labels(truth: &Truth, random: &mut ChaCha8Rng) -> CameraLabels {
     }
 }
 
+/// A log of [`way`] in other axes.
 pub fn log(random: &mut ChaCha8Rng, axes: impl Fn(Point3<f64>) -> Point3<f64>) -> FlightLog {
+    log_of(random, |time_s| axes(way(time_s)), 0.2)
+}
+
+/// A log of a way, a place each so many seconds.
+pub fn log_of(random: &mut ChaCha8Rng, way: impl Fn(f64) -> Point3<f64>, step_s: f64) -> FlightLog {
     let mut noisy = |place: Point3<f64>| {
         place + Vector3::from_fn(|_, _| -> f64 { StandardNormal.sample(random) }) * LOG.sd_m
     };
     let sample = |k: u32| {
-        let time_s = 0.2 * f64::from(k);
-        LogSample { time_s, position: noisy(axes(way(time_s))) }
+        let time_s = step_s * f64::from(k);
+        LogSample { time_s, position: noisy(way(time_s)) }
     };
-    FlightLog { samples: (0..(SECONDS / 0.2) as u32).map(sample).collect(), errors: LOG }
+    FlightLog { samples: (0..(SECONDS / step_s) as u32).map(sample).collect(), errors: LOG }
 }
 
 pub fn flight(seed: u64) -> (Vec<Truth>, Vec<CameraLabels>, FlightLog) {
+    flight_of(way, seed)
+}
+
+pub fn flight_of(
+    way: impl Fn(f64) -> Point3<f64> + Copy,
+    seed: u64,
+) -> (Vec<Truth>, Vec<CameraLabels>, FlightLog) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let truths = cameras();
-    let labels = truths.iter().map(|truth| labels(truth, &mut random)).collect();
-    let log = log(&mut random, |place| place);
+    let labels = truths.iter().map(|truth| labels_of(truth, way, &mut random)).collect();
+    let log = log_of(&mut random, way, 0.2);
     (truths, labels, log)
 }
 

@@ -11,6 +11,7 @@ use crossfix_message::{
     BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
+use super::beside_survey::BesideSurvey;
 use super::hold_out::{HeldOut, HoldOut};
 use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
@@ -136,13 +137,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
-    let figures = report::figures(&result, &survey, rests, worth);
+    let beside = BesideSurvey::of(&result, &survey);
+    let is_contradicted = beside.contradicts();
+    let figures = report::figures(&result, beside, rests, worth);
     if args.json {
         output::json(&figures)?;
     } else {
         output::line(report::render(&result, &figures));
     }
     args.draw(&result)?;
+    ensure!(
+        !is_contradicted,
+        "nothing is written: most surveyed places lie beside where the flight has them"
+    );
     take_out_wrong(&mut result)?;
     args.write(&result)
 }

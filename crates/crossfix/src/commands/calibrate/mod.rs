@@ -1,3 +1,4 @@
+mod beside_survey;
 mod check;
 mod clicks;
 mod compare;

@@ -1,9 +1,10 @@
 //! What a calibration has found, for people and for programs.
 
-use crossfix_calibration::{CalibratedCamera, CameraResult, FlightResult, LandmarkMisfit, Survey};
+use crossfix_calibration::{CalibratedCamera, CameraResult, FlightResult, LandmarkMisfit};
 use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
+use super::beside_survey::BesideSurvey;
 use super::cost::Cost;
 use super::hold_out::Worth;
 use super::remarks::{self, Rests};
@@ -26,7 +27,7 @@ pub struct Figures {
     /// What a person should know.
     remarks: Vec<String>,
     /// How surveyed places and distances fit.
-    survey: Vec<SurveyFigures>,
+    survey: BesideSurvey,
     /// Absent of one camera alone.
     datum: Option<DatumFigures>,
     /// What a target will be known to; absent where no two cameras see one.
@@ -66,46 +67,6 @@ impl LandmarkFigures {
         };
         let deviations = format!("{:.1}", self.deviations);
         vec![self.landmark.clone(), self.camera.clone(), beside(0), beside(1), deviations]
-    }
-}
-
-#[derive(Debug, Serialize)]
-struct SurveyFigures {
-    /// A camera's name, or two of whom the distance was taped.
-    of: String,
-    /// Where the flight has it beside the survey, east, north, up, m; one number of a distance.
-    beside_m: Vec<f64>,
-    /// The most of these in the survey's deviations.
-    deviations: f64,
-}
-
-impl SurveyFigures {
-    fn all(result: &FlightResult, survey: &Survey) -> Vec<Self> {
-        let centre = |name: &CameraName| {
-            let found = result.cameras.iter().find(|camera| camera.name == *name)?;
-            Some(found.camera.pose().position())
-        };
-        let places = survey.places.iter().filter_map(|place| {
-            let beside = centre(&place.camera)? - place.position;
-            let deviations = beside.component_div(&place.sd_m).amax();
-            Some(Self {
-                of: place.camera.to_string(),
-                beside_m: beside.as_slice().to_vec(),
-                deviations,
-            })
-        });
-        let distances = survey.distances.iter().filter_map(|taped| {
-            let [first, second] = &taped.between;
-            let beside = (centre(second)? - centre(first)?).norm() - taped.metres;
-            let deviations = beside.abs() / taped.sd_m;
-            Some(Self { of: format!("{first} to {second}"), beside_m: vec![beside], deviations })
-        });
-        places.chain(distances).collect()
-    }
-
-    fn row(&self) -> Vec<String> {
-        let metres: Vec<String> = self.beside_m.iter().map(|m| format!("{m:+.3}")).collect();
-        vec![self.of.clone(), metres.join(", "), format!("{:.1}", self.deviations)]
     }
 }
 
@@ -230,10 +191,12 @@ impl From<&CameraResult> for CameraFigures {
 /// The figures for a program.
 pub fn figures(
     result: &FlightResult,
-    survey: &Survey,
+    survey: BesideSurvey,
     rests: Rests,
     held_out: Option<Worth>,
 ) -> Figures {
+    let mut remarks = remarks::of(result, rests);
+    remarks.extend(survey.remark());
     Figures {
         cameras: result.cameras.iter().map(CameraFigures::from).collect(),
         refused: result
@@ -244,8 +207,8 @@ pub fn figures(
         log_residual_m: result.log.map(|log| log.residual_m),
         log_left_out: result.log.map(|log| log.left_out),
         landmarks: result.landmarks.iter().map(LandmarkFigures::from).collect(),
-        remarks: remarks::of(result, rests),
-        survey: SurveyFigures::all(result, survey),
+        remarks,
+        survey,
         datum: result.datum.as_ref().map(DatumFigures::from),
         cost: Cost::of(result),
         held_out,
@@ -312,14 +275,7 @@ pub fn render(result: &FlightResult, figures: &Figures) -> String {
         rows.extend(figures.landmarks.iter().map(LandmarkFigures::row));
         format!("\n\n{}", output::table(&rows))
     };
-    let survey = if figures.survey.is_empty() {
-        String::new()
-    } else {
-        let head = ["survey", "beside it [m]", "deviations"].map(str::to_owned).to_vec();
-        let rows: Vec<_> =
-            std::iter::once(head).chain(figures.survey.iter().map(SurveyFigures::row)).collect();
-        format!("\n\n{}", output::table(&rows))
-    };
+    let survey = figures.survey.render().map_or_else(String::new, |table| format!("\n\n{table}"));
     let datum = figures.datum.as_ref().map_or_else(String::new, |datum| format!("\n\n{datum}"));
     let cost = figures.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
     let held_out =

@@ -12,6 +12,10 @@ const WEAK_POINTING_MRAD: f64 = 5.0;
 const WEAK_POSITION_M: f64 = 0.5;
 /// A camera that may stand anywhere within this share of its range is not calibrated at all.
 const NOWHERE: f64 = 0.5;
+/// Nor is one that may be turned by more than this, mrad: its covariance is of small turns, and the square
+/// of a larger one is more than labels err by. Of flights that hover or go straight 79 and more was found,
+/// a hundred metres beside.
+const ANYHOW_MRAD: f64 = 50.0;
 /// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
 const WRONG_MRAD: f64 = 8.0;
 /// Nor do a hand and a tracker err by more than so many pixels ...
@@ -34,13 +38,17 @@ const MOVED_DEVIATIONS: f64 = 2.5;
 
 /// The verdict: good; weak, and what mends it; wrong, and why.
 pub fn of(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2], wander_ms: f64) -> String {
-    wrong(camera, position_m, wander_ms)
+    wrong(camera, [position_m, pointing_mrad], wander_ms)
         .map(|why| format!("{WRONG}: {why}"))
         .or_else(|| weak(camera, [position_m, pointing_mrad]).map(|why| format!("weak: {why}")))
         .unwrap_or_else(|| "good".to_owned())
 }
 
-fn wrong(camera: &CameraResult, position_m: f64, wander_ms: f64) -> Option<String> {
+fn wrong(
+    camera: &CameraResult,
+    [position_m, pointing_mrad]: [f64; 2],
+    wander_ms: f64,
+) -> Option<String> {
     let name = &camera.name;
     let mrad = |px: f64| px / camera.intrinsics().fx * 1e3;
     let residual = (camera.residual_px, mrad(camera.residual_px));
@@ -70,23 +78,47 @@ fn wrong(camera: &CameraResult, position_m: f64, wander_ms: f64) -> Option<Strin
         Some(format!(
             "its clock would wander by {wander_ms:.0} ms (another target, lens file or frame rate?)"
         ))
-    } else if position_m > NOWHERE * camera.range_m {
-        Some("nothing tells where it stands".to_owned())
+    } else if position_m > NOWHERE * camera.range_m || pointing_mrad > ANYHOW_MRAD {
+        Some(
+            "nothing tells where it stands: the flight hovered, or went straight, where this camera saw it"
+                .to_owned(),
+        )
     } else {
         None
     }
 }
 
-fn weak(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> Option<&'static str> {
+fn weak(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> Option<String> {
     if (camera.used as f64) < WEAK_SHARE * camera.labels as f64 {
-        Some("many labels are not the target's")
+        Some("many labels are not the target's".to_owned())
     } else if (camera.focal_ratio - 1.0).abs() > WEAK_FOCAL {
         Some(
-            "its focal length is far from its file's (another lens file, or fly nearer and farther)",
+            "its focal length is far from its file's (another lens file, or fly nearer and farther)"
+                .to_owned(),
         )
     } else if position_m > WEAK_POSITION_M || pointing_mrad > WEAK_POINTING_MRAD {
-        Some("fly longer, near and far, high and low, through all of its image")
+        Some(format!(
+            "fly longer, near and far, high and low, through all of its image ({})",
+            known_worst(camera)
+        ))
     } else {
         None
+    }
+}
+
+/// Along which direction the camera's place is known worst.
+fn known_worst(camera: &CameraResult) -> String {
+    let place = camera.pose_covariance.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigen();
+    let worst = place.eigenvalues.imax();
+    let axis = place.eigenvectors.column(worst);
+    let level = axis.x.hypot(axis.y);
+    let sd_m = place.eigenvalues[worst].max(0.0).sqrt();
+    // An axis has no sense: the half towards the north or the east is named.
+    let azimuth = axis.x.atan2(axis.y).to_degrees().rem_euclid(180.0);
+    let steep = axis.z.abs().atan2(level).to_degrees();
+    if steep > 60.0 {
+        format!("its height is known worst, to {sd_m:.2} m")
+    } else {
+        format!("its place is known worst along {azimuth:.0} degrees from north, to {sd_m:.2} m")
     }
 }
