@@ -9,8 +9,12 @@ use crate::site_file::SiteCalibration;
 
 /// Of fewer cameras a move of the site would take on what one of them was knocked by.
 const LEAST_MOVED: usize = 3;
-/// Gauss and Newton's steps to the move of the site: from what logs lie beside it takes three.
-const STEPS: usize = 8;
+/// Gauss and Newton's steps to the move of the site: from what logs lie beside it takes three, and a dozen
+/// more until a camera that was knocked counts no more.
+const STEPS: usize = 24;
+/// Degrees of freedom of Student's t, a camera's pixels together: one that lies ten deviations beside the others
+/// counts a twentieth.
+const FREEDOM: f64 = 4.0;
 /// What no sight tells of the move is nothing: deviations that leave what one tells, m, rad, share.
 const UNTOLD: [f64; 7] = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0, 3.0];
 
@@ -138,7 +142,7 @@ pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Optio
     let common_s = known.get(known.len() / 2).copied().filter(|_| has_move);
     let all = sights.concat();
     let stays = SiteMove::none(&all)?;
-    let moved = if has_move { site_move(stays, &all)? } else { stays };
+    let moved = if has_move { site_move(stays, &sights)? } else { stays };
     let cameras = pairs
         .iter()
         .zip(&sights)
@@ -180,17 +184,24 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
 }
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
-/// deviations.
-fn site_move(mut moved: SiteMove, sights: &[Sight]) -> Option<SiteMove> {
+/// deviations. A camera that was knocked must not draw at the site: its pixels have one weight, and heavy tails.
+fn site_move(mut moved: SiteMove, cameras: &[Vec<Sight>]) -> Option<SiteMove> {
     for _ in 0..STEPS {
         let mut information =
             SMatrix::<f64, 7, 7>::from_diagonal(&SVector::from(UNTOLD).map(|sd: f64| sd.powi(-2)));
         let mut right = SVector::<f64, 7>::zeros();
-        for sight in sights {
-            let (residual, by) = moved.miss(sight)?;
-            let weight = sight.said_rad.powi(-2);
-            information += by.transpose() * by * weight;
-            right -= by.transpose() * residual * weight;
+        for sights in cameras {
+            let misses: Vec<_> =
+                sights.iter().map(|sight| moved.miss(sight)).collect::<Option<_>>()?;
+            let weights = sights.iter().map(|sight| sight.said_rad.powi(-2));
+            let squares: f64 =
+                misses.iter().zip(weights.clone()).map(|((r, _), w)| r.norm_squared() * w).sum();
+            let typical = squares / (2 * sights.len()).max(1) as f64;
+            let of_camera = (FREEDOM + 1.0) / (FREEDOM + typical);
+            for ((residual, by), weight) in misses.iter().zip(weights) {
+                information += by.transpose() * by * (weight * of_camera);
+                right -= by.transpose() * residual * (weight * of_camera);
+            }
         }
         let step = information.cholesky()?.solve(&right);
         moved.shift += step.fixed_rows::<3>(0);

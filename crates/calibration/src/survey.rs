@@ -2,8 +2,11 @@
 //! apart, and landmarks in their pictures.
 
 use crossfix_geometry::Pixel;
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Datum};
 use nalgebra::{Point3, Unit, Vector3};
+
+use crate::calibrated_camera::CalibratedCamera;
+use crate::site_file::SiteCalibration;
 
 /// What is known of a site beside what its cameras saw of a target.
 #[derive(Clone, Debug, Default)]
@@ -14,6 +17,8 @@ pub struct Survey {
     pub distances: Vec<TapedDistance>,
     /// Things of known places that were clicked in pictures.
     pub landmarks: Vec<SurveyedLandmark>,
+    /// An earlier calibration of the site, by [`Survey::with_known`].
+    pub known: Option<SiteCalibration>,
 }
 
 /// Where a camera stands.
@@ -85,6 +90,30 @@ pub(crate) const ENOUGH_FOR_POSE: usize = 4;
 pub(crate) const ENOUGH_PLACES: usize = 3;
 
 impl Survey {
+    /// With an earlier calibration of the site as what is known of poses and lenses beforehand, in the
+    /// place of the survey of its cameras. Where the site is as a whole stays what that says.
+    #[must_use]
+    pub fn with_known(mut self, site: SiteCalibration) -> Self {
+        self.places.retain(|place| site.camera(&place.camera).is_none());
+        self.places.extend(site.cameras().iter().map(|camera| SurveyedPlace {
+            camera: camera.name.clone(),
+            position: camera.camera.pose().position(),
+            sd_m: camera.pose_covariance.fixed_view::<3, 3>(3, 3).diagonal().map(f64::sqrt),
+        }));
+        self.known = Some(site);
+        self
+    }
+
+    /// What an earlier calibration says of a camera.
+    pub(crate) fn known(&self, camera: &CameraName) -> Option<&CalibratedCamera> {
+        self.known.as_ref()?.camera(camera)
+    }
+
+    /// What a site may be off by as a whole whose cameras are held by an earlier calibration.
+    pub(crate) fn known_datum(&self) -> Option<&Datum> {
+        self.known.as_ref()?.datum()
+    }
+
     /// Whether it tells these cameras how large their site is.
     pub fn tells_size(&self, cameras: &[&CameraName]) -> bool {
         let stands = |place: &&SurveyedPlace| cameras.contains(&&place.camera);

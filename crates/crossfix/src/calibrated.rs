@@ -89,12 +89,7 @@ pub fn middle_time(camera: &CalibratedCamera, own_ns: i64) -> (Timestamp, f64) {
 /// Makes a frame's bearings anew from its pixels, and its time the common one: that at which the
 /// rows of its targets were read out, in the mean. Returns how many bearings had to be left out.
 pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
-    let height = f64::from(camera.camera.model().intrinsics().size.height);
-    let is_seen =
-        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
-    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
-    let row =
-        if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 };
+    let row = middle_row(frame, camera);
     let (time, sd_s) = camera.common_time(Timestamp::from_nanos(frame.capture_time_ns), row);
     frame.capture_time_ns = time.nanos();
     frame.capture_time_sd_s = frame.capture_time_sd_s.hypot(sd_s);
@@ -110,6 +105,30 @@ pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
         true
     });
     (before - frame.tracks.len()) as u64
+}
+
+/// The row whose read-out gives a frame its time: that of its targets, in the mean.
+fn middle_row(frame: &BearingFrame, camera: &CalibratedCamera) -> f64 {
+    let height = f64::from(camera.camera.model().intrinsics().size.height);
+    let is_seen =
+        |track: &&crossfix_message::BearingTrack| track.state() == ImageTrackState::Tracking;
+    let rows: Vec<f64> = frame.tracks.iter().filter(is_seen).map(|track| track.pixel_y).collect();
+    if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 }
+}
+
+/// The time that the camera's own clock showed when a frame was taken that [`recalibrate`] has given the
+/// common one.
+#[cfg(feature = "centre")]
+pub fn own_time(frame: &BearingFrame, camera: &CalibratedCamera) -> Timestamp {
+    /// What a clock is ahead by changes by less than a hundredth of what its time does: each step leaves
+    /// as much of the error.
+    const STEPS: usize = 6;
+    let common = Timestamp::from_nanos(frame.capture_time_ns);
+    let row = middle_row(frame, camera);
+    (0..STEPS).fold(common, |own, _| {
+        let (shown, _) = camera.common_time(own, row);
+        own.plus_seconds(common.seconds_since(shown))
+    })
 }
 
 #[cfg(test)]
@@ -181,6 +200,8 @@ mod tests {
         assert!((bearing.y / bearing.z - 0.25).abs() < 1e-12);
         let message = camera.message(Timestamp::from_seconds(30.0)).parse().unwrap();
         assert_eq!(message.camera.pose().position().x, 10.0);
+        #[cfg(feature = "centre")]
+        assert!((own_time(&frame, camera.calibrated_camera()).seconds() - 7.0).abs() < 1e-8);
     }
 
     #[test]

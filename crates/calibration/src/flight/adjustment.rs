@@ -194,6 +194,10 @@ impl State {
         for (index, camera) in flight.cameras.iter().enumerate() {
             self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);
             self.prior_rows(index, starts[index], &priors.cameras[index], sink);
+            if flight.survey.known(&camera.name).is_none() {
+                self.lens_rows(index, starts[index], &priors.cameras[index], sink);
+            }
+            self.known_rows(index, starts[index], flight, sink);
             self.place_rows(starts[index], index, flight, sink);
             self.rate_row(index, starts[index], priors.rate_sd, sink);
         }
@@ -364,7 +368,18 @@ impl State {
         sink.take(&[(vec![(start + CLOCK + 1, rate_sd.recip())], rate / rate_sd)], Tails::Heavy);
     }
 
-    /// What is known of a camera before anything is seen.
+    /// What a lens's file says, and how far the lens may be otherwise.
+    fn lens_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
+        let values = lens::values(&self.cameras[index].intrinsics);
+        let known = lens::values(&priors.lens);
+        let deviations = priors.freedom.prior_sd(&priors.lens);
+        for (k, sd) in deviations.into_iter().enumerate() {
+            let term = (start + POSE_AND_CLOCK + k, sd.recip());
+            sink.take(&[(vec![term], (values[k] - known[k]) / sd)], Tails::Normal);
+        }
+    }
+
+    /// What is known of a camera's pose and clock before anything is seen.
     fn prior_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
         let camera = &self.cameras[index];
         let mut hold = |unknown: usize, value: f64, sd: f64| {
@@ -378,12 +393,6 @@ impl State {
         hold(CLOCK, 0.0, WIDE_S);
         let readout = READOUT_SHARE * priors.frame_s;
         hold(CLOCK + 2, clock.readout_s - readout, readout);
-        let values = lens::values(&camera.intrinsics);
-        let known = lens::values(&priors.lens);
-        let deviations = priors.freedom.prior_sd(&priors.lens);
-        for (k, sd) in deviations.into_iter().enumerate() {
-            hold(POSE_AND_CLOCK + k, values[k] - known[k], sd);
-        }
         // The wander's mean and slope are the clock's: the wander itself is held to nought as wide
         // as it may go.
         let order = self.order();

@@ -45,13 +45,16 @@ pub(super) struct Begun {
     pub(super) cameras: Vec<CameraLabels>,
     states: Vec<CameraState>,
     course: Course,
-    /// The others.
+    /// How many labels of a camera are of something else than the log's target.
+    pub(super) of_others: Vec<(CameraName, usize)>,
+    /// The cameras that take no part.
     pub(super) refused: Vec<(CameraName, Refusal)>,
 }
 
 impl Begun {
     fn new(course: Course) -> Self {
-        Self { cameras: Vec::new(), states: Vec::new(), course, refused: Vec::new() }
+        let (cameras, states) = (Vec::new(), Vec::new());
+        Self { cameras, states, course, of_others: Vec::new(), refused: Vec::new() }
     }
 
     /// Each camera against a log.
@@ -59,6 +62,8 @@ impl Begun {
         let mut begun = Self::new(Course::of(log).ok_or(FlightError::NoSolution)?);
         for camera in cameras {
             let (own, start) = target_of(camera, &begun.course);
+            let others = camera.labels.len() - own.labels.len();
+            begun.of_others.push((camera.name.clone(), others));
             begun.take(&own, start.map_err(|why| with_cure(camera, &begun.course, cameras, why)));
         }
         begun.leave_lonely_out(true);

@@ -13,6 +13,7 @@ mod datum;
 mod fitted;
 mod gauge;
 mod halves;
+mod known;
 mod linear;
 mod model;
 mod moved;
@@ -163,12 +164,12 @@ pub fn calibrate_flight(
     let settled = settle(&flight, begun.priors(), state);
     let (adjusted, priors) = settled.ok_or(FlightError::NoSolution)?;
     let mut result = results(&flight, adjusted, &priors).ok_or(FlightError::NoSolution)?;
-    for found in &mut result.cameras {
-        // What was of something else counts, too.
-        let given = cameras.iter().find(|camera| camera.name == found.name);
-        found.labels = given.map_or(found.labels, |camera| camera.labels.len());
+    for (name, count) in begun.of_others {
+        let found = result.cameras.iter_mut().find(|camera| camera.name == name);
+        found.into_iter().for_each(|camera| camera.labels += count);
     }
     result.refused = begun.refused;
+    known::hold_site(&mut result, survey, log.is_some());
     Ok(result)
 }
 

@@ -35,7 +35,7 @@ pub struct CameraResult {
     pub frame_s: f64,
     /// Range at which it saw the target, in the middle, m.
     pub range_m: f64,
-    /// Labels that it was given.
+    /// Labels, those of other things with them.
     pub labels: usize,
     /// Those of them that lie within four deviations.
     pub used: usize,

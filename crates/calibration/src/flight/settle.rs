@@ -54,6 +54,9 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
         let caution = priors.cameras[index].noise.caution(frame_s);
         let explained = explained(flight, adjusted, index, caution);
         let noise = LabelNoise::of(&residuals, explained, frame_s);
+        // Beside a free way one camera's noise may be found to be next to nothing.
+        let before = flight.survey.known(&flight.cameras[index].name).map(|known| known.noise);
+        let noise = before.filter(|before| before.sd_px() > noise.sd_px()).unwrap_or(noise);
         let wander = wander(adjusted, index, priors.cameras[index].wander);
         tracing::debug!(
             "camera `{}`: noise {:.3} px and {:.3} px lasting {:.2} s ({:.3} px explained), wander {:.3} ms/sqrt(s), rate {:.2e}, read-out {:.1} ms, focal ratio {:.4}, centre {:.2}",

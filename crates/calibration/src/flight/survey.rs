@@ -20,7 +20,12 @@ impl State {
         flight: &Flight<'_>,
         sink: &mut impl Sink,
     ) {
-        let Some(place) = flight.survey.place(&flight.cameras[index].name) else { return };
+        let name = &flight.cameras[index].name;
+        let Some(place) = flight.survey.place(name) else { return };
+        // Its place is begun with; what is known of the whole pose counts.
+        if flight.survey.known(name).is_some() {
+            return;
+        }
         let rows = [0, 1, 2].map(|axis| -> Row {
             let scale = place.sd_m[axis].recip();
             let aside = self.cameras[index].centre[axis] - place.position[axis];

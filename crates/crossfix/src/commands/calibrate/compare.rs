@@ -2,7 +2,9 @@ use std::fmt;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use crossfix_calibration::{CameraComparison, SiteComparison, SiteMove, compare_sites};
+use crossfix_calibration::{
+    CameraComparison, SiteCalibration, SiteComparison, SiteMove, compare_sites,
+};
 use serde::Serialize;
 
 use super::plots;
@@ -46,6 +48,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         output::line(figures.render());
         Ok(())
     }
+}
+
+/// How a calibration differs from an earlier one, for people.
+pub fn difference(first: &SiteCalibration, second: &SiteCalibration) -> Option<String> {
+    compare_sites(first, second).map(|comparison| Figures::from(&comparison).render())
 }
 
 #[derive(Debug, Serialize)]

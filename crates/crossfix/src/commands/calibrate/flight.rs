@@ -1,14 +1,14 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use crossfix_calibration::{
     CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration, SurveyedLandmark,
     calibrate_flight,
 };
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
-    BearingFrame, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
+    BearingFrame, BearingTrack, CameraCalibration, CameraName, Channel, ImageTrackState, Timestamp,
 };
 
 use super::beside_survey::BesideSurvey;
@@ -16,7 +16,8 @@ use super::hold_out::{HeldOut, HoldOut};
 use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
 use super::survey::{self, Distance};
-use super::{Lens, clicks, picture, plots, report};
+use super::{Lens, clicks, compare, picture, plots, report};
+use crate::calibrated;
 use crate::commands::numbers;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
@@ -32,7 +33,7 @@ pub struct Args {
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
     /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA (named .nmea or .log).
-    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks"])]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks", "prior"])]
     log: Option<PathBuf>,
     /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log or
     /// landmarks in degrees; the log's first place without.
@@ -63,6 +64,10 @@ pub struct Args {
     /// the sun and stars. Of the same name is the same thing.
     #[arg(long, value_name = "FILE")]
     landmarks: Option<PathBuf>,
+    /// An earlier calibration (TOML) of the site: what it says of poses and lenses is where this begins, and
+    /// counts as what is known. The flight may be anybody's; the difference is printed.
+    #[arg(long, value_name = "FILE")]
+    prior: Option<PathBuf>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
     log_kind: LogKind,
@@ -112,7 +117,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         antenna_m: args.antenna,
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
-    let mut cameras = labels(&args.recording, args.lens.into())?;
+    let prior = args.prior.as_deref().map(calibrated::load).transpose()?;
+    let mut cameras = labels(&args.recording, args.lens.into(), prior.as_ref())?;
     for Moment { camera, time_s } in &args.from {
         cut(&mut cameras, camera, |label| label.time_s >= *time_s)?;
     }
@@ -123,7 +129,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let landmarks = landmarks(args, &cameras)?;
     let of = (&names[..], "the recording");
-    let survey = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
+    let surveyed = survey::read(args.positions.as_deref(), &args.distance, landmarks, of)?;
+    let survey = match &prior {
+        Some(prior) => surveyed.clone().with_known(prior.clone()),
+        None => surveyed.clone(),
+    };
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
     let worth = held_out
         .map(|part| part.fused(&args.recording, SiteCalibration::from(&result), log.as_ref()))
@@ -137,7 +147,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
-    let beside = BesideSurvey::of(&result, &survey);
+    let beside = BesideSurvey::of(&result, &surveyed);
     let is_contradicted = beside.contradicts();
     let figures = report::figures(&result, beside, rests, worth);
     if args.json {
@@ -151,6 +161,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         "nothing is written: most surveyed places lie beside where the flight has them"
     );
     take_out_wrong(&mut result)?;
+    if let Some(prior) = prior.filter(|_| !args.json) {
+        let text = compare::difference(&prior, &SiteCalibration::from(&result));
+        output::line(format!("\nbeside the earlier one:\n\n{}", text.unwrap_or_default()));
+    }
     args.write(&result)
 }
 
@@ -180,6 +194,7 @@ impl Args {
             self.log.as_ref(),
             self.positions.as_ref(),
             self.landmarks.as_ref(),
+            self.prior.as_ref(),
         ];
         files.into_iter().flatten().map(PathBuf::as_path).collect()
     }
@@ -262,30 +277,40 @@ fn cut(
     Ok(())
 }
 
-/// What a recording's cameras saw, by their own clocks.
-fn labels(recording: &Path, freedom: LensFreedom) -> anyhow::Result<Vec<CameraLabels>> {
+/// What a recording's cameras saw, by their own clocks. Where it was made with a calibration, that must be
+/// the earlier one, whose lenses are begun with.
+fn labels(
+    recording: &Path,
+    freedom: LensFreedom,
+    prior: Option<&SiteCalibration>,
+) -> anyhow::Result<Vec<CameraLabels>> {
     let mut lenses: BTreeMap<CameraName, Intrinsics> = BTreeMap::new();
+    let mut is_corrected: BTreeMap<CameraName, bool> = BTreeMap::new();
     let mut seen: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
     let mut lacks = Lacks::default();
+    let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
     recorded::for_each(recording, &mut lacks, |lacks, entry| {
         match &entry.key.channel {
             Channel::Calibration(name) => {
                 if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
-                    lenses.insert(name.clone(), message.lens(name)?);
+                    let of_file = message.lens(name)?;
+                    let of_prior = known(name).map(|camera| *camera.camera.model().intrinsics());
+                    is_corrected.insert(name.clone(), message.datum.is_some());
+                    lenses.insert(name.clone(), of_prior.unwrap_or(of_file));
                 }
             }
             Channel::Bearings(name) => {
                 if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
-                    let time_s = Timestamp::from_nanos(frame.capture_time_ns).seconds();
-                    let measured = frame
-                        .tracks
-                        .iter()
-                        .filter(|track| track.state() == ImageTrackState::Tracking)
-                        .filter(|track| track.pixel_x.is_finite() && track.pixel_y.is_finite())
-                        .map(|track| Label {
-                            time_s,
-                            pixel: Pixel::new(track.pixel_x, track.pixel_y),
-                        });
+                    let time = match (is_corrected.get(name), known(name)) {
+                        (Some(true), Some(camera)) => calibrated::own_time(&frame, camera),
+                        (Some(true), None) => bail!(
+                            "the bearings of camera `{name}` in {} were made with a calibration: give it \
+                             with --prior",
+                            recording.display()
+                        ),
+                        _ => Timestamp::from_nanos(frame.capture_time_ns),
+                    };
+                    let measured = measured(&frame, time.seconds());
                     seen.entry(name.clone()).or_default().extend(measured);
                 }
             }
@@ -310,4 +335,15 @@ fn labels(recording: &Path, freedom: LensFreedom) -> anyhow::Result<Vec<CameraLa
     }
     ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
     Ok(cameras)
+}
+
+/// The targets that a frame measured, at its time by the camera's own clock.
+fn measured(frame: &BearingFrame, time_s: f64) -> impl Iterator<Item = Label> + '_ {
+    let is_measured = |track: &&BearingTrack| {
+        track.state() == ImageTrackState::Tracking
+            && track.pixel_x.is_finite()
+            && track.pixel_y.is_finite()
+    };
+    let pixel = |track: &BearingTrack| Pixel::new(track.pixel_x, track.pixel_y);
+    frame.tracks.iter().filter(is_measured).map(move |track| Label { time_s, pixel: pixel(track) })
 }

@@ -87,7 +87,7 @@ pub fn read(
             known.join(", ")
         );
     }
-    Ok(Survey { places, distances, landmarks })
+    Ok(Survey { places, distances, landmarks, known: None })
 }
 
 fn read_places(path: &Path) -> anyhow::Result<Vec<SurveyedPlace>> {

@@ -1,0 +1,109 @@
+//! What an earlier calibration says of cameras.
+
+use nalgebra::{DMatrix, DVector, Rotation3};
+
+use super::adjustment::{Flight, Row, Sink, State};
+use super::model::POSE_AND_CLOCK;
+use super::noise::Tails;
+use super::results::FlightResult;
+use crate::calibrated_camera::CalibratedCamera;
+use crate::lens;
+use crate::survey::Survey;
+
+/// No pose is said to be known better than this, rad and m: of zeros there is no root.
+const LEAST_SD: f64 = 1e-6;
+
+impl State {
+    /// A camera's pose and lens by an earlier calibration. The pose follows the lens, and what is said of
+    /// it is beside that. The camera may have been moved since, so its tails are heavy.
+    pub(super) fn known_rows(
+        &self,
+        index: usize,
+        start: usize,
+        flight: &Flight<'_>,
+        sink: &mut impl Sink,
+    ) {
+        let Some(known) = flight.survey.known(&flight.cameras[index].name) else { return };
+        let camera = &self.cameras[index];
+        let count = lens::numbers(&camera.intrinsics);
+        let lens = lens_step(known, camera);
+        let pose = pose_step(known, camera);
+        let by_lens = &known.lens.pose_by_lens;
+        if lens.len() != count || by_lens.ncols() != count {
+            return;
+        }
+        let covariance = DMatrix::from_column_slice(6, 6, known.pose_covariance.as_slice());
+        if let Some(whitened) = whitening(&covariance) {
+            let beside = &whitened * (&pose - by_lens * &lens);
+            let follows = &whitened * by_lens;
+            let row = |axis: usize| -> Row {
+                let of_pose = (0..6).map(|k| (start + k, whitened[(axis, k)]));
+                let of_lens = (0..count).map(|k| (start + POSE_AND_CLOCK + k, -follows[(axis, k)]));
+                (of_pose.chain(of_lens).collect(), beside[axis])
+            };
+            sink.take(&(0..6).map(row).collect::<Vec<_>>(), Tails::Heavy);
+        }
+        if let Some(whitened) = whitening(&known.lens.covariance) {
+            let beside = &whitened * &lens;
+            let row = |axis: usize| -> Row {
+                let terms = (0..count).map(|k| (start + POSE_AND_CLOCK + k, whitened[(axis, k)]));
+                (terms.collect(), beside[axis])
+            };
+            sink.take(&(0..count).map(row).collect::<Vec<_>>(), Tails::Heavy);
+        }
+    }
+}
+
+/// No clock is taken to be known better than this at another time than it was calibrated, s: of zeros there
+/// is no mean.
+const LEAST_CLOCK_SD_S: f64 = 1e-3;
+
+/// Holds a site as a whole where an earlier calibration has it: it may be off by what was said then. Without
+/// a log its common time is that which the cameras' clocks showed by what was known of them.
+pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey, has_log: bool) {
+    if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
+        *datum = known.clone();
+    }
+    if has_log {
+        return;
+    }
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for found in &result.cameras {
+        let Some(known) = survey.known(&found.name) else { continue };
+        let middle = &found.clock.knots[found.clock.knots.len() / 2];
+        let (ahead_s, sd_s) = known.clock.at(middle.time_s);
+        let weight = sd_s.max(LEAST_CLOCK_SD_S).powi(-2);
+        sum += weight * (ahead_s - middle.ahead_s);
+        weights += weight;
+    }
+    if weights > 0.0 {
+        let later_s = sum / weights;
+        for camera in &mut result.cameras {
+            camera.clock.knots.iter_mut().for_each(|knot| knot.ahead_s += later_s);
+            camera.fitted.iter_mut().for_each(|label| label.time_s += later_s);
+        }
+    }
+}
+
+/// From the known pose to the state's: a turn about the camera's axes (rad), and its centre (m).
+fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {
+    let pose = known.camera.pose();
+    let turn = Rotation3::from_matrix_unchecked(
+        pose.rotation().matrix().transpose() * camera.rotation.matrix(),
+    );
+    let moved = camera.centre - pose.position();
+    DVector::from_iterator(6, turn.scaled_axis().iter().chain(moved.iter()).copied())
+}
+
+fn lens_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {
+    let known = lens::values(known.camera.model().intrinsics());
+    let now = lens::values(&camera.intrinsics);
+    DVector::from_iterator(known.len().min(now.len()), now.iter().zip(&known).map(|(a, b)| a - b))
+}
+
+/// What makes errors of a covariance independent and of deviation one.
+fn whitening(covariance: &DMatrix<f64>) -> Option<DMatrix<f64>> {
+    let size = covariance.nrows();
+    let least = DMatrix::identity(size, size) * LEAST_SD.powi(2);
+    (covariance + least).cholesky()?.l().try_inverse()
+}

@@ -1,0 +1,73 @@
+//! Another flight, of which there is no log, by what an earlier calibration says.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+mod common;
+
+use common::{Truth, flight, labels_of, pointing_error_mrad};
+use crossfix_calibration::{
+    CameraLabels, SiteCalibration, Survey, calibrate_flight, compare_sites,
+};
+use crossfix_geometry::{Camera, Pose};
+use nalgebra::{Point3, Rotation3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+/// What flew last night, another way through the same air.
+fn last_night(t: f64) -> Point3<f64> {
+    Point3::new(
+        24.0 * (0.13 * t + 2.0).sin() + 7.0 * (0.49 * t).cos(),
+        22.0 * (0.19 * t).sin() + 5.0 * (0.67 * t).cos(),
+        34.0 + 10.0 * (0.21 * t + 1.0).sin(),
+    )
+}
+
+fn of_last_night(truths: &[Truth], seed: u64) -> Vec<CameraLabels> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    truths.iter().map(|truth| labels_of(truth, last_night, &mut random)).collect()
+}
+
+/// The calibration by a flight with a log.
+fn earlier() -> (Vec<Truth>, SiteCalibration) {
+    let (truths, labels, log) = flight(31);
+    let result = calibrate_flight(&labels, Some(&log), &Survey::default()).unwrap();
+    (truths, SiteCalibration::from(&result))
+}
+
+#[test]
+fn anybodys_flight_leaves_a_calibrated_site_where_it_is_in_place_and_time() {
+    let (truths, site) = earlier();
+    let survey = Survey::default().with_known(site.clone());
+    let result = calibrate_flight(&of_last_night(&truths, 32), None, &survey).unwrap();
+    assert_eq!(result.cameras.len(), 3, "{:?}", result.refused);
+    for (index, truth) in truths.iter().enumerate() {
+        let error = pointing_error_mrad(truth, &result, index);
+        assert!(error < 0.25, "{}: {error} mrad", truth.name);
+        let clock = &result.cameras[index].clock;
+        let middle = clock.knots[clock.knots.len() / 2];
+        let off_s = middle.ahead_s - truth.offset_s;
+        assert!(off_s.abs() < 0.01, "{}: {off_s} s", truth.name);
+    }
+    let comparison = compare_sites(&site, &SiteCalibration::from(&result)).unwrap();
+    for camera in &comparison.cameras {
+        assert!(camera.deviations < 2.5, "{}: {}", camera.name, camera.deviations);
+    }
+    assert_eq!(result.datum.as_ref().unwrap().covariance, site.datum().unwrap().covariance);
+}
+
+#[test]
+fn a_camera_that_was_moved_since_is_proposed_where_it_is_now() {
+    const TURN_RAD: f64 = 0.02;
+    let (mut truths, site) = earlier();
+    let old = &truths[1].camera;
+    let turned = Rotation3::new(Vector3::new(0.0, 0.0, TURN_RAD)) * old.pose().rotation();
+    let pose = Pose::new(*turned.matrix(), old.pose().position()).unwrap();
+    truths[1].camera = Camera::new(*old.model().intrinsics(), pose).unwrap();
+    let survey = Survey::default().with_known(site.clone());
+    let result = calibrate_flight(&of_last_night(&truths, 33), None, &survey).unwrap();
+    let comparison = compare_sites(&site, &SiteCalibration::from(&result)).unwrap();
+    let apart: Vec<f64> = comparison.cameras.iter().map(|camera| camera.deviations).collect();
+    assert!(apart[1] > 5.0 && apart[1] > 3.0 * apart[0].max(apart[2]), "{apart:?}");
+    let error = pointing_error_mrad(&truths[1], &result, 1);
+    assert!(error < 2.0, "{error} mrad of {} are left", 1e3 * TURN_RAD);
+}
