@@ -1,6 +1,7 @@
 //! Sites whose calibrations err by what they say: tracks must be as sure as they are right.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+#![allow(clippy::print_stdout, reason = "docs/calibration.md has the figures")]
 #![allow(dead_code, reason = "each test uses what it needs of the common scene")]
 
 mod common;

@@ -87,11 +87,11 @@ impl HeldOut {
         })?;
         let recalibration = Recalibration::of(site);
         for entry in calibrations.into_values() {
-            run.take(recalibration.applied(entry));
+            run.take(&recalibration.applied(entry));
         }
         let mut reordered = Reordered::new(recalibration);
         let mut take = |entry: Entry| {
-            run.take(entry);
+            run.take(&entry);
             Ok(())
         };
         recorded::for_each(recording, &mut lacks, |_, entry| {
@@ -126,7 +126,7 @@ impl Run {
         })
     }
 
-    fn take(&mut self, entry: Entry) {
+    fn take(&mut self, entry: &Entry) {
         if let Ok(frame) = decode::<BearingFrame>(&entry.data)
             && matches!(entry.key.channel, Channel::Bearings(_))
         {

@@ -29,7 +29,7 @@ pub struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Way {
-    Flight(flight::Args),
+    Flight(Box<flight::Args>),
     Landmarks(landmarks::Args),
     Compare(compare::Args),
     Check(check::Args),
