@@ -4,13 +4,15 @@
 
 mod common;
 
-use common::{LOG, SECONDS, Truth, flight, pointing_error_mrad};
+use common::{
+    LOG, SECONDS, Truth, cameras, flight, flight_of, labels_of, pointing_error_mrad, way,
+};
 use crossfix_calibration::{
     FlightError, FlightResult, LogErrors, Refusal, SiteCalibration, Survey, SurveyedPlace,
     TapedDistance, calibrate_flight,
 };
-use crossfix_geometry::{Camera, Distortion, Intrinsics, Pixel};
-use nalgebra::{Matrix6, Rotation3, Vector3, Vector6};
+use crossfix_geometry::{Camera, Distortion, Intrinsics, Pixel, Pose};
+use nalgebra::{Matrix6, Point3, Rotation3, Vector3, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -207,6 +209,72 @@ fn an_unknown_flight_and_three_surveyed_places_give_poses_clocks_and_lenses() {
     }
     let sd = result.datum.as_ref().unwrap().sd();
     assert!((0.01..0.1).contains(&sd[0]) && sd[6] < 2e-3 && sd[7] > 100.0, "{sd:?}");
+}
+
+#[test]
+fn an_unknown_flight_in_a_plane_is_known_from_three_surveyed_places_too() {
+    let ways: [fn(f64) -> Point3<f64>; 2] = [
+        |t| Point3::new(way(t).x, way(t).y, 30.0),
+        |t| Point3::new(way(t).x, way(t).y, 35.0 + 0.2 * way(t).x - 0.15 * way(t).y),
+    ];
+    for (way, seed) in ways.into_iter().flat_map(|way| (40..42).map(move |seed| (way, seed))) {
+        let (truths, labels, _) = flight_of(way, seed);
+        let survey = survey(&truths, &mut ChaCha8Rng::seed_from_u64(seed));
+        let result = calibrate_flight(&labels, None, &survey).unwrap();
+        assert_eq!(result.cameras.len(), 3, "{:?}", result.refused);
+        for (truth, found) in truths.iter().zip(&result.cameras) {
+            let off = (found.camera.pose().position() - truth.camera.pose().position()).norm();
+            assert!(off < 0.3, "{} by seed {seed}: {off} m", truth.name);
+        }
+    }
+}
+
+#[test]
+fn of_a_flight_in_a_plane_two_cameras_alone_say_that_it_fits_two_ways_or_are_right() {
+    let ways: [fn(f64) -> Point3<f64>; 5] = [
+        |t| Point3::new(way(t).x, way(t).y, 30.0),
+        |t| Point3::new(way(t).x, way(t).y, 35.0 + 0.4 * way(t).x),
+        |t| Point3::new(way(t).x, 0.3 * way(t).x + 5.0, way(t).z),
+        |t| Point3::new(0.4 * way(t).x, 0.4 * way(t).y, 30.0),
+        |t| Point3::new(0.4 * way(t).x, 0.4 * way(t).y, 45.0 + 0.8 * way(t).x),
+    ];
+    let mut right = 0;
+    for (way, seed) in ways.into_iter().flat_map(|way| (43..45).map(move |seed| (way, seed))) {
+        let (truths, labels, _) = flight_of(way, seed);
+        let survey = survey(&truths[..2], &mut ChaCha8Rng::seed_from_u64(seed));
+        match calibrate_flight(&labels[..2], None, &survey) {
+            Err(error) => {
+                let is_said = matches!(error, FlightError::TwoWays | FlightError::NoPair);
+                assert!(is_said, "{error}");
+                println!("{error}");
+            }
+            Ok(result) => {
+                for (found, truth) in result.cameras.iter().zip(&truths) {
+                    let turn = truth.camera.pose().rotation();
+                    let off = found.camera.pose().rotation().angle_to(turn);
+                    // Two places and level pictures hold the site itself.
+                    assert!(off < 0.03, "{} by seed {seed}: {off} rad", found.name);
+                }
+                right += 1;
+            }
+        }
+    }
+    assert!(right >= 4, "{right} of ten");
+}
+
+#[test]
+fn two_cameras_on_one_side_of_a_flight_in_a_plane_may_stand_in_two_ways() {
+    let mut truths = cameras();
+    truths.truncate(2);
+    for (truth, place) in truths.iter_mut().zip([[100.0, 30.0, 1.5], [80.0, -30.0, 2.0]]) {
+        let pose = Pose::looking_at(place.into(), Point3::new(0.0, 0.0, 30.0)).unwrap();
+        truth.camera = Camera::new(*truth.camera.model().intrinsics(), pose).unwrap();
+    }
+    let small = |t: f64| Point3::new(0.3 * way(t).x, 0.3 * way(t).y, 40.0);
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let labels: Vec<_> = truths.iter().map(|truth| labels_of(truth, small, &mut random)).collect();
+    let found = calibrate_flight(&labels, None, &survey(&truths, &mut random));
+    assert!(matches!(found.err(), Some(FlightError::TwoWays)));
 }
 
 #[test]

@@ -33,6 +33,12 @@ const TOGETHER_S: f64 = 0.2;
 /// Without a log so many pairs of cameras are begun with, the best by their looks: one that saw a
 /// short or a flat piece of the way leads astray.
 const PAIRS_TRIED: usize = 3;
+/// Two ways of standing to each other fit alike where one misses this many times what the other does at most:
+/// the two of a flight in a plane fit to within their noise, ...
+const ALIKE_TIMES: f64 = 2.0;
+/// ... and are two where cameras are turned otherwise by this, rad: what one way is begun with from two pairs
+/// of cameras differs by less.
+const OTHERWISE_RAD: f64 = 0.1;
 /// What labels are taken to err by before anything is known, pixels: a hand's or a tracker's, and
 /// what a lens file leaves.
 const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
@@ -87,7 +93,7 @@ impl Begun {
         {
             return Err(FlightError::NoCamera { camera: camera.name.clone(), why: why.clone() });
         }
-        let mut begun = best_of_pairs(&usable).ok_or(FlightError::NoPair)?;
+        let mut begun = best_of_pairs(&usable)?;
         for (camera, why) in unusable {
             begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
         }
@@ -212,6 +218,24 @@ impl Begun {
         }
     }
 
+    /// Whether it fits about as well as the best one, and its cameras stand otherwise to each other.
+    fn rivals(&self, best: &Self) -> bool {
+        let turn = |begun: &Self, name: &CameraName| {
+            let index = begun.cameras.iter().position(|camera| camera.name == *name)?;
+            Some(begun.states[index].rotation)
+        };
+        let names = best.cameras.iter().map(|camera| &camera.name);
+        let turns: Vec<[Rotation3<f64>; 2]> =
+            names.filter_map(|name| Some([turn(self, name)?, turn(best, name)?])).collect();
+        let stand_otherwise = turns.windows(2).any(|pair| {
+            let [own, bests] = [0, 1].map(|k| pair[0][k].inverse() * pair[1][k]);
+            own.angle_to(&bests) > OTHERWISE_RAD
+        });
+        self.cameras.len() == best.cameras.len()
+            && self.misfit() < ALIKE_TIMES * best.misfit()
+            && stand_otherwise
+    }
+
     /// The sum of what all cameras' labels lie beside the course.
     fn misfit(&self) -> f64 {
         let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
@@ -314,17 +338,20 @@ fn with_cure(
 }
 
 /// Of the best pairs the one that most cameras fit, and fit best.
-fn best_of_pairs(cameras: &[&CameraLabels]) -> Option<Begun> {
+fn best_of_pairs(cameras: &[&CameraLabels]) -> Result<Begun, FlightError> {
     let sights: Vec<Sights> = cameras.iter().map(|camera| Sights::of(camera)).collect();
-    let mut found: Vec<(usize, usize, Pair)> = Vec::new();
+    let mut found: Vec<(usize, usize, Vec<Pair>)> = Vec::new();
     for first in 0..cameras.len() {
         for second in first + 1..cameras.len() {
-            let pair = pairs::find(&sights[first], &sights[second]);
-            found.extend(pair.map(|pair| (first, second, pair)));
+            found.push((first, second, pairs::find(&sights[first], &sights[second])));
         }
     }
-    found.sort_by(|a, b| a.2.doubt.total_cmp(&b.2.doubt));
-    let begun = found.iter().take(PAIRS_TRIED).filter_map(|(first, second, pair)| {
+    let doubt = |pairs: &[Pair]| pairs.iter().map(|p| p.doubt).fold(f64::INFINITY, f64::min);
+    found.sort_by(|a, b| doubt(&a.2).total_cmp(&doubt(&b.2)));
+    let tried = found.iter().take(PAIRS_TRIED);
+    let ways =
+        tried.flat_map(|(first, second, pairs)| pairs.iter().map(move |p| (first, second, p)));
+    let begun = ways.filter_map(|(first, second, pair)| {
         tracing::debug!(
             "`{}` and `{}` are {:.3} s apart (doubt {:.1e})",
             cameras[*first].name,
@@ -344,10 +371,16 @@ fn best_of_pairs(cameras: &[&CameraLabels]) -> Option<Begun> {
         begun.place_the_rest(cameras, &sights)?;
         Some(begun)
     });
-    begun.min_by(|a, b| {
+    let mut begun: Vec<Begun> = begun.collect();
+    begun.sort_by(|a, b| {
         let fewer = b.cameras.len().cmp(&a.cameras.len());
         fewer.then_with(|| a.misfit().total_cmp(&b.misfit()))
-    })
+    });
+    let (best, others) = begun.split_first().ok_or(FlightError::NoPair)?;
+    if others.iter().any(|other| other.rivals(best)) {
+        return Err(FlightError::TwoWays);
+    }
+    Ok(begun.swap_remove(0))
 }
 
 /// The time between a camera's frames: the median between its labels, s.

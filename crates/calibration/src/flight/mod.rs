@@ -21,6 +21,7 @@ mod noise;
 mod normal;
 mod pairs;
 mod pieces;
+mod plane;
 mod pull;
 mod results;
 mod settle;
@@ -77,6 +78,12 @@ pub enum FlightError {
          different sides are begun with"
     )]
     NoPair,
+    /// What was seen fits two ways of standing.
+    #[error(
+        "the cameras may stand to each other in two ways that fit alike, as the flight lies in a plane: a \
+         third camera that saw it, a flight at several heights, or a log of it tells which"
+    )]
+    TwoWays,
     /// Nothing says how large the site is.
     #[error(
         "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \

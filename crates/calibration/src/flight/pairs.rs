@@ -7,6 +7,7 @@ use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
 use super::begin::frame_time;
 use super::model::CameraLabels;
+use super::plane;
 use crate::lens;
 
 /// Offsets of the clocks are tried in steps of this, s, and then ever finer ones about the best.
@@ -24,6 +25,9 @@ const GAP_S: f64 = 0.2;
 const GAP_FRAMES: f64 = 1.5;
 /// Sight lines that meet more sharply than this tell no range, rad.
 pub(super) const LEAST_PARALLAX_RAD: f64 = 0.05;
+/// A flight in a plane fits a homography this many times worse than an essential matrix at most, which is of a
+/// whole family then and fits its noise; others fit it hundreds of times worse.
+const PLANE_TIMES: f64 = 10.0;
 /// Cameras are taken to stand so far apart until something says how far, m.
 const BASE_M: f64 = 50.0;
 
@@ -112,9 +116,12 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(f64::INFINITY)
 }
 
-/// How two cameras stand to each other; `None` where they saw too little in common.
-pub(super) fn find(first: &Sights, second: &Sights) -> Option<Pair> {
-    let ((from, to), (other_from, other_to)) = (first.span()?, second.span()?);
+/// How two cameras may stand to each other: of a flight in a plane there are two ways. None where they saw
+/// too little in common.
+pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
+    let (Some((from, to)), Some((other_from, other_to))) = (first.span(), second.span()) else {
+        return Vec::new();
+    };
     let fewer = first.times_s.len().min(second.times_s.len());
     // Of the first's labels that are tried, as many as that share of the fewer.
     let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
@@ -147,9 +154,12 @@ pub(super) fn find(first: &Sights, second: &Sights) -> Option<Pair> {
         coarser = step;
     }
     let (misfit_rad, ahead_s) = best;
-    misfit_rad
-        .is_finite()
-        .then(|| decomposed(&common(first, second, ahead_s), ahead_s, misfit_rad))?
+    if misfit_rad.is_infinite() {
+        return Vec::new();
+    }
+    let seen = common(first, second, ahead_s);
+    let in_space = decomposed(&seen, ahead_s, misfit_rad);
+    in_space.into_iter().chain(in_plane(&seen, ahead_s, misfit_rad)).collect()
 }
 
 /// The pose of the four that an essential matrix allows, which has most of the target ahead of both.
@@ -169,23 +179,40 @@ fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Opti
         let second_from_first = u * quarter * v_t;
         [along, -along].map(|shift| (second_from_first, shift))
     });
-    let pair = |(second_from_first, shift): (Matrix3<f64>, Vector3<f64>)| {
-        let centre = Point3::from(-second_from_first.tr_mul(&shift) * BASE_M);
-        let rotation = Rotation3::from_matrix_unchecked(second_from_first.transpose());
-        let pair = Pair { ahead_s, first_from_second: rotation, centre, doubt: 0.0 };
-        let parallaxes: Vec<f64> = seen.iter().filter_map(|seen| pair.parallax(seen)).collect();
-        (parallaxes, pair)
-    };
-    let (parallaxes, mut pair) = poses.map(pair).max_by_key(|(ahead, _)| ahead.len())?;
-    if 2 * parallaxes.len() < seen.len() {
-        return None;
+    let pairs = poses.filter_map(|pose| Pair::of(pose, seen, ahead_s, misfit_rad));
+    pairs.max_by_key(|(ahead, _)| *ahead).map(|(_, pair)| pair)
+}
+
+/// The poses of a flight in a plane, if a plane explains it about as well.
+fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<Pair> {
+    let Some((matrix, in_plane_rad)) = plane::homography(seen) else { return Vec::new() };
+    if in_plane_rad > PLANE_TIMES * misfit_rad {
+        return Vec::new();
     }
-    let count = parallaxes.len() as f64;
-    pair.doubt = misfit_rad / median(parallaxes.into_iter()) / count.sqrt();
-    Some(pair)
+    let pairs = plane::poses(&matrix, seen).into_iter().filter_map(|(turn, shift)| {
+        Pair::of((turn, shift.try_normalize(1e-9)?), seen, ahead_s, in_plane_rad)
+    });
+    pairs.map(|(_, pair)| pair).collect()
 }
 
 impl Pair {
+    /// A second camera that is turned and shifted (by a unit) so against the first, with how many places lie
+    /// ahead of both; `None` if less than half do.
+    fn of(
+        (second_from_first, shift): (Matrix3<f64>, Vector3<f64>),
+        seen: &[[Vector3<f64>; 2]],
+        ahead_s: f64,
+        misfit_rad: f64,
+    ) -> Option<(usize, Self)> {
+        let centre = Point3::from(-second_from_first.tr_mul(&shift) * BASE_M);
+        let rotation = Rotation3::from_matrix_unchecked(second_from_first.transpose());
+        let mut pair = Self { ahead_s, first_from_second: rotation, centre, doubt: 0.0 };
+        let parallaxes: Vec<f64> = seen.iter().filter_map(|seen| pair.parallax(seen)).collect();
+        let ahead = parallaxes.len();
+        pair.doubt = misfit_rad / median(parallaxes.into_iter()) / (ahead as f64).sqrt();
+        (2 * ahead >= seen.len()).then_some((ahead, pair))
+    }
+
     /// The angle at which the sight lines of a place meet that lies ahead of both; `None` where they
     /// meet too sharply to tell.
     fn parallax(&self, [a, b]: &[Vector3<f64>; 2]) -> Option<f64> {

@@ -1,0 +1,99 @@
+//! Two cameras from what both saw of a flight in a plane: any essential matrix of a whole family fits
+//! that, but a homography tells the two poses that can be.
+
+use nalgebra::{Matrix3, SMatrix, Vector3};
+
+/// Singular values nearer together than this are alike: the cameras stand in one place.
+const ALIKE: f64 = 1e-6;
+
+/// What takes a first camera's directions to a second's, `b ~ H a`, of places in a plane; and the median
+/// angle that it leaves, rad.
+pub(super) fn homography(seen: &[[Vector3<f64>; 2]]) -> Option<(Matrix3<f64>, f64)> {
+    let mut sum = SMatrix::<f64, 9, 9>::zeros();
+    for [a, b] in seen {
+        // b x (H a) = 0, linear in H by columns: the Kronecker product of a' and [b]x.
+        let row: SMatrix<f64, 3, 9> = a.transpose().kronecker(&b.cross_matrix());
+        sum += row.transpose() * row;
+    }
+    let eigen = sum.symmetric_eigen();
+    let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let matrix = Matrix3::from_column_slice(least.as_slice());
+    // Places lie ahead of both cameras, so that it takes directions to directions and not to their
+    // opposites.
+    let ahead = seen.iter().filter(|[a, b]| b.dot(&(matrix * a)) > 0.0).count();
+    let matrix = if 2 * ahead < seen.len() { -matrix } else { matrix };
+    let mut angles: Vec<f64> = seen.iter().map(|[a, b]| (matrix * a).angle(b)).collect();
+    angles.sort_unstable_by(f64::total_cmp);
+    Some((matrix, *angles.get(angles.len() / 2)?))
+}
+
+/// The second's turn and shift (in units of the plane's distance) that a homography may be of: those of the four
+/// by which all places lie ahead (Ma, Soatto, Kosecka and Sastry 2004, section 5.3.3).
+pub(super) fn poses(
+    matrix: &Matrix3<f64>,
+    seen: &[[Vector3<f64>; 2]],
+) -> Vec<(Matrix3<f64>, Vector3<f64>)> {
+    let mut values = matrix.singular_values();
+    values.as_mut_slice().sort_unstable_by(f64::total_cmp);
+    // H = R + t n'/d has the middle one as its unit.
+    let unit = matrix / values[1];
+    let eigen = unit.tr_mul(&unit).symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_unstable_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+    let [most, _, least] = order.map(|k| eigen.eigenvalues[k]);
+    let [v1, v2, v3] = order.map(|k| eigen.eigenvectors.column(k).into_owned());
+    if most - least < ALIKE {
+        return Vec::new();
+    }
+    let scale = (most - least).sqrt();
+    let (along, across) =
+        ((1.0 - least).max(0.0).sqrt() / scale, (most - 1.0).max(0.0).sqrt() / scale);
+    let found = [across, -across].into_iter().flat_map(|across| {
+        // A direction in the plane beside v2 that keeps its length.
+        let u = v1 * along + v3 * across;
+        let normal = v2.cross(&u);
+        let before = Matrix3::from_columns(&[v2, u, normal]);
+        let (hv, hu) = (unit * v2, unit * u);
+        let after = Matrix3::from_columns(&[hv, hu, hv.cross(&hu)]);
+        let turn = after * before.transpose();
+        let shift = (unit - turn) * normal;
+        [(turn, shift, normal), (turn, -shift, -normal)]
+    });
+    let is_ahead = |(_, _, normal): &(Matrix3<f64>, Vector3<f64>, Vector3<f64>)| {
+        let ahead = seen.iter().filter(|[a, _]| normal.dot(a) > 0.0).count();
+        10 * ahead > 9 * seen.len()
+    };
+    found.filter(is_ahead).map(|(turn, shift, _)| (turn, shift)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Point3, Rotation3};
+
+    use super::*;
+
+    #[test]
+    fn one_of_the_poses_is_that_which_saw_the_plane() {
+        let turn = Rotation3::new(Vector3::new(0.1, -0.8, 0.05));
+        let centre = Point3::new(40.0, -3.0, 12.0);
+        let seen: Vec<[Vector3<f64>; 2]> = (0..60)
+            .map(|k| {
+                let t = 0.1 * f64::from(k);
+                // A plane askew to both.
+                let (x, y) = (25.0 * t.sin(), 12.0 * (1.7 * t).cos());
+                let place = Point3::new(x, y, 60.0 + 0.3 * x - 0.4 * y);
+                [place.coords.normalize(), (turn * (place - centre)).normalize()]
+            })
+            .collect();
+        let (matrix, misfit) = homography(&seen).unwrap();
+        assert!(misfit < 1e-9, "{misfit}");
+        let poses = poses(&matrix, &seen);
+        assert!((1..=2).contains(&poses.len()), "{}", poses.len());
+        let shift = turn * -centre.coords;
+        let is_true = |(found, along): &(Matrix3<f64>, Vector3<f64>)| {
+            (found - turn.matrix()).norm() < 1e-6
+                && along.normalize().dot(&shift.normalize()) > 1.0 - 1e-9
+        };
+        assert!(poses.iter().any(is_true), "{poses:?}");
+    }
+}
