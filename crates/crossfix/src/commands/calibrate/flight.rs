@@ -118,14 +118,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
     let prior = args.prior.as_deref().map(calibrated::load).transpose()?;
-    let mut cameras = labels(&args.recording, args.lens.into(), prior.as_ref())?;
+    let Seen { mut cameras, is_corrected } =
+        seen(&args.recording, args.lens.into(), prior.as_ref())?;
+    ensure!(
+        args.hold_out.is_none() || !is_corrected,
+        "--hold-out needs a recording that was made without a calibration"
+    );
     for Moment { camera, time_s } in &args.from {
         cut(&mut cameras, camera, |label| label.time_s >= *time_s)?;
     }
     for Moment { camera, time_s } in &args.to {
         cut(&mut cameras, camera, |label| label.time_s < *time_s)?;
     }
-    let held_out = args.hold_out.map(|which| HeldOut::take_out(which, &mut cameras));
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let landmarks = landmarks(args, &cameras)?;
     let of = (&names[..], "the recording");
@@ -135,6 +139,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         None => surveyed.clone(),
     };
     let mut result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
+    let held_out = args.hold_out.map(|which| HeldOut::take_out(which, &result, &mut cameras));
+    if held_out.is_some() {
+        result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
+    }
     let worth = held_out
         .map(|part| part.fused(&args.recording, SiteCalibration::from(&result), log.as_ref()))
         .transpose()?;
@@ -277,16 +285,23 @@ fn cut(
     Ok(())
 }
 
+/// What a recording's cameras saw.
+struct Seen {
+    cameras: Vec<CameraLabels>,
+    /// Whether its times are common ones, by a calibration.
+    is_corrected: bool,
+}
+
 /// What a recording's cameras saw, by their own clocks. Where it was made with a calibration, that must be
 /// the earlier one, whose lenses are begun with.
-fn labels(
+fn seen(
     recording: &Path,
     freedom: LensFreedom,
     prior: Option<&SiteCalibration>,
-) -> anyhow::Result<Vec<CameraLabels>> {
+) -> anyhow::Result<Seen> {
     let mut lenses: BTreeMap<CameraName, Intrinsics> = BTreeMap::new();
     let mut is_corrected: BTreeMap<CameraName, bool> = BTreeMap::new();
-    let mut seen: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
+    let mut labels_of: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
     let mut lacks = Lacks::default();
     let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
     recorded::for_each(recording, &mut lacks, |lacks, entry| {
@@ -311,7 +326,7 @@ fn labels(
                         _ => Timestamp::from_nanos(frame.capture_time_ns),
                     };
                     let measured = measured(&frame, time.seconds());
-                    seen.entry(name.clone()).or_default().extend(measured);
+                    labels_of.entry(name.clone()).or_default().extend(measured);
                 }
             }
             _ => {}
@@ -319,9 +334,9 @@ fn labels(
         Ok(())
     })?;
     lacks.say(recording);
-    lacks.ensure_found(!seen.is_empty(), "bearings", recording)?;
+    lacks.ensure_found(!labels_of.is_empty(), "bearings", recording)?;
     let mut cameras = Vec::new();
-    for (name, mut labels) in seen {
+    for (name, mut labels) in labels_of {
         let intrinsics = lenses.remove(&name).with_context(|| {
             format!("{} says nothing of the lens of camera `{name}`", recording.display())
         })?;
@@ -334,7 +349,7 @@ fn labels(
         cameras.push(CameraLabels { name, intrinsics, freedom, labels });
     }
     ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
-    Ok(cameras)
+    Ok(Seen { cameras, is_corrected: is_corrected.into_values().any(|is| is) })
 }
 
 /// The targets that a frame measured, at its time by the camera's own clock.

@@ -4,10 +4,12 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 
-use crossfix_calibration::{CameraLabels, FlightLog, Label, SiteCalibration};
+use crossfix_calibration::{
+    CalibratedCamera, CameraLabels, ClockCorrection, FlightLog, FlightResult, SiteCalibration,
+};
 use crossfix_evaluation::{Estimate, Sightings, TrackHistory};
 use crossfix_fusion::{FusionConfig, Output};
-use crossfix_message::{BearingFrame, Channel, Timestamp, TrackFrame, decode};
+use crossfix_message::{BearingFrame, CameraName, Channel, Timestamp, TrackFrame, decode};
 use crossfix_recording::Entry;
 use nalgebra::Matrix3;
 use serde::Serialize;
@@ -33,40 +35,57 @@ const LEAST_CAMERAS: usize = 3;
 /// Farther than this from the log a track is of something else, m.
 const CUTOFF_M: f64 = 5.0;
 
-/// The part of a recording that is held out, by the cameras' own clocks.
-#[derive(Clone, Copy, Debug)]
+/// The part of a recording that is held out.
+#[derive(Debug)]
 pub struct HeldOut {
     which: HoldOut,
+    /// The clocks of the cameras that could be calibrated by all of it: which labels are of one time. What a
+    /// clock is off by since then is the other part's to find.
+    clocks: BTreeMap<CameraName, ClockCorrection>,
     from_s: f64,
     to_s: f64,
 }
 
 impl HeldOut {
-    /// Takes the part out of what cameras saw.
-    pub fn take_out(which: HoldOut, cameras: &mut [CameraLabels]) -> Self {
-        let times = || cameras.iter().flat_map(|camera| &camera.labels).map(|label| label.time_s);
-        let from_s = times().fold(f64::INFINITY, f64::min);
-        let to_s = times().fold(f64::NEG_INFINITY, f64::max);
-        let held_out = Self { which, from_s, to_s };
-        for camera in cameras {
-            camera.labels.retain(|Label { time_s, .. }| !held_out.holds(*time_s));
+    /// Takes the part out of what cameras saw, by the clocks that all of it has shown.
+    pub fn take_out(which: HoldOut, whole: &FlightResult, cameras: &mut [CameraLabels]) -> Self {
+        let clocks: BTreeMap<_, _> = whole
+            .cameras
+            .iter()
+            .map(|camera| (camera.name.clone(), CalibratedCamera::from(camera).clock))
+            .collect();
+        let mut held_out = Self { which, clocks, from_s: f64::INFINITY, to_s: f64::NEG_INFINITY };
+        for camera in &*cameras {
+            for label in &camera.labels {
+                if let Some(time_s) = held_out.common_s(&camera.name, label.time_s) {
+                    held_out.from_s = held_out.from_s.min(time_s);
+                    held_out.to_s = held_out.to_s.max(time_s);
+                }
+            }
+        }
+        for CameraLabels { name, labels, .. } in cameras {
+            labels.retain(|label| !held_out.holds(name, label.time_s));
         }
         held_out
     }
 
-    fn holds(&self, own_s: f64) -> bool {
-        match self.which {
-            HoldOut::Half => own_s >= f64::midpoint(self.from_s, self.to_s),
-            HoldOut::Blocks => ((own_s - self.from_s) / BLOCK_S).rem_euclid(2.0) >= 1.0,
-        }
+    fn common_s(&self, camera: &CameraName, own_s: f64) -> Option<f64> {
+        Some(own_s + self.clocks.get(camera)?.at(own_s).0)
+    }
+
+    fn holds(&self, camera: &CameraName, own_s: f64) -> bool {
+        self.common_s(camera, own_s).is_some_and(|time_s| match self.which {
+            HoldOut::Half => time_s >= f64::midpoint(self.from_s, self.to_s),
+            HoldOut::Blocks => ((time_s - self.from_s) / BLOCK_S).rem_euclid(2.0) >= 1.0,
+        })
     }
 
     /// Whether an entry of a recording is of this part, or of no time.
     fn has(&self, entry: &Entry) -> bool {
-        !matches!(entry.key.channel, Channel::Bearings(_))
-            || decode::<BearingFrame>(&entry.data).is_ok_and(|frame| {
-                self.holds(Timestamp::from_nanos(frame.capture_time_ns).seconds())
-            })
+        let Channel::Bearings(name) = &entry.key.channel else { return true };
+        decode::<BearingFrame>(&entry.data).is_ok_and(|frame| {
+            self.holds(name, Timestamp::from_nanos(frame.capture_time_ns).seconds())
+        })
     }
 
     /// Fuses it by a calibration that has not seen it.

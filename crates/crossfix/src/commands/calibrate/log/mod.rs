@@ -6,7 +6,7 @@ mod nmea;
 
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_calibration::{FlightLog, LogErrors, LogSample};
 use crossfix_geometry::{Geodetic, LocalFrame};
 use nalgebra::Point3;
@@ -127,7 +127,17 @@ pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
 impl Reading {
     /// A row whose height is above the ellipsoid.
     fn placed(&self, row: Row) -> anyhow::Result<Row> {
-        let Place::Geodetic { place, geoid_m } = row.place else { return Ok(row) };
+        ensure!(
+            self.geoid_m.is_none() || self.height == LogHeight::Sea,
+            "--geoid is of heights above the sea (--height sea)"
+        );
+        let Place::Geodetic { place, geoid_m } = row.place else {
+            ensure!(
+                self.height == LogHeight::Ellipsoid,
+                "--height is of a log in degrees: its metres are the site's"
+            );
+            return Ok(row);
+        };
         let raise_m = match self.height {
             // A log that names the geoid counts from the sea.
             LogHeight::Ellipsoid => geoid_m.unwrap_or(0.0),
@@ -273,5 +283,10 @@ mod tests {
         near(up(LogHeight::Takeoff, None).unwrap(), 490.0);
         let error = format!("{:#}", up(LogHeight::Sea, None).unwrap_err());
         assert!(error.contains("--geoid"), "{error}");
+        assert!(up(LogHeight::Ellipsoid, Some(46.5)).is_err());
+        let local = "time_s,east_m,north_m,up_m\n1,2,3,4\n";
+        let reading = Reading { height: LogHeight::Takeoff, ..READING };
+        let error = format!("{:#}", log("drone.csv", local, &reading).unwrap_err());
+        assert!(error.contains("in degrees"), "{error}");
     }
 }
