@@ -91,7 +91,8 @@ pub(crate) const ENOUGH_PLACES: usize = 3;
 
 impl Survey {
     /// With an earlier calibration of the site as what is known of poses and lenses beforehand, in the
-    /// place of the survey of its cameras. Where the site is as a whole stays what that says.
+    /// place of the survey of its cameras. Where the site is as a whole stays what that says, so no log and
+    /// no landmark must say otherwise.
     #[must_use]
     pub fn with_known(mut self, site: SiteCalibration) -> Self {
         self.places.retain(|place| site.camera(&place.camera).is_none());

@@ -58,14 +58,11 @@ impl State {
 /// is no mean.
 const LEAST_CLOCK_SD_S: f64 = 1e-3;
 
-/// Holds a site as a whole where an earlier calibration has it: it may be off by what was said then. Without
-/// a log its common time is that which the cameras' clocks showed by what was known of them.
-pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey, has_log: bool) {
+/// Holds a site as a whole where an earlier calibration has it: it may be off by what was said then. Its
+/// common time is that which the cameras' clocks showed by what was known of them.
+pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
     if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
         *datum = known.clone();
-    }
-    if has_log {
-        return;
     }
     let (mut sum, mut weights) = (0.0, 0.0);
     for found in &result.cameras {

@@ -176,7 +176,9 @@ pub fn calibrate_flight(
         found.into_iter().for_each(|camera| camera.labels += count);
     }
     result.refused = begun.refused;
-    known::hold_site(&mut result, survey, log.is_some());
+    if log.is_none() {
+        known::hold_site(&mut result, survey);
+    }
     Ok(result)
 }
 

@@ -65,8 +65,9 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     landmarks: Option<PathBuf>,
     /// An earlier calibration (TOML) of the site: what it says of poses and lenses is where this begins, and
-    /// counts as what is known. The flight may be anybody's; the difference is printed.
-    #[arg(long, value_name = "FILE")]
+    /// counts as what is known. The flight may be anybody's; the difference is printed. Where the site is
+    /// as a whole stays what it says.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["log", "positions", "distance", "landmarks"])]
     prior: Option<PathBuf>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
