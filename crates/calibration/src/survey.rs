@@ -105,7 +105,7 @@ impl Survey {
         self
     }
 
-    /// What an earlier calibration says of a camera.
+    /// What an earlier calibration says of a camera; its lens is begun with.
     pub(crate) fn known(&self, camera: &CameraName) -> Option<&CalibratedCamera> {
         self.known.as_ref()?.camera(camera)
     }

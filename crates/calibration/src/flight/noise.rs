@@ -9,12 +9,16 @@ use crate::label_noise::LabelNoise;
 const FREEDOM: f64 = 4.0;
 
 /// How unlikely a large residual is.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Tails {
     /// As a normal deviate's.
     Normal,
     /// As Student's t: what is measured may be of something else.
     Heavy,
+    /// As a normal deviate's as far as usual ones go, and beyond as Student's t: what was known beforehand may
+    /// not hold any more, but where it does it counts once. (At its middle Student's t of n numbers weighs
+    /// them (freedom + n) / freedom times.)
+    Known,
 }
 
 impl Tails {
@@ -22,19 +26,35 @@ impl Tails {
     fn freedom(self) -> Option<f64> {
         match self {
             Self::Normal => None,
-            Self::Heavy => Some(FREEDOM),
+            Self::Heavy | Self::Known => Some(FREEDOM),
         }
+    }
+
+    /// Whether residuals count as a normal deviate's: the two join where their mean square is one.
+    fn is_normal(self, squares: f64, count: usize) -> bool {
+        self == Self::Known && squares <= count as f64
     }
 
     /// What residuals with this sum of squares count.
     pub(super) fn weight(self, squares: f64, count: usize) -> f64 {
+        if self.is_normal(squares, count) {
+            return 1.0;
+        }
         self.freedom().map_or(1.0, |freedom| (freedom + count as f64) / (freedom + squares))
     }
 
     /// Twice their negative log likelihood.
     pub(super) fn loss(self, squares: f64, count: usize) -> f64 {
-        let heavy = |freedom: f64| (freedom + count as f64) * (squares / freedom).ln_1p();
-        self.freedom().map_or(squares, heavy)
+        if self.is_normal(squares, count) {
+            return squares;
+        }
+        let count = count as f64;
+        let heavy = |freedom: f64| (freedom + count) * (squares / freedom).ln_1p();
+        let joined = |freedom: f64| match self {
+            Self::Known => count - (freedom + count) * (count / freedom).ln_1p(),
+            _ => 0.0,
+        };
+        self.freedom().map_or(squares, |freedom| heavy(freedom) + joined(freedom))
     }
 }
 
@@ -186,6 +206,22 @@ mod tests {
             })
             .collect();
         LabelNoise::of(&residuals, 0.0, FRAME_S)
+    }
+
+    #[test]
+    fn what_was_known_counts_once_where_it_holds_and_little_where_it_does_not() {
+        for count in [3, 6, 9] {
+            assert_eq!(Tails::Known.weight(0.0, count), 1.0);
+            assert_eq!(Tails::Known.weight(count as f64, count), 1.0);
+            assert!(Tails::Known.weight(1e4, count) < 2e-3);
+            // The loss is continuous, and its slope is the weight.
+            let loss = |squares: f64| Tails::Known.loss(squares, count);
+            for squares in [1.0, count as f64 - 1e-6, count as f64 + 1e-3, 50.0] {
+                let slope = (loss(squares + 1e-4) - loss(squares)) / 1e-4;
+                let weight = Tails::Known.weight(squares, count);
+                assert!((slope - weight).abs() < 1e-3, "{count}, {squares}: {slope} and {weight}");
+            }
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Where one more camera would help most.
 
 use crossfix_geometry::{Camera, Pose};
-use nalgebra::{Point3, Vector2, Vector3};
+use nalgebra::{Matrix6, Point3, Vector2, Vector3};
 use serde::Serialize;
 
 use super::plan::{Observer, accuracy, prior};
@@ -151,7 +151,8 @@ pub fn advise(
         let place = Point3::new(middle.x + offset.x, middle.y + offset.y, height);
         let pose = Pose::looking_at(place, middle).ok()?;
         let camera = Camera::new(*like.camera.model().intrinsics(), pose).ok()?;
-        let more = PlannedCamera { camera, ..like.clone() };
+        let pose_covariance = carried(like, &camera);
+        let more = PlannedCamera { camera, pose_covariance, ..like.clone() };
         let phase = cameras.len() as f64 / (cameras.len() + 1) as f64;
         let observer = Observer::new(&more, phase, assumptions);
         let score = score_with(&known, Some(&observer), worst_m);
@@ -170,10 +171,18 @@ pub fn advise(
     Some(Advice { like: like.name.clone(), look_at_m: middle.into(), now, candidates })
 }
 
+/// A camera's pose covariance where another stands and looks elsewhere: what its place is off by follows where
+/// it looks, as its turn does.
+fn carried(like: &PlannedCamera, other: &Camera) -> Matrix6<f64> {
+    let turn = other.pose().rotation() * like.camera.pose().rotation().inverse();
+    let mut carry = Matrix6::identity();
+    carry.fixed_view_mut::<3, 3>(3, 3).copy_from(turn.matrix());
+    carry * like.pose_covariance * carry.transpose()
+}
+
 #[cfg(test)]
 mod tests {
     use crossfix_geometry::{Distortion, ImageSize, Intrinsics};
-    use nalgebra::Matrix6;
 
     use super::super::TargetSize;
     use super::*;

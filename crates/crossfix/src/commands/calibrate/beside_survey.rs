@@ -67,9 +67,10 @@ impl BesideSurvey {
         self.places.iter().filter(|place| place.deviations > BESIDE)
     }
 
-    /// Whether survey and flight are of two minds: most places lie beside.
+    /// Whether survey and flight are of two minds: most places lie beside, and more than one.
     pub fn contradicts(&self) -> bool {
-        2 * self.off().count() > self.places.len()
+        let off = self.off().count();
+        off > 1 && 2 * off > self.places.len()
     }
 
     /// What is to be said of places that lie beside: all by the same, or one that is another's.

@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         let sheets = plots::of_comparison(&comparison, &second, folder)?;
         tracing::info!("{sheets} sheets drawn in {}", folder.display());
     }
-    let figures = Figures::from(&comparison);
+    let figures = Difference::from(&comparison);
     if args.json {
         output::json(&figures)
     } else {
@@ -50,13 +50,14 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-/// How a calibration differs from an earlier one, for people.
-pub fn difference(first: &SiteCalibration, second: &SiteCalibration) -> Option<String> {
-    compare_sites(first, second).map(|comparison| Figures::from(&comparison).render())
+/// How a calibration differs from an earlier one; absent if they have no camera in common.
+pub fn difference(first: &SiteCalibration, second: &SiteCalibration) -> Option<Difference> {
+    compare_sites(first, second).map(|comparison| Difference::from(&comparison))
 }
 
+/// How two calibrations differ.
 #[derive(Debug, Serialize)]
-struct Figures {
+pub struct Difference {
     /// The second as a whole; absent of fewer than three cameras.
     moved: Option<MoveFigures>,
     cameras: Vec<CameraFigures>,
@@ -119,7 +120,7 @@ struct CameraFigures {
     later_ms: Option<f64>,
 }
 
-impl From<&SiteComparison> for Figures {
+impl From<&SiteComparison> for Difference {
     fn from(comparison: &SiteComparison) -> Self {
         Self {
             moved: comparison.moved.as_ref().map(MoveFigures::from),
@@ -144,8 +145,9 @@ impl From<&CameraComparison> for CameraFigures {
     }
 }
 
-impl Figures {
-    fn render(&self) -> String {
+impl Difference {
+    /// The figures for people.
+    pub fn render(&self) -> String {
         let head = [
             "camera",
             "centre [m]",

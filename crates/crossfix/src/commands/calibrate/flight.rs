@@ -1,10 +1,10 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use crossfix_calibration::{
-    CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration, SurveyedLandmark,
-    calibrate_flight,
+    CalibratedCamera, CameraLabels, FlightResult, Label, LensFreedom, SiteCalibration,
+    SurveyedLandmark, calibrate_flight,
 };
 use crossfix_geometry::{Geodetic, Intrinsics, Pixel};
 use crossfix_message::{
@@ -12,9 +12,11 @@ use crossfix_message::{
 };
 
 use super::beside_survey::BesideSurvey;
+use super::cost::Cost;
 use super::hold_out::{HeldOut, HoldOut};
 use super::log::{self, LogHeight, LogKind, LogTime, Reading};
 use super::remarks::{self, Rests};
+use super::report::OfSite;
 use super::survey::{self, Distance};
 use super::{Lens, clicks, compare, picture, plots, report};
 use crate::calibrated;
@@ -32,11 +34,11 @@ pub struct Args {
     /// The recording (MCAP) of what the cameras saw.
     recording: PathBuf,
     /// Where the target was by its own receiver: a CSV with time_s and east_m, north_m, up_m, or
-    /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA (named .nmea or .log).
+    /// latitude_deg, longitude_deg, height_m; or GPX; or NMEA.
     #[arg(long, value_name = "FILE", required_unless_present_any = ["positions", "distance", "landmarks", "prior"])]
     log: Option<PathBuf>,
-    /// Where the site's origin is (WGS84 degrees, and metres as the log counts heights), for a log or
-    /// landmarks in degrees; the log's first place without.
+    /// Where the site's origin is (WGS84 degrees, and metres above the ellipsoid; above which the drone took
+    /// off with --height takeoff), for a log or landmarks in degrees; the log's first place without.
     #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
     anchor: Option<Geodetic>,
     /// What the log's times are: as in the file, or GPS's, which are 18 s ahead of UTC.
@@ -64,10 +66,9 @@ pub struct Args {
     /// the sun and stars. Of the same name is the same thing.
     #[arg(long, value_name = "FILE")]
     landmarks: Option<PathBuf>,
-    /// An earlier calibration (TOML) of the site: what it says of poses and lenses is where this begins, and
-    /// counts as what is known. The flight may be anybody's; the difference is printed. Where the site is
+    /// An earlier calibration (TOML) of the site: what it says of poses and lenses counts as what is known. The flight may be anybody's; the difference is printed. Where the site is
     /// as a whole stays what it says.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["log", "positions", "distance", "landmarks"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["log", "positions", "distance", "landmarks", "lens"])]
     prior: Option<PathBuf>,
     /// How good the log is.
     #[arg(long, default_value = "consumer", value_enum, value_name = "KIND")]
@@ -144,8 +145,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     if held_out.is_some() {
         result = calibrate_flight(&cameras, log.as_ref(), &survey)?;
     }
+    let believed = report::without_wrong(&result);
     let worth = held_out
-        .map(|part| part.fused(&args.recording, SiteCalibration::from(&result), log.as_ref()))
+        .map(|part| part.fused(&args.recording, SiteCalibration::from(&believed), log.as_ref()))
         .transpose()?;
     let calibrated: Vec<&CameraName> = result.cameras.iter().map(|camera| &camera.name).collect();
     let rests = if log.is_none() || survey.tells_size(&calibrated) {
@@ -156,25 +158,30 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (camera, why) in &result.refused {
         tracing::warn!("camera `{camera}` is not calibrated: it {why}");
     }
-    let beside = BesideSurvey::of(&result, &surveyed);
+    let beside = BesideSurvey::of(&believed, &surveyed);
     let is_contradicted = beside.contradicts();
-    let figures = report::figures(&result, beside, rests, worth);
+    let of_site = OfSite {
+        survey: beside,
+        cost: Cost::of(&believed),
+        held_out: worth,
+        beside_prior: prior
+            .and_then(|prior| compare::difference(&prior, &SiteCalibration::from(&believed))),
+    };
+    let figures = report::figures(&result, of_site, rests);
     if args.json {
         output::json(&figures)?;
     } else {
         output::line(report::render(&result, &figures));
     }
-    args.draw(&result)?;
+    // A picture that cannot be drawn costs no calibration.
+    let drawn = args.draw(&result);
     ensure!(
         !is_contradicted,
         "nothing is written: most surveyed places lie beside where the flight has them"
     );
     take_out_wrong(&mut result)?;
-    if let Some(prior) = prior.filter(|_| !args.json) {
-        let text = compare::difference(&prior, &SiteCalibration::from(&result));
-        output::line(format!("\nbeside the earlier one:\n\n{}", text.unwrap_or_default()));
-    }
-    args.write(&result)
+    args.write(&result)?;
+    drawn
 }
 
 /// Leaves no camera in a calibration that is wrong, and refuses one that is wrong as a whole.
@@ -300,37 +307,26 @@ fn seen(
     freedom: LensFreedom,
     prior: Option<&SiteCalibration>,
 ) -> anyhow::Result<Seen> {
-    let mut lenses: BTreeMap<CameraName, Intrinsics> = BTreeMap::new();
-    let mut is_corrected: BTreeMap<CameraName, bool> = BTreeMap::new();
+    let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
+    let described = described(recording)?;
+    for (name, described) in &described {
+        described.check_against(known(name)).with_context(|| {
+            format!("the bearings of camera `{name}` in {}", recording.display())
+        })?;
+    }
     let mut labels_of: BTreeMap<CameraName, Vec<Label>> = BTreeMap::new();
     let mut lacks = Lacks::default();
-    let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
     recorded::for_each(recording, &mut lacks, |lacks, entry| {
-        match &entry.key.channel {
-            Channel::Calibration(name) => {
-                if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
-                    let of_file = message.lens(name)?;
-                    let of_prior = known(name).map(|camera| *camera.camera.model().intrinsics());
-                    is_corrected.insert(name.clone(), message.datum.is_some());
-                    lenses.insert(name.clone(), of_prior.unwrap_or(of_file));
-                }
-            }
-            Channel::Bearings(name) => {
-                if let Some(frame) = lacks.read::<BearingFrame>(&entry.data) {
-                    let time = match (is_corrected.get(name), known(name)) {
-                        (Some(true), Some(camera)) => calibrated::own_time(&frame, camera),
-                        (Some(true), None) => bail!(
-                            "the bearings of camera `{name}` in {} were made with a calibration: give it \
-                             with --prior",
-                            recording.display()
-                        ),
-                        _ => Timestamp::from_nanos(frame.capture_time_ns),
-                    };
-                    let measured = measured(&frame, time.seconds());
-                    labels_of.entry(name.clone()).or_default().extend(measured);
-                }
-            }
-            _ => {}
+        if let Channel::Bearings(name) = &entry.key.channel
+            && let Some(frame) = lacks.read::<BearingFrame>(&entry.data)
+        {
+            let is_corrected = described.get(name).is_some_and(|camera| camera.is_corrected);
+            let time = match known(name).filter(|_| is_corrected) {
+                Some(camera) => calibrated::own_time(&frame, camera),
+                None => Timestamp::from_nanos(frame.capture_time_ns),
+            };
+            let measured = measured(&frame, time.seconds());
+            labels_of.entry(name.clone()).or_default().extend(measured);
         }
         Ok(())
     })?;
@@ -338,9 +334,11 @@ fn seen(
     lacks.ensure_found(!labels_of.is_empty(), "bearings", recording)?;
     let mut cameras = Vec::new();
     for (name, mut labels) in labels_of {
-        let intrinsics = lenses.remove(&name).with_context(|| {
+        let of_file = described.get(&name).map(|camera| camera.lens).with_context(|| {
             format!("{} says nothing of the lens of camera `{name}`", recording.display())
         })?;
+        let of_prior = known(&name).map(|camera| *camera.camera.model().intrinsics());
+        let intrinsics = of_prior.unwrap_or(of_file);
         let size = intrinsics.size;
         labels.retain(|label| {
             (0.0..=f64::from(size.width)).contains(&label.pixel.x())
@@ -350,7 +348,51 @@ fn seen(
         cameras.push(CameraLabels { name, intrinsics, freedom, labels });
     }
     ensure!(!cameras.is_empty(), "{} holds no camera's bearings", recording.display());
-    Ok(Seen { cameras, is_corrected: is_corrected.into_values().any(|is| is) })
+    Ok(Seen { cameras, is_corrected: described.values().any(|camera| camera.is_corrected) })
+}
+
+/// What a recording says of a camera.
+struct Described {
+    lens: Intrinsics,
+    /// Whether its times are common ones: only a flight finds a clock's wander.
+    is_corrected: bool,
+}
+
+impl Described {
+    /// That an earlier calibration is of this image, and that which the bearings were made with, if they were
+    /// with any.
+    fn check_against(&self, known: Option<&CalibratedCamera>) -> anyhow::Result<()> {
+        let of_prior = known.map(|camera| camera.camera.model().intrinsics());
+        if let Some(lens) = of_prior {
+            ensure!(
+                lens.size == self.lens.size,
+                "have {:?} pixels, and --prior is of {:?}",
+                self.lens.size,
+                lens.size
+            );
+        }
+        ensure!(
+            !self.is_corrected || of_prior.is_some_and(|lens| *lens == self.lens),
+            "were made with a calibration, which is not that of --prior: give that with which they were made"
+        );
+        Ok(())
+    }
+}
+
+/// What a recording says of its cameras, by the first word of each.
+fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>> {
+    let mut cameras: BTreeMap<CameraName, Described> = BTreeMap::new();
+    recorded::for_each(recording, &mut Lacks::default(), |lacks, entry| {
+        if let Channel::Calibration(name) = &entry.key.channel
+            && !cameras.contains_key(name)
+            && let Some(message) = lacks.read::<CameraCalibration>(&entry.data)
+        {
+            let is_corrected = message.datum.is_some() || message.clock_wander_s > 0.0;
+            cameras.insert(name.clone(), Described { lens: message.lens(name)?, is_corrected });
+        }
+        Ok(())
+    })?;
+    Ok(cameras)
 }
 
 /// The targets that a frame measured, at its time by the camera's own clock.

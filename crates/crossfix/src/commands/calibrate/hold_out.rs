@@ -1,6 +1,6 @@
 //! A part of a flight that the calibration does not see, fused by it: what it is worth on another flight.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
@@ -104,8 +104,13 @@ impl HeldOut {
             }
             Ok(())
         })?;
+        // A camera that is not in it has no pose to speak of.
+        let known: BTreeSet<CameraName> =
+            site.cameras().iter().map(|camera| camera.name.clone()).collect();
         let recalibration = Recalibration::of(site);
-        for entry in calibrations.into_values() {
+        for entry in
+            calibrations.into_iter().filter(|(name, _)| known.contains(name)).map(|(_, e)| e)
+        {
             run.take(&recalibration.applied(entry));
         }
         let mut reordered = Reordered::new(recalibration);
@@ -114,7 +119,9 @@ impl HeldOut {
             Ok(())
         };
         recorded::for_each(recording, &mut lacks, |_, entry| {
-            if self.has(&entry) && !matches!(entry.key.channel, Channel::Calibration(_)) {
+            let is_known =
+                matches!(&entry.key.channel, Channel::Bearings(name) if known.contains(name));
+            if is_known && self.has(&entry) {
                 reordered.take(entry, &mut take)?;
             }
             Ok(())

@@ -5,6 +5,7 @@ use crossfix_message::{CameraName, Datum};
 use serde::Serialize;
 
 use super::beside_survey::BesideSurvey;
+use super::compare::Difference;
 use super::cost::Cost;
 use super::hold_out::Worth;
 use super::remarks::{self, Rests};
@@ -26,16 +27,25 @@ pub struct Figures {
     landmarks: Vec<LandmarkFigures>,
     /// What a person should know.
     remarks: Vec<String>,
-    /// How surveyed places and distances fit.
-    survey: BesideSurvey,
+    #[serde(flatten)]
+    of_site: OfSite,
     /// Absent of one camera alone.
     datum: Option<DatumFigures>,
-    /// What a target will be known to; absent where no two cameras see one.
-    cost: Option<Cost>,
-    /// What it is worth on the part that was held out; absent where none was.
-    held_out: Option<Worth>,
     /// Power of the target's jerk, m^2/s^5.
     jerk: f64,
+}
+
+/// What is said of the site that is written: without the cameras that are wrong.
+#[derive(Debug, Serialize)]
+pub struct OfSite {
+    /// How surveyed places and distances fit.
+    pub survey: BesideSurvey,
+    /// What a target will be known to; absent where no two cameras see one.
+    pub cost: Option<Cost>,
+    /// What it is worth on the part that was held out; absent where none was.
+    pub held_out: Option<Worth>,
+    /// How it differs from the earlier calibration; absent without one.
+    pub beside_prior: Option<Difference>,
 }
 
 #[derive(Debug, Serialize)]
@@ -136,6 +146,13 @@ struct CameraFigures {
     verdict: String,
 }
 
+/// A result without the cameras that are wrong.
+pub fn without_wrong(result: &FlightResult) -> FlightResult {
+    let mut believed = result.clone();
+    take_out_wrong(&mut believed);
+    believed
+}
+
 /// Takes the cameras out of a result that are wrong, and names them.
 pub fn take_out_wrong(result: &mut FlightResult) -> Vec<CameraName> {
     let is_wrong = |camera: &mut CameraResult| {
@@ -189,14 +206,9 @@ impl From<&CameraResult> for CameraFigures {
 }
 
 /// The figures for a program.
-pub fn figures(
-    result: &FlightResult,
-    survey: BesideSurvey,
-    rests: Rests,
-    held_out: Option<Worth>,
-) -> Figures {
+pub fn figures(result: &FlightResult, of_site: OfSite, rests: Rests) -> Figures {
     let mut remarks = remarks::of(result, rests);
-    remarks.extend(survey.remark());
+    remarks.extend(of_site.survey.remark());
     Figures {
         cameras: result.cameras.iter().map(CameraFigures::from).collect(),
         refused: result
@@ -208,10 +220,8 @@ pub fn figures(
         log_left_out: result.log.map(|log| log.left_out),
         landmarks: result.landmarks.iter().map(LandmarkFigures::from).collect(),
         remarks,
-        survey,
+        of_site,
         datum: result.datum.as_ref().map(DatumFigures::from),
-        cost: Cost::of(result),
-        held_out,
         jerk: result.jerk,
     }
 }
@@ -275,14 +285,18 @@ pub fn render(result: &FlightResult, figures: &Figures) -> String {
         rows.extend(figures.landmarks.iter().map(LandmarkFigures::row));
         format!("\n\n{}", output::table(&rows))
     };
-    let survey = figures.survey.render().map_or_else(String::new, |table| format!("\n\n{table}"));
+    let survey =
+        figures.of_site.survey.render().map_or_else(String::new, |table| format!("\n\n{table}"));
     let datum = figures.datum.as_ref().map_or_else(String::new, |datum| format!("\n\n{datum}"));
-    let cost = figures.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
+    let cost = figures.of_site.cost.as_ref().map_or_else(String::new, |cost| format!("\n\n{cost}"));
     let held_out =
-        figures.held_out.as_ref().map_or_else(String::new, |worth| format!("\n\n{worth}"));
+        figures.of_site.held_out.as_ref().map_or_else(String::new, |worth| format!("\n\n{worth}"));
+    let beside_prior = figures.of_site.beside_prior.as_ref().map_or_else(String::new, |beside| {
+        format!("\n\nbeside the earlier calibration:\n\n{}", beside.render())
+    });
     let remarks: String = figures.remarks.iter().map(|remark| format!("\n\n{remark}")).collect();
     format!(
-        "{}{refused}{survey}{landmarks}{log}{datum}{cost}{held_out}{remarks}",
+        "{}{refused}{survey}{landmarks}{log}{datum}{cost}{held_out}{remarks}{beside_prior}",
         output::table(&rows)
     )
 }

@@ -7,7 +7,7 @@ use crossfix_geometry::Geodetic;
 use csv::StringRecord;
 use nalgebra::Point3;
 
-use super::{Place, Row};
+use super::{Above, Place, Row};
 
 const LOCAL: [&str; 4] = ["time_s", "east_m", "north_m", "up_m"];
 const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_m"];
@@ -47,7 +47,7 @@ fn csv_row(record: &StringRecord, columns: [usize; 4], is_geodetic: bool) -> any
         bail!("not four numbers");
     };
     let place = if is_geodetic {
-        Place::Geodetic { place: Geodetic::from_degrees(x, y, z)?, geoid_m: None }
+        Place::Geodetic { place: Geodetic::from_degrees(x, y, z)?, above: Above::Unsaid }
     } else {
         Place::Local(Point3::new(x, y, z))
     };

@@ -8,7 +8,7 @@ use anyhow::ensure;
 use crossfix_geometry::Geodetic;
 use time::OffsetDateTime;
 
-use super::{Place, Row};
+use super::{Above, Place, Row};
 
 /// All tracks' points that have a time and a height.
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
@@ -22,7 +22,10 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
         };
         let nanos = OffsetDateTime::from(time).unix_timestamp_nanos();
         let place = Geodetic::from_degrees(point.point().y(), point.point().x(), height)?;
-        let place = Place::Geodetic { place, geoid_m: point.geoidheight };
+        let place = Place::Geodetic {
+            place,
+            above: point.geoidheight.map_or(Above::Unsaid, |geoid_m| Above::Sea(Some(geoid_m))),
+        };
         rows.push(Row { time_s: nanos as f64 * 1e-9, place });
     }
     if bare > 0 {

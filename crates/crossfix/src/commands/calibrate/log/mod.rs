@@ -4,6 +4,8 @@ mod columns;
 mod gpx;
 mod nmea;
 
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 use anyhow::{Context, ensure};
@@ -84,21 +86,30 @@ struct Row {
 #[derive(Clone, Copy, Debug)]
 enum Place {
     Local(Point3<f64>),
-    /// With how far the sea, from which the height counts, is above the ellipsoid there, m, where the
-    /// log says both.
+    /// Degrees, and a height above something.
     Geodetic {
         place: Geodetic,
-        geoid_m: Option<f64>,
+        above: Above,
     },
 }
 
-/// Reads a log: GPX and NMEA by the file's name, columns otherwise.
+/// What a log itself says that its heights count from.
+#[derive(Clone, Copy, Debug)]
+enum Above {
+    Unsaid,
+    /// The sea, which is so far above the ellipsoid there, m, if the log says that, too.
+    Sea(Option<f64>),
+}
+
+/// Reads a log: GPX by the file's name, NMEA by its first letter, columns otherwise.
 pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    let rows = match extension.as_str() {
-        "gpx" => gpx::read(path),
-        "nmea" | "nma" | "ubx" | "log" => nmea::read(path),
-        _ => columns::read(path),
+    let is_gpx = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gpx"));
+    let rows = if is_gpx {
+        gpx::read(path)
+    } else if begins_with(path, b'$') {
+        nmea::read(path)
+    } else {
+        columns::read(path)
     };
     let wrong = || format!("cannot read the log {}", path.display());
     let rows = rows.with_context(wrong)?;
@@ -124,6 +135,12 @@ pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
     Ok(FlightLog { samples, errors: reading.errors })
 }
 
+fn begins_with(path: &Path, letter: u8) -> bool {
+    let mut first = [0];
+    let read = File::open(path).and_then(|mut file| file.read_exact(&mut first));
+    read.is_ok() && first == [letter]
+}
+
 impl Reading {
     /// A row whose height is above the ellipsoid.
     fn placed(&self, row: Row) -> anyhow::Result<Row> {
@@ -131,25 +148,28 @@ impl Reading {
             self.geoid_m.is_none() || self.height == LogHeight::Sea,
             "--geoid is of heights above the sea (--height sea)"
         );
-        let Place::Geodetic { place, geoid_m } = row.place else {
+        let Place::Geodetic { place, above } = row.place else {
             ensure!(
                 self.height == LogHeight::Ellipsoid,
                 "--height is of a log in degrees: its metres are the site's"
             );
             return Ok(row);
         };
-        let raise_m = match self.height {
-            // A log that names the geoid counts from the sea.
-            LogHeight::Ellipsoid => geoid_m.unwrap_or(0.0),
-            LogHeight::Sea => self.geoid_m.or(geoid_m).context(
+        let said_m = match above {
+            Above::Unsaid => None,
+            Above::Sea(geoid_m) => geoid_m,
+        };
+        let raise_m = match (self.height, above) {
+            (LogHeight::Ellipsoid, Above::Unsaid) => 0.0,
+            (LogHeight::Ellipsoid | LogHeight::Sea, _) => self.geoid_m.or(said_m).context(
                 "it does not say how far the sea, from which its heights count, is above the ellipsoid: \
-                 --geoid METRES (in Europe 30 to 60)",
+                 --height sea --geoid METRES (in Europe 30 to 60)",
             )?,
-            LogHeight::Takeoff => self.anchor.map_or(0.0, |anchor| anchor.height()),
+            (LogHeight::Takeoff, _) => self.anchor.map_or(0.0, |anchor| anchor.height()),
         };
         let (latitude, longitude) = (place.latitude_deg(), place.longitude_deg());
         let place = Geodetic::from_degrees(latitude, longitude, place.height() + raise_m)?;
-        Ok(Row { place: Place::Geodetic { place, geoid_m: None }, ..row })
+        Ok(Row { place: Place::Geodetic { place, above: Above::Unsaid }, ..row })
     }
 }
 
@@ -252,6 +272,13 @@ mod tests {
         let reading = Reading { anchor: Some(anchor), ..READING };
         let first = log("drone.nmea", &text, &reading).unwrap().samples[0];
         assert!(first.position.z.abs() < 1e-3, "440 m above a sea that is 46.5 m up: {first:?}");
+        let no_geoid: String = NMEA
+            .replace(",46.5,M,1", ",,M,1")
+            .lines()
+            .map(|line| format!("{}\n", with_checksum(line)))
+            .collect();
+        let error = format!("{:#}", log("drone.nmea", &no_geoid, &READING).unwrap_err());
+        assert!(error.contains("--geoid"), "{error}");
         let undated = text.split_once('\n').unwrap().1;
         let error = format!("{:#}", log("drone.nmea", undated, &READING).unwrap_err());
         assert!(error.contains("no date"), "{error}");

@@ -9,7 +9,7 @@ use anyhow::{Context, ensure};
 use crossfix_geometry::Geodetic;
 use time::{Date, Month};
 
-use super::{Place, Row};
+use super::{Above, Place, Row};
 
 /// Seconds of a day.
 const DAY_S: f64 = 86_400.0;
@@ -102,6 +102,8 @@ impl<'a> Sentence<'a> {
 
     /// An RMC's time and date `ddmmyy`, in seconds after 1970.
     fn moment_s(&self) -> Option<f64> {
+        // A receiver without a fix shows some date.
+        (*self.0.get(2)? == "A").then_some(())?;
         let text = self.0.get(9)?;
         let part = |from: usize| text.get(from..from + 2)?.parse::<u8>().ok();
         let (day, month, year) = (part(0)?, Month::try_from(part(2)?).ok()?, part(4)?);
@@ -127,7 +129,7 @@ impl Found {
         )?;
         let [latitude, longitude, height] = self.place;
         let place = Geodetic::from_degrees(latitude, longitude, height)?;
-        Ok(Row { time_s, place: Place::Geodetic { place, geoid_m: self.geoid_m } })
+        Ok(Row { time_s, place: Place::Geodetic { place, above: Above::Sea(self.geoid_m) } })
     }
 }
 
