@@ -47,8 +47,13 @@ impl Flight {
         let (log, file) = (self.named("calibration.csv"), self.named("calibration.toml"));
         let calibrate = ["calibrate", "flight", &flight, "--log", &log, "--log-kind", "rtk"];
         succeed(&[&calibrate[..], &["-o", &file]].concat());
+        self.fused(&test, &file, min_cameras)
+    }
+
+    /// Fuses a recording by a calibration, and says how good that is.
+    fn fused(&self, recording: &str, calibration: &str, min_cameras: &str) -> Value {
         let tracks = self.named("tracks.mcap");
-        succeed(&["replay", &test, "--fuse", "--calibration", &file, "-o", &tracks]);
+        succeed(&["replay", recording, "--fuse", "--calibration", calibration, "-o", &tracks]);
         let question = ["--min-cameras", min_cameras, "--truth-sd", "0.02", "--json"];
         let evaluated = succeed(&[&["evaluate", &tracks][..], &question].concat());
         serde_json::from_str(&evaluated).unwrap()
@@ -77,6 +82,34 @@ fn phones_whose_clocks_wander_are_calibrated_too() {
     let Some(data) = real_data() else { return };
     let cameras = "iphone6,p20pro,sonyG,sony5n_1920x1080";
     check(&Flight::new(&data, "1", cameras).figures("3"), 0.090, 0.29);
+}
+
+/// The other half of the flight, of which no log is read, by what the first half knew; also of a recording
+/// that was made with a calibration, which another file than that is not taken for.
+#[test]
+fn a_night_later_the_site_is_at_least_as_good_without_a_log() {
+    let Some(data) = real_data() else { return };
+    let flight = Flight::new(&data, "1", "iphone6,p20pro,sonyG,sony5n_1920x1080");
+    let before = flight.figures("3");
+    let (test, known) = (flight.named("test.mcap"), flight.named("calibration.toml"));
+    let proposed = flight.named("proposed.toml");
+    let nightly = |recording: &str, prior: &str| {
+        let options = ["--prior", prior, "-o", &proposed];
+        crossfix(&[&["calibrate", "flight", recording][..], &options].concat()).status.success()
+    };
+    assert!(nightly(&test, &known));
+    let after = flight.fused(&test, &proposed, "3");
+    check(&after, 0.09, 0.29);
+    let rmse = |figures: &Value| figures["position_rmse_m"].as_f64().unwrap();
+    assert!(rmse(&after) < rmse(&before), "{} and {}", rmse(&after), rmse(&before));
+    let corrected = flight.named("corrected.mcap");
+    succeed(&["replay", &test, "--fuse", "--calibration", &known, "-o", &corrected]);
+    let other = flight.named("other.toml");
+    std::fs::copy(&proposed, &other).unwrap();
+    assert!(!nightly(&corrected, &other));
+    assert!(nightly(&corrected, &known));
+    let again = flight.fused(&test, &proposed, "3");
+    assert!((rmse(&again) - rmse(&after)).abs() < 0.01, "{} and {}", rmse(&again), rmse(&after));
 }
 
 /// One half of the flight with its log says where the cameras stand; the other half, of which nothing

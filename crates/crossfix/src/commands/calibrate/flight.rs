@@ -102,23 +102,12 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     /// Calibrate by one part of the recording, and fuse the other by that: what it is worth.
-    #[arg(long, value_enum, value_name = "PART")]
+    #[arg(long, value_enum, value_name = "PART", conflicts_with_all = ["from", "to"])]
     hold_out: Option<HoldOut>,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let mut errors = args.log_kind.errors();
-    errors.sd_m = args.log_sd.unwrap_or(errors.sd_m);
-    errors.drift_sd_m = args.log_drift.unwrap_or(errors.drift_sd_m);
-    let reading = Reading {
-        errors,
-        anchor: args.anchor,
-        is_gps_time: args.time == LogTime::Gps,
-        height: args.height,
-        geoid_m: args.geoid,
-        antenna_m: args.antenna,
-    };
-    let log = args.log.as_deref().map(|path| log::read(path, &reading)).transpose()?;
+    let log = args.log.as_deref().map(|path| log::read(path, &args.reading())).transpose()?;
     let prior = args.prior.as_deref().map(calibrated::load).transpose()?;
     let Seen { mut cameras, is_corrected } =
         seen(&args.recording, args.lens.into(), prior.as_ref())?;
@@ -126,12 +115,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         args.hold_out.is_none() || !is_corrected,
         "--hold-out needs a recording that was made without a calibration"
     );
-    for Moment { camera, time_s } in &args.from {
-        cut(&mut cameras, camera, |label| label.time_s >= *time_s)?;
-    }
-    for Moment { camera, time_s } in &args.to {
-        cut(&mut cameras, camera, |label| label.time_s < *time_s)?;
-    }
+    args.cut(&mut cameras)?;
     let names: Vec<CameraName> = cameras.iter().map(|camera| camera.name.clone()).collect();
     let landmarks = landmarks(args, &cameras)?;
     let of = (&names[..], "the recording");
@@ -204,6 +188,32 @@ fn take_out_wrong(result: &mut FlightResult) -> anyhow::Result<()> {
 }
 
 impl Args {
+    /// How the log is to be read.
+    fn reading(&self) -> Reading {
+        let mut errors = self.log_kind.errors();
+        errors.sd_m = self.log_sd.unwrap_or(errors.sd_m);
+        errors.drift_sd_m = self.log_drift.unwrap_or(errors.drift_sd_m);
+        Reading {
+            errors,
+            anchor: self.anchor,
+            is_gps_time: self.time == LogTime::Gps,
+            height: self.height,
+            geoid_m: self.geoid,
+            antenna_m: self.antenna,
+        }
+    }
+
+    /// Leaves of what cameras saw the times that were asked for.
+    fn cut(&self, cameras: &mut [CameraLabels]) -> anyhow::Result<()> {
+        for Moment { camera, time_s } in &self.from {
+            cut(cameras, camera, |label| label.time_s >= *time_s)?;
+        }
+        for Moment { camera, time_s } in &self.to {
+            cut(cameras, camera, |label| label.time_s < *time_s)?;
+        }
+        Ok(())
+    }
+
     fn inputs(&self) -> Vec<&Path> {
         let files = [
             Some(&self.recording),
