@@ -194,7 +194,7 @@ impl State {
         for (index, camera) in flight.cameras.iter().enumerate() {
             self.label_rows(index, starts[index], camera, &priors.cameras[index], sink);
             self.prior_rows(index, starts[index], &priors.cameras[index], sink);
-            if flight.survey.known(&camera.name).is_none() {
+            if flight.known(index).is_none() {
                 self.lens_rows(index, starts[index], &priors.cameras[index], sink);
             }
             self.known_rows(index, starts[index], flight, sink);

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector, Rotation3};
 
 use super::adjustment::{Flight, Row, Sink, State};
-use super::model::POSE_AND_CLOCK;
+use super::model::{CameraLabels, POSE_AND_CLOCK};
 use super::noise::Tails;
 use super::results::{CameraResult, FlightResult};
 use crate::calibrated_camera::CalibratedCamera;
@@ -12,6 +12,17 @@ use crate::survey::Survey;
 
 /// No pose is said to be known better than this, rad and m: of zeros there is no root.
 const LEAST_SD: f64 = 1e-6;
+
+impl Flight<'_> {
+    /// What an earlier calibration says of a camera, if that is of the same kind of lens.
+    pub(super) fn known(&self, index: usize) -> Option<&CalibratedCamera> {
+        let CameraLabels { name, intrinsics, .. } = &self.cameras[index];
+        let is_alike = |known: &&CalibratedCamera| {
+            lens::numbers(known.camera.model().intrinsics()) == lens::numbers(intrinsics)
+        };
+        self.survey.known(name).filter(is_alike)
+    }
+}
 
 impl State {
     /// A camera's pose and lens by an earlier calibration. The pose follows the lens, and what is said of
@@ -23,7 +34,7 @@ impl State {
         flight: &Flight<'_>,
         sink: &mut impl Sink,
     ) {
-        let Some(known) = flight.survey.known(&flight.cameras[index].name) else { return };
+        let Some(known) = flight.known(index) else { return };
         let camera = &self.cameras[index];
         let count = lens::numbers(&camera.intrinsics);
         let lens = lens_step(known, camera);

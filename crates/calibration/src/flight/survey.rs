@@ -20,10 +20,9 @@ impl State {
         flight: &Flight<'_>,
         sink: &mut impl Sink,
     ) {
-        let name = &flight.cameras[index].name;
-        let Some(place) = flight.survey.place(name) else { return };
+        let Some(place) = flight.survey.place(&flight.cameras[index].name) else { return };
         // Its place is begun with; what is known of the whole pose counts.
-        if flight.survey.known(name).is_some() {
+        if flight.known(index).is_some() {
             return;
         }
         let rows = [0, 1, 2].map(|axis| -> Row {
