@@ -56,7 +56,18 @@ pub enum LensFreedom {
     /// pixels), each coefficient of distortion (a third of itself).
     #[default]
     All,
+    /// All, and widely: the file is a guess, as from a data sheet. Focal length 5 %, aspect 0.3 %, principal
+    /// point 20 of 1920 pixels, distortion as most lenses have it. Only where much of the image is covered.
+    Guess,
 }
+
+/// Standard deviations of a lens that nobody has measured, in the order and units of a file's above: a data
+/// sheet's focal length, and sensors sit a hundredth of their width beside the axis.
+const GUESSED: [f64; 3] = [0.05, 0.003, 20.0 / 1920.0];
+/// Of Brown and Conrady's coefficients (k1, k2, p1, p2, k3) and of a fisheye's: beyond these a lens for
+/// watching would show straight walls as barrels.
+const GUESSED_BROWN_CONRADY: [f64; 5] = [0.2, 0.2, 0.003, 0.003, 0.1];
+const GUESSED_FISHEYE: [f64; 4] = [0.05; 4];
 
 impl LensFreedom {
     /// How well a lens file knows each number.
@@ -65,10 +76,20 @@ impl LensFreedom {
         let mut deviations = vec![LOG_FOCAL_SD, LOG_ASPECT_SD, centre, centre];
         let distortion = coefficients(&intrinsics.distortion);
         deviations.extend(distortion.iter().map(|k| (k.abs() * DISTORTION_SD).max(HELD_SD)));
+        if self == Self::Guess {
+            let [focal, aspect, centre] = GUESSED;
+            let centre = centre * f64::from(intrinsics.size.width);
+            deviations = vec![focal, aspect, centre, centre];
+            deviations.extend(match intrinsics.distortion {
+                Distortion::None => &[][..],
+                Distortion::BrownConrady(_) => &GUESSED_BROWN_CONRADY,
+                Distortion::Fisheye(_) => &GUESSED_FISHEYE,
+            });
+        }
         let free = match self {
             Self::Keep => 0,
             Self::Focal => 1,
-            Self::All => deviations.len(),
+            Self::All | Self::Guess => deviations.len(),
         };
         deviations[free..].fill(HELD_SD);
         deviations

@@ -179,6 +179,7 @@ fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pos
         freedom: camera.freedom,
         place: survey.place(&camera.name).cloned(),
         landmarks: survey.landmarks.iter().filter_map(landmark).collect(),
+        sky_turn: Matrix3::zeros(),
     };
     let mut result = match calibrate_landmarks(&picture) {
         Err(LandmarkError::TooFew { .. }) => return Ok(None),

@@ -22,8 +22,10 @@ pub(super) struct Adjusted {
     pub(super) state: State,
     /// Sum of the squares, in deviations, of clicks, lens and survey.
     pub(super) cost: f64,
-    /// Covariance of rotation, centre and lens.
+    /// Covariance of rotation, centre and lens by what each landmark errs by alone.
     pub(super) covariance: DMatrix<f64>,
+    /// What the turn of all directions together adds to it.
+    by_sky_turn: DMatrix<f64>,
 }
 
 impl Adjusted {
@@ -42,11 +44,12 @@ impl Adjusted {
 
     /// The pose's covariance with the lens held, and the lens with how the pose follows it.
     pub(super) fn pose_and_lens(&self) -> Option<(Matrix6<f64>, LensUncertainty)> {
-        let count = self.covariance.nrows() - POSE;
-        let tied = self.covariance.view((0, POSE), (POSE, count));
-        let lens = self.covariance.view((POSE, POSE), (count, count)).into_owned();
+        let all = &self.covariance + &self.by_sky_turn;
+        let count = all.nrows() - POSE;
+        let tied = all.view((0, POSE), (POSE, count));
+        let lens = all.view((POSE, POSE), (count, count)).into_owned();
         let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
-        let held = self.covariance.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
+        let held = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
         let held = (&held + held.transpose()) * 0.5;
         let pose = Matrix6::from_column_slice(held.as_slice());
         Some((pose, LensUncertainty { covariance: lens, pose_by_lens }))
@@ -161,6 +164,24 @@ pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted
         }
     }
     let covariance = Scaled::of(&equations.information)?.inverse();
-    let is_finite = covariance.iter().all(|value| value.is_finite());
-    is_finite.then_some(Adjusted { state, cost: equations.cost, covariance })
+    let by_sky_turn = by_sky_turn(picture, &state, &covariance)?;
+    let is_finite = covariance.iter().chain(&by_sky_turn).all(|value| value.is_finite());
+    is_finite.then_some(Adjusted { state, cost: equations.cost, covariance, by_sky_turn })
+}
+
+/// What a turn of all directions together adds to the unknowns' covariance (consider covariance,
+/// Schmidt): they follow the turn as they follow the clicks that it moves.
+fn by_sky_turn(
+    picture: &LandmarkPicture,
+    state: &State,
+    covariance: &DMatrix<f64>,
+) -> Option<DMatrix<f64>> {
+    let mut pulled = DMatrix::zeros(covariance.nrows(), 3);
+    for landmark in &picture.landmarks {
+        let seen = seen::see(&landmark.at, landmark.pixel, state)?;
+        let weight = seen.noise(landmark.click_sd_px).try_inverse()?;
+        pulled += seen.by.transpose() * weight * seen.by_sky_turn;
+    }
+    let follows = covariance * pulled;
+    Some(&follows * picture.sky_turn * follows.transpose())
 }

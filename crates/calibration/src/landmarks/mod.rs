@@ -10,7 +10,7 @@ mod start;
 
 use crossfix_geometry::{Camera, Intrinsics, Pixel, Pose};
 use crossfix_message::CameraName;
-use nalgebra::{Matrix2, Matrix6, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix3, Matrix6, Point3, Vector2};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 use thiserror::Error;
 
@@ -46,6 +46,9 @@ pub struct LandmarkPicture {
     pub place: Option<SurveyedPlace>,
     /// The landmarks.
     pub landmarks: Vec<Landmark>,
+    /// Covariance of what all directions among them may be turned by together, about east, north and up,
+    /// rad^2: of the time at which the sun or stars were seen, say.
+    pub sky_turn: Matrix3<f64>,
 }
 
 /// Why landmarks tell no pose.

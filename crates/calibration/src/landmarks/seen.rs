@@ -38,6 +38,8 @@ pub(crate) struct Seen {
     pub(crate) by: OMatrix<f64, U2, Dyn>,
     /// By what the landmark's own place or direction may be off by, in deviations.
     pub(crate) by_place: Matrix2x3<f64>,
+    /// By a turn of all directions about east, north and up, rad; nothing where it is a place.
+    pub(crate) by_sky_turn: Matrix2x3<f64>,
 }
 
 impl Seen {
@@ -59,16 +61,18 @@ pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<S
     let count = lens::numbers(&state.intrinsics);
     let mut by = OMatrix::<f64, U2, Dyn>::zeros(POSE + count);
     by.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * offset.cross_matrix()));
-    let by_place = match at {
+    let (by_place, by_sky_turn) = match at {
         LandmarkPlace::Place { sd_m, .. } => {
             by.fixed_columns_mut::<3>(3).copy_from(&-by_place);
-            by_place * Matrix3::from_diagonal(sd_m)
+            (by_place * Matrix3::from_diagonal(sd_m), Matrix2x3::zeros())
         }
-        LandmarkPlace::Direction { sd_rad, .. } => by_place * *sd_rad,
+        LandmarkPlace::Direction { direction, sd_rad } => {
+            (by_place * *sd_rad, -by_place * direction.cross_matrix())
+        }
     };
     for (number, by_number) in seen.by_lens[..count].iter().enumerate() {
         by.set_column(POSE + number, by_number);
     }
     let residual = seen.pixel - Vector2::new(clicked.x(), clicked.y());
-    Some(Seen { residual, by, by_place })
+    Some(Seen { residual, by, by_place, by_sky_turn })
 }

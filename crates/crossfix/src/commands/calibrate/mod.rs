@@ -12,6 +12,7 @@ mod picture;
 mod plots;
 mod remarks;
 mod report;
+mod stars;
 mod survey;
 mod verdict;
 

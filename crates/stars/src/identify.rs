@@ -1,0 +1,153 @@
+//! Which spot is which star.
+
+use crossfix_geometry::{Camera, CameraModel, Pixel};
+use nalgebra::{Unit, Vector3};
+use tetra3::{CameraModel as Pinhole, Centroid, SolveConfig};
+
+use crate::sky::{Sky, Star, pattern_width};
+use crate::{Spot, StarError};
+
+/// A spot and the star that it is.
+#[derive(Clone, Debug)]
+pub struct NamedStar {
+    /// The star's name.
+    pub name: String,
+    /// Where it is in the picture.
+    pub pixel: Pixel,
+    /// Where it stands, local ENU.
+    pub direction: Unit<Vector3<f64>>,
+}
+
+/// Of fewer spots no pattern with a star to spare can be made.
+const FEWEST_SPOTS: usize = 5;
+/// A lens' file may have the focal length wrong by this share: zooms that are not touched keep it to 2 %.
+const SCALE_SHARE: f64 = 0.04;
+/// The brightest spots that patterns are made of: planets, lamps and aircraft are among them.
+const PATTERN_SPOTS: u32 = 32;
+/// A named star must lie within this share of the image's width of where the pattern has it.
+const MATCH_SHARE: f32 = 0.01;
+/// How long the sky may be searched, ms: named pictures take a tenth of a second, others end here.
+const SEARCH_MS: u64 = 20_000;
+/// Under this sine of the elevation (3 degrees) light is bent by more than is known.
+const LOWEST_SINE: f64 = 0.05;
+/// Beside a spot, two stars of which one is this much fainter in magnitude are the brighter one.
+const OUTSHONE: f64 = 2.0;
+/// Where stars are named by a pose and lens, those fainter by so many magnitudes than the faintest that must
+/// be seen are not asked for: what is there is noise.
+const FAINTER: f64 = 1.0;
+
+impl Sky {
+    /// Names spots without knowing where the camera looks, by the patterns that they make.
+    ///
+    /// # Errors
+    /// [`StarError`] where nothing in the sky is like it, or the stars cannot be seen then and there.
+    pub fn identify(
+        &self,
+        spots: &[Spot],
+        lens: &CameraModel,
+    ) -> Result<Vec<NamedStar>, StarError> {
+        let width = pattern_width(lens);
+        let half = (width / 2.0).tan();
+        // As a pinhole sees them, of focal length one; a wide lens' sides are left out.
+        let seen: Vec<(usize, Vector3<f64>)> = spots
+            .iter()
+            .enumerate()
+            .filter_map(|(index, spot)| {
+                Some((index, lens.direction(spot.pixel).ok()?.into_inner()))
+            })
+            .filter(|(_, direction)| direction.z > 0.0)
+            .map(|(index, direction)| (index, direction / direction.z))
+            .filter(|(_, plane)| plane.x.abs() <= half && plane.y.abs() <= half)
+            .collect();
+        if seen.len() < FEWEST_SPOTS {
+            return Err(StarError::TooFew { found: seen.len(), needed: FEWEST_SPOTS });
+        }
+        let size = lens.intrinsics().size;
+        let focal = f64::from(size.width) / 2.0 / half;
+        let centroid = |(index, plane): &(usize, Vector3<f64>)| Centroid {
+            x: (plane.x * focal) as f32,
+            y: (plane.y * focal) as f32,
+            mass: Some(spots[*index].brightness as f32),
+            cov: None,
+        };
+        let centroids: Vec<Centroid> = seen.iter().map(centroid).collect();
+        let config = SolveConfig {
+            fov_max_error_rad: Some((width * SCALE_SHARE) as f32),
+            match_radius: MATCH_SHARE,
+            pattern_checking_stars: PATTERN_SPOTS,
+            solve_timeout_ms: Some(SEARCH_MS),
+            ..SolveConfig::with_camera_model(Pinhole::from_fov(width, size.width, size.height))
+        };
+        let solution = self
+            .database
+            .solve_from_centroids(&centroids, &config)
+            .map_err(|_| StarError::Unknown { spots: spots.len() })?;
+        if solution.parity_flip {
+            return Err(StarError::Mirrored);
+        }
+        let pairs = solution.matched_centroid_indices.iter().zip(&solution.matched_catalog_ids);
+        let named: Vec<NamedStar> = pairs
+            .filter_map(|(&centroid, id)| {
+                let star = self.database.star_catalog_ids.iter().position(|known| known == id)?;
+                Some(self.stars[star].named(&spots[seen[centroid].0]))
+            })
+            .collect();
+        let above: Vec<NamedStar> =
+            named.into_iter().filter(|star| star.direction.z > LOWEST_SINE).collect();
+        if above.is_empty() { Err(StarError::UnderHorizon) } else { Ok(above) }
+    }
+
+    /// Names the spots that lie where a camera sees a star, within so many pixels as it may be off by there
+    /// (`gate_px`): those that have one star there, and are the only spot there.
+    pub fn named(
+        &self,
+        spots: &[Spot],
+        camera: &Camera,
+        gate_px: impl Fn(Pixel) -> f64,
+    ) -> Vec<NamedStar> {
+        let faintest = self.faintest_of(spots.len(), camera);
+        let camera_from_world = camera.pose().rotation().inverse();
+        let seen: Vec<(&Star, Pixel, f64)> = self
+            .stars
+            .iter()
+            .filter(|star| star.direction.z > LOWEST_SINE && star.magnitude < faintest)
+            .filter_map(|star| {
+                let direction = camera_from_world * star.direction.into_inner();
+                let is_seen = camera.model().sees(&direction);
+                let at = is_seen.then(|| camera.model().project(&direction)).flatten()?;
+                Some((star, at, gate_px(at)))
+            })
+            .collect();
+        let apart = |a: Pixel, b: Pixel| (a.x() - b.x()).hypot(a.y() - b.y());
+        let mut named = Vec::new();
+        for spot in spots {
+            let mut near = seen.iter().filter(|(_, at, gate)| apart(*at, spot.pixel) < 2.0 * gate);
+            // Brightest first.
+            let Some((star, at, gate)) = near.next() else { continue };
+            let is_alone =
+                near.next().is_none_or(|(next, ..)| next.magnitude > star.magnitude + OUTSHONE);
+            let rivals = spots.iter().filter(|other| apart(other.pixel, *at) < 2.0 * gate).count();
+            if is_alone && rivals == 1 && apart(*at, spot.pixel) < *gate {
+                named.push(star.named(spot));
+            }
+        }
+        named
+    }
+
+    /// The magnitude of the faintest star that a camera can be seeing if it sees so many in its image.
+    fn faintest_of(&self, count: usize, camera: &Camera) -> f64 {
+        let camera_from_world = camera.pose().rotation().inverse();
+        let is_seen = |star: &&Star| {
+            star.direction.z > LOWEST_SINE
+                && camera.model().sees(&(camera_from_world * star.direction.into_inner()))
+        };
+        let last = self.stars.iter().filter(is_seen).take(count.max(1)).last();
+        last.map_or(f64::INFINITY, |star| star.magnitude + FAINTER)
+    }
+}
+
+impl Star {
+    fn named(&self, spot: &Spot) -> NamedStar {
+        NamedStar { name: self.name.clone(), pixel: spot.pixel, direction: self.direction }
+    }
+}
