@@ -75,3 +75,36 @@ fn a_camera_that_was_moved_since_is_proposed_where_it_is_now() {
     let turn = result.cameras[1].pose_covariance.fixed_view::<3, 3>(0, 0).trace().sqrt() * 1e3;
     assert!(error < 2.0 && error < 4.0 * turn, "{error} mrad are left, {turn} are said");
 }
+
+/// A straight way at one height, which tells no poses by itself: from any place on a circle it looks the same.
+fn straight(t: f64) -> Point3<f64> {
+    Point3::new(-25.0 + 0.42 * t, 12.0 - 0.17 * t, 38.0)
+}
+
+/// As last night, but at one height.
+fn level(t: f64) -> Point3<f64> {
+    let place = last_night(t);
+    Point3::new(place.x, place.y, 36.0)
+}
+
+/// What was known tells what two cameras and a flight do not: how they stand, and that nothing has changed.
+#[test]
+fn two_cameras_and_a_flight_that_tells_no_poses_leave_what_was_known() {
+    let (truths, site) = earlier();
+    type Way = fn(f64) -> Point3<f64>;
+    for (name, way) in [("all round", last_night as Way), ("level", level), ("straight", straight)]
+    {
+        let mut random = ChaCha8Rng::seed_from_u64(34);
+        let two = [0, 2].map(|k| labels_of(&truths[k], way, &mut random));
+        let survey = Survey::default().with_known(site.clone());
+        let result =
+            calibrate_flight(&two, None, &survey).unwrap_or_else(|error| panic!("{name}: {error}"));
+        assert_eq!(result.cameras.len(), 2, "{name}: {:?}", result.refused);
+        let comparison = compare_sites(&site, &SiteCalibration::from(&result)).unwrap();
+        for (index, camera) in comparison.cameras.iter().enumerate() {
+            assert!(camera.deviations < 2.5, "{name}, {}: {}", camera.name, camera.deviations);
+            let error = pointing_error_mrad(&truths[2 * index], &result, index);
+            assert!(error < 0.5, "{name}, {}: {error} mrad", camera.name);
+        }
+    }
+}

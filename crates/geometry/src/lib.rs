@@ -38,5 +38,5 @@ pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, 
 pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};
 pub use model::BearingModel;
-pub use pose::Pose;
+pub use pose::{Pose, turn_vector};
 pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};

@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::GeometryError;
 
@@ -12,6 +12,14 @@ const ORTHONORMAL_TOLERANCE: f64 = 1e-5;
 pub struct Pose {
     rotation: Rotation3<f64>,
     position: Point3<f64>,
+}
+
+/// A rotation as its axis times its angle, rad.
+///
+/// Of next to no turn it is next to nothing, where [`Rotation3::scaled_axis`] is no number as soon as rounding
+/// makes the matrix' trace larger than three.
+pub fn turn_vector(rotation: &Rotation3<f64>) -> Vector3<f64> {
+    UnitQuaternion::from_rotation_matrix(rotation).scaled_axis()
 }
 
 impl Pose {
@@ -90,5 +98,17 @@ mod tests {
         let mut shear = Matrix3::identity();
         shear[(0, 1)] = 0.01;
         assert!(Pose::new(shear, Point3::origin()).is_err());
+    }
+
+    #[test]
+    fn a_turn_of_next_to_nothing_is_next_to_nothing() {
+        // Products of rotations: their traces lie on both sides of three by rounding.
+        for k in 1..1000 {
+            let rotation = Rotation3::new(Vector3::new(0.3, -1.1, 0.7) * f64::from(k));
+            let turn = turn_vector(&(rotation.inverse() * rotation));
+            assert!(turn.norm() < 1e-7, "{turn}");
+        }
+        let turn = turn_vector(&Rotation3::new(Vector3::new(0.1, 0.2, -0.3)));
+        assert!((turn - Vector3::new(0.1, 0.2, -0.3)).norm() < 1e-12);
     }
 }

@@ -1,6 +1,6 @@
 //! A site that was put together from what cameras saw is brought to where it stands.
 
-use crossfix_geometry::Pose;
+use crossfix_geometry::{Pose, turn_vector};
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::adjustment::State;
@@ -123,18 +123,22 @@ impl Known {
         let spread = linear::median(self.places.iter().map(|(_, there)| (there - to).norm()));
         let most = FAR * misfit.max(LEAST_FAR / FAR * spread);
         self.places.retain(|place| shown.misfit(place) <= most);
-        self.rotations
-            .retain(|(here, there)| (shown.rotation * here).angle_to(there) < FAR_TURNED_RAD);
+        self.rotations.retain(|(here, there)| {
+            turn_vector(&(there.inverse() * shown.rotation * here)).norm() < FAR_TURNED_RAD
+        });
         self
     }
 
-    /// Cameras' surveyed places, landmarks that two cameras see, and cameras whose own landmarks tell
-    /// their pose.
+    /// Cameras' surveyed places and earlier poses, landmarks that two cameras see, and cameras whose own
+    /// landmarks tell their pose.
     fn of(state: &State, labels: &[CameraLabels], survey: &Survey) -> Self {
         let mut known = Self { places: Vec::new(), rotations: Vec::new(), untold: Vec::new() };
         for (labels, camera) in labels.iter().zip(&state.cameras) {
             if let Some(place) = survey.place(&labels.name) {
                 known.places.push((camera.centre, place.position));
+            }
+            if let Some(earlier) = survey.known(&labels.name) {
+                known.rotations.push((camera.rotation, *earlier.camera.pose().rotation()));
             }
             match by_own_landmarks(labels, survey) {
                 Ok(Some(pose)) => {

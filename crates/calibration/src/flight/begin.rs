@@ -12,6 +12,7 @@ use super::{
 };
 use crate::label_noise::LabelNoise;
 use crate::survey::Survey;
+use crossfix_geometry::turn_vector;
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3};
 
@@ -93,7 +94,7 @@ impl Begun {
         {
             return Err(FlightError::NoCamera { camera: camera.name.clone(), why: why.clone() });
         }
-        let mut begun = best_of_pairs(&usable)?;
+        let mut begun = best_of_pairs(&usable, survey)?;
         for (camera, why) in unusable {
             begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
         }
@@ -229,11 +230,14 @@ impl Begun {
             names.filter_map(|name| Some([turn(self, name)?, turn(best, name)?])).collect();
         let stand_otherwise = turns.windows(2).any(|pair| {
             let [own, bests] = [0, 1].map(|k| pair[0][k].inverse() * pair[1][k]);
-            own.angle_to(&bests) > OTHERWISE_RAD
+            turn_vector(&(own.inverse() * bests)).norm() > OTHERWISE_RAD
         });
-        self.cameras.len() == best.cameras.len()
-            && self.misfit() < ALIKE_TIMES * best.misfit()
-            && stand_otherwise
+        self.fits_as(best) && stand_otherwise
+    }
+
+    /// Whether it fits about as well as the best one.
+    fn fits_as(&self, best: &Self) -> bool {
+        self.cameras.len() == best.cameras.len() && self.misfit() <= ALIKE_TIMES * best.misfit()
     }
 
     /// The sum of what all cameras' labels lie beside the course.
@@ -337,50 +341,96 @@ fn with_cure(
     Refusal::Misfit { misfit_mrad, would_fit }
 }
 
-/// Of the best pairs the one that most cameras fit, and fit best.
-fn best_of_pairs(cameras: &[&CameraLabels]) -> Result<Begun, FlightError> {
+/// Two cameras to begin with: where they may stand, and the second's clock.
+struct BeginWith<'a> {
+    cameras: [&'a CameraLabels; 2],
+    /// Rotation, centre, and the time by the first's clock less that by the own, s.
+    poses: [(Rotation3<f64>, Point3<f64>, f64); 2],
+    /// As [`Pair::doubt`].
+    doubt: f64,
+    /// Whether an earlier calibration has them so.
+    is_known: bool,
+}
+
+impl<'a> BeginWith<'a> {
+    fn found(cameras: [&'a CameraLabels; 2], sights: [&Sights; 2]) -> Vec<Self> {
+        let of_pair = |pair: Pair| Self {
+            cameras,
+            poses: [
+                (Rotation3::identity(), Point3::origin(), 0.0),
+                (pair.first_from_second, pair.centre, pair.ahead_s),
+            ],
+            doubt: pair.doubt,
+            is_known: false,
+        };
+        pairs::find(sights[0], sights[1]).into_iter().map(of_pair).collect()
+    }
+
+    fn known(
+        cameras: [&'a CameraLabels; 2],
+        sights: [&Sights; 2],
+        survey: &Survey,
+    ) -> Option<Self> {
+        let pose = |camera: &CameraLabels| Some(survey.known(&camera.name)?.camera.pose());
+        let (a, b) = (pose(cameras[0])?, pose(cameras[1])?);
+        let stand = [a, b].map(|pose| (pose.rotation(), pose.position()));
+        let pair = pairs::known(sights[0], sights[1], stand)?;
+        let poses =
+            [(*a.rotation(), a.position(), 0.0), (*b.rotation(), b.position(), pair.ahead_s)];
+        Some(Self { cameras, poses, doubt: pair.doubt, is_known: true })
+    }
+}
+
+/// Of the best pairs the one that most cameras fit, and fit best; where an earlier calibration's poses fit as
+/// well as others, these.
+fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, FlightError> {
     let sights: Vec<Sights> = cameras.iter().map(|camera| Sights::of(camera)).collect();
-    let mut found: Vec<(usize, usize, Vec<Pair>)> = Vec::new();
+    let (mut found, mut known) = (Vec::new(), Vec::new());
     for first in 0..cameras.len() {
         for second in first + 1..cameras.len() {
-            found.push((first, second, pairs::find(&sights[first], &sights[second])));
+            let both = [cameras[first], cameras[second]];
+            let seen = [&sights[first], &sights[second]];
+            found.push(BeginWith::found(both, seen));
+            known.extend(BeginWith::known(both, seen, survey));
         }
     }
-    let doubt = |pairs: &[Pair]| pairs.iter().map(|p| p.doubt).fold(f64::INFINITY, f64::min);
-    found.sort_by(|a, b| doubt(&a.2).total_cmp(&doubt(&b.2)));
-    let tried = found.iter().take(PAIRS_TRIED);
-    let ways =
-        tried.flat_map(|(first, second, pairs)| pairs.iter().map(move |p| (first, second, p)));
-    let begun = ways.filter_map(|(first, second, pair)| {
+    let doubt = |ways: &[BeginWith<'_>]| ways.iter().map(|p| p.doubt).fold(f64::INFINITY, f64::min);
+    found.sort_by(|a, b| doubt(a).total_cmp(&doubt(b)));
+    known.sort_by(|a, b| a.doubt.total_cmp(&b.doubt));
+    let tried = found.into_iter().take(PAIRS_TRIED).flatten();
+    let ways = tried.chain(known.into_iter().take(PAIRS_TRIED));
+    let begun = ways.filter_map(|way| {
         tracing::debug!(
-            "`{}` and `{}` are {:.3} s apart (doubt {:.1e})",
-            cameras[*first].name,
-            cameras[*second].name,
-            pair.ahead_s,
-            pair.doubt
+            "`{}` and `{}` are {:.3} s apart (doubt {:.1e}){}",
+            way.cameras[0].name,
+            way.cameras[1].name,
+            way.poses[1].2,
+            way.doubt,
+            if way.is_known { ", where they were" } else { "" }
         );
         // Their way is not known yet: the clocks' knots are found with it.
         let mut begun = Begun::new(Course::nowhere());
-        let (a, b) = (cameras[*first], cameras[*second]);
-        let second_pose = (pair.first_from_second, pair.centre, pair.ahead_s);
-        let poses = [(a, (Rotation3::identity(), Point3::origin(), 0.0)), (b, second_pose)];
-        for (camera, pose) in poses {
+        for (camera, pose) in way.cameras.into_iter().zip(way.poses) {
             let state = start::state(camera, &begun.course, pose);
             begun.take(camera, Ok(state));
         }
         begun.place_the_rest(cameras, &sights)?;
-        Some(begun)
+        Some((begun, way.is_known))
     });
-    let mut begun: Vec<Begun> = begun.collect();
-    begun.sort_by(|a, b| {
+    let mut begun: Vec<(Begun, bool)> = begun.collect();
+    begun.sort_by(|(a, _), (b, _)| {
         let fewer = b.cameras.len().cmp(&a.cameras.len());
         fewer.then_with(|| a.misfit().total_cmp(&b.misfit()))
     });
-    let (best, others) = begun.split_first().ok_or(FlightError::NoPair)?;
-    if others.iter().any(|other| other.rivals(best)) {
+    let ((best, _), others) = begun.split_first().ok_or(FlightError::NoPair)?;
+    let as_good = |(other, is_known): &(Begun, bool)| *is_known && other.fits_as(best);
+    if let Some(index) = begun.iter().position(as_good) {
+        return Ok(begun.swap_remove(index).0);
+    }
+    if others.iter().any(|(other, _)| other.rivals(best)) {
         return Err(FlightError::TwoWays);
     }
-    Ok(begun.swap_remove(0))
+    Ok(begun.swap_remove(0).0)
 }
 
 /// The time between a camera's frames: the median between its labels, s.

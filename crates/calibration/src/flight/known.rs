@@ -1,5 +1,6 @@
 //! What an earlier calibration says of cameras.
 
+use crossfix_geometry::turn_vector;
 use nalgebra::{DMatrix, DVector, Rotation3};
 
 use super::adjustment::{Flight, Row, Sink, State};
@@ -117,7 +118,7 @@ fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DV
         pose.rotation().matrix().transpose() * camera.rotation.matrix(),
     );
     let moved = camera.centre - pose.position();
-    DVector::from_iterator(6, turn.scaled_axis().iter().chain(moved.iter()).copied())
+    DVector::from_iterator(6, turn_vector(&turn).iter().chain(moved.iter()).copied())
 }
 
 fn lens_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {

@@ -1,6 +1,6 @@
 //! What is measured of a flight, and what is unknown of it.
 
-use crossfix_geometry::{Intrinsics, Pixel};
+use crossfix_geometry::{Intrinsics, Pixel, turn_vector};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3, Vector2, Vector3};
 
@@ -208,7 +208,7 @@ pub(super) struct Seen {
 /// The step in a camera's own unknowns that leads from one state to another.
 pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
     let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
-    let mut step: Vec<f64> = turn.scaled_axis().iter().copied().collect();
+    let mut step: Vec<f64> = turn_vector(&turn).iter().copied().collect();
     step.extend((to.centre - from.centre).iter());
     let (a, b) = (&from.clock, &to.clock);
     step.extend([b.offset_s - a.offset_s, b.rate - a.rate, b.readout_s - a.readout_s]);

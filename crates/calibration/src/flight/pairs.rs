@@ -102,12 +102,17 @@ fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
     let eigen = sum.symmetric_eigen();
     let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
     let matrix = Matrix3::from_column_slice(least.as_slice());
+    (matrix, misfit(&matrix, seen))
+}
+
+/// The median angle that an essential matrix leaves, rad.
+fn misfit(matrix: &Matrix3<f64>, seen: &[[Vector3<f64>; 2]]) -> f64 {
     let angle = |[a, b]: &[Vector3<f64>; 2]| {
         let (of_a, of_b) = (matrix * a, matrix.tr_mul(b));
         let size2 = f64::midpoint(of_a.norm_squared(), of_b.norm_squared());
         b.dot(&of_a).abs() / size2.sqrt().max(1e-12)
     };
-    (matrix, median(seen.iter().map(angle)))
+    median(seen.iter().map(angle))
 }
 
 fn median(values: impl Iterator<Item = f64>) -> f64 {
@@ -119,9 +124,37 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 /// How two cameras may stand to each other: of a flight in a plane there are two ways. None where they saw
 /// too little in common.
 pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
-    let (Some((from, to)), Some((other_from, other_to))) = (first.span(), second.span()) else {
+    let Some((ahead_s, misfit_rad)) = offset(first, second, |seen| essential(seen).1) else {
         return Vec::new();
     };
+    let seen = common(first, second, ahead_s);
+    let in_space = decomposed(&seen, ahead_s, misfit_rad);
+    in_space.into_iter().chain(in_plane(&seen, ahead_s, misfit_rad)).collect()
+}
+
+/// Two cameras of which it is known how they stand to each other: only their clocks are to be found. None
+/// where what they saw does not fit that, or is too little.
+pub(super) fn known(
+    first: &Sights,
+    second: &Sights,
+    [a, b]: [(&Rotation3<f64>, Point3<f64>); 2],
+) -> Option<Pair> {
+    let second_from_first = (b.0.inverse() * a.0).into_inner();
+    let shift = b.0.inverse() * (a.1 - b.1);
+    let matrix = shift.cross_matrix() * second_from_first;
+    let (ahead_s, misfit_rad) = offset(first, second, |seen| misfit(&matrix, seen))?;
+    let seen = common(first, second, ahead_s);
+    let unit = shift.try_normalize(1e-9)?;
+    Some(Pair::of((second_from_first, unit), &seen, ahead_s, misfit_rad)?.1)
+}
+
+/// The offset of the clocks, s, at which what both see fits best, and by how much it does not.
+fn offset(
+    first: &Sights,
+    second: &Sights,
+    misfit_of: impl Fn(&[[Vector3<f64>; 2]]) -> f64,
+) -> Option<(f64, f64)> {
+    let ((from, to), (other_from, other_to)) = (first.span()?, second.span()?);
     let fewer = first.times_s.len().min(second.times_s.len());
     // Of the first's labels that are tried, as many as that share of the fewer.
     let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
@@ -129,7 +162,7 @@ pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
     let enough = LEAST_COMMON.max((share * tried as f64) as usize);
     let misfit = |ahead_s: f64| {
         let seen = common(first, second, ahead_s);
-        if seen.len() < enough { f64::INFINITY } else { essential(&seen).1 }
+        if seen.len() < enough { f64::INFINITY } else { misfit_of(&seen) }
     };
     let (least, most) = (from - other_to, to - other_from);
     let steps = ((most - least) / STEP_S) as usize;
@@ -154,12 +187,7 @@ pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
         coarser = step;
     }
     let (misfit_rad, ahead_s) = best;
-    if misfit_rad.is_infinite() {
-        return Vec::new();
-    }
-    let seen = common(first, second, ahead_s);
-    let in_space = decomposed(&seen, ahead_s, misfit_rad);
-    in_space.into_iter().chain(in_plane(&seen, ahead_s, misfit_rad)).collect()
+    misfit_rad.is_finite().then_some((ahead_s, misfit_rad))
 }
 
 /// The pose of the four that an essential matrix allows, which has most of the target ahead of both.

@@ -1,5 +1,6 @@
 //! Pose and lens adjusted to clicks, by Levenberg and Marquardt.
 
+use crossfix_geometry::turn_vector;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6};
 
 use super::LandmarkPicture;
@@ -34,7 +35,7 @@ impl Adjusted {
         if other.cost > self.cost + ALIKE {
             return false;
         }
-        let turned = self.state.rotation.rotation_to(&other.state.rotation).angle();
+        let turned = turn_vector(&(self.state.rotation.inverse() * other.state.rotation)).norm();
         let moved = other.state.centre - self.state.centre;
         let place = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         let turns = self.covariance.fixed_view::<3, 3>(0, 0).trace();

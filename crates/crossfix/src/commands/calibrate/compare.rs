@@ -5,6 +5,7 @@ use anyhow::Context;
 use crossfix_calibration::{
     CameraComparison, SiteCalibration, SiteComparison, SiteMove, compare_sites,
 };
+use crossfix_geometry::turn_vector;
 use serde::Serialize;
 
 use super::plots;
@@ -81,7 +82,7 @@ impl From<&SiteMove> for MoveFigures {
     fn from(moved: &SiteMove) -> Self {
         Self {
             shift_m: moved.shift.into(),
-            turn_mrad: (moved.turn.scaled_axis() * 1e3).into(),
+            turn_mrad: (turn_vector(&moved.turn) * 1e3).into(),
             larger: moved.size - 1.0,
             later_s: moved.later_s,
         }
