@@ -7,8 +7,8 @@ use super::model::{CameraLabels, CameraState, FlightLog};
 use super::pairs::{self, Pair, Sights};
 use super::spline::Spline;
 use super::{
-    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal, WouldFit, hours, start, triangulation,
-    would_fit,
+    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal, WouldFit, hours, start, things,
+    triangulation, would_fit,
 };
 use crate::label_noise::LabelNoise;
 use crate::survey::Survey;
@@ -52,7 +52,7 @@ pub(super) struct Begun {
     pub(super) cameras: Vec<CameraLabels>,
     states: Vec<CameraState>,
     course: Course,
-    /// How many labels of a camera are of something else than the log's target.
+    /// How many labels of a camera are of something else than the target.
     pub(super) of_others: Vec<(CameraName, usize)>,
     /// The cameras that take no part.
     pub(super) refused: Vec<(CameraName, Refusal)>,
@@ -94,7 +94,13 @@ impl Begun {
         {
             return Err(FlightError::NoCamera { camera: camera.name.clone(), why: why.clone() });
         }
-        let mut begun = best_of_pairs(&usable, survey)?;
+        let own = things::of_one_target(&usable, survey);
+        let mut begun = best_of_pairs(&own.iter().collect::<Vec<_>>(), survey)?;
+        let of_others = usable
+            .iter()
+            .zip(&own)
+            .map(|(all, own)| (own.name.clone(), all.labels.len() - own.labels.len()));
+        begun.of_others = of_others.collect();
         for (camera, why) in unusable {
             begun.refused.extend(why.err().map(|why| (camera.name.clone(), why)));
         }

@@ -28,6 +28,7 @@ mod settle;
 mod spline;
 mod start;
 mod survey;
+mod things;
 mod triangulation;
 mod unknowns;
 mod would_fit;

@@ -19,6 +19,8 @@ const TRIED: usize = 150;
 const LEAST_COMMON: usize = 40;
 /// ... and so large a share of the smaller one's labels: eight numbers fit any short piece of a way.
 const LEAST_SHARE: f64 = 0.3;
+/// Of known ways of standing so many sight lines tell whether they meet.
+const LEAST_MET: usize = 15;
 /// A direction between two labels farther apart than this is not known, s: or than so many of its
 /// frames.
 const GAP_S: f64 = 0.2;
@@ -224,6 +226,16 @@ fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<Pa
 }
 
 impl Pair {
+    /// The median angle by which sight lines of the two pass each other, rad; `None` where too few are of one
+    /// time.
+    pub(super) fn aside(&self, first: &Sights, second: &Sights) -> Option<f64> {
+        let seen = common(first, second, self.ahead_s);
+        let second_from_first = self.first_from_second.inverse();
+        let shift = second_from_first * -self.centre.coords;
+        let matrix = shift.cross_matrix() * second_from_first.into_inner();
+        (seen.len() >= LEAST_MET).then(|| misfit(&matrix, &seen))
+    }
+
     /// A second camera that is turned and shifted (by a unit) so against the first, with how many places lie
     /// ahead of both; `None` if less than half do.
     fn of(

@@ -2,6 +2,8 @@
 //!
 //! A bird that flies by is seen for a moment, the target for most of the time.
 
+use nalgebra::Vector2;
+
 use super::model::{CameraLabels, Label};
 
 /// From frame to frame nothing moves farther than this share of the image's width: with half of it fast
@@ -57,6 +59,57 @@ pub(super) fn of_one_thing(camera: &CameraLabels, frame_s: f64) -> (Vec<Vec<Labe
     pieces.sort_by_key(|piece: &Vec<Label>| std::cmp::Reverse(piece.len()));
     let short = pieces.split_off(pieces.partition_point(|piece| piece.len() >= LEAST));
     (pieces, short.concat())
+}
+
+/// A thing that was lost is the one that comes up next where it was going, within so long, s, ...
+const LOST_S: f64 = 5.0;
+/// ... within this share of the image's width, and as much again for each second: what turns at arm's length
+/// is missed, and things are few.
+const ASTRAY: f64 = 0.05;
+/// A thing's speed in the image is that of its first and last so many labels.
+const PACE: usize = 10;
+
+/// Pieces (in their numbers) that go on from one another, as far as can be told by one camera: a thing that
+/// was lost for seconds and found again.
+pub(super) fn chains(pieces: &[Vec<Label>], width_px: f64) -> Vec<Vec<usize>> {
+    let mut links: Vec<(f64, usize, usize)> = Vec::new();
+    for (before, piece) in pieces.iter().enumerate() {
+        for (after, next) in pieces.iter().enumerate() {
+            let astray = astray(piece, next, width_px);
+            links.extend(astray.map(|astray| (astray, before, after)));
+        }
+    }
+    links.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut next_of: Vec<Option<usize>> = vec![None; pieces.len()];
+    let mut has_before = vec![false; pieces.len()];
+    for (_, before, after) in links {
+        if next_of[before].is_none() && !has_before[after] {
+            next_of[before] = Some(after);
+            has_before[after] = true;
+        }
+    }
+    let first = (0..pieces.len()).filter(|piece| !has_before[*piece]);
+    let chain =
+        |piece: usize| std::iter::successors(Some(piece), |piece| next_of[*piece]).collect();
+    first.map(chain).collect()
+}
+
+/// How far beside where it was going a thing has come up again, as a share of how far it may; `None` if it
+/// is another.
+fn astray(piece: &[Label], next: &[Label], width_px: f64) -> Option<f64> {
+    let (end, start) = (piece.last()?, next.first()?);
+    let gap_s = start.time_s - end.time_s;
+    let place = |label: &Label| Vector2::new(label.pixel.x(), label.pixel.y());
+    let pace = |labels: &[Label]| {
+        let (from, to) = (labels.first()?, labels.last()?);
+        Some((place(to) - place(from)) / (to.time_s - from.time_s))
+    };
+    let from = pace(&piece[piece.len().saturating_sub(PACE)..])?;
+    let to = pace(&next[..PACE.min(next.len())])?;
+    // Half of the way at the one pace, and half at the other.
+    let expected = place(end) + (from + to) * (gap_s / 2.0);
+    let beside = (place(start) - expected).norm() / (width_px * ASTRAY * (1.0 + gap_s));
+    ((0.0..LOST_S).contains(&gap_s) && beside < 1.0).then_some(beside)
 }
 
 fn cut(labels: &[Label], step_px: f64, frame_s: f64) -> Vec<Piece> {

@@ -108,7 +108,7 @@ pub(super) fn among_others(
 }
 
 /// Whether some of the labels, in the order of their times, are of a time.
-fn at_once(labels: &[Label], time_s: f64, within_s: f64) -> bool {
+pub(super) fn at_once(labels: &[Label], time_s: f64, within_s: f64) -> bool {
     let next = labels.partition_point(|label| label.time_s < time_s - within_s);
     labels.get(next).is_some_and(|label| label.time_s < time_s + within_s)
 }
@@ -129,7 +129,8 @@ pub(super) fn without_others(
     of_labels(camera, labels)
 }
 
-fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> CameraLabels {
+/// A camera with other labels than its own.
+pub(super) fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> CameraLabels {
     labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
     let CameraLabels { name, intrinsics, freedom, .. } = camera;
     CameraLabels { name: name.clone(), intrinsics: *intrinsics, freedom: *freedom, labels }

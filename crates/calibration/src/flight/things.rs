@@ -1,0 +1,236 @@
+//! Which labels are of one target, where cameras followed several things at once and no log tells them apart.
+//!
+//! Two cameras see one thing where the sight lines of a piece of the one's labels meet those of the other's,
+//! by one way of standing to each other and one offset of their clocks. Short pieces of other things do so by
+//! chance; the way of standing that joins most pieces is the true one.
+
+use nalgebra::{Point3, Rotation3};
+
+use super::begin::frame_time;
+use super::course::Course;
+use super::model::{CameraLabels, Label};
+use super::pairs::{self, Pair, Sights};
+use super::{LEAST_LABELS, pieces, start, triangulation};
+use crate::survey::Survey;
+
+/// Where fewer labels than this share were made at once with others, these are birds, which the fits
+/// stand; a target that is followed twice is none of it.
+const LEAST_AT_ONCE: f64 = 0.02;
+/// Of each camera so many things are begun with, those that it followed longest, ...
+const THINGS: usize = 4;
+/// ... and so many pairs of them are joined by others.
+const SEEDS: usize = 12;
+/// Sight lines of one thing pass each other by less than this in the median, rad: as lens files leave up to
+/// 4 mrad.
+const MOST_ASIDE_RAD: f64 = 6e-3;
+/// A piece of which more than this share was made at once with the target's labels is another thing's.
+const MOST_AT_ONCE: f64 = 0.1;
+/// How often two cameras' way of standing is found anew from all that was joined.
+const ROUNDS: usize = 3;
+
+/// A camera's labels in pieces.
+struct Things<'a> {
+    camera: &'a CameraLabels,
+    frame_s: f64,
+    pieces: Vec<Vec<Label>>,
+    sights: Vec<Sights>,
+    /// Pieces that go on from one another, the longest first.
+    chains: Vec<Vec<usize>>,
+}
+
+impl<'a> Things<'a> {
+    fn of(camera: &'a CameraLabels) -> Self {
+        let frame_s = frame_time(camera);
+        let (pieces, _) = pieces::of_one_thing(camera, frame_s);
+        let sights = |piece: &Vec<Label>| Sights::of(&start::of_labels(camera, piece.clone()));
+        let sights = pieces.iter().map(sights).collect();
+        let mut chains = pieces::chains(&pieces, f64::from(camera.intrinsics.size.width));
+        let labels = |chain: &Vec<usize>| chain.iter().map(|k| pieces[*k].len()).sum::<usize>();
+        chains.sort_by_key(|chain| std::cmp::Reverse(labels(chain)));
+        Self { camera, frame_s, sights, chains, pieces }
+    }
+
+    /// The share of labels that were made at once with others.
+    fn at_once(&self) -> f64 {
+        let labels = &self.camera.labels;
+        let within_s = 0.5 * self.frame_s;
+        let pairs = labels.windows(2).filter(|pair| pair[1].time_s - pair[0].time_s < within_s);
+        pairs.count() as f64 / labels.len().max(1) as f64
+    }
+
+    /// The labels of some pieces, in the order of their times.
+    fn own(&self, taken: &[usize]) -> CameraLabels {
+        let labels = taken.iter().flat_map(|piece| self.pieces[*piece].iter().copied());
+        start::of_labels(self.camera, labels.collect())
+    }
+
+    /// Whether a piece was followed while the others were not.
+    fn is_beside(&self, piece: usize, own: &CameraLabels) -> bool {
+        let is_at_once =
+            |label: &&Label| start::at_once(&own.labels, label.time_s, 0.5 * self.frame_s);
+        let at_once = self.pieces[piece].iter().filter(is_at_once).count();
+        (at_once as f64) < MOST_AT_ONCE * self.pieces[piece].len() as f64
+    }
+}
+
+/// Two cameras, which of their pieces are of one target, and how they stand.
+struct Joined {
+    cameras: [usize; 2],
+    pieces: [Vec<usize>; 2],
+    pair: Pair,
+    labels: usize,
+}
+
+/// Each camera's labels of one target that most of them show; as they are where nothing was followed
+/// beside it, or no two cameras tell.
+pub(super) fn of_one_target(cameras: &[&CameraLabels], survey: &Survey) -> Vec<CameraLabels> {
+    let things: Vec<Things<'_>> = cameras.iter().map(|camera| Things::of(camera)).collect();
+    let as_they_are = || cameras.iter().map(|camera| (*camera).clone()).collect();
+    if things.iter().all(|things| things.at_once() < LEAST_AT_ONCE) {
+        return as_they_are();
+    }
+    let mut seeds = seeds(&things, survey);
+    seeds.sort_by(|a, b| a.pair.doubt.total_cmp(&b.pair.doubt));
+    seeds.truncate(SEEDS);
+    let joined = seeds.into_iter().map(|seed| seed.joined(&things, survey));
+    let Some(best) = joined.max_by_key(|joined| joined.labels) else { return as_they_are() };
+    best.labels_of_all(&things)
+}
+
+/// Pairs of things that two cameras followed longest, each taken for one.
+fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
+    let mut seeds = Vec::new();
+    for first in 0..things.len() {
+        for second in first + 1..things.len() {
+            let cameras = [first, second];
+            let begun_with = cameras.map(|camera| {
+                let chains = things[camera].chains.iter().take(THINGS);
+                chains.map(|chain| (chain, things[camera].own(chain))).collect::<Vec<_>>()
+            });
+            for (a, labels_a) in &begun_with[0] {
+                for (b, labels_b) in &begun_with[1] {
+                    let sights = [Sights::of(labels_a), Sights::of(labels_b)];
+                    let ways = ways(
+                        cameras.map(|camera| things[camera].camera),
+                        sights.each_ref(),
+                        survey,
+                    );
+                    seeds.extend(ways.into_iter().map(|pair| Joined {
+                        cameras,
+                        pieces: [(*a).clone(), (*b).clone()],
+                        pair,
+                        labels: labels_a.labels.len() + labels_b.labels.len(),
+                    }));
+                }
+            }
+        }
+    }
+    seeds
+}
+
+/// How two cameras may stand to each other: as an earlier calibration has it, or as what they saw shows.
+fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<Pair> {
+    match cameras.map(|camera| survey.known(&camera.name)) {
+        [Some(a), Some(b)] => {
+            let poses = [a, b].map(|known| known.camera.pose());
+            let stand = poses.map(|pose| (pose.rotation(), pose.position()));
+            pairs::known(sights[0], sights[1], stand).into_iter().collect()
+        }
+        _ => pairs::find(sights[0], sights[1]),
+    }
+}
+
+impl Joined {
+    /// With all pieces that are of the same target.
+    fn joined(mut self, things: &[Things<'_>], survey: &Survey) -> Self {
+        for _ in 0..ROUNDS {
+            while self.leave_worst_out(things) {}
+            while self.join_next(things) {}
+            let own = self.own(things);
+            let sights = own.each_ref().map(Sights::of);
+            let cameras = self.cameras.map(|camera| things[camera].camera);
+            let ways = ways(cameras, sights.each_ref(), survey);
+            let best = ways.into_iter().min_by(|a, b| a.doubt.total_cmp(&b.doubt));
+            let labels = own.iter().map(|own| own.labels.len()).sum();
+            let Some(pair) = best else { break };
+            self.pair = pair;
+            if labels == self.labels {
+                break;
+            }
+            self.labels = labels;
+        }
+        self
+    }
+
+    fn own(&self, things: &[Things<'_>]) -> [CameraLabels; 2] {
+        [0, 1].map(|side| things[self.cameras[side]].own(&self.pieces[side]))
+    }
+
+    /// Leaves the piece out that lies farthest beside what the other camera saw of the target; `false` if all
+    /// meet it.
+    fn leave_worst_out(&mut self, things: &[Things<'_>]) -> bool {
+        let own = self.own(things);
+        let sights = own.each_ref().map(Sights::of);
+        let mut worst = (MOST_ASIDE_RAD, None);
+        for side in [0, 1] {
+            for (place, piece) in self.pieces[side].iter().enumerate() {
+                let seen = &things[self.cameras[side]].sights[*piece];
+                let both = if side == 0 { [seen, &sights[1]] } else { [&sights[0], seen] };
+                let aside = self.pair.aside(both[0], both[1]).unwrap_or(0.0);
+                if aside > worst.0 {
+                    worst = (aside, Some((side, place)));
+                }
+            }
+        }
+        let (_, Some((side, place))) = worst else { return false };
+        self.pieces[side].remove(place);
+        true
+    }
+
+    /// Takes the piece that meets what the other camera saw of the target best; `false` if none does.
+    fn join_next(&mut self, things: &[Things<'_>]) -> bool {
+        let own = self.own(things);
+        let sights = own.each_ref().map(Sights::of);
+        let mut best: Option<(f64, usize, usize)> = None;
+        for side in [0, 1] {
+            let of_camera = &things[self.cameras[side]];
+            for (piece, seen) in of_camera.sights.iter().enumerate() {
+                if self.pieces[side].contains(&piece) || !of_camera.is_beside(piece, &own[side]) {
+                    continue;
+                }
+                let both = if side == 0 { [seen, &sights[1]] } else { [&sights[0], seen] };
+                let aside = self.pair.aside(both[0], both[1]).unwrap_or(f64::INFINITY);
+                if aside < best.map_or(MOST_ASIDE_RAD, |(least, ..)| least) {
+                    best = Some((aside, side, piece));
+                }
+            }
+        }
+        let Some((_, side, piece)) = best else { return false };
+        self.pieces[side].push(piece);
+        true
+    }
+
+    /// These two cameras' labels of the target, and the others' by where these two saw it.
+    fn labels_of_all(&self, things: &[Things<'_>]) -> Vec<CameraLabels> {
+        let own = self.own(things);
+        let sights = own.each_ref().map(Sights::of);
+        let poses = [
+            (Rotation3::identity(), Point3::origin(), 0.0),
+            (self.pair.first_from_second, self.pair.centre, self.pair.ahead_s),
+        ];
+        let states = [0, 1].map(|side| start::state(&own[side], &Course::nowhere(), poses[side]));
+        let placed = [0, 1].map(|side| (&sights[side], &states[side]));
+        let course = Course::of(&triangulation::log(&placed));
+        let of_camera = |(index, things): (usize, &Things<'_>)| {
+            if let Some(side) = self.cameras.iter().position(|camera| *camera == index) {
+                return own[side].clone();
+            }
+            let by_course = course
+                .as_ref()
+                .and_then(|course| start::among_others(things.camera, course, things.frame_s))
+                .filter(|own| own.labels.len() >= LEAST_LABELS);
+            by_course.unwrap_or_else(|| things.camera.clone())
+        };
+        things.iter().enumerate().map(of_camera).collect()
+    }
+}
