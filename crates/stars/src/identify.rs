@@ -26,10 +26,13 @@ const SCALE_SHARE: f64 = 0.04;
 const PATTERN_SPOTS: u32 = 32;
 /// A named star must lie within this share of the image's width of where the pattern has it.
 const MATCH_SHARE: f32 = 0.01;
-/// How long the sky may be searched, ms: named pictures take a tenth of a second, others end here.
-const SEARCH_MS: u64 = 20_000;
 /// Under this sine of the elevation (3 degrees) light is bent by more than is known.
 const LOWEST_SINE: f64 = 0.05;
+/// Stars under this sine have set, whatever the air does, ...
+const SET_SINE: f64 = -0.02;
+/// ... and where more than this share of the named ones has, the time or the place is another: one in twenty
+/// may be a wrong name.
+const MOST_SET: f64 = 0.1;
 /// Beside a spot, two stars of which one is this much fainter in magnitude are the brighter one.
 const OUTSHONE: f64 = 2.0;
 /// Where stars are named by a pose and lens, those fainter by so many magnitudes than the faintest that must
@@ -48,6 +51,8 @@ impl Sky {
     ) -> Result<Vec<NamedStar>, StarError> {
         let width = pattern_width(lens);
         let half = (width / 2.0).tan();
+        let size = lens.intrinsics().size;
+        let half_height = half * f64::from(size.height) / f64::from(size.width);
         // As a pinhole sees them, of focal length one; a wide lens' sides are left out.
         let seen: Vec<(usize, Vector3<f64>)> = spots
             .iter()
@@ -57,12 +62,11 @@ impl Sky {
             })
             .filter(|(_, direction)| direction.z > 0.0)
             .map(|(index, direction)| (index, direction / direction.z))
-            .filter(|(_, plane)| plane.x.abs() <= half && plane.y.abs() <= half)
+            .filter(|(_, plane)| plane.x.abs() <= half && plane.y.abs() <= half_height)
             .collect();
         if seen.len() < FEWEST_SPOTS {
             return Err(StarError::TooFew { found: seen.len(), needed: FEWEST_SPOTS });
         }
-        let size = lens.intrinsics().size;
         let focal = f64::from(size.width) / 2.0 / half;
         let centroid = |(index, plane): &(usize, Vector3<f64>)| Centroid {
             x: (plane.x * focal) as f32,
@@ -75,7 +79,8 @@ impl Sky {
             fov_max_error_rad: Some((width * SCALE_SHARE) as f32),
             match_radius: MATCH_SHARE,
             pattern_checking_stars: PATTERN_SPOTS,
-            solve_timeout_ms: Some(SEARCH_MS),
+            // The same picture has the same names on a slow host: the patterns' number is the bound.
+            solve_timeout_ms: None,
             ..SolveConfig::with_camera_model(Pinhole::from_fov(width, size.width, size.height))
         };
         let solution = self
@@ -92,9 +97,14 @@ impl Sky {
                 Some(self.stars[star].named(&spots[seen[centroid].0]))
             })
             .collect();
+        let count = named.len();
+        let has_set = named.iter().filter(|star| star.direction.z < SET_SINE).count();
         let above: Vec<NamedStar> =
             named.into_iter().filter(|star| star.direction.z > LOWEST_SINE).collect();
-        if above.is_empty() { Err(StarError::UnderHorizon) } else { Ok(above) }
+        if above.is_empty() || has_set as f64 > MOST_SET * count as f64 {
+            return Err(StarError::UnderHorizon);
+        }
+        Ok(above)
     }
 
     /// Names the spots that lie where a camera sees a star, within so many pixels as it may be off by there

@@ -33,7 +33,7 @@ mod sky;
 mod spots;
 
 pub use identify::NamedStar;
-pub use observer::{Observer, Turn};
+pub use observer::{Observer, Turn, star_sd_rad};
 pub use sky::{Sky, Star};
 pub use spots::{Picture, Spot, find_spots};
 

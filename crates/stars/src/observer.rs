@@ -28,9 +28,11 @@ const WAVELENGTH_UM: f64 = 0.6;
 /// standard deviation.
 const REFRACTION_SHARE: f64 = 0.05;
 
-/// UT1, by which the Earth turns, is kept within 0.9 s of UTC and was within 0.1 s of it from 2022 to
-/// 2026; what it is of a day is in no file here. Standard deviation, s.
-const EARTH_TIME_SD_S: f64 = 0.15;
+/// UT1, by which the Earth turns, was within 0.3 s of UTC in these years, ...
+const QUIET_YEARS: std::ops::Range<f64> = 2017.0..2028.0;
+const QUIET_EARTH_SD_S: f64 = 0.15;
+/// ... and is kept within 0.9 s of it. What it is of a day is in no file here. Standard deviations, s.
+const EARTH_SD_S: f64 = 0.4;
 /// The Earth's rate against the stars, rad/s.
 const EARTH_RATE: f64 = 7.292_115e-5;
 
@@ -99,13 +101,28 @@ impl Observer {
     /// axis; and refraction towards where the stars are, in the middle, about the horizontal across it.
     pub fn turn(&self, middle: &Unit<Vector3<f64>>, time_sd_s: f64) -> Turn {
         let (sin, cos) = self.place.latitude().sin_cos();
-        let pole = Vector3::new(0.0, cos, sin) * EARTH_RATE * time_sd_s.hypot(EARTH_TIME_SD_S);
-        let across = Vector3::z().cross(middle);
-        // A minute of arc for each tangent of the distance from the zenith.
-        let refraction = 2.9e-4 * across.norm() / middle.z.max(0.1);
-        let tilt = across.try_normalize(1e-9).unwrap_or_default() * refraction * REFRACTION_SHARE;
+        let is_quiet = QUIET_YEARS.contains(&self.julian_year());
+        let earth_sd_s = if is_quiet { QUIET_EARTH_SD_S } else { EARTH_SD_S };
+        let pole = Vector3::new(0.0, cos, sin) * EARTH_RATE * time_sd_s.hypot(earth_sd_s);
+        let across = Vector3::z().cross(middle).try_normalize(1e-9).unwrap_or_default();
+        let tilt = across * refraction_sd_rad(middle);
         Turn { covariance: pole * pole.transpose() + tilt * tilt.transpose() }
     }
+}
+
+/// Light from the zenith's side is bent by a minute of arc for each tangent of the distance from it, rad.
+const REFRACTION_RAD: f64 = 2.9e-4;
+/// Catalogues are good to less; double stars, and what has moved beside them, to 2 seconds of arc.
+const STAR_SD_RAD: f64 = 1e-5;
+
+/// By what a star may be seen lower or higher than it should, for the weather, rad.
+fn refraction_sd_rad(direction: &Unit<Vector3<f64>>) -> f64 {
+    REFRACTION_SHARE * REFRACTION_RAD * direction.xy().norm() / direction.z.max(0.05)
+}
+
+/// How well the direction to a star is known, rad: low ones less, as the air bends their light.
+pub fn star_sd_rad(direction: &Unit<Vector3<f64>>) -> f64 {
+    STAR_SD_RAD.hypot(refraction_sd_rad(direction))
 }
 
 impl Prepared {

@@ -29,10 +29,16 @@ pub struct Sky {
 
 /// Lenses are taken to see so many degrees at least, and at most: patterns of stars outside of this part of
 /// a wide image are not looked at, stars there are named afterwards.
-const WIDTHS_DEG: std::ops::RangeInclusive<f64> = 2.0..=100.0;
+const WIDTHS_DEG: std::ops::RangeInclusive<f64> = 4.0..=100.0;
 /// Sides of a pattern may be off by this share of the longest: lenses' files are off by 2 % in scale, which
 /// cancels, and by less in shape.
 const PATTERN_SHARE: f32 = 0.003;
+/// Patterns are made at so many places for each image that the sky holds, ...
+const OVERSAMPLING: f64 = 100.0;
+/// ... and of lenses that are narrower than this at fewer, as the sky holds more of their images: with as many
+/// places, patterns of a lens of 5 degrees would take gigabytes.
+const WIDE_DEG: f64 = 20.0;
+const LEAST_OVERSAMPLING: f64 = 6.0;
 /// Patterns of each part of the sky: with the library's 50 one picture in five was not
 /// named where a fifth of the spots are no stars and a seventh of the stars hidden; with 400 one in
 /// thirty.
@@ -52,8 +58,12 @@ impl Sky {
         let wrong =
             |why: String| StarError::Catalogue { path: catalogue.display().to_string(), why };
         let prepared = observer.prepare()?;
+        let width_deg = pattern_width(lens).to_degrees();
+        let narrowness = (width_deg / WIDE_DEG).powi(2).min(1.0);
+        let oversampling = (OVERSAMPLING * narrowness).max(LEAST_OVERSAMPLING);
         let config = GenerateDatabaseConfig {
-            max_fov_deg: pattern_width(lens).to_degrees() as f32,
+            max_fov_deg: width_deg as f32,
+            lattice_field_oversampling: oversampling as u32,
             pattern_max_error: PATTERN_SHARE,
             patterns_per_lattice_field: PATTERNS,
             epoch_proper_motion_year: Some(observer.julian_year()),

@@ -7,7 +7,7 @@ use crossfix_geometry::{
 };
 use crossfix_message::Timestamp;
 use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, StarError, find_spots};
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Point3, Unit, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -115,15 +115,24 @@ fn wrong(named: &[NamedStar], seen: &[(String, Pixel, f64)]) -> usize {
     named.len() - named.iter().filter(is_right).count()
 }
 
-/// Lenses from 20 to 106 degrees wide, each 1.5 % longer or shorter than its file says, towards all sides. Nine
+/// Lenses from 10 to 106 degrees wide and a fisheye of 180, each 1.5 % longer or shorter than its file says, towards all sides. Nine
 /// pictures in ten are named, and none is given other names: of the stars that are named first one in
 /// twenty may be a neighbour.
 #[test]
 fn stars_are_named_by_lenses_of_all_widths() {
     let mut random = Random::of(1);
     let catalogue = catalogue(&mut random);
-    for (focal_px, faintest) in [(5400.0, 6.5), (2000.0, 5.5), (1200.0, 4.5), (720.0, 4.0)] {
-        let file = lens(focal_px, Distortion::BrownConrady([-0.05, 0.01, 0.0, 0.0, 0.0]));
+    let brown_conrady = Distortion::BrownConrady([-0.05, 0.01, 0.0, 0.0, 0.0]);
+    let fisheye = Distortion::Fisheye([0.0; 4]);
+    for (focal_px, distortion, faintest) in [
+        (11_000.0, brown_conrady, 6.5),
+        (5400.0, brown_conrady, 6.5),
+        (2000.0, brown_conrady, 5.5),
+        (1200.0, brown_conrady, 4.5),
+        (720.0, brown_conrady, 4.0),
+        (611.0, fisheye, 4.0),
+    ] {
+        let file = lens(focal_px, distortion);
         let model = CameraModel::new(file).unwrap();
         let sky = Sky::load(catalogue.path(), &observer(), &model).unwrap();
         let (pictures, mut found) = (20, 0);
@@ -217,7 +226,16 @@ fn what_is_wrong_is_said() {
         .collect();
     let error = sky.identify(&mirrored, model).unwrap_err();
     assert!(matches!(error, StarError::Mirrored), "{error}");
-    // Twelve hours off: these stars had set.
+    // Some hours off: a part of these stars had set.
+    let low = looking(file, 200.0, 20.0);
+    let of_low = self::seen(&sky, &low, 5.0);
+    let low_spots = self::spots(&of_low, &mut random);
+    assert!(sky.identify(&low_spots, model).is_ok());
+    let later = Observer { time: observer().time.plus_seconds(7_200.0), ..observer() };
+    let later_sky = Sky::load(catalogue.path(), &later, model).unwrap();
+    let error = later_sky.identify(&low_spots, model).unwrap_err();
+    assert!(matches!(error, StarError::UnderHorizon), "{error}");
+    // Twelve hours off: all of them had.
     let late = Observer { time: observer().time.plus_seconds(43_200.0), ..observer() };
     let late_sky = Sky::load(catalogue.path(), &late, model).unwrap();
     let error = late_sky.identify(&spots, model).unwrap_err();
@@ -229,8 +247,24 @@ fn what_is_wrong_is_said() {
     std::fs::write(nothing.path(), "RA,Dec\n1,2\n").unwrap();
     let error = Sky::load(nothing.path(), &observer(), model).err().unwrap();
     assert!(matches!(error, StarError::Catalogue { .. }), "{error}");
-    let up = Vector3::z();
-    assert!(
-        observer().turn(&nalgebra::Unit::new_normalize(up), 1.0).covariance.trace().sqrt() < 1e-4
-    );
+}
+
+/// A second of time turns the sky about the pole, by the Earth's rate; low stars are tilted, too, by a twentieth
+/// of their refraction.
+#[test]
+fn the_sky_turns_by_time_and_air() {
+    for latitude_deg in [47.4, -33.9] {
+        let place = Geodetic::from_degrees(latitude_deg, 8.5, 0.0).unwrap();
+        let observer = Observer { place, ..observer() };
+        let zenith = observer.turn(&Unit::new_normalize(Vector3::z()), 1.0).covariance;
+        let expected = 7.292e-5 * 1.0f64.hypot(0.15);
+        assert!((zenith.trace().sqrt() / expected - 1.0).abs() < 1e-3, "{zenith}");
+        let (sin, cos) = latitude_deg.to_radians().sin_cos();
+        let pole = Vector3::new(0.0, cos, sin);
+        assert!(((zenith * pole).norm() / zenith.trace() - 1.0).abs() < 1e-9, "{zenith}");
+        // 10 degrees over the southern horizon: 5.5 minutes of arc, about the east-west line.
+        let low = Unit::new_normalize(Vector3::new(0.0, -0.9848, 0.1736));
+        let tilt = (observer.turn(&low, 1.0).covariance - zenith)[(0, 0)].sqrt();
+        assert!((tilt / 8.2e-5 - 1.0).abs() < 0.05, "{tilt}");
+    }
 }

@@ -36,6 +36,8 @@ pub enum TimedBy {
     /// The camera's own, as it was known before the stream broke off, and by the frame's arrival: it has
     /// not said anew what its clock shows.
     Remembered,
+    /// This host's, by the driver of a camera that hangs on it.
+    Driver,
     /// This host's: the frame's arrival, less what it takes to come here. The camera has not said
     /// yet what its clock shows, or is not to be asked.
     Arrival,

@@ -1,6 +1,6 @@
 //! Frames with their capture times, from files (PNG and JPEG sequences, Y4M,
-//! MP4 with H.264, AVI with Motion JPEG) and from network cameras (RTSP with
-//! H.264 or Motion JPEG). Nothing but cargo dependencies.
+//! MP4 with H.264, AVI with Motion JPEG) from network cameras (RTSP with
+//! H.264 or Motion JPEG) and, on Linux, from those of the host (V4L2). Nothing but cargo dependencies.
 //!
 //! The seam is [`FrameSource`]; [`Live`] keeps one that may break off. [`open`] finds the right one for a path; a camera of one's own is
 //! another:
@@ -46,10 +46,12 @@ mod error;
 mod frame;
 mod h264;
 mod live;
+mod live_camera;
 mod mp4;
 mod rtsp;
 mod sequence;
 mod still;
+mod usb;
 mod y4m_file;
 
 use std::path::Path;
@@ -59,6 +61,7 @@ pub use error::VideoError;
 pub use frame::{Arrival, CaptureTime, Frame, Pixels, TimedBy};
 pub use h264::{H264Encoder, decoding_time};
 pub use live::{Live, LiveCounts, Sight};
+pub use live_camera::LiveCamera;
 pub use mp4::Mp4Source;
 pub use rtsp::{
     Latency, Login, Mount, RtspCamera, RtspOptions, RtspServer, RtspSource, RtspTransport,
@@ -66,6 +69,7 @@ pub use rtsp::{
 };
 pub use sequence::SequenceSource;
 pub use still::decode_still;
+pub use usb::{UsbCamera, UsbOptions, usb_cameras};
 pub use y4m_file::Y4mSource;
 
 use crossfix_message::Timestamp;

@@ -2,13 +2,15 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
+use crossfix_geometry::ImageSize;
 use crossfix_video::{
-    Frame, Latency, Live, RtspCamera, RtspOptions, RtspTransport, Sight, StreamAddress, TimedBy,
+    Frame, Latency, Live, LiveCamera, RtspCamera, RtspOptions, RtspTransport, Sight, StreamAddress,
+    TimedBy, UsbCamera, UsbOptions, usb_cameras,
 };
 use serde::Serialize;
 
 use crate::commands::numbers;
-use crate::config::CameraFile;
+use crate::config::{CameraFile, SourceConfig};
 use crate::eye::jpeg;
 use crate::output::{self, Draft};
 use crate::pace::wall_seconds;
@@ -22,12 +24,14 @@ const MOST_TROUBLES: usize = 10;
 /// Try a camera: what it sends, how often, and what its clock is worth.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix sources rtsp://10.0.0.5/stream1\n  crossfix sources -c configs/site/north.toml --picture north.jpg"
+    after_help = "Examples:\n  crossfix sources rtsp://10.0.0.5/stream1\n  crossfix sources -c configs/site/north.toml --picture north.jpg\n  crossfix sources\n  crossfix sources /dev/video0 --size 1280x720"
 )]
 pub struct Args {
     /// The stream, rtsp://HOST/PATH. One that wants to know who asks is better tried with -c: a
     /// command line can be read by others.
-    #[arg(required_unless_present = "config", conflicts_with = "config")]
+    ///
+    /// Or a camera of this host, /dev/video0. Without, these are listed.
+    #[arg(conflicts_with = "config")]
     url: Option<String>,
     /// A camera's configuration (TOML) whose stream is tried.
     #[arg(short, long, value_name = "FILE")]
@@ -35,6 +39,9 @@ pub struct Args {
     /// Ask for datagrams.
     #[arg(long, conflicts_with = "config")]
     udp: bool,
+    /// The size of the images of a camera of this host, as 1280x720; as it is set otherwise.
+    #[arg(long, value_name = "SIZE", value_parser = size, conflicts_with = "config")]
+    size: Option<[u32; 2]>,
     /// How long it is watched, s: cameras say what their clock shows every few seconds.
     #[arg(long, default_value_t = 8.0, value_name = "SECONDS", value_parser = numbers::positive)]
     seconds: f64,
@@ -89,7 +96,7 @@ impl Tried {
             self.longest_interval_s = self.longest_interval_s.max(interval_s);
         }
         match arrival.timed_by {
-            TimedBy::Camera => {
+            TimedBy::Camera | TimedBy::Driver => {
                 self.first_report_s.get_or_insert(at_s);
                 let at = wall_seconds() - arrival.at.elapsed().as_secs_f64();
                 Some(at - frame.capture.time.seconds())
@@ -103,10 +110,18 @@ impl Tried {
     }
 }
 
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let sides: Vec<Result<u32, _>> = text.split('x').map(str::parse).collect();
+    match sides.as_slice() {
+        [Ok(width), Ok(height)] => Ok([*width, *height]),
+        _ => Err("columns and rows are wanted, as in 1280x720".to_owned()),
+    }
+}
+
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let options = options(args)?;
-    let url = options.address.to_string();
-    let (tried, last) = try_out(options, args.seconds);
+    let Some(camera) = camera(args)? else { return list(args.json) };
+    let address = camera.address();
+    let (tried, last) = try_out(camera, args.seconds);
     if let (Some(path), Some(frame)) = (&args.picture, &last) {
         write(path, frame)?;
     }
@@ -118,29 +133,78 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     match (last, tried.troubles.first()) {
         (Some(_), _) => Ok(()),
         (None, Some(trouble)) => bail!("no image: {trouble}"),
-        (None, None) => bail!("no image came from {url} within {} s", args.seconds),
+        (None, None) => bail!("no image came from {address} within {} s", args.seconds),
     }
 }
 
-fn options(args: &Args) -> anyhow::Result<RtspOptions> {
+/// The camera that is to be tried; `None` if none is named.
+fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     if let Some(path) = &args.config {
         let file = CameraFile::load(path, &[])?;
         let wrong = || format!("the configuration file {} has an error", path.display());
-        let stream = file.stream().with_context(wrong)?;
-        return stream.with_context(|| format!("{} has no stream as its source", path.display()));
+        let size = match &file.source {
+            // The size of its images is that of the lens.
+            SourceConfig::Usb { .. } => file.described(path)?.model().intrinsics().size,
+            _ => ImageSize { width: 0, height: 0 },
+        };
+        let live = file.live(size).with_context(wrong)?;
+        let none = || format!("{} has no live camera as its source", path.display());
+        return live.with_context(none).map(Some);
     }
-    let (address, login) = StreamAddress::parse(args.url.as_deref().unwrap_or_default())?;
+    let Some(address) = args.url.as_deref() else { return Ok(None) };
+    if address.starts_with('/') {
+        let (device, size) = (address.into(), args.size);
+        let options = UsbOptions {
+            device,
+            size,
+            rate_hz: None,
+            latency_s: None,
+            sd_s: Latency::default().sd_s,
+        };
+        return Ok(Some(LiveCamera::Usb(UsbCamera::new(options))));
+    }
+    let (address, login) = StreamAddress::parse(address)?;
     let transport = if args.udp { RtspTransport::Udp } else { RtspTransport::Tcp };
-    Ok(RtspOptions { address, login, transport, heeds_reports: true, latency: Latency::default() })
+    let latency = Latency::default();
+    let options = RtspOptions { address, login, transport, heeds_reports: true, latency };
+    Ok(Some(LiveCamera::Stream(RtspCamera::new(options))))
 }
 
-/// Watches a stream for some seconds; returns its last image as well.
-pub fn try_out(options: RtspOptions, seconds: f64) -> (Tried, Option<Frame>) {
+/// Says which cameras hang on this host.
+fn list(json: bool) -> anyhow::Result<()> {
+    let cameras = usb_cameras();
+    if json {
+        let rows: Vec<Listed> = cameras
+            .into_iter()
+            .map(|(device, name)| Listed { device: device.display().to_string(), name })
+            .collect();
+        return output::json(&rows);
+    }
+    if cameras.is_empty() {
+        output::line(
+            "no camera hangs on this host, or this user may not watch it (group video); a network \
+             camera is tried by its address, rtsp://HOST/PATH",
+        );
+    }
+    for (device, name) in cameras {
+        output::line(format!("{}  {name}", device.display()));
+    }
+    Ok(())
+}
+
+/// A camera of this host.
+#[derive(Debug, Serialize)]
+struct Listed {
+    device: String,
+    name: String,
+}
+
+/// Watches a camera for some seconds; returns its last image as well.
+pub fn try_out(camera: LiveCamera, seconds: f64) -> (Tried, Option<Frame>) {
     let shutdown = Shutdown::listen();
-    let mut tried = Tried { url: options.address.to_string(), ..Tried::default() };
-    let camera = RtspCamera::new(options);
+    let mut tried = Tried { url: camera.address(), ..Tried::default() };
     let begun = Instant::now();
-    let live = Live::start(move |silence| Ok(Box::new(camera.open(silence)?)));
+    let live = Live::start(move |silence| camera.open(silence));
     let mut last: Option<Frame> = None;
     let mut delays_s = Vec::new();
     while begun.elapsed().as_secs_f64() < seconds && !shutdown.requested() {

@@ -6,7 +6,7 @@ use crossfix_geometry::{Camera, ImageSize, Intrinsics, Pixel, PixelCovariance, P
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
-use crossfix_video::{FrameClock, Latency, RtspOptions};
+use crossfix_video::{FrameClock, Latency, LiveCamera, RtspCamera, UsbCamera, UsbOptions};
 use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
@@ -102,6 +102,18 @@ pub enum SourceConfig {
     },
     /// A network camera's live stream.
     Stream(StreamConfig),
+    /// A camera of this host, as Linux shows it.
+    Usb {
+        /// Its device, `/dev/video0`; `crossfix sources` lists them.
+        device: PathBuf,
+        /// Frames a second; the most that it has at the size of the intrinsics where it is not said.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        rate_hz: Option<f64>,
+        /// From the middle of the exposure to the driver's time, s, 0 to 10. Default: nothing where the
+        /// driver says when the exposure began, half of a frame's interval where it does not.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        latency_s: Option<f64>,
+    },
     /// The recorded bearings of this camera.
     Recording {
         /// The recording (MCAP).
@@ -119,6 +131,9 @@ fn one() -> f64 {
 fn thirty() -> f64 {
     30.0
 }
+
+/// What a driver's times and an exposure that nobody has told are off by, s.
+const USB_CLOCK_SD_S: f64 = 0.01;
 
 /// What capture times are worth, and how they are corrected.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -198,13 +213,14 @@ impl CameraFile {
                 *path = folder.join(&*path);
             }
             SourceConfig::Simulation { scene, .. } => *scene = folder.join(&*scene),
+            SourceConfig::Usb { .. } => {}
             SourceConfig::Stream(stream) => {
                 stream.password_file = stream.password_file.take().map(|file| folder.join(file));
-                if file.boxes.is_empty() && file.tracker.detector.is_none() {
-                    // Nobody knows where targets will be in what has not been filmed yet.
-                    file.tracker.detector = Some(DetectorConfig::default());
-                }
             }
+        }
+        if file.is_live() && file.boxes.is_empty() && file.tracker.detector.is_none() {
+            // Nobody knows where targets will be in what has not been filmed yet.
+            file.tracker.detector = Some(DetectorConfig::default());
         }
         file.clock.source = Some(file.clock.source.unwrap_or_else(|| file.usual_clock().0));
         file.clock.sd_s = Some(file.clock_sd_s());
@@ -308,6 +324,17 @@ impl CameraFile {
             SourceConfig::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
             SourceConfig::Recording { speed, .. } => (thirty(), 0.0, speed),
             SourceConfig::Stream(ref stream) => return stream.check(),
+            SourceConfig::Usb { rate_hz, latency_s, .. } => {
+                ensure!(
+                    rate_hz.is_none_or(|rate_hz| (0.1..=1000.0).contains(&rate_hz)),
+                    "key `source.rate_hz` must be from 0.1 to 1000 frames a second"
+                );
+                ensure!(
+                    latency_s.is_none_or(|latency_s| (0.0..=10.0).contains(&latency_s)),
+                    "key `source.latency_s` must be from 0 to 10 s"
+                );
+                return Ok(());
+            }
             SourceConfig::Simulation { .. } => return Ok(()),
         };
         ensure!(
@@ -385,10 +412,8 @@ impl CameraFile {
                 ("source.path", path)
             }
             SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
-            SourceConfig::Stream(_) => {
-                self.stream()?;
-                return Ok(());
-            }
+            SourceConfig::Usb { device, .. } => ("source.device", device),
+            SourceConfig::Stream(stream) => return stream.options(None).map(drop),
         };
         ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
         Ok(())
@@ -428,6 +453,7 @@ impl CameraFile {
                 let named = |camera: &&SceneCamera| camera.name == self.name;
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }
+            SourceConfig::Usb { rate_hz, .. } => Ok(*rate_hz),
             SourceConfig::Recording { .. } | SourceConfig::Stream(_) => Ok(None),
         }
     }
@@ -438,7 +464,9 @@ impl CameraFile {
             SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => {
                 speed == 0.0
             }
-            SourceConfig::Simulation { .. } | SourceConfig::Stream(_) => false,
+            SourceConfig::Simulation { .. }
+            | SourceConfig::Stream(_)
+            | SourceConfig::Usb { .. } => false,
         }
     }
 
@@ -456,17 +484,35 @@ impl CameraFile {
     fn usual_clock(&self) -> (ClockSourceName, f64) {
         match self.source {
             SourceConfig::Stream(_) => (ClockSourceName::Camera, Latency::default().sd_s),
+            SourceConfig::Usb { .. } => (ClockSourceName::Host, USB_CLOCK_SD_S),
             _ => (ClockSourceName::FrameCount, 1e-3),
         }
     }
 
-    /// The stream that it watches, if it watches one.
-    pub fn stream(&self) -> anyhow::Result<Option<RtspOptions>> {
-        let SourceConfig::Stream(stream) = &self.source else {
-            return Ok(None);
-        };
-        let by_arrival = self.clock_source() == ClockSource::Arrival;
-        Ok(Some(stream.options(by_arrival.then(|| self.clock_sd_s()))?))
+    /// Whether its source is a camera that is watched live.
+    pub fn is_live(&self) -> bool {
+        matches!(self.source, SourceConfig::Stream(_) | SourceConfig::Usb { .. })
+    }
+
+    /// The camera that it watches live, in images of a size, if it watches one.
+    pub fn live(&self, size: ImageSize) -> anyhow::Result<Option<LiveCamera>> {
+        Ok(match &self.source {
+            SourceConfig::Stream(stream) => {
+                let by_arrival = self.clock_source() == ClockSource::Arrival;
+                let options = stream.options(by_arrival.then(|| self.clock_sd_s()))?;
+                Some(LiveCamera::Stream(RtspCamera::new(options)))
+            }
+            SourceConfig::Usb { device, rate_hz, latency_s } => {
+                Some(LiveCamera::Usb(UsbCamera::new(UsbOptions {
+                    device: device.clone(),
+                    size: Some([size.width, size.height]),
+                    rate_hz: *rate_hz,
+                    latency_s: *latency_s,
+                    sd_s: self.clock_sd_s(),
+                })))
+            }
+            _ => None,
+        })
     }
 
     /// The boxes of targets to take up.

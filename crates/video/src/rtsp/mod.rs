@@ -106,6 +106,11 @@ impl RtspCamera {
         Self { options, memory: ClockMemory::default() }
     }
 
+    /// Where it is, without who asks.
+    pub fn address(&self) -> String {
+        self.options.address.to_string()
+    }
+
     /// Asks for its stream. `silence` is how long it may send nothing; a stream whose frames come
     /// slowly may pause for three of their intervals.
     ///

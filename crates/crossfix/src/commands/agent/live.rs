@@ -1,9 +1,9 @@
-//! What a network camera shows, as long as somebody wants it.
+//! What a live camera shows, as long as somebody wants it.
 
 use std::time::{Duration, Instant};
 
 use crossfix_message::{ClockSource, Timestamp};
-use crossfix_video::{Arrival, CaptureTime, Frame, Live, RtspCamera, Sight, TimedBy, VideoError};
+use crossfix_video::{Arrival, CaptureTime, Frame, Live, LiveCamera, Sight, TimedBy, VideoError};
 use crossfix_vision::ImageTracker;
 
 use super::stream_health::StreamHealth;
@@ -47,12 +47,12 @@ impl Watch<'_> {
 }
 
 impl Agent {
-    /// Follows what a network camera shows until it is asked to stop. A camera that is lost is asked
+    /// Follows what a live camera shows until it is asked to stop. A camera that is lost is asked
     /// again, and that it is lost is said.
-    pub(super) fn watch_stream(
+    pub(super) fn watch_live(
         &mut self,
         file: &CameraFile,
-        camera: RtspCamera,
+        camera: LiveCamera,
         begins: Timestamp,
     ) -> anyhow::Result<()> {
         let mut tracker = ImageTracker::new(file.tracker.clone())?;
@@ -62,7 +62,7 @@ impl Agent {
         let mut watch = Watch { file, begins, tracker, tracked: None, shown: None };
         let heeds_reports = file.clock_source() != ClockSource::Arrival;
         self.stream = Some(StreamHealth::new(heeds_reports));
-        let live = Live::start(move |silence| Ok(Box::new(camera.open(silence)?)));
+        let live = Live::start(move |silence| camera.open(silence));
         while !self.shutdown.requested() {
             match live.next(POLL) {
                 Sight::Frame(frame) => self.follow(&mut watch, &frame)?,
@@ -114,7 +114,7 @@ impl Agent {
             corrected(CaptureTime { sd_s, ..frame.capture }, watch.begins, &watch.file.clock)
         };
         let (is_by_camera, capture) = match live.timed_by {
-            TimedBy::Camera => (true, of_camera(declared_s)),
+            TimedBy::Camera | TimedBy::Driver => (true, of_camera(declared_s)),
             TimedBy::Remembered => (true, of_camera(declared_s.max(frame.capture.sd_s))),
             TimedBy::Arrival | TimedBy::ArrivalAgainstCamera { .. } => (false, frame.capture),
         };

@@ -11,7 +11,7 @@ use anyhow::{Context, ensure};
 use crossfix_correlation::Plane;
 use crossfix_message::{BearingFrame, Channel, Counter, Health, Payload, Timestamp};
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
-use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource, RtspCamera};
+use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
 
 use self::start::Start;
@@ -123,7 +123,9 @@ fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::
         SourceConfig::Recording { path, .. } => first_bearing(path, calibrated),
         SourceConfig::Video { start_s, .. } => Ok(Timestamp::from_seconds(*start_s)),
         SourceConfig::Simulation { .. } => Ok(Timestamp::EPOCH),
-        SourceConfig::Stream(_) => Ok(Timestamp::from_seconds(wall_seconds())),
+        SourceConfig::Stream(_) | SourceConfig::Usb { .. } => {
+            Ok(Timestamp::from_seconds(wall_seconds()))
+        }
     }
 }
 
@@ -178,7 +180,7 @@ impl Agent {
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
         // Life waits for nobody.
-        let is_live = matches!(file.source, SourceConfig::Stream(_));
+        let is_live = file.is_live();
         let start = if args.no_wait || is_live {
             self.appear()?;
             Some(Start::now())
@@ -232,10 +234,12 @@ impl Agent {
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
-            SourceConfig::Stream(_) => match file.stream()? {
-                Some(options) => self.watch_stream(file, RtspCamera::new(options), begins),
-                None => Ok(()),
-            },
+            SourceConfig::Stream(_) | SourceConfig::Usb { .. } => {
+                match file.live(self.identity.camera.model().intrinsics().size)? {
+                    Some(camera) => self.watch_live(file, camera, begins),
+                    None => Ok(()),
+                }
+            }
             #[cfg(feature = "centre")]
             SourceConfig::Simulation { scene, publish_truth } => {
                 self.play_scene(file, scene, *publish_truth, start)

@@ -72,7 +72,7 @@ impl StreamHealth {
         (self.lost, self.wrong_size) = (None, None);
         self.begun.get_or_insert(now);
         self.timed_by = Some(live.timed_by);
-        if live.timed_by == TimedBy::Camera {
+        if matches!(live.timed_by, TimedBy::Camera | TimedBy::Driver) {
             self.synchronised = Some(now);
             let age_s = wall.seconds_since(captured).clamp(0.0, 1e3);
             self.from_exposure.add(Duration::from_secs_f64(age_s));
@@ -148,7 +148,10 @@ impl StreamHealth {
             ("frames_left_out", self.counts.left_out),
             ("frames_repeated", self.repeated),
             ("stream_opened", self.counts.opened),
-            ("synchronised", u64::from(self.timed_by == Some(TimedBy::Camera))),
+            (
+                "synchronised",
+                u64::from(matches!(self.timed_by, Some(TimedBy::Camera | TimedBy::Driver))),
+            ),
         ];
         for samples in [&mut self.from_arrival, &mut self.from_exposure, &mut self.intervals] {
             samples.0.clear();

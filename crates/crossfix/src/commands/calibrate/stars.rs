@@ -9,7 +9,7 @@ use crossfix_calibration::{
 };
 use crossfix_geometry::{CameraModel, Distortion, Geodetic, Pixel};
 use crossfix_message::Timestamp;
-use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, find_spots};
+use crossfix_stars::{NamedStar, Observer, Picture, Sky, Spot, find_spots, star_sd_rad};
 use crossfix_video::{CaptureTime, Frame, decode_still};
 use nalgebra::{Point3, Unit, Vector3};
 use time::OffsetDateTime;
@@ -46,15 +46,15 @@ const FIRST_SD_PX: f64 = 0.5;
 const LEAST_SD_PX: f64 = 0.05;
 /// Where stars fit no better than this, pixels, it is not the lens of the file, or they are not these stars.
 const MOST_SD_PX: f64 = 1.5;
-/// Catalogues are good to less; double stars, and what moves in fifty years, to 2 seconds of arc.
-const STAR_SD_RAD: f64 = 1e-5;
 /// Named stars that lie farther beside than so many deviations of the middle one are others: faint ones err by
 /// twice as much as that.
 const MOST_DEVIATIONS: f64 = 8.0;
 /// Three numbers of the rotation, and nine of a lens with five of distortion.
 const FITTED_NUMBERS: f64 = 12.0;
 /// The lens has 6 to 9 numbers and the rotation 3: with fewer stars than this a wrong one is not seen.
-const FEWEST_STARS: usize = 8;
+const FEWEST_STARS: usize = 12;
+/// A turn of the sky by more than this time is not held against landmarks that do not turn with it, s.
+const MOST_BESIDE_PLACES_S: f64 = 2.0;
 /// What lenses' models leave of a lens is less than this, pixels, ...
 const LEAST_BENT_PX: f64 = 0.25;
 /// ... and neighbours whose errors are correlated by this share their cause.
@@ -85,7 +85,11 @@ pub fn add(
     else {
         return Ok(());
     };
-    ensure!((0.0..=3600.0).contains(&args.time_sd), "--time-sd is from 0 to 3600 s");
+    ensure!((0.0..=600.0).contains(&args.time_sd), "--time-sd is from 0 to 600 s");
+    ensure!(
+        picture.landmarks.is_empty() || args.time_sd <= MOST_BESIDE_PLACES_S,
+        "beside landmarks the time of the stars must be known to {MOST_BESIDE_PLACES_S} s (--time-sd)"
+    );
     let observer = Observer { place: anchor.context("--anchor is missing")?, time: *time };
     if picture.freedom == LensFreedom::All {
         picture.freedom = LensFreedom::Guess;
@@ -138,7 +142,15 @@ fn spots(path: &PathBuf, model: &CameraModel) -> anyhow::Result<Vec<Spot>> {
     let capture = CaptureTime { time: Timestamp::EPOCH, sd_s: 0.0 };
     let frame = Frame { index: 0, capture, live: None, width, height, pixels };
     let brightness = frame.brightness();
-    Ok(find_spots(&Picture { width: size.width, height: size.height, brightness: &brightness })?)
+    let mut spots =
+        find_spots(&Picture { width: size.width, height: size.height, brightness: &brightness })?;
+    let count = spots.len();
+    spots.retain(|spot| model.direction(spot.pixel).is_ok());
+    if spots.len() < count {
+        let left_out = count - spots.len();
+        tracing::info!("{left_out} spots are left out, as the lens' file has no direction there");
+    }
+    Ok(spots)
 }
 
 /// Stars, and the rotation and lens by them alone.
@@ -225,7 +237,9 @@ impl Fitted {
 /// part.
 fn sd_of(squares: &[f64]) -> f64 {
     let numbers = 2.0 * squares.len() as f64;
-    let left = (numbers - FITTED_NUMBERS).max(numbers / 4.0);
+    // Of so many free numbers the mean square is found with an error of its own, which makes the expected
+    // variance larger.
+    let left = (numbers - FITTED_NUMBERS - 2.0).max(numbers / 4.0);
     (squares.iter().sum::<f64>() / left).sqrt().max(LEAST_SD_PX)
 }
 
@@ -253,7 +267,10 @@ fn landmarks(stars: &[NamedStar], click_sd_px: f64) -> Vec<Landmark> {
         name: star.name.clone(),
         pixel: star.pixel,
         click_sd_px,
-        at: LandmarkPlace::Direction { direction: star.direction, sd_rad: STAR_SD_RAD },
+        at: LandmarkPlace::Direction {
+            direction: star.direction,
+            sd_rad: star_sd_rad(&star.direction),
+        },
     };
     stars.iter().map(landmark).collect()
 }

@@ -131,9 +131,9 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     let file = CameraFile::load(path, &[])?;
     let camera = file.camera(path)?;
     let mut findings = vec![Finding::new("files", Verdict::Pass, path.display().to_string())];
-    match file.stream()? {
-        Some(options) => {
-            let (tried, _) = try_out(options, WATCHED_S);
+    match file.live(camera.model().intrinsics().size)? {
+        Some(live) => {
+            let (tried, _) = try_out(live, WATCHED_S);
             findings.extend(of_stream(&tried, &camera, file.clock.offset_s));
         }
         None => findings.push(match file.check_pictures(&camera) {

@@ -1,0 +1,338 @@
+//! Cameras of this host as Linux shows them: Video4Linux, version 2.
+
+use std::os::fd::AsRawFd;
+use std::path::PathBuf;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crossfix_message::Timestamp;
+use linux_video::types::{
+    BufferType, CapabilityFlag, CaptureParm, ContentType, FourCc, In, Mmap, PixFormat,
+};
+use linux_video::{Device, Stream};
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::poll::{PollFd, PollFlags, poll};
+use nix::time::{ClockId, clock_gettime};
+
+use super::UsbOptions;
+use crate::{Arrival, CaptureTime, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
+
+/// Buffers that the driver fills in turn: with one it could not fill the next while this one is read.
+const BUFFERS: usize = 4;
+/// Formats that are read, those without loss first.
+const FORMATS: [FourCc; 3] = [FourCc::Grey, FourCc::Yuyv, FourCc::Mjpeg];
+/// What is asked for where all are to come, Hz: drivers take the next that they have.
+const FASTEST_HZ: f64 = 1000.0;
+/// A rate this much below what is asked for is not it: 29.97 is 30.
+const LEAST_RATE: f64 = 0.97;
+
+/// Flags of a buffer (videodev2.h): it is damaged; its time is that of `CLOCK_MONOTONIC`; its time is of the
+/// start of the exposure, and not of the frame's end.
+const DAMAGED: u32 = 0x40;
+const MONOTONIC: (u32, u32) = (0xe000, 0x2000);
+const START_OF_EXPOSURE: (u32, u32) = (0x7_0000, 0x1_0000);
+
+/// The frames of a camera of this host, until it is unplugged or falls silent.
+///
+/// Their times are the driver's, by this host's clock.
+pub(super) struct UsbSource {
+    options: UsbOptions,
+    device: Device,
+    stream: Stream<In, Mmap>,
+    format: PixFormat,
+    interval_s: f64,
+    silence: Duration,
+    last: Instant,
+    /// The driver's number of the first frame.
+    first: Option<u32>,
+}
+
+impl UsbSource {
+    pub(super) fn open(options: &UsbOptions, silence: Duration) -> Result<Self, VideoError> {
+        let failed =
+            |what: String| VideoError::Stream { url: options.device.display().to_string(), what };
+        let device = Device::open(&options.device).map_err(|error| failed(opening(&error)))?;
+        let (format, interval_s) = choose(&device, options).map_err(failed)?;
+        // Whoever waits for a frame is to be told that none comes.
+        fcntl(device.as_raw_fd(), FcntlArg::F_SETFL(OFlag::O_NONBLOCK))
+            .map_err(|error| failed(error.to_string()))?;
+        let stream = device
+            .stream::<In, Mmap>(ContentType::Video, BUFFERS)
+            .map_err(|error| failed(opening(&error)))?;
+        let (options, last) = (options.clone(), Instant::now());
+        Ok(Self { options, device, stream, format, interval_s, silence, last, first: None })
+    }
+
+    fn failed(&self, what: String) -> VideoError {
+        VideoError::Stream { url: self.options.device.display().to_string(), what }
+    }
+
+    /// Waits until a frame may be there.
+    fn wait(&self) -> Result<(), VideoError> {
+        let left = self.silence.saturating_sub(self.last.elapsed());
+        if left.is_zero() {
+            return Err(VideoError::Silent {
+                url: self.options.device.display().to_string(),
+                seconds: self.last.elapsed().as_secs_f64(),
+            });
+        }
+        let mut waited = [PollFd::new(self.device.as_raw_fd(), PollFlags::POLLIN)];
+        let milliseconds = i32::try_from(left.as_millis()).unwrap_or(i32::MAX).max(1);
+        match poll(&mut waited, milliseconds) {
+            Ok(_) | Err(Errno::EINTR) => {}
+            Err(error) => return Err(self.failed(error.to_string())),
+        }
+        let gone = PollFlags::POLLERR | PollFlags::POLLHUP | PollFlags::POLLNVAL;
+        match waited[0].revents() {
+            Some(happened) if happened.intersects(gone) => {
+                Err(self.failed("it was unplugged, or has stopped".to_owned()))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// What a filled buffer holds.
+    fn take(&mut self, filled: &Filled<'_>) -> Result<Frame, VideoError> {
+        self.last = Instant::now();
+        let index =
+            u64::from(filled.sequence.wrapping_sub(*self.first.get_or_insert(filled.sequence)));
+        let bad =
+            |what: String| VideoError::Frame { path: self.options.device.clone(), index, what };
+        if filled.flags & DAMAGED != 0 {
+            return Err(bad("the driver says that it is damaged".to_owned()));
+        }
+        let [width, height] = [self.format.width(), self.format.height()].map(|side| side as usize);
+        let pixels = pixels(&self.format, filled.bytes).map_err(bad)?;
+        let (capture, stream_s) = self.capture(filled);
+        Ok(Frame {
+            index,
+            capture,
+            live: Some(Arrival { at: self.last, stream_s, timed_by: TimedBy::Driver }),
+            width,
+            height,
+            pixels,
+        })
+    }
+
+    /// When a frame was captured, and its time by the driver's count, s.
+    fn capture(&self, filled: &Filled<'_>) -> (CaptureTime, f64) {
+        let is = |(mask, value): (u32, u32)| filled.flags & mask == value;
+        let wall_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
+        let now_s = clock_gettime(ClockId::CLOCK_MONOTONIC)
+            .map_or(0.0, |now| Duration::from(now).as_secs_f64());
+        // A driver that stamps by no clock that is known has its frames' arrival.
+        let stamped_s = if is(MONOTONIC) { filled.time.as_secs_f64() } else { now_s };
+        let usual_s = if is(START_OF_EXPOSURE) { 0.0 } else { self.interval_s / 2.0 };
+        let before_s = now_s - stamped_s + self.options.latency_s.unwrap_or(usual_s);
+        let time = Timestamp::from_seconds(wall_s).plus_seconds(-before_s);
+        (CaptureTime { time, sd_s: self.options.sd_s }, stamped_s)
+    }
+}
+
+impl FrameSource for UsbSource {
+    fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        loop {
+            match self.stream.next() {
+                Ok(buffer) => {
+                    let data = buffer.lock();
+                    let header: &linux_video::types::Buffer = &data;
+                    let filled = Filled {
+                        sequence: header.sequence(),
+                        flags: header.flags().bits(),
+                        time: header.timestamp(),
+                        bytes: data.as_ref(),
+                    };
+                    return self.take(&filled).map(Some);
+                }
+                Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => self.wait()?,
+                Err(error) => return Err(self.failed(opening(&error))),
+            }
+        }
+    }
+}
+
+/// What the driver says of a buffer, with what it holds.
+struct Filled<'a> {
+    sequence: u32,
+    flags: u32,
+    time: Duration,
+    bytes: &'a [u8],
+}
+
+/// What keeps a device from being opened, with what mends it.
+fn opening(error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "there is no such device: is the camera plugged in?".into(),
+        std::io::ErrorKind::PermissionDenied => {
+            "this user may not watch it: `sudo usermod -aG video $USER`, and log in anew".into()
+        }
+        std::io::ErrorKind::ResourceBusy => "another program is watching it".into(),
+        _ if error.raw_os_error() == Some(Errno::ENODEV as i32) => "it was unplugged".into(),
+        _ => error.to_string(),
+    }
+}
+
+/// Sets the camera to the size that is asked for, in the first format that has the rate, or in that which
+/// has the most; the format, and the interval between frames, s.
+fn choose(device: &Device, options: &UsbOptions) -> Result<(PixFormat, f64), String> {
+    let size = match options.size {
+        Some(size) => size,
+        None => size_of(device).map_err(|error| opening(&error))?,
+    };
+    let mut best: Option<(FourCc, f64)> = None;
+    let mut others = Vec::new();
+    for wanted in FORMATS {
+        let Some((format, interval_s)) =
+            set(device, size, options.rate_hz, wanted).map_err(|error| opening(&error))?
+        else {
+            continue;
+        };
+        if [format.width(), format.height()] != size {
+            others.push(format!("{}x{}", format.width(), format.height()));
+            continue;
+        }
+        let has_rate =
+            options.rate_hz.is_some_and(|rate_hz| rate_hz * LEAST_RATE * interval_s <= 1.0);
+        if has_rate {
+            return Ok((format, interval_s));
+        }
+        if best.is_none_or(|(_, least_s)| interval_s < least_s) {
+            best = Some((wanted, interval_s));
+        }
+    }
+    let [width, height] = size;
+    let (wanted, interval_s) = best.ok_or_else(|| match others.first() {
+        Some(other) => format!("it has no images of {width}x{height}; next to that it has {other}"),
+        None => "it has no images in a format that is read: GREY, YUYV or MJPG".to_owned(),
+    })?;
+    if let Some(rate_hz) = options.rate_hz {
+        return Err(format!(
+            "it has {:.1} images of {width}x{height} a second at most, and not {rate_hz}",
+            1.0 / interval_s
+        ));
+    }
+    let set = set(device, size, options.rate_hz, wanted).map_err(|error| opening(&error))?;
+    set.ok_or_else(|| "it does not keep to a format".to_owned())
+}
+
+/// The size that a camera is set to.
+fn size_of(device: &Device) -> std::io::Result<[u32; 2]> {
+    let format = device.format(BufferType::VideoCapture)?;
+    Ok(format.try_ref::<PixFormat>().map_or([0, 0], |now| [now.width(), now.height()]))
+}
+
+/// Devices that capture, in the order of their names, and what they call themselves.
+pub(super) fn cameras() -> Vec<(PathBuf, String)> {
+    let captures = |path: PathBuf| {
+        let capability = Device::open(&path).ok()?.capabilities().ok()?;
+        let can = capability.device_capabilities();
+        let does =
+            can.contains(CapabilityFlag::VideoCapture) && can.contains(CapabilityFlag::Streaming);
+        does.then(|| (path, capability.card().to_owned()))
+    };
+    let devices = Device::list().into_iter().flatten().filter_map(Result::ok);
+    let mut cameras: Vec<(PathBuf, String)> = devices.filter_map(captures).collect();
+    cameras.sort();
+    cameras
+}
+
+/// Sets the camera to a format; what it has become, and its interval, s. `None` if it has not got that.
+fn set(
+    device: &Device,
+    size: [u32; 2],
+    rate_hz: Option<f64>,
+    wanted: FourCc,
+) -> std::io::Result<Option<(PixFormat, f64)>> {
+    let mut format = device.format(BufferType::VideoCapture)?;
+    if let Some(pixels) = format.try_mut::<PixFormat>() {
+        pixels.set_width(size[0]);
+        pixels.set_height(size[1]);
+        pixels.set_pixel_format(wanted);
+        // Strides and sizes are the driver's to say.
+        pixels.set_bytes_per_line(0);
+        pixels.set_size_image(0);
+    }
+    device.set_format(&mut format)?;
+    let now = device.format(BufferType::VideoCapture)?;
+    let Some(now) = now.try_ref::<PixFormat>().copied().filter(|now| now.pixel_format() == wanted)
+    else {
+        return Ok(None);
+    };
+    let mut parameters = device.param(BufferType::VideoCapture)?;
+    if let Some(capture) = parameters.try_mut::<CaptureParm>() {
+        let mut interval = capture.time_per_frame();
+        interval.set_numerator(1000);
+        interval.set_denominator((rate_hz.unwrap_or(FASTEST_HZ) * 1000.0) as u32);
+        capture.set_time_per_frame(interval);
+    }
+    // Some have one rate, and say so by refusing to be asked.
+    let _ = device.set_param(&mut parameters);
+    let parameters = device.param(BufferType::VideoCapture)?;
+    let interval_s = parameters.try_ref::<CaptureParm>().map_or(0.0, |capture| {
+        let interval = capture.time_per_frame();
+        f64::from(interval.numerator()) / f64::from(interval.denominator().max(1))
+    });
+    // Of one that does not say the rate is taken to be the usual.
+    Ok(Some((now, if interval_s > 0.0 { interval_s } else { 1.0 / 30.0 })))
+}
+
+/// The pixels of a frame in a driver's format.
+fn pixels(format: &PixFormat, bytes: &[u8]) -> Result<Pixels, String> {
+    let [width, height] = [format.width(), format.height()].map(|side| side as usize);
+    let stride = format.bytes_per_line() as usize;
+    match format.pixel_format() {
+        FourCc::Grey => rows(bytes, [width, height], stride, 1).map(Pixels::Gray8),
+        // Brightness is every other byte.
+        FourCc::Yuyv => rows(bytes, [width, height], stride, 2).map(Pixels::Gray8),
+        _ => match decode_still(bytes)? {
+            (columns, lines, pixels) if (columns, lines) == (width, height) => Ok(pixels),
+            (columns, lines, _) => Err(format!("its size is {columns}x{lines}")),
+        },
+    }
+}
+
+/// The first byte of each pixel, of rows that are a stride apart.
+fn rows(
+    bytes: &[u8],
+    [width, height]: [usize; 2],
+    stride: usize,
+    pixel: usize,
+) -> Result<Vec<u8>, String> {
+    let stride = stride.max(width * pixel);
+    if bytes.len() < stride * (height - 1) + width * pixel {
+        return Err(format!("it holds {} bytes only", bytes.len()));
+    }
+    let row = |row: usize| bytes[row * stride..][..width * pixel].iter().step_by(pixel).copied();
+    Ok((0..height).flat_map(row).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::UsbCamera;
+
+    #[test]
+    fn brightness_is_every_other_byte_of_rows_that_may_be_padded() {
+        let padded = [1, 9, 2, 9, 0, 0, 3, 9, 4, 9];
+        assert_eq!(rows(&padded, [2, 2], 6, 2), Ok(vec![1, 2, 3, 4]));
+        assert_eq!(rows(&padded, [3, 2], 6, 1), Ok(vec![1, 9, 2, 3, 9, 4]));
+        assert!(rows(&padded, [2, 3], 6, 2).is_err());
+    }
+
+    #[test]
+    fn what_is_not_there_or_no_camera_is_said() {
+        let options = |device: &str| UsbOptions {
+            device: device.into(),
+            size: Some([640, 480]),
+            rate_hz: None,
+            latency_s: None,
+            sd_s: 0.02,
+        };
+        let open = |device: &str| {
+            let opened = UsbCamera::new(options(device)).open(Duration::from_secs(1));
+            opened.err().map(|error| error.to_string()).unwrap_or_default()
+        };
+        assert!(open("/dev/video999").contains("plugged in"), "{}", open("/dev/video999"));
+        assert!(!open("/dev/null").is_empty());
+    }
+}
