@@ -68,3 +68,32 @@ fn the_site_to_copy_is_good() {
     let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/site");
     crossfix().args(["check", "-c", site]).assert().success();
 }
+
+/// A camera of the host that is not there, and one that is no camera, are said with what mends it; its
+/// configuration is held against what cameras can do.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_camera_of_the_host_is_asked_for_by_its_device() {
+    let tried = |arguments: &[&str]| {
+        let output = crossfix().args(arguments).output().unwrap();
+        let text = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        (output.status.code(), text)
+    };
+    let (code, said) = tried(&["sources", "/dev/video999", "--seconds", "0.3"]);
+    assert!(code == Some(1) && said.contains("is the camera plugged in?"), "{said}");
+    let (code, _) = tried(&["sources", "/dev/null", "--seconds", "0.3"]);
+    assert_eq!(code, Some(1));
+    let (code, _) = tried(&["sources", "/dev/video999", "--size", "1280"]);
+    assert_eq!(code, Some(2));
+    assert_eq!(tried(&["sources"]).0, Some(0));
+    let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/site");
+    let camera = format!("{site}/north.toml");
+    let with = |source: &str| {
+        let set = format!("source={source}");
+        tried(&["check", "-c", &camera, "--set", &set])
+    };
+    let (code, said) = with(r#"{ kind = "usb", device = "/dev/null", rate_hz = 0.0 }"#);
+    assert!(code == Some(1) && said.contains("source.rate_hz"), "{said}");
+    let (code, said) = with(r#"{ kind = "usb", device = "/dev/video999" }"#);
+    assert!(code == Some(1) && said.contains("/dev/video999 is not there"), "{said}");
+}

@@ -99,6 +99,7 @@ impl Known {
     /// Without what is not where the others are: one wrong place among four would turn the site over.
     /// By the three places whose similarity half of all fit best.
     fn without_wrong(mut self) -> Self {
+        self.leave_turned_out();
         if self.places.len() <= ENOUGH_PLACES {
             return self;
         }
@@ -127,6 +128,19 @@ impl Known {
             turn_vector(&(there.inverse() * shown.rotation * here)).norm() < FAR_TURNED_RAD
         });
         self
+    }
+
+    /// Leaves rotations out that are turned far from what most others say of the site's: of a camera that has been
+    /// knocked since.
+    fn leave_turned_out(&mut self) {
+        let site = |(here, there): &(Rotation3<f64>, Rotation3<f64>)| there * here.inverse();
+        let apart = |a: &Rotation3<f64>, b: &Rotation3<f64>| turn_vector(&(a.inverse() * b)).norm();
+        let said: Vec<Rotation3<f64>> = self.rotations.iter().map(site).collect();
+        let median = |one: &Rotation3<f64>| linear::median(said.iter().map(|b| apart(one, b)));
+        let middle = said.iter().min_by(|a, b| median(a).total_cmp(&median(b))).copied();
+        if let Some(middle) = middle.filter(|_| said.len() > 2) {
+            self.rotations.retain(|pair| apart(&site(pair), &middle) < FAR_TURNED_RAD);
+        }
     }
 
     /// Cameras' surveyed places and earlier poses, landmarks that two cameras see, and cameras whose own

@@ -50,6 +50,23 @@ impl Sights {
         Self { times_s, directions, gap_s }
     }
 
+    /// What several pieces of one camera's labels saw.
+    pub(super) fn together(pieces: &[&Self]) -> Self {
+        let gap_s = pieces.iter().map(|piece| piece.gap_s).fold(0.0, f64::max);
+        let seen = |piece: &&Self| {
+            piece.times_s.iter().copied().zip(piece.directions.iter().copied()).collect::<Vec<_>>()
+        };
+        let mut all: Vec<(f64, Vector3<f64>)> = pieces.iter().flat_map(seen).collect();
+        all.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let (times_s, directions) = all.into_iter().unzip();
+        Self { times_s, directions, gap_s }
+    }
+
+    /// How many directions there are.
+    pub(super) fn len(&self) -> usize {
+        self.times_s.len()
+    }
+
     /// The direction at a time; `None` where it was not seen.
     pub(super) fn at(&self, time_s: f64) -> Option<Vector3<f64>> {
         let next = self.times_s.partition_point(|seen| *seen < time_s);

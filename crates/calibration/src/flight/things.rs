@@ -18,7 +18,10 @@ use crate::survey::Survey;
 const LEAST_AT_ONCE: f64 = 0.02;
 /// Of each camera so many things are begun with, those that it followed longest, ...
 const THINGS: usize = 4;
-/// ... and so many pairs of them are joined by others.
+/// ... of so many pairs of cameras, those that followed something longest both: each takes seconds of a long
+/// flight, ...
+const PAIRS: usize = 12;
+/// ... and so many pairs of things are joined by others.
 const SEEDS: usize = 12;
 /// Sight lines of one thing pass each other by less than this in the median, rad: as lens files leave up to
 /// 4 mrad.
@@ -58,6 +61,17 @@ impl<'a> Things<'a> {
         pairs.count() as f64 / labels.len().max(1) as f64
     }
 
+    /// How many labels some pieces have.
+    fn labels(&self, taken: &[usize]) -> usize {
+        taken.iter().map(|piece| self.pieces[*piece].len()).sum()
+    }
+
+    /// What was seen in some pieces.
+    fn seen(&self, taken: &[usize]) -> Sights {
+        let pieces: Vec<&Sights> = taken.iter().map(|piece| &self.sights[*piece]).collect();
+        Sights::together(&pieces)
+    }
+
     /// The labels of some pieces, in the order of their times.
     fn own(&self, taken: &[usize]) -> CameraLabels {
         let labels = taken.iter().flat_map(|piece| self.pieces[*piece].iter().copied());
@@ -92,36 +106,36 @@ pub(super) fn of_one_target(cameras: &[&CameraLabels], survey: &Survey) -> Vec<C
     let mut seeds = seeds(&things, survey);
     seeds.sort_by(|a, b| a.pair.doubt.total_cmp(&b.pair.doubt));
     seeds.truncate(SEEDS);
-    let joined = seeds.into_iter().map(|seed| seed.joined(&things, survey));
+    let joined = seeds.into_iter().filter_map(|seed| seed.joined(&things, survey));
     let Some(best) = joined.max_by_key(|joined| joined.labels) else { return as_they_are() };
     best.labels_of_all(&things)
 }
 
 /// Pairs of things that two cameras followed longest, each taken for one.
 fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
+    let longest =
+        |things: &Things<'_>| things.chains.first().map_or(0, |chain| things.labels(chain));
+    let mut pairs: Vec<[usize; 2]> = (0..things.len())
+        .flat_map(|first| (first + 1..things.len()).map(move |second| [first, second]))
+        .collect();
+    let least = |pair: &[usize; 2]| pair.map(|camera| longest(&things[camera])).into_iter().min();
+    pairs.sort_by_key(|pair| std::cmp::Reverse(least(pair)));
+    pairs.truncate(PAIRS);
     let mut seeds = Vec::new();
-    for first in 0..things.len() {
-        for second in first + 1..things.len() {
-            let cameras = [first, second];
-            let begun_with = cameras.map(|camera| {
-                let chains = things[camera].chains.iter().take(THINGS);
-                chains.map(|chain| (chain, things[camera].own(chain))).collect::<Vec<_>>()
-            });
-            for (a, labels_a) in &begun_with[0] {
-                for (b, labels_b) in &begun_with[1] {
-                    let sights = [Sights::of(labels_a), Sights::of(labels_b)];
-                    let ways = ways(
-                        cameras.map(|camera| things[camera].camera),
-                        sights.each_ref(),
-                        survey,
-                    );
-                    seeds.extend(ways.into_iter().map(|pair| Joined {
-                        cameras,
-                        pieces: [(*a).clone(), (*b).clone()],
-                        pair,
-                        labels: labels_a.labels.len() + labels_b.labels.len(),
-                    }));
-                }
+    for cameras in pairs {
+        let begun_with = cameras.map(|camera| {
+            let chains = things[camera].chains.iter().take(THINGS);
+            chains.map(|chain| (chain, things[camera].seen(chain))).collect::<Vec<_>>()
+        });
+        for (a, seen_a) in &begun_with[0] {
+            for (b, seen_b) in &begun_with[1] {
+                let both = cameras.map(|camera| things[camera].camera);
+                seeds.extend(ways(both, [seen_a, seen_b], survey).into_iter().map(|pair| Joined {
+                    cameras,
+                    pieces: [(*a).clone(), (*b).clone()],
+                    pair,
+                    labels: seen_a.len() + seen_b.len(),
+                }));
             }
         }
     }
@@ -141,25 +155,29 @@ fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> V
 }
 
 impl Joined {
-    /// With all pieces that are of the same target.
-    fn joined(mut self, things: &[Things<'_>], survey: &Survey) -> Self {
+    /// With all pieces that are of the same target; `None` if what it was begun with is not.
+    fn joined(mut self, things: &[Things<'_>], survey: &Survey) -> Option<Self> {
         for _ in 0..ROUNDS {
             while self.leave_worst_out(things) {}
             while self.join_next(things) {}
-            let own = self.own(things);
-            let sights = own.each_ref().map(Sights::of);
+            let counts = [0, 1].map(|side| things[self.cameras[side]].labels(&self.pieces[side]));
+            if counts.into_iter().any(|count| count < LEAST_LABELS) {
+                return None;
+            }
+            let sights = self.seen(things);
             let cameras = self.cameras.map(|camera| things[camera].camera);
-            let ways = ways(cameras, sights.each_ref(), survey);
-            let best = ways.into_iter().min_by(|a, b| a.doubt.total_cmp(&b.doubt));
-            let labels = own.iter().map(|own| own.labels.len()).sum();
-            let Some(pair) = best else { break };
-            self.pair = pair;
-            if labels == self.labels {
+            let ways = ways(cameras, sights.each_ref(), survey).into_iter();
+            self.pair = ways.min_by(|a, b| a.doubt.total_cmp(&b.doubt))?;
+            let before = std::mem::replace(&mut self.labels, counts.into_iter().sum());
+            if self.labels == before {
                 break;
             }
-            self.labels = labels;
         }
-        self
+        Some(self)
+    }
+
+    fn seen(&self, things: &[Things<'_>]) -> [Sights; 2] {
+        [0, 1].map(|side| things[self.cameras[side]].seen(&self.pieces[side]))
     }
 
     fn own(&self, things: &[Things<'_>]) -> [CameraLabels; 2] {
@@ -169,8 +187,7 @@ impl Joined {
     /// Leaves the piece out that lies farthest beside what the other camera saw of the target; `false` if all
     /// meet it.
     fn leave_worst_out(&mut self, things: &[Things<'_>]) -> bool {
-        let own = self.own(things);
-        let sights = own.each_ref().map(Sights::of);
+        let sights = self.seen(things);
         let mut worst = (MOST_ASIDE_RAD, None);
         for side in [0, 1] {
             for (place, piece) in self.pieces[side].iter().enumerate() {
@@ -190,7 +207,7 @@ impl Joined {
     /// Takes the piece that meets what the other camera saw of the target best; `false` if none does.
     fn join_next(&mut self, things: &[Things<'_>]) -> bool {
         let own = self.own(things);
-        let sights = own.each_ref().map(Sights::of);
+        let sights = self.seen(things);
         let mut best: Option<(f64, usize, usize)> = None;
         for side in [0, 1] {
             let of_camera = &things[self.cameras[side]];
@@ -213,7 +230,7 @@ impl Joined {
     /// These two cameras' labels of the target, and the others' by where these two saw it.
     fn labels_of_all(&self, things: &[Things<'_>]) -> Vec<CameraLabels> {
         let own = self.own(things);
-        let sights = own.each_ref().map(Sights::of);
+        let sights = self.seen(things);
         let poses = [
             (Rotation3::identity(), Point3::origin(), 0.0),
             (self.pair.first_from_second, self.pair.centre, self.pair.ahead_s),
