@@ -11,12 +11,9 @@ use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
-use super::{Kind, StreamConfig};
+use super::{Kind, SourceConfig};
 use crate::calibrated::Calibrated;
 use crate::recorded;
-
-/// The last second of this century: what begins later begins in error.
-const LAST_START_S: f64 = 4_102_444_800.0;
 
 /// One camera: what it is, where it stands, where its pictures come from, how it follows targets.
 /// Paths are relative to the file.
@@ -72,64 +69,6 @@ pub struct PoseConfig {
     /// Standard deviation of the centre along each axis, m. 0 to 1000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub position_sd_m: Option<f64>,
-}
-
-/// Where pictures, or bearings made elsewhere, come from.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum SourceConfig {
-    /// A video file or a folder of images.
-    Video {
-        /// .mp4 (H.264), .y4m, or a folder of PNG or JPEG images.
-        path: PathBuf,
-        /// Capture time of the first frame, s since the Unix epoch, 0 to 4102444800. Default 0.
-        #[serde(default)]
-        start_s: f64,
-        /// Frame rate of image folders, 1/s, 0.001 to 10000. Default 30.
-        #[serde(default = "thirty")]
-        rate_hz: f64,
-        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
-        #[serde(default = "one")]
-        speed: f64,
-    },
-    /// A simulated camera of a scene, in real time.
-    Simulation {
-        /// The scene (TOML).
-        scene: PathBuf,
-        /// Whether this agent publishes the truth as well. Default false.
-        #[serde(default)]
-        publish_truth: bool,
-    },
-    /// A network camera's live stream.
-    Stream(StreamConfig),
-    /// A camera of this host, as Linux shows it.
-    Usb {
-        /// Its device, `/dev/video0`; `crossfix sources` lists them.
-        device: PathBuf,
-        /// Frames a second; the most that it has at the size of the intrinsics where it is not said.
-        #[serde(default, skip_serializing_if = "Option::is_none")]
-        rate_hz: Option<f64>,
-        /// From the middle of the exposure to the driver's time, s, 0 to 10. Default: nothing where the
-        /// driver says when the exposure began, half of a frame's interval where it does not.
-        #[serde(default, skip_serializing_if = "Option::is_none")]
-        latency_s: Option<f64>,
-    },
-    /// The recorded bearings of this camera.
-    Recording {
-        /// The recording (MCAP).
-        path: PathBuf,
-        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
-        #[serde(default = "one")]
-        speed: f64,
-    },
-}
-
-fn one() -> f64 {
-    1.0
-}
-
-fn thirty() -> f64 {
-    30.0
 }
 
 /// What a driver's times and an exposure that nobody has told are off by, s.
@@ -218,7 +157,7 @@ impl CameraFile {
                 stream.password_file = stream.password_file.take().map(|file| folder.join(file));
             }
         }
-        if file.is_live() && file.boxes.is_empty() && file.tracker.detector.is_none() {
+        if file.source.is_live() && file.boxes.is_empty() && file.tracker.detector.is_none() {
             // Nobody knows where targets will be in what has not been filmed yet.
             file.tracker.detector = Some(DetectorConfig::default());
         }
@@ -230,7 +169,7 @@ impl CameraFile {
     /// Checks everything that can be checked without starting, and returns the camera.
     pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
-        self.check().and_then(|()| self.check_source()).with_context(wrong)?;
+        self.check().and_then(|()| self.source.check_there()).with_context(wrong)?;
         self.described(path)
     }
 
@@ -315,41 +254,7 @@ impl CameraFile {
                 "key `boxes`: {place:?} is no box: left and top within 1e6 pixels, sides of 1 to 1000"
             );
         }
-        self.check_pace()
-    }
-
-    /// What a source is played with.
-    fn check_pace(&self) -> anyhow::Result<()> {
-        let (rate_hz, start_s, speed) = match self.source {
-            SourceConfig::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
-            SourceConfig::Recording { speed, .. } => (thirty(), 0.0, speed),
-            SourceConfig::Stream(ref stream) => return stream.check(),
-            SourceConfig::Usb { rate_hz, latency_s, .. } => {
-                ensure!(
-                    rate_hz.is_none_or(|rate_hz| (0.1..=1000.0).contains(&rate_hz)),
-                    "key `source.rate_hz` must be from 0.1 to 1000 frames a second"
-                );
-                ensure!(
-                    latency_s.is_none_or(|latency_s| (0.0..=10.0).contains(&latency_s)),
-                    "key `source.latency_s` must be from 0 to 10 s"
-                );
-                return Ok(());
-            }
-            SourceConfig::Simulation { .. } => return Ok(()),
-        };
-        ensure!(
-            (0.001..=10_000.0).contains(&rate_hz),
-            "key `source.rate_hz` is {rate_hz}: it must be from 0.001 to 10000 frames a second"
-        );
-        ensure!(
-            (0.0..=LAST_START_S).contains(&start_s),
-            "key `source.start_s` is {start_s}: it must be from 0 to {LAST_START_S} s since the Unix epoch"
-        );
-        ensure!(
-            (0.0..=1000.0).contains(&speed),
-            "key `source.speed` is {speed}: it must be from 0 (as fast as it goes) to 1000"
-        );
-        Ok(())
+        self.source.check_pace()
     }
 
     /// Checks what needs the lens: that it shows a direction for every pixel, and that boxes are in
@@ -406,19 +311,6 @@ impl CameraFile {
         Ok(())
     }
 
-    fn check_source(&self) -> anyhow::Result<()> {
-        let (key, file) = match &self.source {
-            SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
-                ("source.path", path)
-            }
-            SourceConfig::Simulation { scene, .. } => ("source.scene", scene),
-            SourceConfig::Usb { device, .. } => ("source.device", device),
-            SourceConfig::Stream(stream) => return stream.options(None).map(drop),
-        };
-        ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
-        Ok(())
-    }
-
     /// The message that describes the camera: the recorded one as it is, where it is replayed with
     /// its own, so that the same bytes give the same tracks.
     pub fn calibration(
@@ -458,18 +350,6 @@ impl CameraFile {
         }
     }
 
-    /// Whether its source is played as fast as it goes.
-    pub fn is_unpaced(&self) -> bool {
-        match self.source {
-            SourceConfig::Video { speed, .. } | SourceConfig::Recording { speed, .. } => {
-                speed == 0.0
-            }
-            SourceConfig::Simulation { .. }
-            | SourceConfig::Stream(_)
-            | SourceConfig::Usb { .. } => false,
-        }
-    }
-
     /// What sets the clock that its capture times are by.
     pub fn clock_source(&self) -> ClockSource {
         self.clock.source.unwrap_or_else(|| self.usual_clock().0).into()
@@ -487,11 +367,6 @@ impl CameraFile {
             SourceConfig::Usb { .. } => (ClockSourceName::Host, USB_CLOCK_SD_S),
             _ => (ClockSourceName::FrameCount, 1e-3),
         }
-    }
-
-    /// Whether its source is a camera that is watched live.
-    pub fn is_live(&self) -> bool {
-        matches!(self.source, SourceConfig::Stream(_) | SourceConfig::Usb { .. })
     }
 
     /// The camera that it watches live, in images of a size, if it watches one.

@@ -5,11 +5,13 @@ mod file;
 #[cfg(feature = "centre")]
 mod fusion;
 mod site;
+mod source;
 mod stream;
 
-pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig, SourceConfig};
+pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig};
 pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use site::{Site, load_cameras, load_network};
+pub use source::SourceConfig;
 pub use stream::StreamConfig;

@@ -106,7 +106,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
     };
-    let mut agent = Agent::new(identity, link, file.is_unpaced(), shutdown)?;
+    let mut agent = Agent::new(identity, link, file.source.is_unpaced(), shutdown)?;
     agent.calibrated = calibrated;
     service::ready(&format!("camera {}", file.name));
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
@@ -180,7 +180,7 @@ impl Agent {
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
         // Life waits for nobody.
-        let is_live = file.is_live();
+        let is_live = file.source.is_live();
         let start = if args.no_wait || is_live {
             self.appear()?;
             Some(Start::now())

@@ -124,7 +124,7 @@ impl Agent {
         if self.shutdown.requested() {
             return Ok(None);
         }
-        if has_start || file.is_unpaced() {
+        if has_start || file.source.is_unpaced() {
             self.appear()?;
             return Ok(Some(Start::now()));
         }
