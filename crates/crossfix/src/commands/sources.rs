@@ -2,7 +2,6 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
-use crossfix_geometry::ImageSize;
 use crossfix_video::{
     Frame, Latency, Live, LiveCamera, RtspCamera, RtspOptions, RtspTransport, Sight, StreamAddress,
     TimedBy, UsbCamera, UsbOptions, usb_cameras,
@@ -144,8 +143,8 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         let size = match &file.source {
             // The size of its images is that of the lens.
-            SourceConfig::Usb { .. } => file.described(path)?.model().intrinsics().size,
-            _ => ImageSize { width: 0, height: 0 },
+            SourceConfig::Usb { .. } => Some(file.described(path)?.model().intrinsics().size),
+            _ => None,
         };
         let live = file.live(size).with_context(wrong)?;
         let none = || format!("{} has no live camera as its source", path.display());

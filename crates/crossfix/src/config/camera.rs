@@ -369,8 +369,9 @@ impl CameraFile {
         }
     }
 
-    /// The camera that it watches live, in images of a size, if it watches one.
-    pub fn live(&self, size: ImageSize) -> anyhow::Result<Option<LiveCamera>> {
+    /// The camera that it watches live, if it watches one. One of this host is set to the size, or left as it
+    /// is set.
+    pub fn live(&self, size: Option<ImageSize>) -> anyhow::Result<Option<LiveCamera>> {
         Ok(match &self.source {
             SourceConfig::Stream(stream) => {
                 let by_arrival = self.clock_source() == ClockSource::Arrival;
@@ -380,7 +381,7 @@ impl CameraFile {
             SourceConfig::Usb { device, rate_hz, latency_s } => {
                 Some(LiveCamera::Usb(UsbCamera::new(UsbOptions {
                     device: device.clone(),
-                    size: Some([size.width, size.height]),
+                    size: size.map(|size| [size.width, size.height]),
                     rate_hz: *rate_hz,
                     latency_s: *latency_s,
                     sd_s: self.clock_sd_s(),

@@ -235,7 +235,7 @@ impl Agent {
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
             SourceConfig::Stream(_) | SourceConfig::Usb { .. } => {
-                match file.live(self.identity.camera.model().intrinsics().size)? {
+                match file.live(Some(self.identity.camera.model().intrinsics().size))? {
                     Some(camera) => self.watch_live(file, camera, begins),
                     None => Ok(()),
                 }

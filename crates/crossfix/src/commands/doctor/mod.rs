@@ -131,7 +131,7 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     let file = CameraFile::load(path, &[])?;
     let camera = file.camera(path)?;
     let mut findings = vec![Finding::new("files", Verdict::Pass, path.display().to_string())];
-    match file.live(camera.model().intrinsics().size)? {
+    match file.live(Some(camera.model().intrinsics().size))? {
         Some(live) => {
             let (tried, _) = try_out(live, WATCHED_S);
             findings.extend(of_stream(&tried, &camera, file.clock.offset_s));
