@@ -1,6 +1,7 @@
 //! The fusion as its two shells need it, live and offline: what comes in is read, refused, counted
 //! and said in one way.
 
+use std::collections::BTreeSet;
 use std::time::Instant;
 
 use crossfix_fusion::{CameraReport, CameraStanding, ConfigError, Fusion, FusionConfig, Output};
@@ -22,6 +23,8 @@ pub struct Centre {
     frames: u64,
     poses: PoseWatch,
     scene_begins: Timestamp,
+    /// Cameras that have said that no more will come of them.
+    ended: BTreeSet<CameraName>,
 }
 
 /// What was turned away before it came to the fusion.
@@ -91,6 +94,7 @@ impl Centre {
             frames: 0,
             poses: PoseWatch::default(),
             scene_begins: Timestamp::EPOCH,
+            ended: BTreeSet::new(),
         })
     }
 
@@ -163,7 +167,13 @@ impl Centre {
         if health.scene_begins_ns != 0 {
             self.scene_begins = Timestamp::from_nanos(health.scene_begins_ns);
         }
-        if health.ended { self.fusion.camera_ended(camera) } else { Vec::new() }
+        if health.ended {
+            self.ended.insert(camera.clone());
+            self.fusion.camera_ended(camera)
+        } else {
+            self.ended.remove(camera);
+            Vec::new()
+        }
     }
 
     /// A message that was read, or `None` and why not is counted.
@@ -215,6 +225,11 @@ impl Centre {
     /// Whether cameras still stand as they were calibrated.
     pub fn poses(&self) -> &PoseWatch {
         &self.poses
+    }
+
+    /// Whether a camera has said that no more will come of it.
+    pub fn has_ended(&self, camera: &CameraName) -> bool {
+        self.ended.contains(camera)
     }
 
     /// The cameras that are left out.
@@ -272,6 +287,7 @@ impl Centre {
             cameras: self.fusion.cameras().map(|report| camera_health(&report)).collect(),
             problems: left_out.chain(moved).chain(nothing).collect(),
             scene_begins_ns: self.scene_begins.nanos(),
+            tracks: self.fusion.tracks().count().try_into().unwrap_or(u32::MAX),
             ..Default::default()
         }
     }

@@ -5,6 +5,8 @@ use std::io::IsTerminal;
 use clap::{Args, ValueEnum};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::{Directive, LevelFilter};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// How logs look.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -52,12 +54,40 @@ pub fn start(args: &LoggingArgs) {
     // says in detail may hold how one logs in to them, whoever asks for it.
     let quiet = Directive::from(LevelFilter::ERROR);
     let filter = filter.add_directive("retina=error".parse().unwrap_or(quiet));
-    let builder = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_writer(std::io::stderr);
-    match args.log_format {
-        LogFormat::Text => builder.with_target(false).init(),
-        LogFormat::Json => builder.json().init(),
+    let builder = |filter| {
+        tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_ansi(std::io::stderr().is_terminal())
+            .with_writer(std::io::stderr)
+    };
+    match (args.log_format, journal()) {
+        (LogFormat::Text, Some(journal)) => {
+            tracing_subscriber::registry().with(journal).with(filter).init();
+        }
+        (LogFormat::Text, None) => builder(filter).with_target(false).init(),
+        (LogFormat::Json, _) => builder(filter).json().init(),
     }
+}
+
+/// The system's journal, where stderr goes there: then lines have their level and where in the code they
+/// come from as fields (`journalctl -p warning -t crossfix`).
+#[cfg(target_os = "linux")]
+fn journal() -> Option<tracing_journald::Layer> {
+    use std::os::fd::AsFd;
+    use std::os::linux::fs::MetadataExt;
+
+    // systemd says which of its sockets that is (systemd.exec(5), `JOURNAL_STREAM`): somebody may have
+    // sent stderr elsewhere since.
+    let said = std::env::var("JOURNAL_STREAM").ok()?;
+    let stderr = std::io::stderr().as_fd().try_clone_to_owned().ok()?;
+    let stderr = std::fs::File::from(stderr).metadata().ok()?;
+    let is_stderr = said == format!("{}:{}", stderr.st_dev(), stderr.st_ino());
+    let layer = is_stderr.then(tracing_journald::layer)?.ok()?;
+    Some(layer.with_syslog_identifier("crossfix".to_owned()))
+}
+
+/// Elsewhere there is none.
+#[cfg(not(target_os = "linux"))]
+fn journal() -> Option<tracing_subscriber::layer::Identity> {
+    None
 }

@@ -57,6 +57,8 @@ struct Other {
     is_here: bool,
     /// Whether it was there at the look before, too.
     was_here: bool,
+    /// Whether it ever was.
+    has_been_here: bool,
 }
 
 impl Lookout {
@@ -72,6 +74,7 @@ impl Lookout {
             channel: Channel::Alive(camera.clone()),
             is_here: false,
             was_here: false,
+            has_been_here: false,
         });
         Self::new(link, others.collect())
     }
@@ -84,6 +87,7 @@ impl Lookout {
             channel: Channel::FusionAlive,
             is_here: false,
             was_here: false,
+            has_been_here: false,
         };
         Self::new(link, vec![fusion])
     }
@@ -105,6 +109,7 @@ impl Lookout {
             changed |= is_here != other.is_here;
             other.was_here = other.is_here;
             other.is_here = is_here;
+            other.has_been_here |= is_here;
         }
         let here = self.others.iter().filter(|other| other.is_here).count();
         if self.absence.is_due(here, self.others.len(), changed, now) {
@@ -122,6 +127,12 @@ impl Lookout {
     pub fn cameras_here(&self) -> Vec<String> {
         let here = self.others.iter().filter(|other| other.is_here && other.was_here);
         here.filter_map(|other| other.channel.camera()).map(ToString::to_string).collect()
+    }
+
+    /// The cameras of them that were there and are not now.
+    pub fn cameras_gone(&self) -> impl Iterator<Item = &CameraName> {
+        let gone = self.others.iter().filter(|other| other.has_been_here && !other.is_here);
+        gone.filter_map(|other| other.channel.camera())
     }
 
     fn missing(&self) -> String {

@@ -14,10 +14,13 @@ mod centre;
 mod commands;
 mod config;
 mod eye;
+mod health;
+mod host;
 #[cfg(feature = "centre")]
 mod import;
 mod logging;
 mod lookout;
+mod metrics;
 mod network;
 mod output;
 mod pace;

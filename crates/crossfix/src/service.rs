@@ -13,6 +13,14 @@ pub fn alive() {
     tell(&[NotifyState::Watchdog]);
 }
 
+/// It reads its configuration again; [`ready`] says that it has.
+pub fn reloading() {
+    match NotifyState::monotonic_usec_now() {
+        Ok(now) => tell(&[NotifyState::Reloading, now]),
+        Err(_) => tell(&[NotifyState::Reloading]),
+    }
+}
+
 /// It has been asked to stop, and does.
 pub fn stopping() {
     tell(&[NotifyState::Stopping]);

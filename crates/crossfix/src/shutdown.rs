@@ -1,12 +1,15 @@
-//! Stopping: Ctrl-C, SIGTERM, or, for children of `demo`, the end of stdin.
+//! Stopping: Ctrl-C, SIGTERM, or, for children of `demo`, the end of stdin. And SIGHUP, on which those who
+//! serve read their configuration again.
 
-use std::io::Read;
+use std::io::{IsTerminal, Read};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
 
 /// How long a command may take to end after it has been asked to: people wait for it. What it does
 /// then of its own accord takes [`LAST_WORDS`] and half a second to take its leave of the network.
@@ -24,32 +27,52 @@ const POLL: Duration = Duration::from_millis(20);
 /// The commands run on a thread of their own, with the stack of a main thread.
 const STACK_BYTES: usize = 8 << 20;
 
-/// The system has one handler a process; it holds when the program was asked to stop.
-static ASKED: OnceLock<Arc<OnceLock<Instant>>> = OnceLock::new();
+/// The system has one handler a process; it holds what the program was asked for.
+static ASKED: OnceLock<Arc<Asked>> = OnceLock::new();
 
-/// Whether the program has been asked to stop.
+/// What a program was asked for.
+#[derive(Debug, Default)]
+struct Asked {
+    /// To stop, and when.
+    stop: OnceLock<Instant>,
+    /// To read its configuration again, and whether it can.
+    reload: AtomicBool,
+    can_reload: AtomicBool,
+}
+
+/// Whether the program has been asked to stop, or to read its configuration again.
 #[derive(Clone, Debug)]
-pub struct Shutdown(Arc<OnceLock<Instant>>);
+pub struct Shutdown(Arc<Asked>);
 
 impl Shutdown {
-    /// Listens for Ctrl-C and SIGTERM; a second one ends the program at once.
+    /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second one ends the program at once.
     pub fn listen() -> Self {
         let asked = ASKED.get_or_init(|| {
-            let asked = Arc::new(OnceLock::new());
-            let handled = Arc::clone(&asked);
-            let is_second = AtomicBool::new(false);
-            let installed = ctrlc::set_handler(move || {
-                handled.get_or_init(Instant::now);
-                if is_second.swap(true, Ordering::SeqCst) {
-                    std::process::exit(130);
-                }
+            let asked = Arc::new(Asked::default());
+            let heard = Arc::clone(&asked);
+            let listening = Signals::new([SIGINT, SIGTERM, SIGHUP]).and_then(|signals| {
+                std::thread::Builder::new()
+                    .name("signals".into())
+                    .spawn(move || heed(signals, &heard))
             });
-            if let Err(error) = installed {
+            if let Err(error) = listening {
                 tracing::warn!("cannot listen for Ctrl-C: {error}");
             }
             asked
         });
         Self(Arc::clone(asked))
+    }
+
+    /// Takes SIGHUP, but on a terminal, where it says that the terminal is gone, for the wish that the
+    /// configuration is read again.
+    pub fn with_reload(self) -> Self {
+        self.0.can_reload.store(!std::io::stdin().is_terminal(), Ordering::SeqCst);
+        self
+    }
+
+    /// Whether the configuration is to be read again; once for each time that it was asked for.
+    pub fn take_reload(&self) -> bool {
+        self.0.reload.swap(false, Ordering::SeqCst)
     }
 
     /// Stops as well when stdin ends: when the parent closes it, or dies.
@@ -59,7 +82,7 @@ impl Shutdown {
             std::thread::spawn(move || {
                 let mut sink = [0; 64];
                 while std::io::stdin().read(&mut sink).is_ok_and(|n| n > 0) {}
-                asked.get_or_init(Instant::now);
+                asked.stop.get_or_init(Instant::now);
             });
         }
         self
@@ -67,12 +90,27 @@ impl Shutdown {
 
     /// Whether to stop.
     pub fn requested(&self) -> bool {
-        self.0.get().is_some()
+        self.0.stop.get().is_some()
     }
 
     /// Whether to stop without looking at what still comes: it was asked for longer ago than this.
     pub fn overdue(&self, patience: Duration) -> bool {
-        self.0.get().is_some_and(|asked| asked.elapsed() > patience)
+        self.0.stop.get().is_some_and(|asked| asked.elapsed() > patience)
+    }
+}
+
+/// Notes what signals ask for.
+fn heed(mut signals: Signals, asked: &Asked) {
+    let mut is_second = false;
+    for signal in &mut signals {
+        if signal == SIGHUP && asked.can_reload.load(Ordering::SeqCst) {
+            asked.reload.store(true, Ordering::SeqCst);
+        } else if is_second {
+            std::process::exit(130);
+        } else {
+            asked.stop.get_or_init(Instant::now);
+            is_second = true;
+        }
     }
 }
 
@@ -97,7 +135,7 @@ pub fn supervise(
                 bail!("the command ended without a result");
             }
         }
-        let asked = ASKED.get().and_then(|asked| asked.get());
+        let asked = ASKED.get().and_then(|asked| asked.stop.get());
         if asked.is_some_and(|asked| asked.elapsed() > GRACE) {
             bail!(
                 "it was busy and did not end within 2 s: ended without it; what it was writing is not complete"

@@ -9,13 +9,13 @@ use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Rol
 use crate::centre::Centre;
 use crate::commands::numbers;
 use crate::config::{self, FusionFile};
+use crate::health::{self, HealthArgs, HealthReporter};
 use crate::lookout::Lookout;
 use crate::network::{self, rivalry};
 use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
-const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(20);
 
 /// Run the fusion centre: bearings in, tracks out.
@@ -32,6 +32,8 @@ pub struct Args {
     /// have told: on `fusion/smoothed`, beside those that go out at once.
     #[arg(long, value_name = "SECONDS", value_parser = numbers::positive, allow_negative_numbers = true)]
     lag: Option<f64>,
+    #[command(flatten)]
+    health: HealthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
@@ -44,7 +46,7 @@ struct Station {
     tracks: LinkPublisher,
     smoothed: LinkPublisher,
     events: LinkPublisher,
-    health: LinkPublisher,
+    health: HealthReporter,
     reception: Reception,
     lookout: Lookout,
     /// What time it was in the data at the last report.
@@ -52,7 +54,7 @@ struct Station {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let file = FusionFile::load(Some(&args.config), &args.sets)?;
     let network = file.network.as_ref().with_context(|| {
         format!("{}: key `network` is missing: name the network file", args.config.display())
@@ -69,7 +71,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
         smoothed: link.publisher(Channel::Smoothed, Delivery::Queued)?,
         events: link.publisher(Channel::Events, Delivery::Queued)?,
-        health: link.publisher(Channel::FusionHealth, Delivery::Queued)?,
+        health: HealthReporter::new(&args.health, &link, Channel::FusionHealth, Delivery::Queued)?,
         reception: Reception::default(),
         lookout,
         said_at: Timestamp::EPOCH,
@@ -101,9 +103,14 @@ impl Station {
             if let Some(received) = subscription.next(POLL) {
                 self.take(&received)?;
             }
-            if healthy_at.elapsed() >= HEALTH_PERIOD {
+            if healthy_at.elapsed() >= health::PERIOD {
                 healthy_at = Instant::now();
                 service::alive();
+                if shutdown.take_reload() {
+                    tracing::warn!(
+                        "the fusion centre reads its configuration at its start alone: restart it"
+                    );
+                }
                 self.lookout.look(healthy_at);
                 self.centre.remind(healthy_at);
                 self.say_health(subscription, false)?;
@@ -182,9 +189,11 @@ impl Station {
             ("received_too_long", refused.too_long),
         ]);
         health.ended = ended;
-        health.run = self.link.run().0;
-        health.host = network::host();
         health.present = self.lookout.cameras_here();
+        let gone = self.lookout.cameras_gone().filter(|camera| !self.centre.has_ended(camera));
+        health.problems.extend(gone.map(|camera| {
+            format!("camera `{camera}` is gone: its agent has died, or the way to it is cut")
+        }));
         health.is_playing = self.centre.now() > self.said_at;
         self.said_at = self.centre.now();
         for (key, runs) in self.reception.rivals(Instant::now()) {
@@ -192,6 +201,7 @@ impl Station {
             self.centre.warn(&format!("rivals {key}"), || rivalry.clone());
             health.problems.push(rivalry);
         }
-        Ok(self.health.put(health.encode())?)
+        let health = self.health.completed(health);
+        self.health.say(&health)
     }
 }

@@ -274,12 +274,13 @@ pub struct TrackEvent {
     #[prost(uint64, tag = "5")]
     pub other_id: u64,
 }
-/// A number that a component counts.
+/// A number that a component counts, since its start.
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Counter {
-    /// What is counted, snake_case.
+    /// What is counted, snake_case. A name that ends in `_us` or `_ms`, and `synchronised`, are no counts: they are how
+    /// it is in the second before the report.
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
     #[prost(uint64, tag = "2")]
@@ -357,6 +358,39 @@ pub struct Health {
     /// From the fusion centre: the time of the data has gone on since the report before.
     #[prost(bool, tag = "13")]
     pub is_playing: bool,
+    /// The process and its host; absent where the system does not say.
+    #[prost(message, optional, tag = "14")]
+    pub load: ::core::option::Option<HostLoad>,
+    /// Of `handled`, so many a second since the report before.
+    #[prost(double, tag = "15")]
+    pub rate_hz: f64,
+    /// Tracks that live: of an agent in the image, of the fusion centre in the air.
+    #[prost(uint32, tag = "16")]
+    pub tracks: u32,
+}
+/// How busy a process and its host are, in the second before the report.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct HostLoad {
+    /// Processor time of the process, in cores: 1.5 is one and a half.
+    #[prost(double, tag = "1")]
+    pub process_cores: f64,
+    /// Memory that it holds, bytes.
+    #[prost(uint64, tag = "2")]
+    pub process_memory: u64,
+    /// Share of all cores that is in use, 0 to 1.
+    #[prost(double, tag = "3")]
+    pub cores_in_use: f64,
+    /// Memory that programs can still have, bytes.
+    #[prost(uint64, tag = "4")]
+    pub memory_available: u64,
+    /// Of the hottest part that can be read, degrees Celsius; absent where none can.
+    #[prost(double, optional, tag = "5")]
+    pub temperature_c: ::core::option::Option<f64>,
+    /// How far off the host's clock may be, as its kernel says, s; absent where nothing keeps it.
+    #[prost(double, optional, tag = "6")]
+    pub clock_bound_s: ::core::option::Option<f64>,
 }
 /// A small picture for people.
 #[derive(serde::Serialize, serde::Deserialize)]

@@ -11,6 +11,7 @@ use super::{Agent, corrected};
 use crate::config::CameraFile;
 use crate::eye::brightness;
 use crate::pace::wall_seconds;
+use crate::service;
 
 /// How often an agent that sees nothing looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(200);
@@ -21,17 +22,17 @@ const ANOTHER_COUNT_S: f64 = 2.0;
 const SHORTEST_S: f64 = 1e-3;
 
 /// Follows targets in a stream.
-struct Watch<'a> {
-    file: &'a CameraFile,
+pub(super) struct Watch {
+    pub(super) file: CameraFile,
     begins: Timestamp,
-    tracker: ImageTracker,
+    pub(super) tracker: ImageTracker,
     /// The tracker's time goes on evenly whatever becomes of the clocks: the last frame's, its stream
     /// time, s, and its arrival.
     tracked: Option<(Timestamp, f64, Instant)>,
     shown: Option<Timestamp>,
 }
 
-impl Watch<'_> {
+impl Watch {
     /// A frame's time for the tracker.
     fn even_time(&mut self, live: Arrival) -> Timestamp {
         let time = self.tracked.map_or(self.begins, |(before, stream_s, at)| {
@@ -59,7 +60,7 @@ impl Agent {
         for place in file.boxes() {
             tracker.take_up(place);
         }
-        let mut watch = Watch { file, begins, tracker, tracked: None, shown: None };
+        let mut watch = Watch { file: file.clone(), begins, tracker, tracked: None, shown: None };
         let heeds_reports = file.clock_source() != ClockSource::Arrival;
         self.stream = Some(StreamHealth::new(heeds_reports));
         let live = Live::start(move |silence| camera.open(silence));
@@ -74,6 +75,11 @@ impl Agent {
             }
             if let Some(stream) = &mut self.stream {
                 stream.note_counts(live.counts());
+            }
+            if self.shutdown.take_reload() {
+                service::reloading();
+                self.reload(&mut watch)?;
+                service::ready(&format!("camera {}", self.identity.name));
             }
             self.keep_up()?;
         }
@@ -96,7 +102,7 @@ impl Agent {
     }
 
     /// Follows targets in one frame and says where they are.
-    fn follow(&mut self, watch: &mut Watch<'_>, frame: &Frame) -> anyhow::Result<()> {
+    fn follow(&mut self, watch: &mut Watch, frame: &Frame) -> anyhow::Result<()> {
         if let Err(error) = self.check_size(frame) {
             // It may come back; the others see on.
             self.bad_frames += 1;
@@ -133,6 +139,6 @@ impl Agent {
             let wall = Timestamp::from_seconds(wall_seconds());
             stream.note_frame(capture.time, live, Instant::now(), wall);
         }
-        self.show(watch.file, &mut watch.shown, &image, capture)
+        self.show(&watch.file, &mut watch.shown, &image, capture)
     }
 }

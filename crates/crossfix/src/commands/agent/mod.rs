@@ -1,4 +1,5 @@
 mod live;
+mod reload;
 #[cfg(feature = "centre")]
 mod simulated;
 mod start;
@@ -20,6 +21,7 @@ use crate::calibrated::Calibrated;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
+use crate::health::{self, HealthArgs, HealthReporter};
 use crate::network;
 use crate::output;
 use crate::pace::wall_seconds;
@@ -35,8 +37,6 @@ pub use self::simulated::truth_frame;
 
 /// How often the calibration is said again, for those who came late.
 const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
-/// How often the agent says how it does.
-const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 /// An agent that is this far behind its source is too slow for it: the fusion centre waits half a
 /// second.
 pub const BEHIND: Duration = Duration::from_millis(500);
@@ -62,6 +62,8 @@ pub struct Args {
     /// that play.
     #[arg(long, value_name = "SECONDS", value_parser = numbers::wall_time)]
     start_at: Option<f64>,
+    #[command(flatten)]
+    health: HealthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
@@ -69,6 +71,9 @@ pub struct Args {
 
 /// What an agent has open.
 struct Agent {
+    /// The camera's file, and what overrides it.
+    config: PathBuf,
+    sets: Vec<String>,
     identity: CameraIdentity,
     /// Lens, pose and clock by the site's calibration, where there is one.
     calibrated: Option<Calibrated>,
@@ -78,13 +83,15 @@ struct Agent {
     alive: Option<AliveToken>,
     bearings: LinkPublisher,
     calibrations: LinkPublisher,
-    health: LinkPublisher,
+    health: HealthReporter,
     previews: LinkPublisher,
     calibrated_at: Option<Instant>,
     healthy_at: Option<Instant>,
     frames: u64,
     bad_frames: u64,
     unseen_bearings: u64,
+    /// Tracks in its newest frame.
+    tracks: u32,
     behind: Duration,
     scene_begins: Timestamp,
     now: Timestamp,
@@ -95,7 +102,7 @@ struct Agent {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let file = CameraFile::load(&args.config, &args.sets)?;
     let camera = file.camera(&args.config)?;
     let network = config::load_network(&file.network)?;
@@ -106,7 +113,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
     };
-    let mut agent = Agent::new(identity, link, file.source.is_unpaced(), shutdown)?;
+    let mut agent = Agent::new(args, identity, link, file.source.is_unpaced(), shutdown)?;
     agent.calibrated = calibrated;
     service::ready(&format!("camera {}", file.name));
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
@@ -139,6 +146,7 @@ fn corrected(own: CaptureTime, start: Timestamp, clock: &ClockConfig) -> Capture
 
 impl Agent {
     fn new(
+        args: &Args,
         identity: CameraIdentity,
         link: Link,
         is_unpaced: bool,
@@ -148,9 +156,16 @@ impl Agent {
         let delivery = if is_unpaced { Delivery::Every } else { Delivery::Queued };
         let name = identity.name.clone();
         Ok(Self {
+            config: args.config.clone(),
+            sets: args.sets.clone(),
             bearings: link.publisher(Channel::Bearings(name.clone()), delivery)?,
             calibrations: link.publisher(Channel::Calibration(name.clone()), delivery)?,
-            health: link.publisher(Channel::CameraHealth(name.clone()), delivery)?,
+            health: HealthReporter::new(
+                &args.health,
+                &link,
+                Channel::CameraHealth(name.clone()),
+                delivery,
+            )?,
             previews: link.publisher(Channel::Preview(name), Delivery::Picture)?,
             identity,
             calibrated: None,
@@ -162,6 +177,7 @@ impl Agent {
             frames: 0,
             bad_frames: 0,
             unseen_bearings: 0,
+            tracks: 0,
             behind: Duration::ZERO,
             scene_begins: Timestamp::EPOCH,
             now: Timestamp::EPOCH,
@@ -257,9 +273,13 @@ impl Agent {
             self.calibrations.put(self.calibration.clone())?;
             self.calibrated_at = Some(Instant::now());
         }
-        if due(self.healthy_at, HEALTH_PERIOD) {
+        if due(self.healthy_at, health::PERIOD) {
             service::alive();
             self.repeats.remind(Instant::now());
+            // A live camera's file is read again where it is watched.
+            if self.stream.is_none() && self.shutdown.take_reload() {
+                tracing::warn!("a source that is played keeps its configuration to its end");
+            }
             self.say_health(false)?;
             self.healthy_at = Some(Instant::now());
         }
@@ -283,13 +303,13 @@ impl Agent {
                 .map(|(name, value)| Counter { name: name.to_owned(), value })
                 .collect(),
             ended,
-            run: self.link.run().0,
-            host: network::host(),
             problems: self.problems(),
             scene_begins_ns: self.scene_begins.nanos(),
+            tracks: self.tracks,
             ..Default::default()
         };
-        Ok(self.health.put(health.encode())?)
+        let health = self.health.completed(health);
+        self.health.say(&health)
     }
 
     fn problems(&self) -> Vec<String> {
@@ -324,6 +344,7 @@ impl Agent {
         self.now = Timestamp::from_nanos(frame.capture_time_ns);
         self.keep_up()?;
         self.frames += 1;
+        self.tracks = frame.tracks.len().try_into().unwrap_or(u32::MAX);
         Ok(self.bearings.put(frame.encode())?)
     }
 

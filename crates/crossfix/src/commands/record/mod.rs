@@ -5,20 +5,19 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use crossfix_message::{Channel, Health, Key, Payload};
+use crossfix_message::{Channel, Key};
 use crossfix_recording::{RecordingError, RecordingWriter, Source};
-use crossfix_transport::{Delivery, LinkPublisher, Role, Subscription};
+use crossfix_transport::{Delivery, Role, Subscription};
 
 use self::recorder::{FileWriter, Recorder};
 use crate::config;
+use crate::health::{self, HealthArgs, HealthReporter};
 use crate::lookout::Lookout;
 use crate::network;
 use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
-/// What was flushed survives a crash of the machine's programs; health is said as often.
-const PERIOD: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
@@ -35,13 +34,15 @@ pub struct Args {
     /// Replace a recording that is there already.
     #[arg(long)]
     overwrite: bool,
+    #[command(flatten)]
+    health: HealthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
     // The file comes last: what cannot record must not touch it.
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
@@ -50,7 +51,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let cameras: Vec<_> = network.cameras.keys().cloned().collect();
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let mut subscription = link.subscribe(&[Key::everything_of(link.site())])?;
-    let health = link.publisher(Channel::RecorderHealth, Delivery::Queued)?;
+    let mut health =
+        HealthReporter::new(&args.health, &link, Channel::RecorderHealth, Delivery::Queued)?;
     let (mut writer, path) = create(&args.output, args.overwrite)?;
     writer.sign(&Source {
         run: link.run().to_string(),
@@ -62,7 +64,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());
 
     service::ready(&format!("recording to {}", path.display()));
-    let recorded = work(&mut recorder, &mut subscription, &mut lookout, &health, &shutdown)
+    let recorded = work(&mut recorder, &mut subscription, &mut lookout, &mut health, &shutdown)
         .context("recording has stopped; the rest of the site goes on");
     drop((subscription, alive, health, lookout));
     let finished = recorded.and_then(|()| Ok(recorder.finish()?));
@@ -97,7 +99,7 @@ fn work(
     recorder: &mut Recorder,
     subscription: &mut Subscription,
     lookout: &mut Lookout,
-    publisher: &LinkPublisher,
+    reporter: &mut HealthReporter,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
     let mut said_at = Instant::now();
@@ -105,11 +107,18 @@ fn work(
         if let Some(received) = subscription.next(POLL) {
             recorder.take(received)?;
         }
-        if said_at.elapsed() >= PERIOD {
+        if said_at.elapsed() >= health::PERIOD {
             said_at = Instant::now();
             service::alive();
+            if shutdown.take_reload() {
+                tracing::warn!(
+                    "the recorder reads its configuration at its start alone: restart it"
+                );
+            }
             lookout.look(said_at);
-            say(&recorder.health(subscription.refused(), false)?, publisher)?;
+            let health = recorder.health(subscription.refused(), false, reporter)?;
+            reporter.say(&health)?;
+            // What was flushed survives a crash of the machine's programs.
             recorder.flush()?;
         }
     }
@@ -126,9 +135,6 @@ fn work(
         recorder.take(received)?;
     }
     subscription.give_up();
-    say(&recorder.health(subscription.refused(), true)?, publisher)
-}
-
-fn say(health: &Health, publisher: &LinkPublisher) -> anyhow::Result<()> {
-    Ok(publisher.put(health.encode())?)
+    let health = recorder.health(subscription.refused(), true, reporter)?;
+    reporter.say(&health)
 }

@@ -10,7 +10,8 @@ use crossfix_recording::{Entry, RecordingError, RecordingWriter};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
 use super::data_time::{DataTime, Said};
-use crate::network::{self, rivalry};
+use crate::health::HealthReporter;
+use crate::network::rivalry;
 use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 
@@ -156,7 +157,12 @@ impl Recorder {
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
-    pub fn health(&mut self, refused: Refused, ended: bool) -> Result<Health, RecordingError> {
+    pub fn health(
+        &mut self,
+        refused: Refused,
+        ended: bool,
+        reporter: &mut HealthReporter,
+    ) -> Result<Health, RecordingError> {
         let now = Instant::now();
         self.repeats.remind(now);
         let counted = [
@@ -186,11 +192,10 @@ impl Recorder {
                 .map(|(name, value)| Counter { name: name.to_owned(), value })
                 .collect(),
             problems,
-            run: self.run.0,
-            host: network::host(),
             ended,
             ..Default::default()
         };
+        let health = reporter.completed(health);
         let entry = Entry {
             key: Key::new(self.site.clone(), Channel::RecorderHealth),
             data_time: time,

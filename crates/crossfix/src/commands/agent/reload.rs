@@ -1,0 +1,98 @@
+//! A live camera's file, read again while its agent runs (SIGHUP, `systemctl reload`).
+
+use crossfix_message::{Payload, Timestamp};
+use crossfix_vision::ImageTracker;
+
+use super::Agent;
+use super::live::Watch;
+use crate::config::CameraFile;
+use crate::pace::wall_seconds;
+
+/// A file that was read again, and what of it has to wait for a start anew.
+struct Again {
+    file: CameraFile,
+    /// Names of keys.
+    waits: Vec<&'static str>,
+}
+
+impl Again {
+    /// What of a new file can hold at once, in the place of the old.
+    fn of(new: CameraFile, old: &CameraFile) -> anyhow::Result<Self> {
+        let mut waits = Vec::new();
+        // Sources hold passwords and are compared, not shown.
+        let is_other_source = toml::to_string(&new.source)? != toml::to_string(&old.source)?;
+        for (key, is_other) in [
+            ("name", new.name != old.name),
+            ("network", new.network != old.network),
+            ("source", is_other_source),
+            ("clock.source", new.clock.source != old.clock.source),
+        ] {
+            if is_other {
+                waits.push(key);
+            }
+        }
+        let mut file = new;
+        file.name.clone_from(&old.name);
+        file.network.clone_from(&old.network);
+        file.source.clone_from(&old.source);
+        file.clock.source = old.clock.source;
+        Ok(Self { file, waits })
+    }
+}
+
+impl Agent {
+    /// Reads the camera's file again: pose, lens, clock, preview and the tracker's parameters hold from
+    /// now on. A file with an error changes nothing.
+    pub(super) fn reload(&mut self, watch: &mut Watch) -> anyhow::Result<()> {
+        let name = self.identity.name.clone();
+        match self.read_again(watch) {
+            Ok(waits) if waits.is_empty() => {
+                tracing::info!("camera `{name}`: {} is read again", self.config.display());
+            }
+            Ok(waits) => tracing::warn!(
+                "camera `{name}`: {} is read again; what it says of {} holds once the agent is \
+                 started anew",
+                self.config.display(),
+                waits.join(", ")
+            ),
+            Err(error) => {
+                tracing::warn!("camera `{name}` goes on as it was: {error:#}");
+            }
+        }
+        // Before anything else is said of it.
+        self.calibrated_at = None;
+        self.keep_up()
+    }
+
+    /// Takes over what can be; returns the keys that cannot.
+    fn read_again(&mut self, watch: &mut Watch) -> anyhow::Result<Vec<&'static str>> {
+        let Again { file, waits } =
+            Again::of(CameraFile::load(&self.config, &self.sets)?, &watch.file)?;
+        let camera = file.camera(&self.config)?;
+        let size = self.identity.camera.model().intrinsics().size;
+        let new_size = camera.model().intrinsics().size;
+        anyhow::ensure!(
+            new_size == size,
+            "the lens is for {}x{} now and the camera sends {}x{}: start the agent anew",
+            new_size.width,
+            new_size.height,
+            size.width,
+            size.height
+        );
+        let calibrated = file.calibrated()?;
+        let now = Timestamp::from_seconds(wall_seconds());
+        let message = match &calibrated {
+            Some(calibrated) => calibrated.message(calibrated.common(now)),
+            None => file.calibration(&camera, now)?,
+        };
+        if file.tracker != watch.file.tracker {
+            watch.tracker = ImageTracker::new(file.tracker.clone())?;
+            tracing::info!("targets are found anew, by other parameters");
+        }
+        self.calibration = message.encode();
+        self.calibrated = calibrated;
+        self.identity.camera = camera;
+        watch.file = file;
+        Ok(waits)
+    }
+}

@@ -1,0 +1,77 @@
+//! How a component says, every second, how it does: to the site, to Prometheus, and to systemd.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use crossfix_message::{Channel, Health, Payload};
+use crossfix_transport::{Delivery, Link, LinkPublisher};
+
+use crate::host::HostWatch;
+use crate::metrics::MetricsPage;
+use crate::network;
+
+/// How often a component says how it does.
+pub const PERIOD: Duration = Duration::from_secs(1);
+
+/// Where a component's health can be seen beside the site's network.
+#[derive(Debug, clap::Args)]
+pub struct HealthArgs {
+    /// Serve metrics for Prometheus at http://ADDRESS/metrics, e.g. 127.0.0.1:9464.
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<SocketAddr>,
+}
+
+/// Says how a component does.
+#[derive(Debug)]
+pub struct HealthReporter {
+    publisher: LinkPublisher,
+    run: u64,
+    host: HostWatch,
+    page: Option<MetricsPage>,
+    /// When it reported last, and what had been handled then.
+    before: Option<(Instant, u64)>,
+}
+
+impl HealthReporter {
+    /// Of the component whose health goes out on a channel.
+    ///
+    /// # Errors
+    /// If the channel cannot be published on, or the metrics' address not be listened on.
+    pub fn new(
+        args: &HealthArgs,
+        link: &Link,
+        channel: Channel,
+        delivery: Delivery,
+    ) -> anyhow::Result<Self> {
+        Ok(Self {
+            publisher: link.publisher(channel, delivery)?,
+            run: link.run().0,
+            host: HostWatch::start(),
+            page: args.metrics.map(MetricsPage::serve).transpose()?,
+            before: None,
+        })
+    }
+
+    /// What a component says of itself, with what is known of its run, process and host.
+    pub fn completed(&mut self, health: Health) -> Health {
+        let now = Instant::now();
+        let rate_hz = self.before.map_or(0.0, |(at, handled)| {
+            let new = health.handled.saturating_sub(handled);
+            new as f64 / now.saturating_duration_since(at).as_secs_f64().max(f64::EPSILON)
+        });
+        self.before = Some((now, health.handled));
+        let (run, host) = (self.run, network::host());
+        Health { run, host, rate_hz, load: self.host.look(), ..health }
+    }
+
+    /// Says it.
+    ///
+    /// # Errors
+    /// If the session is closed.
+    pub fn say(&self, health: &Health) -> anyhow::Result<()> {
+        if let Some(page) = &self.page {
+            page.show(health);
+        }
+        Ok(self.publisher.put(health.encode())?)
+    }
+}

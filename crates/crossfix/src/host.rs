@@ -1,0 +1,97 @@
+//! How busy this process and its host are, and how good the host's clock is.
+
+use std::time::{Duration, Instant};
+
+use crossfix_message::HostLoad;
+use sysinfo::{Components, Pid, ProcessRefreshKind, ProcessesToUpdate, System};
+
+/// Looks at this process and its host once a second.
+#[derive(Debug, Default)]
+pub struct HostWatch {
+    /// None where the system does not tell.
+    system: Option<System>,
+    parts: Option<Components>,
+    /// When it looked last, and the processor time that the process had had by then.
+    before: Option<(Instant, Duration)>,
+}
+
+impl HostWatch {
+    /// Begins to look: what is in use is told from the second look on.
+    pub fn start() -> Self {
+        let parts = Components::new_with_refreshed_list();
+        Self { system: System::new().ok(), parts: parts.ok(), before: None }
+    }
+
+    /// How it is since the look before; `None` where the system does not tell.
+    pub fn look(&mut self) -> Option<HostLoad> {
+        let system = self.system.as_mut()?;
+        let own = Pid::from_u32(std::process::id());
+        system.refresh_cpu_usage();
+        system.refresh_memory();
+        let kind = ProcessRefreshKind::nothing().with_cpu().with_memory();
+        system.refresh_processes_specifics(ProcessesToUpdate::Some(&[own]), false, kind);
+        let process = system.process(own)?;
+        let (now, used) = (Instant::now(), Duration::from_millis(process.accumulated_cpu_time()));
+        let process_cores = self.before.map_or(0.0, |(at, before)| {
+            let passed_s = now.saturating_duration_since(at).as_secs_f64();
+            used.saturating_sub(before).as_secs_f64() / passed_s.max(f64::EPSILON)
+        });
+        self.before = Some((now, used));
+        Some(HostLoad {
+            process_cores,
+            process_memory: process.memory(),
+            cores_in_use: f64::from(system.global_cpu_usage()) / 100.0,
+            memory_available: system.available_memory(),
+            temperature_c: self.parts.as_mut().and_then(hottest),
+            clock_bound_s: kernel_clock_bound().map(|bound| bound.as_secs_f64()),
+        })
+    }
+}
+
+/// The temperature of the hottest part, degrees Celsius.
+fn hottest(parts: &mut Components) -> Option<f64> {
+    parts.refresh(false);
+    let read = parts.iter().filter_map(|part| part.temperature());
+    read.filter(|celsius| celsius.is_finite()).map(f64::from).max_by(f64::total_cmp)
+}
+
+/// How far off the host's clock may be, by what the program that keeps it has told the kernel; `None`
+/// where nothing keeps it. Such programs tell it every few seconds to minutes; in between the kernel
+/// adds half a millisecond a second, and says that nothing keeps it once that has come to 16 s.
+#[cfg(target_os = "linux")]
+#[expect(unsafe_code, reason = "no crate that is kept has this call without setting the clock")]
+pub fn kernel_clock_bound() -> Option<Duration> {
+    // SAFETY: the structure is numbers alone, for which zeros are valid; with `modes` nought the call
+    // writes into it and sets nothing.
+    let (state, answer) = unsafe {
+        let mut answer: libc::timex = std::mem::zeroed();
+        (libc::adjtimex(&raw mut answer), answer)
+    };
+    let is_kept = (0..libc::TIME_ERROR).contains(&state) && answer.status & libc::STA_UNSYNC == 0;
+    is_kept.then(|| Duration::from_micros(answer.maxerror.max(0).unsigned_abs()))
+}
+
+/// As on Linux, but that the kernel is not asked.
+#[cfg(not(target_os = "linux"))]
+pub fn kernel_clock_bound() -> Option<Duration> {
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_works_is_seen_to_work() {
+        let mut watch = HostWatch::start();
+        let first = watch.look().unwrap();
+        assert!(first.process_memory > 1 << 20 && first.memory_available > 1 << 20, "{first:?}");
+        let until = Instant::now() + Duration::from_millis(500);
+        while Instant::now() < until {}
+        let load = watch.look().unwrap();
+        assert!((0.3..4.0).contains(&load.process_cores), "{load:?}");
+        assert!((0.0..=1.0).contains(&load.cores_in_use), "{load:?}");
+        // Nobody's clock is off by the age of the universe, however it is kept.
+        assert!(load.clock_bound_s.is_none_or(|bound| (0.0..100.0).contains(&bound)), "{load:?}");
+    }
+}
