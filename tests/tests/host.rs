@@ -205,6 +205,63 @@ fn a_file_that_is_read_again_holds_from_then_on_but_for_what_cannot() {
     }
 }
 
+/// Runs commands of a shell in a network of their own; `None` and a clear word where that, or a program that
+/// they need, is not to be had.
+fn alone(needed: &str, commands: &str) -> Option<String> {
+    let may = Command::new("unshare").args(["-n", needed, "--version"]).output();
+    if !may.is_ok_and(|may| may.status.success()) {
+        eprintln!("SKIPPED: needs root and {needed}");
+        return None;
+    }
+    let commands = format!("set -eu\nip link set lo up\n{commands}");
+    let output = Command::new("unshare").args(["-n", "sh", "-c", &commands]).output().unwrap();
+    Some(String::from_utf8(output.stdout).unwrap())
+}
+
+#[test]
+fn the_doctor_asks_chrony_how_good_the_hosts_clock_is() {
+    let site = Site::new(1.0);
+    // chronyc as the doctor finds it asks the chronyd of the test.
+    site.write("chronyc", "#!/bin/sh\nexec /usr/bin/chronyc -h \"$ASKED\" \"$@\"\n");
+    let commands = format!(
+        r#"
+chmod +x {folder}/chronyc
+dir=$(mktemp -d)
+chown _chrony:_chrony "$dir"
+chmod 770 "$dir"
+own() {{ printf 'cmdport 0\nbindcmdaddress %s/%s.sock\npidfile %s/%s.pid\n' "$dir" "$1" "$dir" "$1"; }}
+{{ own server; printf 'local stratum 3\nallow 127.0.0.0/8\nport 11123\n'; }} > "$dir/server.conf"
+{{ own kept; printf 'server 127.0.0.1 port 11123 minpoll 0 maxpoll 1 iburst trust\nport 0\n'; }} > "$dir/kept.conf"
+{{ own lost; printf 'server 127.0.0.1 port 9 iburst\nport 0\n'; }} > "$dir/lost.conf"
+for one in server kept lost; do chronyd -x -d -f "$dir/$one.conf" >/dev/null 2>&1 & done
+for _ in $(seq 100); do
+  /usr/bin/chronyc -h "$dir/kept.sock" -c tracking 2>/dev/null |
+    awk -F, '{{ exit !($2 == "127.0.0.1" && $12 < 0.001) }}' && break
+  sleep 0.2
+done
+for one in kept lost; do
+  ASKED="$dir/$one.sock" PATH="{folder}:$PATH" {program} doctor -c {camera} --json 2>/dev/null || true
+done
+kill $(cat "$dir"/*.pid)
+rm -r "$dir""#,
+        folder = site.path(""),
+        program = program().display(),
+        camera = site.path("north.toml"),
+    );
+    let Some(said) = alone("chronyd", &commands) else { return };
+    let said = serde_json::Deserializer::from_str(&said).into_iter::<serde_json::Value>();
+    let clocks: Vec<[String; 2]> = said
+        .map(|findings| {
+            let findings = findings.unwrap();
+            let clock = findings.as_array().unwrap().iter().find(|f| f["what"] == "host clock");
+            ["verdict", "found"].map(|key| clock.unwrap()[key].as_str().unwrap().to_owned())
+        })
+        .collect();
+    let [kept, lost] = &clocks[..] else { panic!("{clocks:?}") };
+    assert!(kept[0] == "pass" && kept[1].starts_with("by 127.0.0.1, within"), "{kept:?}");
+    assert_eq!(lost[..], ["fail", "chrony runs, and has no time server"]);
+}
+
 /// A shared object that lets a test set the clock of one program; `None` and a clear word where it is
 /// not installed.
 fn clock_setter() -> Option<String> {

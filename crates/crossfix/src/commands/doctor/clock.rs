@@ -1,8 +1,9 @@
-//! How good this host's clock is, as chrony tells it.
+//! How good this host's clock is, as chrony, ptp4l or the kernel tells it.
 
 use std::process::Command;
 
 use super::{Finding, Verdict};
+use crate::host::kernel_clock_bound;
 use crate::pace::wall_seconds;
 
 /// A clock that may be off by so much costs a target at 20 m/s a tenth of a metre, s.
@@ -45,12 +46,9 @@ impl Tracking {
             return (Verdict::Fail, "chrony runs, and has no time server".to_owned());
         }
         let age_s = now_s - self.compared_s;
-        let verdict = if self.bound_s > BEARABLE_S {
-            Verdict::Fail
-        } else if self.bound_s > GOOD_S || age_s > OLD_S {
-            Verdict::Warn
-        } else {
-            Verdict::Pass
+        let verdict = match of_bound(self.bound_s) {
+            Verdict::Pass if age_s > OLD_S => Verdict::Warn,
+            verdict => verdict,
         };
         let found = format!(
             "by {}, within {:.1} ms, compared {age_s:.0} s ago",
@@ -61,14 +59,65 @@ impl Tracking {
     }
 }
 
-/// How good this host's clock is.
+/// What `pmc` says of the clock that ptp4l keeps (IEEE 1588's TIME_STATUS_NP).
+#[derive(Clone, Debug, PartialEq)]
+struct Ptp {
+    grandmaster: String,
+    offset_s: f64,
+}
+
+impl Ptp {
+    /// Reads pmc's answer; `None` if it has none, or no grandmaster is there.
+    fn parse(text: &str) -> Option<Self> {
+        let value = |name: &str| {
+            let mut lines =
+                text.lines().filter_map(|line| line.trim().split_once(char::is_whitespace));
+            lines.find(|(key, _)| *key == name).map(|(_, value)| value.trim())
+        };
+        let offset_ns: f64 = value("master_offset")?.parse().ok()?;
+        (value("gmPresent")? == "true" && offset_ns.is_finite()).then_some(Self {
+            grandmaster: value("gmIdentity")?.to_owned(),
+            offset_s: offset_ns * 1e-9,
+        })
+    }
+
+    fn judge(&self) -> (Verdict, String) {
+        let off_s = self.offset_s.abs();
+        let found = format!("by PTP's grandmaster {}, {:.1} us off", self.grandmaster, off_s * 1e6);
+        (of_bound(off_s), found)
+    }
+}
+
+/// A clock that may be off by so much.
+fn of_bound(bound_s: f64) -> Verdict {
+    if bound_s > BEARABLE_S {
+        Verdict::Fail
+    } else if bound_s > GOOD_S {
+        Verdict::Warn
+    } else {
+        Verdict::Pass
+    }
+}
+
+/// What a program says, where it is there and says it in time.
+fn said(program: &str, arguments: &[&str]) -> Option<String> {
+    let output = Command::new(program).args(arguments).output().ok()?;
+    Some(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// How good this host's clock is: by the program that keeps it, or by what that has told the kernel.
 pub fn host_clock() -> Finding {
-    let said = Command::new("chronyc").args(["-c", "tracking"]).output();
-    let line = said.map(|output| String::from_utf8_lossy(&output.stdout).into_owned());
-    let (verdict, found) = match line.as_deref().map(Tracking::parse) {
-        Ok(Some(tracking)) => tracking.judge(wall_seconds()),
-        Ok(None) => (Verdict::Warn, "chrony is there and does not answer".to_owned()),
-        Err(_) => (Verdict::Warn, "nobody here can say how good it is".to_owned()),
+    let chrony = || Tracking::parse(&said("chronyc", &["-c", "tracking"])?);
+    let ptp = || Ptp::parse(&said("pmc", &["-u", "-b", "0", "GET TIME_STATUS_NP"])?);
+    let (verdict, found) = if let Some(tracking) = chrony() {
+        tracking.judge(wall_seconds())
+    } else if let Some(ptp) = ptp() {
+        ptp.judge()
+    } else if let Some(bound) = kernel_clock_bound() {
+        let bound_s = bound.as_secs_f64();
+        (of_bound(bound_s), format!("within {:.1} ms, as the kernel was told", bound_s * 1e3))
+    } else {
+        (Verdict::Warn, "nothing here keeps it".to_owned())
     };
     Finding::new("host clock", verdict, found)
         .mend("run chrony, with the time server that the cameras have: apt-get install chrony")
@@ -94,6 +143,25 @@ mod tests {
         // Its server is dead, and nothing but the dispersion says so.
         assert_eq!(judged("0.0001", "0.002", "0.9", "Normal"), Verdict::Fail);
         assert_eq!(judged("0.0", "0.0", "0.0", "Not synchronised"), Verdict::Fail);
+    }
+
+    #[test]
+    fn a_clock_by_ptp_is_judged_by_its_offset_and_without_a_grandmaster_not_at_all() {
+        let said = |offset: &str, present: &str| {
+            format!(
+                "sending: GET TIME_STATUS_NP\n\t5254.0-1 seq 0 RESPONSE MANAGEMENT TIME_STATUS_NP\n\t\t\
+                 master_offset              {offset}\n\t\tgmPresent                  {present}\n\t\t\
+                 gmIdentity                 525400.fffe.123456\n"
+            )
+        };
+        let judged = |offset: &str| Ptp::parse(&said(offset, "true")).unwrap().judge();
+        let (verdict, found) = judged("-500");
+        assert_eq!(verdict, Verdict::Pass);
+        assert_eq!(found, "by PTP's grandmaster 525400.fffe.123456, 0.5 us off");
+        assert_eq!(judged("20000000").0, Verdict::Warn);
+        assert_eq!(judged("-37000000000").0, Verdict::Fail);
+        assert_eq!(Ptp::parse(&said("0", "false")), None);
+        assert_eq!(Ptp::parse("sending: GET TIME_STATUS_NP\n"), None);
     }
 
     #[test]
