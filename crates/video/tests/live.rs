@@ -247,13 +247,32 @@ fn a_camera_that_falls_silent_or_hangs_up_is_opened_anew() {
 }
 
 #[test]
-fn a_camera_that_sends_a_frame_in_three_seconds_is_watched_all_the_same() {
-    let camera = Camera::start(None, 1.0 / 3.0, |_, _, _| true);
+fn a_camera_that_sends_a_frame_in_ten_seconds_is_watched_all_the_same() {
+    let camera = Camera::start(None, 0.1, |_, _, _| true);
     let live = camera.watched();
-    let (frames, troubles) = within(&live, 26.0);
-    assert!(frames.len() >= 4, "{}: {troubles:?}", frames.len());
+    // How slow it is, is found out in the first twenty.
+    let (frames, troubles) = within(&live, 55.0);
+    assert!(frames.len() >= 3, "{}: {troubles:?}", frames.len());
     let late = frames.last().unwrap().live.unwrap().at;
-    assert!(late.elapsed() < Duration::from_secs(4));
+    assert!(late.elapsed() < Duration::from_secs(11));
+}
+
+#[test]
+fn a_camera_of_eight_million_pixels_is_seen_whole_and_in_time() {
+    const SIZE: [usize; 2] = [3840, 2160];
+    let mut encoder = H264Encoder::new(2.0).unwrap();
+    let camera = Camera::start(None, 2.0, move |mount, number, _| {
+        let unit = encoder.encode(&picture(number, SIZE[0], SIZE[1]), SIZE[0], SIZE[1]).unwrap();
+        mount.send(&unit, ticks(number, 2.0));
+        false
+    });
+    let (frames, troubles) = within(&camera.watched(), 8.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.len() >= 8, "{}", frames.len());
+    for pair in frames.windows(2) {
+        assert_eq!([pair[1].width, pair[1].height], SIZE);
+        assert_eq!(shown(&pair[1]), shown(&pair[0]) + 1);
+    }
 }
 
 #[test]
