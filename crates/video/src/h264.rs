@@ -11,8 +11,8 @@ use openh264::encoder::{
 };
 use openh264::formats::{YUVSlices, YUVSource};
 
-use crate::MAX_PIXELS;
 use crate::rtsp::units;
+use crate::{MAX_PIXELS, Pixels};
 
 /// No decoder holds back more pictures than this: H.264 allows 16.
 const MOST_PENDING: usize = 32;
@@ -25,6 +25,13 @@ pub(crate) struct Picture {
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) brightness: Vec<u8>,
+}
+
+impl Picture {
+    /// Its time, size and pixels.
+    pub(crate) fn into_parts(self) -> (i64, usize, usize, Pixels) {
+        (self.shown_at, self.width, self.height, Pixels::Gray8(self.brightness))
+    }
 }
 
 /// Decodes H.264 to brightness, every picture with its own time.

@@ -44,6 +44,7 @@
 mod avi;
 mod error;
 mod frame;
+mod gstreamer;
 mod h264;
 mod live;
 mod live_camera;
@@ -59,6 +60,7 @@ use std::path::Path;
 pub use avi::AviSource;
 pub use error::VideoError;
 pub use frame::{Arrival, CaptureTime, Frame, Pixels, TimedBy};
+pub use gstreamer::{GstreamerCamera, GstreamerOptions};
 pub use h264::{H264Encoder, decoding_time};
 pub use live::{Live, LiveCounts, Sight};
 pub use live_camera::LiveCamera;

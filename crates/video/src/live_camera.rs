@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use crate::{FrameSource, RtspCamera, UsbCamera, VideoError};
+use crate::{FrameSource, GstreamerCamera, RtspCamera, UsbCamera, VideoError};
 
 /// A camera that is watched live, and opened again whenever it breaks off.
 #[derive(Clone, Debug)]
@@ -9,6 +9,8 @@ pub enum LiveCamera {
     Stream(RtspCamera),
     /// On a bus of this host.
     Usb(UsbCamera),
+    /// What GStreamer can show.
+    Gstreamer(GstreamerCamera),
 }
 
 impl LiveCamera {
@@ -17,6 +19,7 @@ impl LiveCamera {
         match self {
             Self::Stream(camera) => camera.address(),
             Self::Usb(camera) => camera.address(),
+            Self::Gstreamer(camera) => camera.address(),
         }
     }
 
@@ -28,6 +31,7 @@ impl LiveCamera {
         Ok(match self {
             Self::Stream(camera) => Box::new(camera.open(silence)?),
             Self::Usb(camera) => camera.open(silence)?,
+            Self::Gstreamer(camera) => camera.open(silence)?,
         })
     }
 }

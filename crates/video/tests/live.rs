@@ -359,3 +359,48 @@ fn what_is_no_request_or_no_answer_ends_nothing_but_the_connection() {
     let said = refused(RtspOptions { address, ..camera.options("north") });
     assert!(said.contains("does not answer within 5 s"), "{said}");
 }
+
+/// Needs avdec_h264 (gstreamer1.0-libav).
+#[cfg(feature = "gstreamer")]
+#[test]
+fn a_pipeline_is_watched_as_a_stream_is() {
+    use crossfix_video::{GstreamerCamera, GstreamerOptions};
+
+    let camera = Camera::with_clock(0.0);
+    let address = camera.server.address();
+    let decoded = "rtph264depay ! h264parse ! avdec_h264 max-threads=1";
+    let watched = |source: &str| {
+        let camera = GstreamerCamera::new(GstreamerOptions {
+            pipeline: format!("{source} ! {decoded}"),
+            login: None,
+            heeds_reports: true,
+            latency: Latency::default(),
+        });
+        Live::start(move |silence| camera.open(silence))
+    };
+    let source = "rtspsrc latency=0 protocols=tcp add-reference-timestamp-meta=true";
+    let (frames, troubles) =
+        within(&watched(&format!("{source} location=rtsp://{address}/north")), 6.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.len() > 120, "{}", frames.len());
+    let numbers: Vec<u64> = frames.iter().map(shown).collect();
+    assert!(numbers.windows(2).all(|n| n[1] == n[0] + 1), "{numbers:?}");
+    let by_camera: Vec<&Frame> =
+        frames.iter().filter(|f| f.live.unwrap().timed_by == TimedBy::Camera).collect();
+    assert!(by_camera.len() > 80, "{}", by_camera.len());
+    for frame in by_camera {
+        let error_s = frame.capture.time.seconds_since(camera.captured(shown(frame)));
+        assert!(error_s.abs() < 2e-3, "{error_s}");
+    }
+    for (source, says) in [
+        (format!("{source} location=rtsp://{address}/nowhere"), "Not"),
+        ("nothing_like_it".to_owned(), "nothing_like_it"),
+    ] {
+        match watched(&source).next(Duration::from_secs(10)) {
+            Sight::Trouble(trouble) => {
+                assert!(trouble.to_string().contains(says), "{trouble}");
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}

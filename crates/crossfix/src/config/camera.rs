@@ -6,7 +6,9 @@ use crossfix_geometry::{Camera, ImageSize, Intrinsics, Pixel, PixelCovariance, P
 use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Timestamp, decode};
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
-use crossfix_video::{FrameClock, Latency, LiveCamera, RtspCamera, UsbCamera, UsbOptions};
+use crossfix_video::{
+    FrameClock, GstreamerCamera, Latency, LiveCamera, RtspCamera, UsbCamera, UsbOptions,
+};
 use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
@@ -153,6 +155,10 @@ impl CameraFile {
             }
             SourceConfig::Simulation { scene, .. } => *scene = folder.join(&*scene),
             SourceConfig::Usb { .. } => {}
+            SourceConfig::Gstreamer(pipeline) => {
+                pipeline.password_file =
+                    pipeline.password_file.take().map(|file| folder.join(file));
+            }
             SourceConfig::Stream(stream) => {
                 stream.password_file = stream.password_file.take().map(|file| folder.join(file));
             }
@@ -346,7 +352,9 @@ impl CameraFile {
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }
             SourceConfig::Usb { rate_hz, .. } => Ok(*rate_hz),
-            SourceConfig::Recording { .. } | SourceConfig::Stream(_) => Ok(None),
+            SourceConfig::Recording { .. }
+            | SourceConfig::Stream(_)
+            | SourceConfig::Gstreamer(_) => Ok(None),
         }
     }
 
@@ -363,7 +371,9 @@ impl CameraFile {
     /// What sets the clock of such a source, and its standard deviation, s, where nobody has said.
     fn usual_clock(&self) -> (ClockSourceName, f64) {
         match self.source {
-            SourceConfig::Stream(_) => (ClockSourceName::Camera, Latency::default().sd_s),
+            SourceConfig::Stream(_) | SourceConfig::Gstreamer(_) => {
+                (ClockSourceName::Camera, Latency::default().sd_s)
+            }
             SourceConfig::Usb { .. } => (ClockSourceName::Host, USB_CLOCK_SD_S),
             _ => (ClockSourceName::FrameCount, 1e-3),
         }
@@ -372,11 +382,15 @@ impl CameraFile {
     /// The camera that it watches live, if it watches one. One of this host is set to the size, or left as it
     /// is set.
     pub fn live(&self, size: Option<ImageSize>) -> anyhow::Result<Option<LiveCamera>> {
+        let by_arrival = self.clock_source() == ClockSource::Arrival;
+        let by_arrival_sd_s = by_arrival.then(|| self.clock_sd_s());
         Ok(match &self.source {
             SourceConfig::Stream(stream) => {
-                let by_arrival = self.clock_source() == ClockSource::Arrival;
-                let options = stream.options(by_arrival.then(|| self.clock_sd_s()))?;
-                Some(LiveCamera::Stream(RtspCamera::new(options)))
+                Some(LiveCamera::Stream(RtspCamera::new(stream.options(by_arrival_sd_s)?)))
+            }
+            SourceConfig::Gstreamer(pipeline) => {
+                let options = pipeline.options(by_arrival_sd_s)?;
+                Some(LiveCamera::Gstreamer(GstreamerCamera::new(options)))
             }
             SourceConfig::Usb { device, rate_hz, latency_s } => {
                 Some(LiveCamera::Usb(UsbCamera::new(UsbOptions {

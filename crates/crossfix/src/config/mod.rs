@@ -14,4 +14,4 @@ pub use file::{Kind, load, parse};
 pub use fusion::FusionFile;
 pub use site::{Site, load_cameras, load_network};
 pub use source::SourceConfig;
-pub use stream::StreamConfig;
+pub use stream::{GstreamerConfig, StreamConfig};

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::ensure;
 use serde::{Deserialize, Serialize};
 
-use super::StreamConfig;
+use super::{GstreamerConfig, StreamConfig};
 
 /// The last second of this century: what begins later begins in error.
 const LAST_START_S: f64 = 4_102_444_800.0;
@@ -48,6 +48,8 @@ pub enum SourceConfig {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         latency_s: Option<f64>,
     },
+    /// What GStreamer can show, in builds with the feature `gstreamer`.
+    Gstreamer(GstreamerConfig),
     /// The recorded bearings of this camera.
     Recording {
         /// The recording (MCAP).
@@ -73,6 +75,7 @@ impl SourceConfig {
             Self::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
             Self::Recording { speed, .. } => (thirty(), 0.0, speed),
             Self::Stream(ref stream) => return stream.check(),
+            Self::Gstreamer(ref pipeline) => return pipeline.check(),
             Self::Usb { rate_hz, latency_s, .. } => {
                 ensure!(
                     rate_hz.is_none_or(|rate_hz| (0.1..=1000.0).contains(&rate_hz)),
@@ -108,6 +111,7 @@ impl SourceConfig {
             Self::Simulation { scene, .. } => ("source.scene", scene),
             Self::Usb { device, .. } => ("source.device", device),
             Self::Stream(stream) => return stream.options(None).map(drop),
+            Self::Gstreamer(pipeline) => return pipeline.options(None).map(drop),
         };
         ensure!(file.exists(), "key `{key}`: {} is not there", file.display());
         Ok(())
@@ -117,12 +121,14 @@ impl SourceConfig {
     pub fn is_unpaced(&self) -> bool {
         match *self {
             Self::Video { speed, .. } | Self::Recording { speed, .. } => speed == 0.0,
-            Self::Simulation { .. } | Self::Stream(_) | Self::Usb { .. } => false,
+            Self::Simulation { .. } | Self::Stream(_) | Self::Usb { .. } | Self::Gstreamer(_) => {
+                false
+            }
         }
     }
 
     /// Whether it is a camera that is watched live.
     pub fn is_live(&self) -> bool {
-        matches!(self, Self::Stream(_) | Self::Usb { .. })
+        matches!(self, Self::Stream(_) | Self::Usb { .. } | Self::Gstreamer(_))
     }
 }

@@ -1,7 +1,7 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail, ensure};
-use crossfix_video::{Latency, Login, RtspOptions, RtspTransport, StreamAddress};
+use crossfix_video::{GstreamerOptions, Latency, Login, RtspOptions, RtspTransport, StreamAddress};
 use serde::{Deserialize, Serialize, Serializer};
 
 /// A network camera's live stream.
@@ -107,20 +107,78 @@ impl StreamConfig {
     }
 
     fn login(&self, in_url: Option<&Login>) -> anyhow::Result<Option<Login>> {
-        match (in_url, &self.user, &self.password_file) {
-            (login, None, None) => Ok(login.cloned()),
-            (None, Some(user), Some(file)) => {
-                let text = std::fs::read_to_string(file)
-                    .with_context(|| format!("key `source.password_file`: {}", file.display()))?;
-                Ok(Some(Login::new(user, text.lines().next().unwrap_or_default())))
-            }
-            (Some(_), ..) => {
-                bail!(
-                    "the user is in `source.url`: leave out `source.user` and `source.password_file`"
-                )
-            }
-            (None, ..) => bail!("give both `source.user` and `source.password_file`"),
+        let by_file = login(self.user.as_deref(), self.password_file.as_deref())?;
+        ensure!(
+            in_url.is_none() || by_file.is_none(),
+            "the user is in `source.url`: leave out `source.user` and `source.password_file`"
+        );
+        Ok(in_url.cloned().or(by_file))
+    }
+}
+
+/// Who asks, with the password in the first line of a file.
+fn login(user: Option<&str>, password_file: Option<&Path>) -> anyhow::Result<Option<Login>> {
+    match (user, password_file) {
+        (None, None) => Ok(None),
+        (Some(user), Some(file)) => {
+            let text = std::fs::read_to_string(file)
+                .with_context(|| format!("key `source.password_file`: {}", file.display()))?;
+            Ok(Some(Login::new(user, text.lines().next().unwrap_or_default())))
         }
+        _ => bail!("give both `source.user` and `source.password_file`"),
+    }
+}
+
+/// A pipeline of GStreamer's.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GstreamerConfig {
+    /// Elements with `!` between them, as `gst-launch-1.0` takes them, up to the decoded video, without a
+    /// sink. It is shown in logs: who asks stands in `user` and `password_file`.
+    pub pipeline: String,
+    /// Who asks: `user-id` of the element with `name=camera`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub user: Option<String>,
+    /// The file whose first line is the password, `user-pw` of that element.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub password_file: Option<PathBuf>,
+    /// As a stream's.
+    #[serde(default = "usual_latency_s")]
+    pub latency_s: f64,
+}
+
+impl GstreamerConfig {
+    pub(super) fn check(&self) -> anyhow::Result<()> {
+        ensure!(!self.pipeline.trim().is_empty(), "key `source.pipeline` is empty");
+        let names_somebody = |word: &str| {
+            let host =
+                word.split_once("://").map(|(_, rest)| rest.split('/').next().unwrap_or(rest));
+            word.starts_with("user-pw") || host.is_some_and(|host| host.contains('@'))
+        };
+        ensure!(
+            !self.pipeline.split_whitespace().any(names_somebody),
+            "key `source.pipeline` holds a password, and is shown in logs: give `source.user` and \
+             `source.password_file`, and name=camera to the element that asks"
+        );
+        ensure!(
+            (0.0..=10.0).contains(&self.latency_s),
+            "key `source.latency_s` is {}: it must be from 0 to 10 s",
+            self.latency_s
+        );
+        Ok(())
+    }
+
+    /// How to watch it; as [`StreamConfig::options`].
+    pub(super) fn options(&self, by_arrival_sd_s: Option<f64>) -> anyhow::Result<GstreamerOptions> {
+        Ok(GstreamerOptions {
+            pipeline: self.pipeline.clone(),
+            login: login(self.user.as_deref(), self.password_file.as_deref())?,
+            heeds_reports: by_arrival_sd_s.is_none(),
+            latency: Latency {
+                mean_s: self.latency_s,
+                sd_s: by_arrival_sd_s.unwrap_or(Latency::default().sd_s),
+            },
+        })
     }
 }
 
@@ -151,6 +209,19 @@ mod tests {
                 "{shown}"
             );
         }
+    }
+
+    #[test]
+    fn a_pipeline_with_a_password_is_refused_as_it_is_shown() {
+        for word in ["user-pw=hunter2", "location=rtsp://eye:hunter2@10.0.0.5/live"] {
+            let text = format!("pipeline = \"rtspsrc {word} ! decodebin\"");
+            let pipeline: GstreamerConfig = crate::config::parse(&text, &[]).unwrap();
+            let error = format!("{:#}", pipeline.check().unwrap_err());
+            assert!(error.contains("password_file") && !error.contains("hunter2"), "{error}");
+        }
+        let text = "pipeline = \"rtspsrc location=rtsp://10.0.0.5/live@home ! decodebin\"";
+        let pipeline: GstreamerConfig = crate::config::parse(text, &[]).unwrap();
+        assert!(pipeline.check().is_ok());
     }
 
     #[test]

@@ -22,12 +22,17 @@ use tokio::runtime::Runtime;
 pub use self::address::{Login, StreamAddress};
 pub(crate) use self::packets::units;
 pub use self::server::{Mount, RtspServer};
+pub(crate) use self::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock};
 
-use self::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock};
+#[cfg(feature = "gstreamer")]
+use crate::gstreamer::H265Decoder;
 use crate::h264::{H264Decoder, Picture};
 use crate::live::SILENCE;
 use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
+/// What can be decoded, as sessions' descriptions name it.
+const DECODED: &[&str] =
+    if cfg!(feature = "gstreamer") { &["h264", "h265", "jpeg"] } else { &["h264", "jpeg"] };
 /// How long a camera may take to answer before it is given up.
 const ANSWER: Duration = Duration::from_secs(5);
 /// How long it may take to take leave of it.
@@ -153,6 +158,8 @@ pub struct RtspSource {
 
 enum Codec {
     H264(Box<H264Decoder>),
+    #[cfg(feature = "gstreamer")]
+    H265(H265Decoder),
     MotionJpeg,
 }
 
@@ -283,11 +290,13 @@ impl RtspSource {
         self.arrivals.insert(ticks, at);
         let decoded = match &mut self.codec {
             _ if self.torn => Err("packets were lost on the way".to_owned()),
-            Codec::H264(decoder) => decoder.decode(unit.data(), ticks).map(|picture| {
-                picture.map(|Picture { shown_at, width, height, brightness }| {
-                    (shown_at, width, height, Pixels::Gray8(brightness))
-                })
-            }),
+            Codec::H264(decoder) => {
+                decoder.decode(unit.data(), ticks).map(|picture| picture.map(Picture::into_parts))
+            }
+            #[cfg(feature = "gstreamer")]
+            Codec::H265(decoder) => {
+                decoder.decode(unit.data(), ticks).map(|picture| picture.map(Picture::into_parts))
+            }
             Codec::MotionJpeg => decode_still(unit.data())
                 .map(|(width, height, pixels)| Some((ticks, width, height, pixels))),
         };
@@ -318,7 +327,7 @@ impl RtspSource {
 
 /// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count; `None` where a camera says
 /// that it knows none. The count begins again in 2036 (RFC 4330, 3).
-fn unix_time(ntp: u64) -> Option<Timestamp> {
+pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
     let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
     let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
     let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
@@ -368,12 +377,14 @@ async fn connect(
         .map(|stream| format!("{} {}", stream.media(), stream.encoding_name()))
         .collect();
     let refusal = |error: retina::Error| refusal(options, &error);
-    let found = session.streams().iter().position(|stream| {
-        stream.media() == "video" && matches!(stream.encoding_name(), "h264" | "jpeg")
-    });
+    let found = session
+        .streams()
+        .iter()
+        .position(|stream| stream.media() == "video" && DECODED.contains(&stream.encoding_name()));
     let stream_id = found.ok_or_else(|| {
         options.wrong(format!(
-            "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264",
+            "it offers no H.264 or Motion JPEG (it offers {}): set the camera to H.264, or build \
+             with --features gstreamer for H.265",
             offered.join(", ")
         ))
     })?;
@@ -381,6 +392,8 @@ async fn connect(
         "h264" => {
             Codec::H264(Box::new(H264Decoder::of_stream().map_err(|what| options.wrong(what))?))
         }
+        #[cfg(feature = "gstreamer")]
+        "h265" => Codec::H265(H265Decoder::new().map_err(|what| options.wrong(what))?),
         _ => Codec::MotionJpeg,
     };
     let transport = match options.transport {

@@ -15,7 +15,7 @@ const REPORTS_S: f64 = 60.0;
 const MOST_REPORTS: usize = 64;
 /// A clock that is this far from what it showed before was set, s: more than a busy camera is late in
 /// reporting, and than a quartz loses between two reports.
-pub(super) const SET_S: f64 = 0.25;
+pub(crate) const SET_S: f64 = 0.25;
 /// A camera's clock that is farther from the host's is not on UTC, or the host's is not, s. A network
 /// that stalls holds frames for as long; half of it would refuse cameras on bad networks.
 const FARTHEST_S: f64 = 2.0;

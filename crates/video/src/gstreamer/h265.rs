@@ -1,0 +1,197 @@
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use gstreamer::prelude::*;
+use gstreamer::{Buffer, ClockTime, Pipeline, State};
+use gstreamer_app::{AppSink, AppSrc};
+
+use super::pipeline::{brightness, built, trouble};
+use crate::h264::Picture;
+
+/// Access units in, pictures out. One thread, as each more holds back a picture.
+const DECODER: &str = "appsrc name=units format=time is-live=true \
+                       caps=video/x-h265,stream-format=byte-stream,alignment=au ! h265parse ! \
+                       avdec_h265 max-threads=1 max-errors=-1";
+/// How long a picture may take to come out before it is one that is held back: several times what 4K
+/// takes.
+const DECODED_WITHIN: Duration = Duration::from_millis(100);
+/// Units whose pictures may be held back: H.265 allows 16.
+const MOST_PENDING: usize = 32;
+/// The time by which the decoder knows the first unit: others may be shown before it.
+const FIRST: ClockTime = ClockTime::from_seconds(3600);
+/// What a unit of the source's time is to the decoder, which only has to see the order.
+const TICK_NS: i64 = 1000;
+
+/// Decodes H.265 to brightness, every picture with its own time: GStreamer carries it through.
+pub(crate) struct H265Decoder {
+    pipeline: Pipeline,
+    units: AppSrc,
+    pictures: AppSink,
+    /// The time of the first unit.
+    first: Option<i64>,
+    /// The times, in the units of their source, of the units whose pictures have not come out yet, by those
+    /// by which the decoder knows them.
+    pending: BTreeMap<ClockTime, i64>,
+    /// Of those, so many are held back until it is sure that none is to be shown before them.
+    held_back: usize,
+}
+
+impl H265Decoder {
+    pub(crate) fn new() -> Result<Self, String> {
+        let (pipeline, pictures) = built(DECODER)?;
+        let units = pipeline.by_name("units").and_then(|units| units.downcast::<AppSrc>().ok());
+        let units = units.ok_or("GStreamer has no appsrc")?;
+        pipeline.set_state(State::Playing).map_err(|error| error.to_string())?;
+        Ok(Self { pipeline, units, pictures, first: None, pending: BTreeMap::new(), held_back: 0 })
+    }
+
+    /// Decodes an access unit in Annex B; `None` if its picture comes out later.
+    pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Option<Picture>, String> {
+        let since_first = shown_at.wrapping_sub(*self.first.get_or_insert(shown_at));
+        let known = FIRST.nseconds().saturating_add_signed(since_first.saturating_mul(TICK_NS));
+        let known = ClockTime::from_nseconds(known);
+        let mut buffer = Buffer::from_slice(unit.to_vec());
+        if let Some(buffer) = buffer.get_mut() {
+            buffer.set_pts(known);
+        }
+        self.pending.insert(known, shown_at);
+        while self.pending.len() > MOST_PENDING {
+            // A unit without a picture: nothing will come out of it.
+            self.pending.pop_first();
+        }
+        self.units.push_buffer(buffer).map_err(|error| error.to_string())?;
+        let picture = self.come_out()?;
+        if let Some(what) = trouble(&self.pipeline) {
+            return Err(what);
+        }
+        Ok(picture)
+    }
+
+    /// The next picture. Waits for it where more units wait than are held back; what does not come then is
+    /// held back.
+    fn come_out(&mut self) -> Result<Option<Picture>, String> {
+        let is_due = self.pending.len() > self.held_back;
+        let begun = Instant::now();
+        let patience = if is_due { DECODED_WITHIN } else { Duration::ZERO };
+        let patience = ClockTime::try_from(patience).unwrap_or(ClockTime::ZERO);
+        while let Some(sample) = self.pictures.try_pull_sample(patience) {
+            let known = sample.buffer().and_then(|buffer| buffer.pts());
+            let Some(shown_at) = known.and_then(|known| self.pending.remove(&known)) else {
+                continue;
+            };
+            self.held_back = self.held_back.min(self.pending.len());
+            let (width, height, brightness) = brightness(&sample)?;
+            return Ok(Some(Picture { shown_at, width, height, brightness }));
+        }
+        if is_due && begun.elapsed() >= DECODED_WITHIN {
+            self.held_back = self.pending.len();
+        }
+        Ok(None)
+    }
+}
+
+impl Drop for H265Decoder {
+    fn drop(&mut self) {
+        // One that does not stop is left: there is nobody to tell.
+        let _ = self.pipeline.set_state(State::Null);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PICTURES: u64 = 60;
+
+    /// A ball that flies about, with what stands between the pattern and the brightness.
+    fn ball(encoded_by: &str) -> (Pipeline, AppSink) {
+        let description = format!(
+            "videotestsrc pattern=ball num-buffers={PICTURES} ! \
+             video/x-raw,format=I420,width=322,height=242,framerate=30/1 {encoded_by}"
+        );
+        let (pipeline, sink) = built(&description).unwrap();
+        sink.set_property("drop", false);
+        sink.set_property("max-buffers", 1000_u32);
+        pipeline.set_state(State::Playing).unwrap();
+        (pipeline, sink)
+    }
+
+    /// The middle of what is bright.
+    fn middle(width: usize, pixels: &[u8]) -> [f64; 2] {
+        let bright = pixels.iter().enumerate().filter(|(_, pixel)| **pixel > 128);
+        let places: Vec<[usize; 2]> = bright.map(|(at, _)| [at % width, at / width]).collect();
+        [0, 1].map(|axis| {
+            places.iter().map(|place| place[axis] as f64).sum::<f64>() / places.len() as f64
+        })
+    }
+
+    /// H.265 of the ball, in access units with the number of the picture that each is.
+    fn units(encoder: &str) -> Vec<(usize, Vec<u8>)> {
+        gstreamer::init().unwrap();
+        let description = format!(
+            "videotestsrc pattern=ball num-buffers={PICTURES} ! \
+             video/x-raw,format=I420,width=322,height=242,framerate=30/1 ! {encoder} ! h265parse ! \
+             video/x-h265,stream-format=byte-stream,alignment=au ! \
+             appsink name=units sync=false max-buffers=1000"
+        );
+        let pipeline = gstreamer::parse::launch(&description).unwrap();
+        let pipeline = pipeline.downcast::<Pipeline>().unwrap();
+        pipeline.set_state(State::Playing).unwrap();
+        let sink = pipeline.by_name("units").unwrap().downcast::<AppSink>().unwrap();
+        let mut units = Vec::new();
+        let mut first = None;
+        while let Ok(sample) = sink.pull_sample() {
+            let buffer = sample.buffer().unwrap();
+            let shown = buffer.pts().unwrap();
+            let since_first = shown - *first.get_or_insert(shown);
+            let number = (since_first.nseconds() as f64 * 30e-9).round() as usize;
+            units.push((number, buffer.map_readable().unwrap().to_vec()));
+        }
+        pipeline.set_state(State::Null).unwrap();
+        units
+    }
+
+    fn truth() -> Vec<[f64; 2]> {
+        let (pipeline, sink) = ball("");
+        let mut places = Vec::new();
+        while let Ok(sample) = sink.pull_sample() {
+            let (width, _, pixels) = brightness(&sample).unwrap();
+            places.push(middle(width, &pixels));
+        }
+        pipeline.set_state(State::Null).unwrap();
+        places
+    }
+
+    #[test]
+    fn every_picture_comes_out_with_its_own_time() {
+        let truth = truth();
+        for (encoder, held_back) in [
+            ("x265enc tune=zerolatency key-int-max=10", 0..1),
+            // Pictures that build on later ones.
+            ("x265enc key-int-max=10 option-string=bframes=3", 1..8),
+        ] {
+            let mut decoder = H265Decoder::new().unwrap();
+            let mut seen = 0;
+            for (sent, (number, unit)) in units(encoder).iter().enumerate() {
+                // A unit that is spoilt gives no picture, and none after it another's time.
+                let unit = if sent == 35 { &unit[..unit.len() / 2] } else { &unit[..] };
+                let Ok(Some(picture)) = decoder.decode(unit, *number as i64 * 3000) else {
+                    continue;
+                };
+                assert_eq!((picture.width, picture.height), (322, 242));
+                let number = (picture.shown_at / 3000) as usize;
+                let place = middle(picture.width, &picture.brightness);
+                let off = [0, 1].map(|axis| (place[axis] - truth[number][axis]).abs());
+                // What builds on the spoilt one is spoilt itself.
+                let is_whole = !(30..42).contains(&number);
+                assert!(
+                    !is_whole || off.iter().all(|off| *off < 0.5),
+                    "{encoder} {number}: {off:?}"
+                );
+                seen += 1;
+            }
+            assert!(seen >= PICTURES - 12, "{encoder}: {seen}");
+            assert!(held_back.contains(&decoder.held_back), "{encoder}: {}", decoder.held_back);
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! Whatever GStreamer can show: cameras, codecs and decoders in hardware for which this crate has nothing of
+//! its own. Needs the feature `gstreamer` and the system's libraries.
+
+#[cfg(feature = "gstreamer")]
+mod h265;
+#[cfg(feature = "gstreamer")]
+mod pipeline;
+
+use std::time::Duration;
+
+#[cfg(feature = "gstreamer")]
+pub(crate) use self::h265::H265Decoder;
+
+use crate::rtsp::ClockMemory;
+use crate::{FrameSource, Latency, Login, VideoError};
+
+/// A pipeline to watch and how.
+#[derive(Clone, Debug)]
+pub struct GstreamerOptions {
+    /// Elements with `!` between them, as `gst-launch-1.0` takes them, to the decoded video; it has no sink.
+    /// Frames for which it has a reference time (`rtspsrc add-reference-timestamp-meta=true`) are timed by
+    /// that.
+    pub pipeline: String,
+    /// Who asks: `user-id` and `user-pw` of the element that is named `camera`.
+    pub login: Option<Login>,
+    /// Whether the reference time is believed; else frames are timed by their arrival.
+    pub heeds_reports: bool,
+    /// What it takes from the exposure to the arrival.
+    pub latency: Latency,
+}
+
+/// A pipeline that can be started again and again.
+#[derive(Clone, Debug)]
+pub struct GstreamerCamera {
+    options: GstreamerOptions,
+    memory: ClockMemory,
+}
+
+impl GstreamerCamera {
+    /// A camera that is watched so.
+    pub fn new(options: GstreamerOptions) -> Self {
+        Self { options, memory: ClockMemory::default() }
+    }
+
+    /// The pipeline.
+    pub fn address(&self) -> String {
+        self.options.pipeline.clone()
+    }
+
+    /// Starts it. `silence` is how long it may show nothing.
+    ///
+    /// # Errors
+    /// [`VideoError::Stream`] if there are no such elements, or they do not fit.
+    #[cfg(feature = "gstreamer")]
+    pub fn open(&self, silence: Duration) -> Result<Box<dyn FrameSource>, VideoError> {
+        let source = pipeline::PipelineSource::open(&self.options, self.memory.clone(), silence)?;
+        Ok(Box::new(source))
+    }
+
+    /// As with the feature, but that nothing can be opened.
+    ///
+    /// # Errors
+    /// [`VideoError::Stream`], always.
+    #[cfg(not(feature = "gstreamer"))]
+    pub fn open(&self, _: Duration) -> Result<Box<dyn FrameSource>, VideoError> {
+        let _ = &self.memory;
+        let what = "this program was built without GStreamer: cargo build --features gstreamer";
+        Err(VideoError::Stream { url: self.address(), what: what.to_owned() })
+    }
+}
