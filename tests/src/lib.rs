@@ -106,6 +106,19 @@ pub fn real_data() -> Option<PathBuf> {
     data
 }
 
+/// Runs commands of a shell in a network of their own and returns what they print; `None` and a clear word
+/// where that is not to be had, or what they need: a command that succeeds where it is.
+pub fn alone(needed: &str, commands: &str) -> Option<String> {
+    let shell =
+        |commands: &str| Command::new("unshare").args(["-n", "sh", "-c", commands]).output();
+    if !shell(needed).is_ok_and(|tried| tried.status.success()) {
+        eprintln!("SKIPPED: needs root, and `{needed}`");
+        return None;
+    }
+    let output = shell(&format!("set -eu\nip link set lo up\n{commands}")).unwrap();
+    Some(String::from_utf8(output.stdout).unwrap())
+}
+
 /// All messages of a recording on one channel.
 pub fn messages(recording: &Path, wanted: impl Fn(&Channel) -> bool) -> Vec<Entry> {
     let mut entries = Vec::new();

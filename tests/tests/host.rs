@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, ClockSource, Health, Payload, decode,
 };
-use crossfix_tests::{PATIENCE, Process, Site, messages, now_seconds, program};
+use crossfix_tests::{PATIENCE, Process, Site, alone, messages, now_seconds, program};
 use crossfix_transport::Subscription;
 
 fn free_address() -> String {
@@ -205,19 +205,6 @@ fn a_file_that_is_read_again_holds_from_then_on_but_for_what_cannot() {
     }
 }
 
-/// Runs commands of a shell in a network of their own; `None` and a clear word where that, or a program that
-/// they need, is not to be had.
-fn alone(needed: &str, commands: &str) -> Option<String> {
-    let may = Command::new("unshare").args(["-n", needed, "--version"]).output();
-    if !may.is_ok_and(|may| may.status.success()) {
-        eprintln!("SKIPPED: needs root and {needed}");
-        return None;
-    }
-    let commands = format!("set -eu\nip link set lo up\n{commands}");
-    let output = Command::new("unshare").args(["-n", "sh", "-c", &commands]).output().unwrap();
-    Some(String::from_utf8(output.stdout).unwrap())
-}
-
 #[test]
 fn the_doctor_asks_chrony_how_good_the_hosts_clock_is() {
     let site = Site::new(1.0);
@@ -248,7 +235,7 @@ rm -r "$dir""#,
         program = program().display(),
         camera = site.path("north.toml"),
     );
-    let Some(said) = alone("chronyd", &commands) else { return };
+    let Some(said) = alone("chronyd --version", &commands) else { return };
     let said = serde_json::Deserializer::from_str(&said).into_iter::<serde_json::Value>();
     let clocks: Vec<[String; 2]> = said
         .map(|findings| {

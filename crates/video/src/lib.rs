@@ -44,6 +44,7 @@
 mod avi;
 mod error;
 mod frame;
+mod gige;
 mod gstreamer;
 mod h264;
 mod live;
@@ -60,6 +61,7 @@ use std::path::Path;
 pub use avi::AviSource;
 pub use error::VideoError;
 pub use frame::{Arrival, CaptureTime, Frame, Pixels, TimedBy};
+pub use gige::{GigeCamera, GigeOptions, gige_cameras};
 pub use gstreamer::{GstreamerCamera, GstreamerOptions};
 pub use h264::{H264Encoder, decoding_time};
 pub use live::{Live, LiveCounts, Sight};
@@ -91,6 +93,20 @@ pub trait FrameSource: Send {
     /// # Errors
     /// [`VideoError`] naming the file and the frame.
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError>;
+
+    /// What became of the packets in which its frames came, where it knows.
+    fn packets(&self) -> Packets {
+        Packets::default()
+    }
+}
+
+/// What became of the packets in which frames came.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Packets {
+    /// That never came.
+    pub lost: u64,
+    /// That came when they were asked for once more.
+    pub recovered: u64,
 }
 
 /// When the frames of a file were captured, for files that do not say.

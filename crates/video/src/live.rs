@@ -3,7 +3,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::{Frame, FrameSource, VideoError};
+use crate::{Frame, FrameSource, Packets, VideoError};
 
 /// A camera that sends nothing for so long is opened anew. Half of it would open one anew that is
 /// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
@@ -47,6 +47,8 @@ pub struct LiveCounts {
     pub opened: u64,
     /// Frames that came and were never looked at, as newer ones were here.
     pub left_out: u64,
+    /// What became of the packets in which they came, where that is known.
+    pub packets: Packets,
 }
 
 /// A live camera that is opened anew whenever it breaks off or falls silent, on a thread of its own,
@@ -233,8 +235,13 @@ fn watch(
     first: u64,
     frames: &mut u64,
 ) -> Result<(), VideoError> {
+    let before = shared.locked().counts.packets;
     while !shared.ended() {
-        match source.next_frame() {
+        let next = source.next_frame();
+        let Packets { lost, recovered } = source.packets();
+        shared.locked().counts.packets =
+            Packets { lost: before.lost + lost, recovered: before.recovered + recovered };
+        match next {
             Ok(Some(frame)) => {
                 *frames = frame.index + 1;
                 shared.give(Frame { index: first + frame.index, ..frame });

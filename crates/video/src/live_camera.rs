@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use crate::{FrameSource, GstreamerCamera, RtspCamera, UsbCamera, VideoError};
+use crate::{FrameSource, GigeCamera, GstreamerCamera, RtspCamera, UsbCamera, VideoError};
 
 /// A camera that is watched live, and opened again whenever it breaks off.
 #[derive(Clone, Debug)]
@@ -9,6 +9,8 @@ pub enum LiveCamera {
     Stream(RtspCamera),
     /// On a bus of this host.
     Usb(UsbCamera),
+    /// An industrial one.
+    Gige(GigeCamera),
     /// What GStreamer can show.
     Gstreamer(GstreamerCamera),
 }
@@ -19,6 +21,7 @@ impl LiveCamera {
         match self {
             Self::Stream(camera) => camera.address(),
             Self::Usb(camera) => camera.address(),
+            Self::Gige(camera) => camera.address(),
             Self::Gstreamer(camera) => camera.address(),
         }
     }
@@ -31,6 +34,7 @@ impl LiveCamera {
         Ok(match self {
             Self::Stream(camera) => Box::new(camera.open(silence)?),
             Self::Usb(camera) => camera.open(silence)?,
+            Self::Gige(camera) => camera.open(silence)?,
             Self::Gstreamer(camera) => camera.open(silence)?,
         })
     }

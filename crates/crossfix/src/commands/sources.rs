@@ -1,10 +1,10 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use crossfix_video::{
-    Frame, Latency, Live, LiveCamera, RtspCamera, RtspOptions, RtspTransport, Sight, StreamAddress,
-    TimedBy, UsbCamera, UsbOptions, usb_cameras,
+    Frame, GigeCamera, GigeOptions, Latency, Live, LiveCamera, RtspCamera, RtspOptions,
+    RtspTransport, Sight, StreamAddress, TimedBy, UsbCamera, UsbOptions, gige_cameras, usb_cameras,
 };
 use serde::Serialize;
 
@@ -17,6 +17,8 @@ use crate::shutdown::Shutdown;
 
 /// How often is looked whether it is to stop.
 const POLL: Duration = Duration::from_millis(100);
+/// How long cameras on the network may take to answer a broadcast.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
 /// Different troubles that are told: a camera that fails in more ways has failed.
 const MOST_TROUBLES: usize = 10;
 
@@ -29,12 +31,16 @@ pub struct Args {
     /// The stream, rtsp://HOST/PATH. One that wants to know who asks is better tried with -c: a
     /// command line can be read by others.
     ///
-    /// Or a camera of this host, /dev/video0. Without, these are listed.
+    /// Or a camera of this host, /dev/video0, or an industrial one, gige://10.0.0.7. Without, those of this
+    /// host are listed.
     #[arg(conflicts_with = "config")]
     url: Option<String>,
     /// A camera's configuration (TOML) whose stream is tried.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// List industrial cameras (GigE Vision), too: asks all on this host's networks by a broadcast.
+    #[arg(long, conflicts_with_all = ["url", "config"])]
+    lan: bool,
     /// Ask for datagrams.
     #[arg(long, conflicts_with = "config")]
     udp: bool,
@@ -118,7 +124,7 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let Some(camera) = camera(args)? else { return list(args.json) };
+    let Some(camera) = camera(args)? else { return list(args) };
     let address = camera.address();
     let (tried, last) = try_out(camera, args.seconds);
     if let (Some(path), Some(frame)) = (&args.picture, &last) {
@@ -143,7 +149,9 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         let size = match &file.source {
             // The size of its images is that of the lens.
-            SourceConfig::Usb { .. } => Some(file.described(path)?.model().intrinsics().size),
+            SourceConfig::Usb { .. } | SourceConfig::Gige { .. } => {
+                Some(file.described(path)?.model().intrinsics().size)
+            }
             _ => None,
         };
         let live = file.live(size).with_context(wrong)?;
@@ -162,6 +170,13 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
         };
         return Ok(Some(LiveCamera::Usb(UsbCamera::new(options))));
     }
+    if let Some(address) = address.strip_prefix("gige://") {
+        let address = address.parse().with_context(|| format!("`{address}` is no address"))?;
+        let sd_s = Latency::default().sd_s;
+        let options =
+            GigeOptions { address, size: args.size, rate_hz: None, latency_s: None, sd_s };
+        return Ok(Some(LiveCamera::Gige(GigeCamera::new(options))));
+    }
     let (address, login) = StreamAddress::parse(address)?;
     let transport = if args.udp { RtspTransport::Udp } else { RtspTransport::Tcp };
     let latency = Latency::default();
@@ -169,29 +184,33 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     Ok(Some(LiveCamera::Stream(RtspCamera::new(options))))
 }
 
-/// Says which cameras hang on this host.
-fn list(json: bool) -> anyhow::Result<()> {
-    let cameras = usb_cameras();
-    if json {
-        let rows: Vec<Listed> = cameras
-            .into_iter()
-            .map(|(device, name)| Listed { device: device.display().to_string(), name })
-            .collect();
-        return output::json(&rows);
+/// Says which cameras hang on this host and, where it is to ask, which are on its networks.
+fn list(args: &Args) -> anyhow::Result<()> {
+    let own = usb_cameras().into_iter();
+    let mut cameras: Vec<Listed> =
+        own.map(|(device, name)| Listed { device: device.display().to_string(), name }).collect();
+    if args.lan {
+        let found = gige_cameras(ANSWERED_WITHIN)
+            .map_err(|what| anyhow!("nobody on the network can be asked: {what}"))?;
+        let listed = |(address, name)| Listed { device: format!("gige://{address}"), name };
+        cameras.extend(found.into_iter().map(listed));
+    }
+    if args.json {
+        return output::json(&cameras);
     }
     if cameras.is_empty() {
         output::line(
             "no camera hangs on this host, or this user may not watch it (group video); a network \
-             camera is tried by its address, rtsp://HOST/PATH",
+             camera is tried by its address, rtsp://HOST/PATH; --lan looks for industrial ones",
         );
     }
-    for (device, name) in cameras {
-        output::line(format!("{}  {name}", device.display()));
+    for Listed { device, name } in cameras {
+        output::line(format!("{device}  {name}"));
     }
     Ok(())
 }
 
-/// A camera of this host.
+/// A camera of this host, or one that has answered.
 #[derive(Debug, Serialize)]
 struct Listed {
     device: String,

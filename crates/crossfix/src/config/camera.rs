@@ -7,7 +7,8 @@ use crossfix_message::{CameraCalibration, CameraName, Channel, ClockSource, Time
 #[cfg(feature = "centre")]
 use crossfix_simulation::{Scene, SceneCamera};
 use crossfix_video::{
-    FrameClock, GstreamerCamera, Latency, LiveCamera, RtspCamera, UsbCamera, UsbOptions,
+    FrameClock, GigeCamera, GigeOptions, GstreamerCamera, Latency, LiveCamera, RtspCamera,
+    UsbCamera, UsbOptions,
 };
 use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
@@ -74,6 +75,8 @@ pub struct PoseConfig {
 }
 
 /// What a driver's times and an exposure that nobody has told are off by, s.
+/// An industrial camera stamps the exposure itself, and is asked for its clock over a quick network, s.
+const GIGE_CLOCK_SD_S: f64 = 1e-3;
 const USB_CLOCK_SD_S: f64 = 0.01;
 
 /// What capture times are worth, and how they are corrected.
@@ -154,7 +157,7 @@ impl CameraFile {
                 *path = folder.join(&*path);
             }
             SourceConfig::Simulation { scene, .. } => *scene = folder.join(&*scene),
-            SourceConfig::Usb { .. } => {}
+            SourceConfig::Usb { .. } | SourceConfig::Gige { .. } => {}
             SourceConfig::Gstreamer(pipeline) => {
                 pipeline.password_file =
                     pipeline.password_file.take().map(|file| folder.join(file));
@@ -351,7 +354,7 @@ impl CameraFile {
                 let named = |camera: &&SceneCamera| camera.name == self.name;
                 Ok(scene.cameras.iter().find(named).map(|camera| camera.rate_hz))
             }
-            SourceConfig::Usb { rate_hz, .. } => Ok(*rate_hz),
+            SourceConfig::Usb { rate_hz, .. } | SourceConfig::Gige { rate_hz, .. } => Ok(*rate_hz),
             SourceConfig::Recording { .. }
             | SourceConfig::Stream(_)
             | SourceConfig::Gstreamer(_) => Ok(None),
@@ -375,6 +378,7 @@ impl CameraFile {
                 (ClockSourceName::Camera, Latency::default().sd_s)
             }
             SourceConfig::Usb { .. } => (ClockSourceName::Host, USB_CLOCK_SD_S),
+            SourceConfig::Gige { .. } => (ClockSourceName::Host, GIGE_CLOCK_SD_S),
             _ => (ClockSourceName::FrameCount, 1e-3),
         }
     }
@@ -387,6 +391,15 @@ impl CameraFile {
         Ok(match &self.source {
             SourceConfig::Stream(stream) => {
                 Some(LiveCamera::Stream(RtspCamera::new(stream.options(by_arrival_sd_s)?)))
+            }
+            SourceConfig::Gige { address, rate_hz, latency_s } => {
+                Some(LiveCamera::Gige(GigeCamera::new(GigeOptions {
+                    address: *address,
+                    size: size.map(|size| [size.width, size.height]),
+                    rate_hz: *rate_hz,
+                    latency_s: *latency_s,
+                    sd_s: self.clock_sd_s(),
+                })))
             }
             SourceConfig::Gstreamer(pipeline) => {
                 let options = pipeline.options(by_arrival_sd_s)?;

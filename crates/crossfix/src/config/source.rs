@@ -1,3 +1,4 @@
+use std::net::Ipv4Addr;
 use std::path::PathBuf;
 
 use anyhow::ensure;
@@ -43,8 +44,20 @@ pub enum SourceConfig {
         /// Frames a second; the most that it has at the size of the intrinsics where it is not said.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         rate_hz: Option<f64>,
-        /// From the middle of the exposure to the driver's time, s, 0 to 10. Default: nothing where the
+        /// From the middle of the exposure to the driver's time, s, -10 to 10. Default: nothing where the
         /// driver says when the exposure began, half of a frame's interval where it does not.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        latency_s: Option<f64>,
+    },
+    /// An industrial camera on the network, GigE Vision.
+    Gige {
+        /// Where it is, `10.0.0.7`; `crossfix sources --lan` lists them.
+        address: Ipv4Addr,
+        /// Frames a second; as it is set where it is not said.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        rate_hz: Option<f64>,
+        /// From the middle of the exposure to the camera's time, s, -10 to 10. Default: minus half the
+        /// exposure that the camera says, as its time is that of the exposure's start.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         latency_s: Option<f64>,
     },
@@ -76,14 +89,14 @@ impl SourceConfig {
             Self::Recording { speed, .. } => (thirty(), 0.0, speed),
             Self::Stream(ref stream) => return stream.check(),
             Self::Gstreamer(ref pipeline) => return pipeline.check(),
-            Self::Usb { rate_hz, latency_s, .. } => {
+            Self::Usb { rate_hz, latency_s, .. } | Self::Gige { rate_hz, latency_s, .. } => {
                 ensure!(
                     rate_hz.is_none_or(|rate_hz| (0.1..=1000.0).contains(&rate_hz)),
                     "key `source.rate_hz` must be from 0.1 to 1000 frames a second"
                 );
                 ensure!(
-                    latency_s.is_none_or(|latency_s| (0.0..=10.0).contains(&latency_s)),
-                    "key `source.latency_s` must be from 0 to 10 s"
+                    latency_s.is_none_or(|latency_s| (-10.0..=10.0).contains(&latency_s)),
+                    "key `source.latency_s` must be from -10 to 10 s"
                 );
                 return Ok(());
             }
@@ -110,6 +123,7 @@ impl SourceConfig {
             Self::Video { path, .. } | Self::Recording { path, .. } => ("source.path", path),
             Self::Simulation { scene, .. } => ("source.scene", scene),
             Self::Usb { device, .. } => ("source.device", device),
+            Self::Gige { .. } => return Ok(()),
             Self::Stream(stream) => return stream.options(None).map(drop),
             Self::Gstreamer(pipeline) => return pipeline.options(None).map(drop),
         };
@@ -121,14 +135,16 @@ impl SourceConfig {
     pub fn is_unpaced(&self) -> bool {
         match *self {
             Self::Video { speed, .. } | Self::Recording { speed, .. } => speed == 0.0,
-            Self::Simulation { .. } | Self::Stream(_) | Self::Usb { .. } | Self::Gstreamer(_) => {
-                false
-            }
+            Self::Simulation { .. }
+            | Self::Stream(_)
+            | Self::Usb { .. }
+            | Self::Gige { .. }
+            | Self::Gstreamer(_) => false,
         }
     }
 
     /// Whether it is a camera that is watched live.
     pub fn is_live(&self) -> bool {
-        matches!(self, Self::Stream(_) | Self::Usb { .. } | Self::Gstreamer(_))
+        matches!(self, Self::Stream(_) | Self::Usb { .. } | Self::Gige { .. } | Self::Gstreamer(_))
     }
 }

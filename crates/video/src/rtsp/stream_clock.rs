@@ -19,6 +19,12 @@ pub(crate) const SET_S: f64 = 0.25;
 /// A camera's clock that is farther from the host's is not on UTC, or the host's is not, s. A network
 /// that stalls holds frames for as long; half of it would refuse cameras on bad networks.
 const FARTHEST_S: f64 = 2.0;
+/// A line through reports that span less would follow what they err by, s: cameras report when they get round to
+/// it, to some milliseconds.
+const LEVEL_S: f64 = REPORTS_S / 5.0;
+/// The same of answers to a question, which are good to a tenth of a millisecond: half as long, and the line would
+/// err by as much as the fastest quartz gains.
+const ASKED_LEVEL_S: f64 = 2.0;
 /// The quickest arrival of this long is taken for one that nothing held up, s. A quartz drifts by a
 /// millisecond in it; half as long, and a stall of some seconds would be taken for the camera's.
 const ARRIVALS_S: f64 = 30.0;
@@ -31,22 +37,29 @@ const REMEMBERED_S: f64 = 600.0;
 const REMEMBERED_SD_S: f64 = 0.1;
 
 /// A camera's clock as its last reports tell it.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 struct Reports {
     /// Stream time, s, and what the camera's clock showed then beyond the line of the first report, s.
     told: VecDeque<(f64, f64)>,
     /// The clock's time at the stream's time 0, by the first report.
     zero: Option<Timestamp>,
+    /// As long as the reports span less, s, the clock is taken to run as the stream's count does.
+    level_s: f64,
 }
 
 impl Reports {
+    fn new(level_s: f64) -> Self {
+        Self { told: VecDeque::new(), zero: None, level_s }
+    }
+
     /// Takes a report in.
     fn add(&mut self, stream_s: f64, told: Timestamp) {
         let zero = *self.zero.get_or_insert(told.plus_seconds(-stream_s));
         let beyond = told.seconds_since(zero.plus_seconds(stream_s));
         let was_set = !self.told.is_empty() && (beyond - self.beyond(stream_s)).abs() > SET_S;
         if was_set {
-            *self = Self { told: VecDeque::new(), zero: Some(told.plus_seconds(-stream_s)) };
+            self.told.clear();
+            self.zero = Some(told.plus_seconds(-stream_s));
         }
         self.told.push_back((stream_s, if was_set { 0.0 } else { beyond }));
         while self.told.len() > MOST_REPORTS
@@ -57,14 +70,14 @@ impl Reports {
     }
 
     /// What the clock shows beyond the first report's line at a stream time, s: a straight line through
-    /// the reports, level as long as they span less than a fifth of what they may.
+    /// the reports, level as long as they span too little.
     fn beyond(&self, stream_s: f64) -> f64 {
         let n = self.told.len().max(1) as f64;
         let mean = |of: fn(&(f64, f64)) -> f64| self.told.iter().map(of).sum::<f64>() / n;
         let (mid, level) = (mean(|(s, _)| *s), mean(|(_, beyond)| *beyond));
         let spread: f64 = self.told.iter().map(|(s, _)| (s - mid).powi(2)).sum();
         let span = self.told.back().map_or(0.0, |(last, _)| last - self.told[0].0);
-        if span < REPORTS_S / 5.0 || spread == 0.0 {
+        if span < self.level_s || spread == 0.0 {
             return level;
         }
         let slope = self.told.iter().map(|(s, b)| (s - mid) * (b - level)).sum::<f64>() / spread;
@@ -125,6 +138,11 @@ pub(crate) struct HostClock {
 }
 
 impl HostClock {
+    /// What it showed so many seconds after it was read.
+    pub(crate) fn at(&self, seconds: f64) -> Timestamp {
+        self.wall.plus_seconds(seconds)
+    }
+
     pub(crate) fn read() -> Self {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let nanos = i64::try_from(now.as_nanos()).unwrap_or(i64::MAX);
@@ -182,8 +200,14 @@ impl StreamClock {
         heeds_reports: bool,
         memory: ClockMemory,
     ) -> Self {
-        let (reports, arrivals) = (Reports::default(), Arrivals::default());
+        let (reports, arrivals) = (Reports::new(LEVEL_S), Arrivals::default());
         Self { host, latency, heeds_reports, reports, arrivals, memory, last: None }
+    }
+
+    /// The same of a camera that is asked what its clock shows over a quick network.
+    pub(crate) fn of_asked(host: HostClock, latency: Latency) -> Self {
+        let reports = Reports::new(ASKED_LEVEL_S);
+        Self { reports, ..Self::new(host, latency, true, ClockMemory::default()) }
     }
 
     /// The camera says that its clock showed `told` at a stream time.
@@ -201,7 +225,8 @@ impl StreamClock {
             let passed_s = stream_s - stream_before_s;
             // It counts from another instant. A network may hold up what it likes: late is late alone.
             if passed_s < 0.0 || passed_s - (arrived_s - arrived_before_s) > FARTHEST_S {
-                (self.reports, self.arrivals) = (Reports::default(), Arrivals::default());
+                self.reports = Reports::new(self.reports.level_s);
+                self.arrivals = Arrivals::default();
             }
         }
         self.arrivals.add(stream_s, arrived_s);

@@ -130,9 +130,10 @@ fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::
         SourceConfig::Recording { path, .. } => first_bearing(path, calibrated),
         SourceConfig::Video { start_s, .. } => Ok(Timestamp::from_seconds(*start_s)),
         SourceConfig::Simulation { .. } => Ok(Timestamp::EPOCH),
-        SourceConfig::Stream(_) | SourceConfig::Usb { .. } | SourceConfig::Gstreamer(_) => {
-            Ok(Timestamp::from_seconds(wall_seconds()))
-        }
+        SourceConfig::Stream(_)
+        | SourceConfig::Usb { .. }
+        | SourceConfig::Gige { .. }
+        | SourceConfig::Gstreamer(_) => Ok(Timestamp::from_seconds(wall_seconds())),
     }
 }
 
@@ -250,7 +251,10 @@ impl Agent {
                 let mut source = crossfix_video::open(path, clock)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
-            SourceConfig::Stream(_) | SourceConfig::Usb { .. } | SourceConfig::Gstreamer(_) => {
+            SourceConfig::Stream(_)
+            | SourceConfig::Usb { .. }
+            | SourceConfig::Gige { .. }
+            | SourceConfig::Gstreamer(_) => {
                 match file.live(Some(self.identity.camera.model().intrinsics().size))? {
                     Some(camera) => self.watch_live(file, camera, begins),
                     None => Ok(()),

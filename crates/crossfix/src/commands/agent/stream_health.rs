@@ -147,6 +147,8 @@ impl StreamHealth {
             ("frames_late", self.late),
             ("frames_left_out", self.counts.left_out),
             ("frames_repeated", self.repeated),
+            ("packets_lost", self.counts.packets.lost),
+            ("packets_recovered", self.counts.packets.recovered),
             ("stream_opened", self.counts.opened),
             (
                 "synchronised",

@@ -63,16 +63,21 @@ fn film(
     for index in 0..camera.frames() {
         // It is exposed up to half its exposure after its time.
         let exposed_s = camera.true_time(index) + description.exposure_s / 2.0;
-        if !pace.wait(exposed_s, shutdown) {
+        if !mount.is_watched() {
+            if pace.wait(exposed_s, shutdown) {
+                continue;
+            }
             break;
         }
-        if !mount.is_watched() {
-            continue;
-        }
+        // It is drawn and encoded before it is exposed, so that what takes time here is not taken for what
+        // those take who watch.
         let frame = camera.frame(index);
         let unit = encoder
             .encode(&frame.brightness, frame.width, frame.height)
             .map_err(|what| anyhow!("camera `{}`: {what}", camera.name()))?;
+        if !pace.wait(exposed_s, shutdown) {
+            break;
+        }
         // Any camera's count begins anywhere and turns over.
         let ticks = (frame.own_s * TICKS_HZ).round() as i64 as u32;
         mount.send(&unit, ticks);

@@ -1,0 +1,195 @@
+//! Industrial cameras that do what they do, on this machine alone.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
+
+#[path = "gige/fake.rs"]
+mod fake;
+
+use std::net::Ipv4Addr;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crossfix_video::{Frame, GigeCamera, GigeOptions, Live, Pixels, Sight, TimedBy, VideoError};
+
+use self::fake::{Behaviour, Clock, Fake};
+
+/// Columns, rows and images a second that are asked for.
+const SIZE: [u32; 2] = [256, 200];
+const RATE_HZ: f64 = 50.0;
+
+/// Where the dot is at a time by the camera's clock, whole pixels.
+fn place(seconds: f64) -> [f64; 2] {
+    [(100.0 + 50.0 * seconds.cos()).trunc(), (100.0 + 50.0 * seconds.sin()).trunc()]
+}
+
+fn picture(seconds: f64, width: usize, height: usize) -> Vec<u8> {
+    let mut pixels = vec![40; width * height];
+    let [x, y] = place(seconds).map(|at| at as usize);
+    for row in y - 3..=y + 3 {
+        pixels[row * width + x - 3..][..7].fill(230);
+    }
+    pixels
+}
+
+/// The middle of the dot.
+fn seen(frame: &Frame) -> [f64; 2] {
+    let Pixels::Gray8(pixels) = &frame.pixels else { panic!("it is no brightness") };
+    let bright = pixels.iter().enumerate().filter(|(_, pixel)| **pixel > 150).map(|(at, _)| at);
+    let places: Vec<[usize; 2]> = bright.map(|at| [at % frame.width, at / frame.width]).collect();
+    [0, 1].map(|axis| places.iter().map(|p| p[axis] as f64).sum::<f64>() / places.len() as f64)
+}
+
+/// A camera whose clock runs by itself, 300 millionths too fast.
+fn own_clock() -> Behaviour {
+    Behaviour {
+        clock: Clock { begins: 5_000_000_000, ticks_hz: 125_000_000, fast_ppm: 300.0 },
+        drops: Box::new(|_, _| false),
+        picture: Box::new(picture),
+        resends: false,
+        taken: false,
+    }
+}
+
+fn watched(camera: &Fake) -> Live {
+    let camera = GigeCamera::new(GigeOptions {
+        address: camera.ip,
+        size: Some(SIZE),
+        rate_hz: Some(RATE_HZ),
+        latency_s: None,
+        sd_s: 1e-3,
+    });
+    Live::start(move |silence| camera.open(silence))
+}
+
+/// What comes within a time.
+fn within(live: &Live, seconds: f64) -> (Vec<Frame>, Vec<VideoError>) {
+    let (mut frames, mut troubles) = (Vec::new(), Vec::new());
+    let until = Instant::now() + Duration::from_secs_f64(seconds);
+    while Instant::now() < until {
+        match live.next(until.saturating_duration_since(Instant::now())) {
+            Sight::Frame(frame) => frames.push(frame),
+            Sight::Trouble(trouble) => troubles.push(trouble),
+            Sight::Nothing => {}
+        }
+    }
+    (frames, troubles)
+}
+
+fn address(last: u8) -> Ipv4Addr {
+    Ipv4Addr::new(127, 77, 0, last)
+}
+
+fn wall_s() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs_f64()
+}
+
+#[test]
+fn a_camera_whose_clock_runs_by_itself_is_timed_by_what_it_answers() {
+    let begun_s = wall_s();
+    let camera = Fake::start(address(1), own_clock());
+    let (frames, troubles) = within(&watched(&camera), 6.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.len() > 200, "{}", frames.len());
+    let mut errors_s = Vec::new();
+    for (frame, index) in frames.iter().zip(0..) {
+        assert_eq!(frame.index, index);
+        assert_eq!([frame.width, frame.height], SIZE.map(|side| side as usize));
+        let live = frame.live.unwrap();
+        assert_eq!(live.timed_by, TimedBy::Driver);
+        assert_eq!(seen(frame), place(live.stream_s));
+        // Its clock showed 40 s when it was begun.
+        let true_s = begun_s + (live.stream_s - 40.0) / (1.0 + 300e-6);
+        errors_s.push(frame.capture.time.seconds() - true_s);
+    }
+    // The test has read the clock a little before the camera did; a busy machine holds answers up.
+    errors_s.sort_unstable_by(f64::total_cmp);
+    let ninety = &errors_s[errors_s.len() / 20..errors_s.len() * 19 / 20];
+    assert!(ninety.iter().all(|error_s| (-1e-3..3e-3).contains(error_s)), "{errors_s:?}");
+}
+
+#[test]
+fn a_camera_whose_clock_is_utc_is_believed() {
+    let now_ns = (wall_s() * 1e9) as u64;
+    let clock = Clock { begins: now_ns, ticks_hz: 1_000_000_000, fast_ppm: 0.0 };
+    let behaviour = Behaviour { clock, ..own_clock() };
+    let camera = Fake::start(address(2), behaviour);
+    let (frames, troubles) = within(&watched(&camera), 3.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.len() > 100, "{}", frames.len());
+    for frame in frames {
+        let live = frame.live.unwrap();
+        assert_eq!(live.timed_by, TimedBy::Camera);
+        assert_eq!(seen(&frame), place(live.stream_s));
+        assert!((frame.capture.time.seconds() - live.stream_s).abs() < 1e-4);
+    }
+}
+
+#[test]
+fn packets_that_are_lost_are_asked_for_again_and_else_the_frame_is_missing() {
+    let lossy = |resends| Behaviour {
+        resends,
+        drops: Box::new(|block, packet| block % 5 == 0 && packet == 7),
+        ..own_clock()
+    };
+    let camera = Fake::start(address(3), lossy(true));
+    let live = watched(&camera);
+    let (frames, troubles) = within(&live, 3.0);
+    assert!(troubles.is_empty(), "{troubles:?}");
+    assert!(frames.windows(2).all(|pair| pair[1].index == pair[0].index + 1));
+    let packets = live.counts().packets;
+    assert!(packets.recovered >= frames.len() as u64 / 5 - 1 && packets.lost == 0, "{packets:?}");
+    drop((live, camera));
+
+    let camera = Fake::start(address(3), lossy(false));
+    let live = watched(&camera);
+    let (frames, troubles) = within(&live, 3.0);
+    assert!(troubles.iter().all(VideoError::is_one_frame), "{troubles:?}");
+    let packets = live.counts().packets;
+    assert!(packets.lost >= troubles.len() as u64 && packets.recovered == 0, "{packets:?}");
+    // Of five frames one is missing, and its number is.
+    let last = frames.last().unwrap().index + 1;
+    let missing = last - frames.len() as u64;
+    assert!((missing as f64 / last as f64 - 0.2).abs() < 0.06, "{missing} of {last}");
+    assert!(frames.iter().all(|frame| seen(frame) == place(frame.live.unwrap().stream_s)));
+    assert!(troubles.len() as u64 + 2 >= missing, "{} of {missing} are told", troubles.len());
+}
+
+#[test]
+fn a_camera_that_falls_silent_is_opened_anew_and_one_that_is_left_is_free() {
+    let camera = Fake::start(address(4), own_clock());
+    let live = watched(&camera);
+    assert!(within(&live, 2.0).0.len() > 40);
+    camera.mute.store(true, Ordering::SeqCst);
+    let (frames, troubles) = within(&live, 5.0);
+    assert!(frames.len() < 20, "{}", frames.len());
+    assert!(matches!(troubles[0], VideoError::Silent { .. }), "{troubles:?}");
+    assert!(troubles[1].to_string().contains("no GigE Vision camera answers"), "{troubles:?}");
+    camera.mute.store(false, Ordering::SeqCst);
+    let (frames, troubles) = within(&live, 6.0);
+    assert!(frames.len() > 40, "{} {troubles:?}", frames.len());
+    assert!(frames.iter().all(|frame| seen(frame) == place(frame.live.unwrap().stream_s)));
+    drop(live);
+    std::thread::sleep(Duration::from_millis(100));
+    assert!(!camera.is_controlled() && !camera.is_acquiring());
+}
+
+#[test]
+fn a_camera_that_somebody_else_controls_or_that_is_not_there_is_said() {
+    let camera = Fake::start(address(5), Behaviour { taken: true, ..own_clock() });
+    let first = |live: Live| match live.next(Duration::from_secs(10)) {
+        Sight::Trouble(trouble) => trouble.to_string(),
+        other => panic!("{other:?}"),
+    };
+    let said = first(watched(&camera));
+    assert!(said.contains("gige://127.77.0.5") && said.contains("ACCESS_DENIED"), "{said}");
+    drop(camera);
+    let nobody = GigeCamera::new(GigeOptions {
+        address: address(6),
+        size: None,
+        rate_hz: None,
+        latency_s: None,
+        sd_s: 1e-3,
+    });
+    let said = first(Live::start(move |silence| nobody.open(silence)));
+    assert!(said.contains("no GigE Vision camera answers there"), "{said}");
+}
