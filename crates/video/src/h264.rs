@@ -2,7 +2,7 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::time::{Duration, Instant};
 
-use h264_reader::nal::sps::SeqParameterSet;
+use h264_reader::nal::sps::{ChromaFormat, SeqParameterSet};
 use h264_reader::nal::{Nal, RefNal};
 use openh264::OpenH264API;
 use openh264::decoder::{DecodeOptions, DecodedYUV, Decoder, DecoderConfig, Flush};
@@ -47,6 +47,8 @@ pub(crate) struct H264Decoder {
     /// Times of the units whose pictures have not come out yet; pictures come out in the order of
     /// display, so the smallest is the next picture's.
     pending: BinaryHeap<Reverse<i64>>,
+    /// Of what kind its pictures are, where that is none that is decoded.
+    unreadable: Option<String>,
 }
 
 impl H264Decoder {
@@ -63,7 +65,7 @@ impl H264Decoder {
     fn new(reorders: bool) -> Result<Self, String> {
         let decoder = Decoder::with_api_config(OpenH264API::from_source(), DecoderConfig::new())
             .map_err(|error| in_words(&error))?;
-        Ok(Self { decoder, reorders, pending: BinaryHeap::new() })
+        Ok(Self { decoder, reorders, pending: BinaryHeap::new(), unreadable: None })
     }
 
     /// Decodes an access unit in Annex B; `None` if its picture comes out later.
@@ -76,6 +78,9 @@ impl H264Decoder {
         // Holding back from the middle of a stream on spoils the pictures up to the next that builds on
         // no other, so what the stream says of itself counts first.
         self.reorders |= units(unit).any(|unit| says_it_reorders(unit) || builds_on_later(unit));
+        if let Some(parameters) = units(unit).filter_map(sequence_parameters).last() {
+            self.unreadable = unreadable(&parameters);
+        }
         let flush = if self.reorders { Flush::NoFlush } else { Flush::Flush };
         if !self.reorders {
             // What gave no picture before gives none now.
@@ -87,7 +92,7 @@ impl H264Decoder {
             Ok(None) => Ok(None),
             Err(error) => {
                 self.pending.retain(|Reverse(time)| *time != shown_at);
-                Err(in_words(&error))
+                Err(self.unreadable.clone().unwrap_or_else(|| in_words(&error)))
             }
         }
     }
@@ -103,10 +108,30 @@ impl H264Decoder {
 /// Whether a unit without its start code says that pictures come in another order than they are shown in
 /// (a sequence's parameters, where they speak of it at all: H.264, E.2.1).
 fn says_it_reorders(unit: &[u8]) -> bool {
-    let is_sequence = unit.first().is_some_and(|head| head & 0x1f == 7);
-    let sequence = || SeqParameterSet::from_bits(RefNal::new(unit, &[], true).rbsp_bits()).ok();
-    let restrictions = || sequence()?.vui_parameters?.bitstream_restrictions;
-    is_sequence && restrictions().is_some_and(|said| said.max_num_reorder_frames > 0)
+    let restrictions = || sequence_parameters(unit)?.vui_parameters?.bitstream_restrictions;
+    restrictions().is_some_and(|said| said.max_num_reorder_frames > 0)
+}
+
+/// What a unit without its start code says of the pictures that follow, if it is one that does.
+fn sequence_parameters(unit: &[u8]) -> Option<SeqParameterSet> {
+    unit.first().filter(|head| **head & 0x1f == 7)?;
+    SeqParameterSet::from_bits(RefNal::new(unit, &[], true).rbsp_bits()).ok()
+}
+
+/// Why pictures of a sequence are not decoded: OpenH264 has eight bits and colours of a quarter of the
+/// places.
+fn unreadable(parameters: &SeqParameterSet) -> Option<String> {
+    let of = &parameters.chroma_info;
+    let colours = match of.chroma_format {
+        ChromaFormat::YUV420 => None,
+        ChromaFormat::Monochrome => Some("without colours (4:0:0)"),
+        ChromaFormat::YUV422 => Some("4:2:2"),
+        ChromaFormat::YUV444 => Some("4:4:4"),
+        ChromaFormat::Invalid(_) => Some("of an unknown kind"),
+    };
+    let bits = 8 + u32::from(of.bit_depth_luma_minus8);
+    let kind = colours.map(str::to_owned).or((bits > 8).then(|| format!("of {bits} bits")))?;
+    Some(format!("its pictures are {kind}: H.264 of 8 bits and 4:2:0 is read (-pix_fmt yuv420p)"))
 }
 
 /// Whether a unit without its start code is a part of a picture that builds on later ones (a B slice).
@@ -242,4 +267,30 @@ fn picture_of(picture: &DecodedYUV<'_>, time: Option<Reverse<i64>>) -> Result<Pi
     }
     let Reverse(shown_at) = time.ok_or("it has no time")?;
     Ok(Picture { shown_at, width, height, brightness })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_that_are_not_decoded_are_named_by_their_kind() {
+        // Of x264, 640x480, High 4:4:4 Predictive.
+        let unit = [
+            0x67, 0xf4, 0x00, 0x1e, 0x91, 0x96, 0x80, 0xa0, 0x3d, 0xb0, 0x16, 0xa0, 0xc0, 0xc0,
+            0xc8, 0x00, 0x00, 0x03, 0x00, 0x08, 0x00, 0x00, 0x03, 0x01, 0xe4, 0x78, 0xb1, 0x75,
+        ];
+        let parameters = sequence_parameters(&unit).unwrap();
+        assert!(unreadable(&parameters).unwrap().starts_with("its pictures are 4:4:4"));
+        let mut decoder = H264Decoder::of_file().unwrap();
+        let stream = [&[0, 0, 0, 1][..], &unit, &[0, 0, 0, 1, 0x65, 0x88, 0x84, 0x00]].concat();
+        let said = decoder.decode(&stream, 0).unwrap_err();
+        assert!(said.contains("4:4:4") && said.contains("yuv420p"), "{said}");
+
+        // Our own are.
+        let pixels = vec![90; 64 * 48];
+        let stream = H264Encoder::new(30.0).unwrap().encode(&pixels, 64, 48).unwrap();
+        let parameters = units(&stream).find_map(sequence_parameters).unwrap();
+        assert_eq!(unreadable(&parameters), None);
+    }
 }

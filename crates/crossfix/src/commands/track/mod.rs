@@ -8,12 +8,13 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Instant;
 
-use anyhow::bail;
+use anyhow::{bail, ensure};
 use crossfix_video::{Frame, FrameClock, FrameSource, VideoError};
 use crossfix_vision::{DetectorConfig, ImageTracker, PixelBox, TrackerConfig};
 
 use crate::commands::numbers;
 use crate::output::{self, Draft};
+use crate::repeats::Repeats;
 use crate::{config, eye};
 use picture::Picture;
 use table::Table;
@@ -101,9 +102,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         .map(|draft| Picture::new(draft.path(), args.labels.as_deref()))
         .transpose()?;
 
-    let mut frames = 0_u64;
+    let mut repeats = Repeats::default();
+    let (mut frames, mut bad_frames) = (0_u64, 0_u64);
     let mut length = 0;
-    while let Some((index, read)) = next(source.as_mut())? {
+    while let Some((index, read)) = next(source.as_mut(), &mut repeats)? {
         length = index + 1;
         if index < args.from {
             continue;
@@ -113,6 +115,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             if read.is_some() {
                 tracing::warn!("frame {index} has no pixels; going on");
             }
+            bad_frames += 1;
             table.write(index, &[], 0.0)?;
             continue;
         };
@@ -132,6 +135,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             args.from
         );
     }
+    ensure!(
+        bad_frames <= frames,
+        "{}: {bad_frames} of {} frames could not be decoded",
+        args.video.display(),
+        frames + bad_frames
+    );
+    repeats.remind(Instant::now());
     if tracker.refused() > 0 {
         tracing::warn!(
             "{} frames were refused: another size, or not after the one before",
@@ -171,11 +181,14 @@ fn tracker(args: &Args) -> anyhow::Result<ImageTracker> {
 }
 
 /// The next frame with its number, without the frame where it cannot be decoded; `None` at the end.
-fn next(source: &mut dyn FrameSource) -> anyhow::Result<Option<(u64, Option<Frame>)>> {
+fn next(
+    source: &mut dyn FrameSource,
+    repeats: &mut Repeats,
+) -> anyhow::Result<Option<(u64, Option<Frame>)>> {
     match source.next_frame() {
         Ok(frame) => Ok(frame.map(|frame| (frame.index, Some(frame)))),
         Err(error @ VideoError::Frame { index, .. }) => {
-            tracing::warn!("{error}; going on");
+            repeats.warn("bad frame", Instant::now(), || format!("{error}; going on"));
             Ok(Some((index, None)))
         }
         Err(error) => bail!(error),
