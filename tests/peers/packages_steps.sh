@@ -101,7 +101,7 @@ systemctl start $agent || fail "the camera host's package does not start an agen
 pid="$(pid_of $agent)"
 dpkg -i crossfix.deb >/dev/null 2>&1
 if dpkg -s crossfix-agent 2>/dev/null | grep -q '^Status: .* installed'; then fail "both packages are there"; fi
-is_up_anew $agent "$pid" || fail "the fusion centre's package in the place of the agent's stops the agent"
+wait_for 3000 is_up_anew $agent "$pid" >/dev/null || fail "the fusion centre's package in the place of the agent's stops the agent"
 dpkg -P crossfix >/dev/null
 say "removed; the site's files and recordings stay"
 echo PASSED

@@ -89,7 +89,8 @@ mod tests {
         let until = Instant::now() + Duration::from_millis(500);
         while Instant::now() < until {}
         let load = watch.look().unwrap();
-        assert!((0.3..4.0).contains(&load.process_cores), "{load:?}");
+        // Other tests of this process may work beside.
+        assert!(load.process_cores > 0.3, "{load:?}");
         assert!((0.0..=1.0).contains(&load.cores_in_use), "{load:?}");
         // Nobody's clock is off by the age of the universe, however it is kept.
         assert!(load.clock_bound_s.is_none_or(|bound| (0.0..100.0).contains(&bound)), "{load:?}");

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::{Arc, PoisonError, RwLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{CameraStanding, Health};
@@ -24,13 +24,22 @@ const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
 /// Who may ask at the same time; the next wait. Each takes a file descriptor, of which the camera and
 /// the network need some, too.
 const ASKING: usize = 16;
+/// A page that is older is of a component that does not say any more how it does.
+const STALE: Duration = Duration::from_secs(5);
 /// The pause after a connection could not be taken, as descriptors are short.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// The page; it is gone when the process ends.
 #[derive(Debug)]
 pub struct MetricsPage {
-    text: Arc<RwLock<String>>,
+    shown: Arc<RwLock<Shown>>,
+}
+
+/// What the page says, and since when.
+#[derive(Debug)]
+struct Shown {
+    text: String,
+    at: Instant,
 }
 
 impl MetricsPage {
@@ -46,8 +55,9 @@ impl MetricsPage {
             .enable_all()
             .build()
             .context("cannot serve metrics")?;
-        let text = Arc::<RwLock<String>>::default();
-        let shown = Arc::clone(&text);
+        let shown = Shown { text: String::new(), at: Instant::now() };
+        let page = Self { shown: Arc::new(RwLock::new(shown)) };
+        let shown = Arc::clone(&page.shown);
         std::thread::Builder::new().name("metrics".into()).spawn(move || {
             runtime.block_on(async {
                 match TcpListener::from_std(listener) {
@@ -57,29 +67,32 @@ impl MetricsPage {
             });
         })?;
         tracing::info!("metrics at http://{address}/metrics");
-        Ok(Self { text })
+        Ok(page)
     }
 
     /// Shows a report from now on.
     pub fn show(&self, health: &Health) {
         match exposition(health) {
-            Ok(text) => *self.text.write().unwrap_or_else(PoisonError::into_inner) = text,
+            Ok(text) => {
+                let mut shown = self.shown.write().unwrap_or_else(PoisonError::into_inner);
+                *shown = Shown { text, at: Instant::now() };
+            }
             Err(error) => tracing::debug!("a report is not shown as metrics: {error}"),
         }
     }
 }
 
 /// Answers everybody who asks.
-async fn answer(listener: &TcpListener, text: &Arc<RwLock<String>>) {
+async fn answer(listener: &TcpListener, shown: &Arc<RwLock<Shown>>) {
     let room = Arc::new(Semaphore::new(ASKING));
     loop {
         let Ok(place) = Arc::clone(&room).acquire_owned().await else { return };
         match listener.accept().await {
             Ok((stream, _)) => {
-                let text = Arc::clone(text);
+                let shown = Arc::clone(shown);
                 tokio::spawn(async move {
                     // What goes wrong with one who asks is theirs.
-                    let _ = timeout(ANSWERED_WITHIN, answer_one(stream, &text)).await;
+                    let _ = timeout(ANSWERED_WITHIN, answer_one(stream, &shown)).await;
                     drop(place);
                 });
             }
@@ -88,25 +101,26 @@ async fn answer(listener: &TcpListener, text: &Arc<RwLock<String>>) {
     }
 }
 
-async fn answer_one(stream: TcpStream, text: &RwLock<String>) -> hyper::Result<()> {
-    let page = service_fn(|request| async move { Ok::<_, Infallible>(page(&request, text)) });
+async fn answer_one(stream: TcpStream, shown: &RwLock<Shown>) -> hyper::Result<()> {
+    let page = service_fn(|request| async move { Ok::<_, Infallible>(page(&request, shown)) });
     hyper::server::conn::http1::Builder::new()
         .keep_alive(false)
         .serve_connection(TokioIo::new(stream), page)
         .await
 }
 
-fn page<B>(request: &Request<B>, text: &RwLock<String>) -> Response<Full<Bytes>> {
+fn page<B>(request: &Request<B>, shown: &RwLock<Shown>) -> Response<Full<Bytes>> {
     let is_there = request.uri().path() == "/metrics" && request.method() == Method::GET;
-    let text = if is_there {
-        text.read().unwrap_or_else(PoisonError::into_inner).clone()
+    let shown = shown.read().unwrap_or_else(PoisonError::into_inner);
+    let (status, text) = if !is_there {
+        (StatusCode::NOT_FOUND, "GET /metrics\n".to_owned())
+    } else if shown.at.elapsed() > STALE {
+        (StatusCode::SERVICE_UNAVAILABLE, "it does not say any more how it does\n".to_owned())
     } else {
-        "GET /metrics\n".to_owned()
+        (StatusCode::OK, shown.text.clone())
     };
     let mut response = Response::new(Full::new(Bytes::from(text)));
-    if !is_there {
-        *response.status_mut() = StatusCode::NOT_FOUND;
-    }
+    *response.status_mut() = status;
     let kind = HeaderValue::from_static("text/plain; version=0.0.4; charset=utf-8");
     response.headers_mut().insert(CONTENT_TYPE, kind);
     response

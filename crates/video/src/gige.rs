@@ -1,7 +1,7 @@
 //! Industrial cameras: GigE Vision.
 
 use std::net::Ipv4Addr;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use crossfix_message::Timestamp;
 use viva_genicam::genapi::RegisterIo;
@@ -12,9 +12,9 @@ use viva_genicam::{
     StreamOptions, blocking,
 };
 
-use crate::rtsp::{HostClock, SET_S, StreamClock};
+use crate::rtsp::{HostClock, StreamClock};
 use crate::{
-    Arrival, CaptureTime, Frame, FrameSource, Latency, MAX_PIXELS, Packets, Pixels, TimedBy,
+    Arrival, CaptureTime, Frame, FrameSource, Latency, Losses, MAX_PIXELS, Pixels, TimedBy,
     VideoError,
 };
 
@@ -26,15 +26,26 @@ const FOUND_WITHIN: Duration = Duration::from_millis(500);
 /// How often the camera is asked what its clock shows. Quartzes part by 50 us in a second: with ten times
 /// as long the line through the answers would follow a clock that warms up too late.
 const ASKED_EVERY: Duration = Duration::from_secs(1);
-/// An answer that took less is good enough; else the quickest of so many is.
+/// A camera that does not answer is asked so seldom, as whoever asks waits.
+const ASKED_AGAIN: Duration = Duration::from_secs(10);
+/// An answer that took less is good enough, one that took more is off by half of it and none; in between
+/// the quickest of so many is.
 const QUICK: Duration = Duration::from_millis(1);
-const TRIES: usize = 5;
+const SLOW: Duration = Duration::from_millis(20);
+const TRIES: usize = 3;
+/// This host's clock was set by more than answers err by, s: what was answered before is of another time.
+const HOST_SET_S: f64 = 0.02;
 /// A camera's clock that is within this of the host's counts the same time as that; one that counts
 /// from when it was switched on is years off.
 const SAME_TIME_S: f64 = 2.0;
 /// A frame is here within this after the time that the camera's answers make of its stamp, or they are not of
 /// the clock that stamps frames, s: the one is half an answer's way, the other a long exposure's.
 const POSSIBLE_S: std::ops::Range<f64> = -0.02..1.0;
+/// So many impossible frames in a row are no stall's: it holds back sixteen.
+const IMPOSSIBLE: u32 = 20;
+/// Names of what says whether the camera's clock follows another by PTP, and what it says then.
+const PTP: [&str; 2] = ["PtpStatus", "GevIEEE1588Status"];
+const FOLLOWS: &str = "Slave";
 /// What it takes from the exposure to the arrival where nothing better is known: an image is read out and
 /// sent in a frame's interval.
 const LATENCY: Latency = Latency { mean_s: 0.04, sd_s: 0.04 };
@@ -67,6 +78,8 @@ pub struct GigeOptions {
     pub latency_s: Option<f64>,
     /// Standard deviation of its frames' times, s.
     pub sd_s: f64,
+    /// Whether its stamps are believed; else frames are timed by their arrival.
+    pub heeds_stamps: bool,
 }
 
 /// A GigE Vision camera that is opened again and again.
@@ -115,13 +128,11 @@ pub fn gige_cameras(patience: Duration) -> Result<Vec<(Ipv4Addr, String)>, Strin
 /// Whose time the camera's stamps are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stamps {
-    /// Nobody knows yet.
-    Unknown,
-    /// UTC's: by PTP, or set by somebody.
+    /// UTC's: its clock follows another by PTP, or it cannot be asked and shows this host's time.
     Utc,
     /// Its own, that counts from anywhere; this host's by what it answers.
     Own,
-    /// Of no clock that it answers for.
+    /// Of no clock that it answers for, or not to be believed.
     Nobodys,
 }
 
@@ -133,10 +144,16 @@ struct GigeSource {
     options: GigeOptions,
     address: String,
     ticks_hz: f64,
-    stamps: Stamps,
+    /// Not known before the first frame of a camera that cannot be asked.
+    stamps: Option<Stamps>,
     clock: StreamClock,
     host: HostClock,
-    asked: Option<Instant>,
+    ask_at: Instant,
+    /// What the last answer may be off by, s.
+    answer_sd_s: f64,
+    /// Whether a frame was possible by its stamp, and how many in a row were not since.
+    is_proven: bool,
+    impossible: u32,
     exposure_s: f64,
     silence: Duration,
     is_silent: bool,
@@ -167,37 +184,34 @@ impl GigeSource {
         let frames = camera.open_stream(stream).map_err(wrong)?;
         let ticks_hz = eight_bytes(&camera, TICKS_AT).filter(|hz| *hz > 0);
         let host = HostClock::read();
-        camera.acquisition_start().map_err(wrong)?;
-        Ok(Self {
+        let mut source = Self {
             frames,
             camera,
             address: address.to_owned(),
             ticks_hz: ticks_hz.map_or(NANOSECONDS, |hz| hz as f64),
-            stamps: Stamps::Unknown,
-            clock: stream_clock(host, options.sd_s),
+            stamps: (!options.heeds_stamps).then_some(Stamps::Nobodys),
+            clock: StreamClock::of_asked(host, LATENCY),
             options: options.clone(),
             host,
-            asked: None,
+            ask_at: Instant::now(),
+            answer_sd_s: 0.0,
+            is_proven: false,
+            impossible: 0,
             exposure_s: 0.0,
             silence,
             is_silent: false,
             before: None,
             torn: 0,
             held: None,
-        })
+        };
+        source.ask();
+        source.camera.acquisition_start().map_err(wrong)?;
+        Ok(source)
     }
 
-    /// Asks, where it is time, what the camera's clock shows and how long it exposes.
-    fn ask(&mut self, stamp_s: f64, arrived: Timestamp) {
-        let own = Timestamp::from_seconds(stamp_s);
-        if self.stamps == Stamps::Unknown {
-            let is_utc = own.seconds_since(arrived).abs() < SAME_TIME_S;
-            self.stamps = if is_utc { Stamps::Utc } else { Stamps::Own };
-        }
-        if self.asked.is_some_and(|asked| asked.elapsed() < ASKED_EVERY) {
-            return;
-        }
-        self.asked = Some(Instant::now());
+    /// Asks what the camera's clock shows and how long it exposes. Whoever asks waits for the answer, so it is
+    /// done between two frames.
+    fn ask(&mut self) {
         let mut said_us = EXPOSURES.iter().filter_map(|name| {
             self.camera.invalidate(name);
             self.camera.get_float(name).ok()
@@ -205,58 +219,80 @@ impl GigeSource {
         if let Some(exposure_us) = said_us.find(|us| (0.0..LONGEST_US).contains(us)) {
             self.exposure_s = exposure_us * 1e-6;
         }
-        match self.stamps {
-            Stamps::Utc => self.clock.report(stamp_s, own),
-            Stamps::Own => {
-                if let Some((ticks, host)) = latched(&mut self.camera) {
-                    self.clock.report(ticks as f64 / self.ticks_hz, host);
-                }
+        self.ask_at = Instant::now() + ASKED_EVERY;
+        if self.stamps.is_none() && follows_another(&mut self.camera) {
+            self.stamps = Some(Stamps::Utc);
+        }
+        if !matches!(self.stamps, None | Some(Stamps::Own)) {
+            return;
+        }
+        match latched(&mut self.camera) {
+            Some(Answer { ticks, at, took }) => {
+                self.stamps = Some(Stamps::Own);
+                self.answer_sd_s = took.as_secs_f64() / 2.0;
+                let told = self.host.at(self.host.since_s(at));
+                self.clock.report(ticks as f64 / self.ticks_hz, told);
             }
-            Stamps::Unknown | Stamps::Nobodys => {}
+            None => self.ask_at = Instant::now() + ASKED_AGAIN,
         }
     }
 
     /// When a frame was captured that came then.
     fn timed(&mut self, stamp_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
         let arrived = self.host.at(arrived_s);
-        self.ask(stamp_s, arrived);
-        let (capture, timed_by) = self.clock.time(stamp_s, arrived_s);
-        let age_s = arrived.seconds_since(capture.time);
-        match (timed_by, self.stamps) {
-            (TimedBy::Camera | TimedBy::ArrivalAgainstCamera { .. }, Stamps::Own)
-                if !POSSIBLE_S.contains(&age_s) || timed_by != TimedBy::Camera =>
-            {
-                self.stamps = Stamps::Nobodys;
-                self.clock = stream_clock(self.host, self.options.sd_s);
-                self.timed(stamp_s, arrived_s)
-            }
-            (TimedBy::Camera, Stamps::Own) => (capture, TimedBy::Driver),
-            (TimedBy::Arrival, _) => {
-                let late = CaptureTime {
-                    time: capture.time.plus_seconds(-LATENCY.mean_s),
-                    sd_s: LATENCY.sd_s,
-                };
-                (late, timed_by)
-            }
-            _ => (capture, timed_by),
+        let own = Timestamp::from_seconds(stamp_s);
+        let stamps = *self.stamps.get_or_insert_with(|| {
+            let shows_ours = own.seconds_since(arrived).abs() < SAME_TIME_S;
+            if shows_ours { Stamps::Utc } else { Stamps::Nobodys }
+        });
+        if stamps == Stamps::Utc {
+            self.clock.report(stamp_s, own);
         }
+        let (capture, timed_by) = self.clock.time(stamp_s, arrived_s);
+        let by_arrival = |timed_by| {
+            let time = arrived.plus_seconds(-LATENCY.mean_s);
+            (CaptureTime { time, sd_s: LATENCY.sd_s }, timed_by)
+        };
+        if timed_by != TimedBy::Camera {
+            return by_arrival(timed_by);
+        }
+        let stamped = CaptureTime {
+            time: capture.time.plus_seconds(self.exposure_s / 2.0),
+            sd_s: self.options.sd_s.hypot(self.answer_sd_s),
+        };
+        let stamped = match self.options.latency_s {
+            Some(late_s) => CaptureTime { time: capture.time.plus_seconds(-late_s), ..stamped },
+            None => stamped,
+        };
+        if stamps == Stamps::Utc {
+            return (stamped, TimedBy::Camera);
+        }
+        let age_s = arrived.seconds_since(capture.time);
+        if POSSIBLE_S.contains(&age_s) {
+            (self.is_proven, self.impossible) = (true, 0);
+            return (stamped, TimedBy::Driver);
+        }
+        self.impossible += 1;
+        if self.impossible >= IMPOSSIBLE {
+            self.stamps = Some(Stamps::Nobodys);
+            self.clock = StreamClock::of_asked(self.host, LATENCY);
+        }
+        // What a stall has held back is late, and its stamp is as good as ever.
+        let is_late = self.is_proven && age_s > 0.0;
+        if is_late { (stamped, TimedBy::Driver) } else { by_arrival(TimedBy::Arrival) }
     }
 
     fn frame(&mut self, block: &Block) -> Result<Frame, VideoError> {
         let at = Instant::now();
         let index = self.numbered(block.block_id);
         let pixels = brightness(block).map_err(|what| self.bad(index, what))?;
-        let arrived_s = self.host.since_s(at);
         let set_by_s = self.host.set_by_s(&HostClock::read());
-        if self.stamps != Stamps::Utc && set_by_s.abs() > SET_S {
+        if self.stamps != Some(Stamps::Utc) && set_by_s.abs() > HOST_SET_S {
             return Err(VideoError::HostClockSet { by_s: set_by_s });
         }
+        let arrived_s = self.host.since_s(at);
         let stream_s = block.ts_dev.map_or(arrived_s, |ticks| ticks as f64 / self.ticks_hz);
         let (capture, timed_by) = self.timed(stream_s, arrived_s);
-        let is_stamped = matches!(timed_by, TimedBy::Camera | TimedBy::Driver);
-        let late_s = self.options.latency_s.unwrap_or(-self.exposure_s / 2.0);
-        let late_s = if is_stamped { late_s } else { 0.0 };
-        let capture = CaptureTime { time: capture.time.plus_seconds(-late_s), ..capture };
         let live = Some(Arrival { at, stream_s, timed_by });
         let (width, height) = (block.width as usize, block.height as usize);
         Ok(Frame { index, capture, live, width, height, pixels: Pixels::Gray8(pixels) })
@@ -271,32 +307,44 @@ impl GigeSource {
         /// The count of cameras of the first version goes to 65535 and begins again with 1.
         const ROUND: u64 = 0xffff;
         let index = self.before.map_or(0, |(before, index)| {
-            let missed = match block.checked_sub(before) {
+            let is_round = block < ROUND / 2 && (ROUND / 2..=ROUND).contains(&before);
+            let steps = match block.checked_sub(before) {
                 Some(steps) => steps,
-                None if before <= ROUND => block + ROUND - before,
+                None if is_round => block + ROUND - before,
+                // It counts anew.
                 None => 1,
             };
-            index + missed.clamp(1, ROUND)
+            index + steps.clamp(1, ROUND)
         });
         self.before = Some((block, index));
         index
+    }
+
+    /// Tells, once for each, that a frame was not whole.
+    fn torn(&mut self) -> Option<VideoError> {
+        let torn = self.frames.stats().frames_incomplete;
+        (torn > self.torn).then(|| {
+            self.torn += 1;
+            let index = self.before.map_or(0, |(_, index)| index + 1);
+            self.bad(index, "packets were lost on the way".to_owned())
+        })
     }
 }
 
 impl FrameSource for GigeSource {
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        if Instant::now() >= self.ask_at {
+            self.ask();
+        }
         let next = match self.held.take() {
             Some(block) => Ok(Some(block)),
             None => self.frames.next_frame_blocking(self.silence),
         };
         self.is_silent = matches!(next, Err(GenicamError::Timeout(_)));
-        let torn = self.frames.stats().frames_incomplete;
-        if torn > self.torn && matches!(next, Ok(Some(_))) {
+        if let Some(torn) = self.torn() {
             // Of those that were not whole, one after the other is told before the next that is.
-            self.torn += 1;
             self.held = next.ok().flatten();
-            let index = self.before.map_or(0, |(_, index)| index + 1);
-            return Err(self.bad(index, "packets were lost on the way".to_owned()));
+            return Err(torn);
         }
         let wrong = |what: String| VideoError::Stream { url: self.address.clone(), what };
         match next {
@@ -313,9 +361,13 @@ impl FrameSource for GigeSource {
         }
     }
 
-    fn packets(&self) -> Packets {
+    fn losses(&self) -> Losses {
         let stats = self.frames.stats();
-        Packets { lost: stats.packets_missing, recovered: stats.resend_recovered }
+        Losses {
+            packets_lost: stats.packets_missing,
+            packets_recovered: stats.resend_recovered,
+            frames_left_out: stats.frames_backpressure,
+        }
     }
 }
 
@@ -326,11 +378,6 @@ impl Drop for GigeSource {
             let _ = self.camera.acquisition_stop();
         }
     }
-}
-
-/// The clock of stamps; what they are late by is known better than that.
-fn stream_clock(host: HostClock, sd_s: f64) -> StreamClock {
-    StreamClock::of_asked(host, Latency { mean_s: 0.0, sd_s })
 }
 
 /// Images of brightness, one after another, of the size and at the rate.
@@ -362,43 +409,59 @@ fn eight_bytes(camera: &Camera<GigeRegisterIo>, at: u64) -> Option<u64> {
     Some(u64::from_be_bytes(bytes.try_into().ok()?))
 }
 
-/// What the camera's clock shows, in ticks, and this host's at the same time: in the middle of a question
-/// and its answer, which is off by half of what they took at most. The quickest of some.
-fn latched(camera: &mut Camera<GigeRegisterIo>) -> Option<(u64, Timestamp)> {
-    let mut quickest: Option<(Duration, u64, Timestamp)> = None;
+/// What a camera's clock showed when it was asked.
+struct Answer {
+    ticks: u64,
+    /// In the middle of the question and its answer: off by half of what they took at most.
+    at: Instant,
+    took: Duration,
+}
+
+/// The quickest of some answers; `None` if the camera has none, or none that is good for anything.
+fn latched(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
+    let mut quickest: Option<Answer> = None;
     for _ in 0..TRIES {
-        let (took, ticks, asked) = latch(camera)?;
-        if quickest.is_none_or(|(before, ..)| took < before) {
-            let asked = Timestamp::from_nanos(i64::try_from(asked.as_nanos()).ok()?);
-            quickest = Some((took, ticks, asked));
+        let answer = latch(camera)?;
+        let took = answer.took;
+        if quickest.as_ref().is_none_or(|before| took < before.took) {
+            quickest = Some(answer);
         }
         if took < QUICK {
             break;
         }
     }
-    quickest.map(|(_, ticks, asked)| (ticks, asked))
+    quickest.filter(|answer| answer.took < SLOW)
 }
 
-/// One question: what it took, the ticks, and the time since the Unix epoch.
-fn latch(camera: &mut Camera<GigeRegisterIo>) -> Option<(Duration, u64, Duration)> {
-    let (before, sent) = (SystemTime::now().duration_since(UNIX_EPOCH).ok()?, Instant::now());
+/// One question.
+fn latch(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
+    let sent = Instant::now();
     let noted = camera.transport().write(LATCH_AT, &LATCH).ok().map(|()| sent.elapsed());
     let by_register = noted.and_then(|took| {
-        let ticks = eight_bytes(camera, LATCHED_AT).filter(|ticks| *ticks != 0);
-        Some((took, ticks?, before + took / 2))
+        let ticks = eight_bytes(camera, LATCHED_AT).filter(|ticks| *ticks != 0)?;
+        Some(Answer { ticks, at: sent + took / 2, took })
     });
     by_register.or_else(|| latch_by_name(camera))
 }
 
 /// The same of cameras that have it under a name alone.
-fn latch_by_name(camera: &mut Camera<GigeRegisterIo>) -> Option<(Duration, u64, Duration)> {
+fn latch_by_name(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     let there = |name: &&&str| camera.nodemap().node(name).is_some();
     let (command, value) = (LATCHES.iter().find(there)?, LATCHED.iter().find(there)?);
-    let (before, sent) = (SystemTime::now().duration_since(UNIX_EPOCH).ok()?, Instant::now());
+    let sent = Instant::now();
     camera.execute_command(command).ok()?;
     let took = sent.elapsed();
     camera.invalidate(value);
-    Some((took, u64::try_from(camera.get_integer(value).ok()?).ok()?, before + took / 2))
+    let ticks = u64::try_from(camera.get_integer(value).ok()?).ok()?;
+    Some(Answer { ticks, at: sent + took / 2, took })
+}
+
+/// Whether the camera's clock follows another by PTP.
+fn follows_another(camera: &mut Camera<GigeRegisterIo>) -> bool {
+    PTP.iter().any(|name| {
+        camera.invalidate(name);
+        camera.get_enum(name).is_ok_and(|status| status == FOLLOWS)
+    })
 }
 
 /// A block's pixels without what its rows are filled up with.

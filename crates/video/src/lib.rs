@@ -94,19 +94,21 @@ pub trait FrameSource: Send {
     /// [`VideoError`] naming the file and the frame.
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError>;
 
-    /// What became of the packets in which its frames came, where it knows.
-    fn packets(&self) -> Packets {
-        Packets::default()
+    /// What was lost on the way from the camera, where it knows.
+    fn losses(&self) -> Losses {
+        Losses::default()
     }
 }
 
-/// What became of the packets in which frames came.
+/// What was lost on the way from a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Packets {
-    /// That never came.
-    pub lost: u64,
-    /// That came when they were asked for once more.
-    pub recovered: u64,
+pub struct Losses {
+    /// Packets that never came.
+    pub packets_lost: u64,
+    /// Packets that came when they were asked for once more.
+    pub packets_recovered: u64,
+    /// Frames that came and were given up, as they were not taken in time.
+    pub frames_left_out: u64,
 }
 
 /// When the frames of a file were captured, for files that do not say.

@@ -3,7 +3,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::{Frame, FrameSource, Packets, VideoError};
+use crate::{Frame, FrameSource, Losses, VideoError};
 
 /// A camera that sends nothing for so long is opened anew. Half of it would open one anew that is
 /// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
@@ -47,8 +47,19 @@ pub struct LiveCounts {
     pub opened: u64,
     /// Frames that came and were never looked at, as newer ones were here.
     pub left_out: u64,
-    /// What became of the packets in which they came, where that is known.
-    pub packets: Packets,
+    /// Packets in which they were that never came, where that is known.
+    pub packets_lost: u64,
+    /// Packets that came when they were asked for once more.
+    pub packets_recovered: u64,
+}
+
+impl LiveCounts {
+    /// Adds what was lost since it was told before.
+    fn add(&mut self, now: Losses, before: Losses) {
+        self.left_out += now.frames_left_out - before.frames_left_out;
+        self.packets_lost += now.packets_lost - before.packets_lost;
+        self.packets_recovered += now.packets_recovered - before.packets_recovered;
+    }
 }
 
 /// A live camera that is opened anew whenever it breaks off or falls silent, on a thread of its own,
@@ -235,12 +246,12 @@ fn watch(
     first: u64,
     frames: &mut u64,
 ) -> Result<(), VideoError> {
-    let before = shared.locked().counts.packets;
+    let mut told = Losses::default();
     while !shared.ended() {
         let next = source.next_frame();
-        let Packets { lost, recovered } = source.packets();
-        shared.locked().counts.packets =
-            Packets { lost: before.lost + lost, recovered: before.recovered + recovered };
+        let losses = source.losses();
+        shared.locked().counts.add(losses, told);
+        told = losses;
         match next {
             Ok(Some(frame)) => {
                 *frames = frame.index + 1;

@@ -173,8 +173,14 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     if let Some(address) = address.strip_prefix("gige://") {
         let address = address.parse().with_context(|| format!("`{address}` is no address"))?;
         let sd_s = Latency::default().sd_s;
-        let options =
-            GigeOptions { address, size: args.size, rate_hz: None, latency_s: None, sd_s };
+        let options = GigeOptions {
+            address,
+            size: args.size,
+            rate_hz: None,
+            latency_s: None,
+            sd_s,
+            heeds_stamps: true,
+        };
         return Ok(Some(LiveCamera::Gige(GigeCamera::new(options))));
     }
     let (address, login) = StreamAddress::parse(address)?;

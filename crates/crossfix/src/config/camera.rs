@@ -74,9 +74,9 @@ pub struct PoseConfig {
     pub position_sd_m: Option<f64>,
 }
 
-/// What a driver's times and an exposure that nobody has told are off by, s.
 /// An industrial camera stamps the exposure itself, and is asked for its clock over a quick network, s.
 const GIGE_CLOCK_SD_S: f64 = 1e-3;
+/// What a driver's times and an exposure that nobody has told are off by, s.
 const USB_CLOCK_SD_S: f64 = 0.01;
 
 /// What capture times are worth, and how they are corrected.
@@ -399,6 +399,7 @@ impl CameraFile {
                     rate_hz: *rate_hz,
                     latency_s: *latency_s,
                     sd_s: self.clock_sd_s(),
+                    heeds_stamps: !by_arrival,
                 })))
             }
             SourceConfig::Gstreamer(pipeline) => {

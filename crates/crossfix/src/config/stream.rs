@@ -147,13 +147,24 @@ pub struct GstreamerConfig {
     pub latency_s: f64,
 }
 
+/// Properties of elements with such names hold what is nobody's to read.
+const SECRETS: [&str; 5] = ["-pw", "pass", "secret", "token", "key="];
+
+/// Whether a word of a pipeline gives a property that is to be kept secret.
+fn is_secret(word: &str) -> bool {
+    let name = word.split_inclusive('=').next().unwrap_or(word).to_lowercase();
+    name.ends_with('=') && SECRETS.iter().any(|secret| name.contains(secret))
+}
+
 impl GstreamerConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         ensure!(!self.pipeline.trim().is_empty(), "key `source.pipeline` is empty");
         let names_somebody = |word: &str| {
             let host =
                 word.split_once("://").map(|(_, rest)| rest.split('/').next().unwrap_or(rest));
-            word.starts_with("user-pw") || host.is_some_and(|host| host.contains('@'))
+            is_secret(word)
+                || word.contains("://") && word.contains('?')
+                || host.is_some_and(|host| host.contains('@'))
         };
         ensure!(
             !self.pipeline.split_whitespace().any(names_somebody),
@@ -213,7 +224,13 @@ mod tests {
 
     #[test]
     fn a_pipeline_with_a_password_is_refused_as_it_is_shown() {
-        for word in ["user-pw=hunter2", "location=rtsp://eye:hunter2@10.0.0.5/live"] {
+        for word in [
+            "user-pw=hunter2",
+            "proxy-pw=hunter2",
+            "passphrase=hunter2",
+            "location=rtsp://eye:hunter2@10.0.0.5/live",
+            "location=rtsp://10.0.0.5/live?password=hunter2",
+        ] {
             let text = format!("pipeline = \"rtspsrc {word} ! decodebin\"");
             let pipeline: GstreamerConfig = crate::config::parse(&text, &[]).unwrap();
             let error = format!("{:#}", pipeline.check().unwrap_err());

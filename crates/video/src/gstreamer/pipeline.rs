@@ -10,14 +10,15 @@ use super::GstreamerOptions;
 use crate::rtsp::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
 use crate::{Arrival, Frame, FrameSource, MAX_PIXELS, Pixels, TimedBy, VideoError};
 
-/// Ends every pipeline: brightness alone, and the oldest frames left out where nobody takes them.
-pub(super) const BRIGHTNESS: &str = "videoconvert ! video/x-raw,format=GRAY8 ! \
-                                     appsink name=brightness sync=false max-buffers=4 drop=true";
+/// Ends every pipeline: brightness alone, as soon as it is there. Whoever watches takes each frame at once, and
+/// what stands in a decoder is limited by what was given to it.
+const BRIGHTNESS: &str =
+    "videoconvert ! video/x-raw,format=GRAY8 ! appsink name=brightness sync=false";
 /// What a reference time counts from, as GStreamer's streams name it: NTP's beginning, or Unix'.
 const NTP: &str = "timestamp/x-ntp";
 const UNIX: &str = "timestamp/x-unix";
 
-/// Builds what is described, with [`BRIGHTNESS`] at its end.
+/// Builds what is described, with brightness at its end.
 pub(super) fn built(description: &str) -> Result<(Pipeline, AppSink), String> {
     gstreamer::init().map_err(|error| error.to_string())?;
     let built = gstreamer::parse::launch(&format!("{description} ! {BRIGHTNESS}"));
@@ -48,7 +49,7 @@ pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), Str
     Ok((width, height, pixels))
 }
 
-/// What went wrong with a pipeline, if something did.
+/// What went wrong with a pipeline, if something did; what it says else is forgotten.
 pub(super) fn trouble(pipeline: &Pipeline) -> Option<String> {
     let message = pipeline.bus()?.pop_filtered(&[gstreamer::MessageType::Error])?;
     match message.view() {
@@ -157,11 +158,12 @@ impl PipelineSource {
 impl FrameSource for PipelineSource {
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
         let patience = ClockTime::try_from(self.silence).unwrap_or(ClockTime::from_seconds(1));
-        if let Some(sample) = self.sink.try_pull_sample(patience) {
-            return self.frame(&sample).map(Some);
-        }
+        let sample = self.sink.try_pull_sample(patience);
         if let Some(what) = trouble(&self.pipeline) {
             return Err(VideoError::Stream { url: self.name.clone(), what });
+        }
+        if let Some(sample) = sample {
+            return self.frame(&sample).map(Some);
         }
         if self.sink.is_eos() {
             return Ok(None);

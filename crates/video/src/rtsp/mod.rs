@@ -154,7 +154,12 @@ pub struct RtspSource {
     /// A packet was lost: what comes builds on it until the next picture that builds on none.
     torn: bool,
     next: u64,
+    /// Frames that came out together with the one before them.
+    ready: VecDeque<Frame>,
 }
+
+/// A picture's time by the stream's count, size and pixels.
+type Decoded = (i64, usize, usize, Pixels);
 
 enum Codec {
     H264(Box<H264Decoder>),
@@ -206,6 +211,7 @@ impl RtspSource {
             arrivals: BTreeMap::new(),
             torn: false,
             next: 0,
+            ready: VecDeque::new(),
         })
     }
 
@@ -247,8 +253,8 @@ impl RtspSource {
         })
     }
 
-    /// The frame that a unit of the stream holds; `None` if its picture comes out later.
-    fn frame(&mut self, unit: &VideoFrame) -> Result<Option<Frame>, VideoError> {
+    /// Makes ready the frames that a unit of the stream lets out; none if its picture comes out later.
+    fn take(&mut self, unit: &VideoFrame) -> Result<(), VideoError> {
         let at = unit.end_ctx().received();
         self.note_arrival(at);
         if at.saturating_duration_since(self.pictured) > UNDECODED {
@@ -257,12 +263,23 @@ impl RtspSource {
                 what: format!("nothing of {} s could be decoded", UNDECODED.as_secs()),
             });
         }
-        let Some((ticks, width, height, pixels)) = self.decode(unit, at)? else {
-            while self.arrivals.len() > MOST_ARRIVALS {
-                self.arrivals.pop_first();
-            }
-            return Ok(None);
-        };
+        for decoded in self.decode(unit, at)? {
+            let frame = self.frame(unit, decoded, at)?;
+            self.ready.push_back(frame);
+        }
+        while self.arrivals.len() > MOST_ARRIVALS {
+            self.arrivals.pop_first();
+        }
+        Ok(())
+    }
+
+    /// A picture as a frame, that came out when a unit had come at a time.
+    fn frame(
+        &mut self,
+        unit: &VideoFrame,
+        (ticks, width, height, pixels): Decoded,
+        at: Instant,
+    ) -> Result<Frame, VideoError> {
         let index = self.next;
         self.next += 1;
         self.pictured = at;
@@ -275,15 +292,11 @@ impl RtspSource {
             return Err(VideoError::HostClockSet { by_s: set_by_s });
         }
         let live = Some(Arrival { at, stream_s, timed_by });
-        Ok(Some(Frame { index, capture, live, width, height, pixels }))
+        Ok(Frame { index, capture, live, width, height, pixels })
     }
 
-    /// The time by the stream's count, the size and the pixels of the picture that a unit lets out.
-    fn decode(
-        &mut self,
-        unit: &VideoFrame,
-        at: Instant,
-    ) -> Result<Option<(i64, usize, usize, Pixels)>, VideoError> {
+    /// The pictures that a unit lets out.
+    fn decode(&mut self, unit: &VideoFrame, at: Instant) -> Result<Vec<Decoded>, VideoError> {
         let is_whole = unit.loss() == 0;
         self.torn = !is_whole || self.torn && !unit.is_random_access_point();
         let ticks = unit.timestamp().timestamp();
@@ -291,14 +304,15 @@ impl RtspSource {
         let decoded = match &mut self.codec {
             _ if self.torn => Err("packets were lost on the way".to_owned()),
             Codec::H264(decoder) => {
-                decoder.decode(unit.data(), ticks).map(|picture| picture.map(Picture::into_parts))
+                let picture = decoder.decode(unit.data(), ticks);
+                picture.map(|picture| picture.map(Picture::into_parts).into_iter().collect())
             }
             #[cfg(feature = "gstreamer")]
-            Codec::H265(decoder) => {
-                decoder.decode(unit.data(), ticks).map(|picture| picture.map(Picture::into_parts))
-            }
+            Codec::H265(decoder) => decoder
+                .decode(unit.data(), ticks)
+                .map(|pictures| pictures.into_iter().map(Picture::into_parts).collect()),
             Codec::MotionJpeg => decode_still(unit.data())
-                .map(|(width, height, pixels)| Some((ticks, width, height, pixels))),
+                .map(|(width, height, pixels)| vec![(ticks, width, height, pixels)]),
         };
         decoded.map_err(|what| {
             self.arrivals.remove(&ticks);
@@ -421,10 +435,14 @@ impl Drop for RtspSource {
 
 impl FrameSource for RtspSource {
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError> {
+        if let Some(frame) = self.ready.pop_front() {
+            return Ok(Some(frame));
+        }
         while let Some(item) = self.receive()? {
             match item {
                 CodecItem::VideoFrame(unit) => {
-                    if let Some(frame) = self.frame(&unit)? {
+                    self.take(&unit)?;
+                    if let Some(frame) = self.ready.pop_front() {
                         return Ok(Some(frame));
                     }
                 }

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// Where the description of what it has is read, and the registers that it names.
 const XML_AT: u32 = 0x0010_0000;
@@ -16,6 +16,7 @@ const START: u32 = 0x2_000c;
 const STOP: u32 = 0x2_0010;
 const RATE: u32 = 0x2_0014;
 const MODE: u32 = 0x2_0018;
+const PTP: u32 = 0x2_001c;
 
 /// Blocks whose packets it can send once more.
 const REMEMBERED: u16 = 8;
@@ -40,6 +41,8 @@ pub struct Behaviour {
     pub picture: Box<dyn Fn(f64, usize, usize) -> Vec<u8> + Send>,
     /// Whether it sends packets once more that are asked for.
     pub resends: bool,
+    /// Its clock follows another by PTP.
+    pub follows: bool,
     /// Another application has control.
     pub taken: bool,
 }
@@ -62,6 +65,8 @@ pub struct Fake {
     pub mute: Arc<AtomicBool>,
     end: Arc<AtomicBool>,
     threads: Vec<std::thread::JoinHandle<()>>,
+    /// When its clock showed what it begins with.
+    pub begun: SystemTime,
 }
 
 impl State {
@@ -116,6 +121,7 @@ impl Fake {
         let xml = xml();
         let hz = behaviour.clock.ticks_hz;
         let url = format!("Local:fake.xml;{XML_AT:X};{:X}", xml.len()).into_bytes();
+        let begun = SystemTime::now();
         let regs = BTreeMap::from([
             (0x904, 1),
             (0x934, if behaviour.resends { 4 } else { 0 }),
@@ -123,6 +129,7 @@ impl Fake {
             (0x93c, (hz >> 32) as u32),
             (0x940, hz as u32),
             (0xd04, 1400),
+            (PTP, u32::from(behaviour.follows)),
             (WIDTH, 320),
             (HEIGHT, 240),
             (FORMAT, 0x0108_0001),
@@ -156,7 +163,7 @@ impl Fake {
                 send(&images, &s, &m, &mut block);
             }
         });
-        Self { ip, state, mute, end, threads: vec![a, b] }
+        Self { ip, state, mute, end, threads: vec![a, b], begun }
     }
     pub fn is_controlled(&self) -> bool {
         self.state.lock().unwrap().controller.is_some()
@@ -331,6 +338,8 @@ fn xml() -> String {
         reg("WidthReg", WIDTH, 4, "RW"), int("Width", "<Min>16</Min><Max>4096</Max><Inc>1</Inc>"), reg("HeightReg", HEIGHT, 4, "RW"), int("Height", "<Min>16</Min><Max>4096</Max><Inc>1</Inc>"),
         reg("PixelFormatReg", FORMAT, 4, "RW"), "<Enumeration Name=\"PixelFormat\"><EnumEntry Name=\"Mono8\"><Value>17301505</Value></EnumEntry><pValue>PixelFormatReg</pValue></Enumeration>".into(),
         "<IntSwissKnife Name=\"PayloadSize\"><pVariable Name=\"W\">WidthReg</pVariable><pVariable Name=\"H\">HeightReg</pVariable><Formula>W*H</Formula></IntSwissKnife>".into(),
+        reg("PtpStatusReg", PTP, 4, "RO"),
+        "<Enumeration Name=\"PtpStatus\"><EnumEntry Name=\"Disabled\"><Value>0</Value></EnumEntry><EnumEntry Name=\"Slave\"><Value>1</Value></EnumEntry><pValue>PtpStatusReg</pValue></Enumeration>".into(),
         reg("AcquisitionModeReg", MODE, 4, "RW"), "<Enumeration Name=\"AcquisitionMode\"><EnumEntry Name=\"Continuous\"><Value>0</Value></EnumEntry><pValue>AcquisitionModeReg</pValue></Enumeration>".into(),
         reg("AcquisitionStartReg", START, 4, "WO"), cmd("AcquisitionStart", 1), reg("AcquisitionStopReg", STOP, 4, "WO"), cmd("AcquisitionStop", 1),
         format!("<FloatReg Name=\"RateReg\"><Address>{RATE:#x}</Address><Length>4</Length><AccessMode>RW</AccessMode><pPort>Device</pPort><Endianess>BigEndian</Endianess></FloatReg>"),

@@ -309,7 +309,11 @@ impl Agent {
             ended,
             problems: self.problems(),
             scene_begins_ns: self.scene_begins.nanos(),
-            tracks: self.tracks,
+            tracks: if self.stream.as_ref().is_some_and(StreamHealth::is_lost) {
+                0
+            } else {
+                self.tracks
+            },
             ..Default::default()
         };
         let health = self.health.completed(health);

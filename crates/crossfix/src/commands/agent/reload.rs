@@ -1,6 +1,6 @@
 //! A live camera's file, read again while its agent runs (SIGHUP, `systemctl reload`).
 
-use crossfix_message::{Payload, Timestamp};
+use crossfix_message::{ClockSource, Payload, Timestamp};
 use crossfix_vision::ImageTracker;
 
 use super::Agent;
@@ -19,6 +19,8 @@ impl Again {
     /// What of a new file can hold at once, in the place of the old.
     fn of(new: CameraFile, old: &CameraFile) -> anyhow::Result<Self> {
         let mut waits = Vec::new();
+        // What is opened is told how well arrivals are known.
+        let by_arrival = old.clock_source() == ClockSource::Arrival;
         // Sources hold passwords and are compared, not shown.
         let is_other_source = toml::to_string(&new.source)? != toml::to_string(&old.source)?;
         for (key, is_other) in [
@@ -26,6 +28,8 @@ impl Again {
             ("network", new.network != old.network),
             ("source", is_other_source),
             ("clock.source", new.clock.source != old.clock.source),
+            ("clock.sd_s", by_arrival && new.clock.sd_s != old.clock.sd_s),
+            ("boxes", new.boxes != old.boxes),
         ] {
             if is_other {
                 waits.push(key);
@@ -47,7 +51,10 @@ impl Agent {
         let name = self.identity.name.clone();
         match self.read_again(watch) {
             Ok(waits) if waits.is_empty() => {
-                tracing::info!("camera `{name}`: {} is read again", self.config.display());
+                tracing::info!(
+                    "camera `{name}`: {} is read again, but not its password",
+                    self.config.display()
+                );
             }
             Ok(waits) => tracing::warn!(
                 "camera `{name}`: {} is read again; what it says of {} holds once the agent is \
@@ -80,8 +87,12 @@ impl Agent {
             size.height
         );
         let calibrated = file.calibrated()?;
-        let now = Timestamp::from_seconds(wall_seconds());
+        // This host's clock may show anything; what is seen next comes after what was seen last.
+        let wall = Timestamp::from_seconds(wall_seconds());
+        let now = if self.frames > 0 { self.now } else { wall };
         let message = match &calibrated {
+            // Times that were published are the common ones already.
+            Some(calibrated) if self.frames > 0 => calibrated.message(now),
             Some(calibrated) => calibrated.message(calibrated.common(now)),
             None => file.calibration(&camera, now)?,
         };

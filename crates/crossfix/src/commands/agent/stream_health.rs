@@ -127,8 +127,8 @@ impl StreamHealth {
                  their arrival; set the camera to a time server"
             )),
             Some(TimedBy::Arrival) if is_late && self.heeds_reports => Some(
-                "the camera does not say what its clock shows (no RTCP sender reports): images are \
-                 timed by their arrival"
+                "the camera does not say what its clock shows (RTCP sender reports; of an industrial \
+                 one, what it answers): images are timed by their arrival"
                     .to_owned(),
             ),
             _ => None,
@@ -147,12 +147,15 @@ impl StreamHealth {
             ("frames_late", self.late),
             ("frames_left_out", self.counts.left_out),
             ("frames_repeated", self.repeated),
-            ("packets_lost", self.counts.packets.lost),
-            ("packets_recovered", self.counts.packets.recovered),
+            ("packets_lost", self.counts.packets_lost),
+            ("packets_recovered", self.counts.packets_recovered),
             ("stream_opened", self.counts.opened),
             (
                 "synchronised",
-                u64::from(matches!(self.timed_by, Some(TimedBy::Camera | TimedBy::Driver))),
+                u64::from(
+                    self.lost.is_none()
+                        && matches!(self.timed_by, Some(TimedBy::Camera | TimedBy::Driver)),
+                ),
             ),
         ];
         for samples in [&mut self.from_arrival, &mut self.from_exposure, &mut self.intervals] {

@@ -1,11 +1,15 @@
 //! How good this host's clock is, as chrony, ptp4l or the kernel tells it.
 
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 use super::{Finding, Verdict};
 use crate::host::kernel_clock_bound;
 use crate::pace::wall_seconds;
 
+/// How long a program may take to say how good the clock is, and how often is looked whether it has.
+const ANSWER: Duration = Duration::from_secs(5);
+const POLL: Duration = Duration::from_millis(10);
 /// A clock that may be off by so much costs a target at 20 m/s a tenth of a metre, s.
 const GOOD_S: f64 = 0.005;
 /// One that may be off by more is worse than what an agent assumes of a camera, s.
@@ -101,7 +105,20 @@ fn of_bound(bound_s: f64) -> Verdict {
 
 /// What a program says, where it is there and says it in time.
 fn said(program: &str, arguments: &[&str]) -> Option<String> {
-    let output = Command::new(program).args(arguments).output().ok()?;
+    let mut command = Command::new(program);
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut child = command.spawn().ok()?;
+    let begun = Instant::now();
+    while child.try_wait().ok()?.is_none() {
+        if begun.elapsed() > ANSWER {
+            // It is asked for nothing else.
+            let _ = child.kill();
+            let _ = child.wait();
+            return None;
+        }
+        std::thread::sleep(POLL);
+    }
+    let output = child.wait_with_output().ok()?;
     Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
@@ -109,11 +126,14 @@ fn said(program: &str, arguments: &[&str]) -> Option<String> {
 pub fn host_clock() -> Finding {
     let chrony = || Tracking::parse(&said("chronyc", &["-c", "tracking"])?);
     let ptp = || Ptp::parse(&said("pmc", &["-u", "-b", "0", "GET TIME_STATUS_NP"])?);
-    let (verdict, found) = if let Some(tracking) = chrony() {
+    let (chrony, kernel) = (chrony(), kernel_clock_bound());
+    let keeps = |tracking: &&Tracking| tracking.is_synchronised || kernel.is_none();
+    let (verdict, found) = if let Some(tracking) = chrony.as_ref().filter(keeps) {
         tracking.judge(wall_seconds())
-    } else if let Some(ptp) = ptp() {
+    // ptp4l keeps a network card's clock, and that is this host's where somebody has told the kernel.
+    } else if let (Some(ptp), Some(_)) = (ptp(), kernel) {
         ptp.judge()
-    } else if let Some(bound) = kernel_clock_bound() {
+    } else if let Some(bound) = kernel {
         let bound_s = bound.as_secs_f64();
         (of_bound(bound_s), format!("within {:.1} ms, as the kernel was told", bound_s * 1e3))
     } else {
