@@ -82,9 +82,12 @@ fn three_network_cameras_are_a_site() {
         let of = |source| frames.iter().filter(|f| f.clock_source() == source).count();
         let (arrival, camera) = (of(ClockSource::Arrival), of(ClockSource::Camera));
         assert!(arrival > 20 && camera > 200 && arrival + camera == frames.len(), "{name}");
-        let last = healths(&site, "live.mcap", name).pop().unwrap();
-        assert!(counter(&last, "stream_opened") >= 1 && counter(&last, "synchronised") == 1);
-        assert_eq!(counter(&last, "bad_frames"), 0, "{last:?}");
+        // When the cameras have ended and an agent still asks, nothing tells it the time.
+        let healths = healths(&site, "live.mcap", name);
+        assert!(healths.iter().filter(|health| counter(health, "synchronised") == 1).count() >= 8);
+        let last = healths.last().unwrap();
+        assert!(counter(last, "stream_opened") >= 1, "{last:?}");
+        assert_eq!(counter(last, "bad_frames"), 0, "{last:?}");
         assert!(!site.text(&format!("{name}.log")).contains("hunter2"));
     }
     let live = site.path("live.mcap");
