@@ -223,7 +223,7 @@ own() {{ printf 'cmdport 0\nbindcmdaddress %s/%s.sock\npidfile %s/%s.pid\n' "$di
 for one in server kept lost; do chronyd -x -d -f "$dir/$one.conf" >/dev/null 2>&1 & done
 for _ in $(seq 100); do
   /usr/bin/chronyc -h "$dir/kept.sock" -c tracking 2>/dev/null |
-    awk -F, '{{ exit !($2 == "127.0.0.1" && $12 < 0.001) }}' && break
+    awk -F, '$2 == "127.0.0.1" && $12 < 0.001 {{ kept = 1 }} END {{ exit !kept }}' && break
   sleep 0.2
 done
 for one in kept lost; do
