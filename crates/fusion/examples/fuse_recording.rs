@@ -57,7 +57,7 @@ fn say(outputs: &[Output]) {
             }
             Output::Camera(camera, standing) => println!("camera {camera}: {standing:?}"),
             // Positions of every exposure, and bearings of no use: more than one wants to read.
-            Output::Tracks(_) | Output::Smoothed(_) | Output::Rejected(_) => {}
+            Output::Tracks(_) | Output::Smoothed(_) | Output::Cues(_) | Output::Rejected(_) => {}
         }
     }
 }

@@ -145,7 +145,7 @@ impl Run {
                     writeln!(out, "S {index} {camera} {standing:?}")?;
                 }
                 // Asked for by no scene.
-                Output::Smoothed(_) => {}
+                Output::Smoothed(_) | Output::Cues(_) => {}
             }
         }
         Ok(())

@@ -4,12 +4,13 @@ mod smoothing;
 use std::collections::BTreeMap;
 
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, Payload, Timestamp, TrackEvent,
-    TrackFrame,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, CueFrame, Payload, Timestamp,
+    TrackEvent, TrackFrame,
 };
 
-use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding};
+use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, Sample};
 use crate::clocks::{ClockEstimate, ClockEstimator};
+use crate::cueing::{self, Cueing};
 use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
@@ -33,6 +34,8 @@ pub enum Output {
     Smoothed(TrackFrame),
     /// Something happened to a track.
     Event(TrackEvent),
+    /// What a camera that looks where it is told should look for.
+    Cues(CueFrame),
     /// Something was not used.
     Rejected(Rejection),
     /// A camera is left out, or used again.
@@ -66,6 +69,7 @@ pub struct Fusion {
     /// Exposures in the order of their times less what their clocks are ahead.
     corrected: ReorderQueue<()>,
     smoothing: Smoothing,
+    cueing: Cueing,
     counters: Counters,
     sequence: u64,
     now: Option<Timestamp>,
@@ -89,6 +93,7 @@ impl Fusion {
             site_time: SiteTime::new(config.event_time.lateness_s),
             corrected: ReorderQueue::default(),
             smoothing: Smoothing::new(config.tracking.smoothing_s),
+            cueing: Cueing::default(),
             counters: Counters::default(),
             sequence: 0,
             now: None,
@@ -113,6 +118,9 @@ impl Fusion {
         });
         let known = KnownCamera {
             camera: calibration.camera,
+            mount: calibration.mount,
+            takes_cues: calibration.takes_cues,
+            is_turning: false,
             pose_covariance,
             lasting,
             clock_walk: calibration.clock_wander_s.powi(2),
@@ -294,6 +302,9 @@ impl Fusion {
             return;
         };
         self.counters.count("exposures");
+        if camera.point(exposure) {
+            self.tracker.turn_camera(&exposure.camera);
+        }
         let mut exposure = exposure.clone();
         camera.tell(&mut exposure, self.config.tracking.clutter_per_sr);
         if let Some(change) = camera.clock_change(&exposure) {
@@ -307,6 +318,12 @@ impl Fusion {
             self.follow(&exposure, &mut changes)
         };
         for samples in self.tracker.draws() {
+            // What a mount's angles are off by is another error after each turn.
+            let is_fixed = |sample: &Sample| !self.cameras.is_on_mount(&sample.camera);
+            let samples: Vec<Sample> = samples.into_iter().filter(is_fixed).collect();
+            if samples.len() < 2 {
+                continue;
+            }
             self.cameras.watch(&samples, exposure.time);
             for (camera, ratio) in self.cameras.learn_poses(&samples) {
                 self.tracker.rescale_pose(&camera, ratio);
@@ -315,6 +332,7 @@ impl Fusion {
         self.compare_clocks(&exposure, &used);
         self.assess_camera(&exposure, &fittings, outputs);
         self.emit_tracks(&exposure, changes, outputs);
+        self.cue(exposure.time, outputs);
     }
 
     /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns
@@ -454,6 +472,28 @@ impl Fusion {
         }
         if self.smoothing.is_wanted() {
             self.smooth(exposure.time, &due, outputs);
+        }
+    }
+
+    /// Tells the cameras that look where they are told what they should look for.
+    fn cue(&mut self, now: Timestamp, outputs: &mut Vec<Output>) {
+        let Self { cameras, tracker, initiator, cueing, clocks, config, .. } = self;
+        let due: Vec<(&CameraName, &KnownCamera)> = cameras
+            .iter()
+            .filter(|(_, camera)| !camera.is_excluded() && camera.at_rest().takes_cues)
+            .filter(|(name, _)| cueing.is_due(name, now))
+            .map(|(name, camera)| (name, camera.at_rest()))
+            .collect();
+        if due.is_empty() {
+            return;
+        }
+        let mut targets = tracker.known(now);
+        targets.extend(initiator.known(now));
+        for (name, known) in due {
+            let ahead_s = clocks.estimate(name).map_or(0.0, |clock| clock.offset_s);
+            let max_range_m = config.initiation.max_range_m;
+            let cues = cueing::cues(name, known, (now, ahead_s), &targets, max_range_m);
+            outputs.push(Output::Cues(cues));
         }
     }
 

@@ -6,8 +6,8 @@ use crossfix_geometry::{Bearing, Camera, GeometryError, SightLine};
 use crossfix_message::{BearingFrame, BearingTrack, CameraName, ImageTrackState, Timestamp};
 use nalgebra::Matrix2;
 
-use crate::cameras::{KnownCamera, Rooted};
-use crate::uncertainty::{CameraUncertainty, PoseUncertainty};
+use crate::cameras::{KnownCamera, Pointed, Rooted};
+use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
 /// Bearings of one frame that are read: more is no picture, and memory is bounded.
@@ -35,6 +35,8 @@ pub struct Exposure {
     pub time: Timestamp,
     /// What is uncertain of the camera as a whole.
     pub(crate) uncertainty: CameraUncertainty,
+    /// Where its mount pointed, if it has one.
+    pub(crate) pointed: Option<Pointed>,
     /// Density of the camera's false bearings, 1/sr.
     pub(crate) clutter_per_sr: f64,
     /// What has been taken off the reported time for the clock's offset, s.
@@ -69,6 +71,9 @@ pub enum RejectionReason {
     Duplicate,
     /// The frame's time or its standard deviation is impossible.
     Time,
+    /// The camera is on a mount, and the frame does not say where that pointed, or says what is
+    /// impossible.
+    Pointing,
     /// One bearing is impossible; the others of the frame are used.
     Bearing(GeometryError),
     /// The frame has more bearings than a picture can have; the first ones are used.
@@ -87,6 +92,7 @@ impl RejectionReason {
             Self::Future { .. } => "rejected_future",
             Self::Duplicate => "rejected_duplicate",
             Self::Time => "rejected_time",
+            Self::Pointing => "rejected_pointing",
             Self::Bearing(_) => "rejected_bearing",
             Self::Crowded { .. } => "frames_crowded",
         }
@@ -118,6 +124,9 @@ impl fmt::Display for Rejection {
             }
             RejectionReason::Duplicate => f.write_str("its capture time came before"),
             RejectionReason::Time => f.write_str("its capture time or its SD is impossible"),
+            RejectionReason::Pointing => {
+                f.write_str("its camera is on a mount, and where that pointed is not said")
+            }
             RejectionReason::Crowded { left_out } => {
                 write!(
                     f,
@@ -150,11 +159,20 @@ fn sighting(
     })
 }
 
+/// Where the mount of a frame's camera pointed, if it has one.
+fn pointed(frame: &BearingFrame, known: &KnownCamera) -> Result<Option<Pointed>, RejectionReason> {
+    if known.mount.is_none() {
+        return Ok(None);
+    }
+    let said = frame.pointing.as_ref().and_then(Pointed::read);
+    said.map(Some).ok_or(RejectionReason::Pointing)
+}
+
 /// Reads a frame: what was measured, and what of it had to be left out.
 pub(crate) fn read(
     frame: &BearingFrame,
     name: &CameraName,
-    KnownCamera { camera, pose_covariance: pose, lasting, clock_walk, .. }: &KnownCamera,
+    calibrated: &KnownCamera,
     config: &Bearings,
     counters: &mut Counters,
 ) -> Result<(Exposure, Vec<RejectionReason>), RejectionReason> {
@@ -162,6 +180,9 @@ pub(crate) fn read(
     if !(sd.is_finite() && (0.0..10.0).contains(&sd)) {
         return Err(RejectionReason::Time);
     }
+    let pointed = pointed(frame, calibrated)?;
+    let turned = pointed.as_ref().map(|pointed| calibrated.pointed(pointed));
+    let known = turned.as_ref().unwrap_or(calibrated);
     let mut rejected = Vec::new();
     let mut sightings = Vec::new();
     let (mut measured, mut left_out) = (0, 0);
@@ -170,12 +191,16 @@ pub(crate) fn read(
             counters.count("bearings_predicted_only");
             continue;
         }
+        if known.is_turning {
+            counters.count("bearings_while_turning");
+            continue;
+        }
         measured += 1;
         if measured > MAX_BEARINGS {
             left_out += 1;
             continue;
         }
-        match sighting(track, camera, config) {
+        match sighting(track, &known.camera, config) {
             Ok(sighting) => sightings.push(sighting),
             Err(error) => rejected.push(RejectionReason::Bearing(error)),
         }
@@ -188,13 +213,11 @@ pub(crate) fn read(
         sequence: frame.sequence,
         time: Timestamp::from_nanos(frame.capture_time_ns),
         uncertainty: CameraUncertainty {
-            pose: Some(PoseUncertainty::new(*pose)),
+            time_sd_s: sd,
             clock_source: frame.clock_source(),
-            clock_walk: *clock_walk,
-            lasting: *lasting,
-            axes: *camera.pose().rotation(),
-            ..CameraUncertainty::of_time(sd)
+            ..known.uncertainty()
         },
+        pointed,
         clutter_per_sr: 1.0,
         correction_s: 0.0,
         sightings,

@@ -56,6 +56,7 @@ mod cameras;
 mod clocks;
 mod config;
 mod counters;
+mod cueing;
 mod event_time;
 mod fusion;
 mod ingress;

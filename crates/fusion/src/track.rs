@@ -9,9 +9,10 @@ use std::fmt;
 
 use crossfix_filter::{Imm, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine};
-use crossfix_message::{CameraName, Solver, Timestamp, TrackNumber};
+use crossfix_message::{CameraName, Cued, Solver, Timestamp, TrackNumber};
 use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, Point3};
 
+use crate::cueing::Known;
 use crate::motion::{Detector, Motion, REINITIALISED_POSITION_SD, REINITIALISED_VELOCITY_SD};
 use crate::spatial::{Fix, Observability, TimedLine, VAGUE_VELOCITY_SD};
 use crate::uncertainty::CameraUncertainty;
@@ -243,6 +244,13 @@ impl Track {
     pub(crate) fn position_at(&self, time: Timestamp) -> Point3<f64> {
         let state = self.imm.combined();
         state.position() + state.velocity() * time.seconds_since(self.updated)
+    }
+
+    /// What is known of it now and for the seconds ahead.
+    pub(crate) fn known(&self, now: Timestamp, motion: &Motion) -> Known {
+        let of = Cued { track_id: self.id.0, ..Default::default() };
+        let seen_from = self.follower.filter(|_| !self.held);
+        Known::new(of, now, seen_from, |time| self.predicted(time, motion))
     }
 
     /// The probability of each motion model.

@@ -10,6 +10,7 @@ use crossfix_filter::{Gate, KinematicState};
 use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 
 use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, Sample};
+use crate::cueing::Known;
 use crate::motion::Motion;
 use crate::prediction::Fit;
 use crate::reacquisition::{Look, Reacquisition};
@@ -137,6 +138,12 @@ impl Tracker {
         self.tracks.values_mut().for_each(|track| track.forget_until(time));
     }
 
+    /// All sure targets, as far as they are known now.
+    pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
+        let sure = self.tracks.values().filter(|track| track.is_confirmed());
+        sure.map(|track| track.known(now, &self.motion)).collect()
+    }
+
     /// Whether any target is followed for sure.
     pub(crate) fn has_sure(&self) -> bool {
         self.tracks.values().any(Track::is_confirmed)
@@ -262,6 +269,11 @@ impl Tracker {
     /// A camera's pose errors have been found to be larger or smaller (ratio of the variances).
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
         self.tracks.values_mut().for_each(|track| track.rescale_pose(camera, ratio));
+    }
+
+    /// A camera's mount has turned it: see [`Track::turn_camera`].
+    pub(crate) fn turn_camera(&mut self, camera: &CameraName) {
+        self.tracks.values_mut().for_each(|track| track.turn_camera(camera));
     }
 
     /// A camera's clock is known otherwise: see [`Track::set_clock`].

@@ -252,6 +252,12 @@ impl Camera {
         Ok(Self { model: CameraModel::new(intrinsics)?, pose })
     }
 
+    /// The same camera in another pose.
+    #[must_use]
+    pub fn posed(&self, pose: Pose) -> Self {
+        Self { model: self.model.clone(), pose }
+    }
+
     /// Its model.
     pub fn model(&self) -> &CameraModel {
         &self.model

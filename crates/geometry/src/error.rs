@@ -39,6 +39,12 @@ pub enum GeometryError {
     /// A camera that looks at its own centre or straight up or down has no defined roll.
     #[error("a camera cannot be aimed at a point straight above, below or at itself")]
     Aim,
+    /// A mount whose angles have no order, or go beyond a turn.
+    #[error(
+        "a mount's least angles must not be above its most, the azimuth's within a turn and the \
+         elevation's within a quarter of one"
+    )]
+    Reach,
     /// A focal length, size or principal point that no camera has.
     #[error("{what} is {value}: {must}")]
     Intrinsics {

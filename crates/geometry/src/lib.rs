@@ -30,6 +30,7 @@ mod error;
 mod fisheye;
 mod geodetic;
 mod model;
+mod pan_tilt;
 mod pose;
 mod scanning;
 
@@ -38,5 +39,6 @@ pub use camera::{Camera, CameraModel, Distortion, ImageSize, Intrinsics, Pixel, 
 pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};
 pub use model::BearingModel;
+pub use pan_tilt::PanTilt;
 pub use pose::{Pose, turn_vector};
 pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};

@@ -59,6 +59,12 @@ impl Pose {
         Self::new(Matrix3::from_columns(&[right, down, forward]), position)
     }
 
+    /// The pose of a camera that stands in the same place and is turned about its own axes.
+    #[must_use]
+    pub fn turned(&self, turn: &Rotation3<f64>) -> Self {
+        Self { rotation: self.rotation * turn, position: self.position }
+    }
+
     /// The rotation `world_from_camera`.
     pub fn rotation(&self) -> &Rotation3<f64> {
         &self.rotation

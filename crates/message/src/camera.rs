@@ -1,11 +1,14 @@
-use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
+use crossfix_geometry::{
+    Camera, Distortion, GeometryError, ImageSize, Intrinsics, PanTilt, Pose, ScanAngles,
+};
 use nalgebra::{Matrix3, Matrix6, Point3};
 use prost::Message;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::{
-    CameraCalibration, CameraName, Datum, DistortionModel, NameError, Payload, Timestamp, Vector3,
+    CameraCalibration, CameraName, Datum, DistortionModel, NameError, PanTiltMount, Payload,
+    Pointing, Timestamp, Vector3,
 };
 
 /// A [`CameraCalibration`] that has been read and found possible.
@@ -13,8 +16,12 @@ use crate::{
 pub struct Calibration {
     /// Whose it is.
     pub name: CameraName,
-    /// Its model and place.
+    /// Its model and place; of a camera on a mount with both angles at zero.
     pub camera: Camera,
+    /// What turns it, if something does.
+    pub mount: Option<PanTilt>,
+    /// Whether it looks for what it is told to look for.
+    pub takes_cues: bool,
     /// Covariance of the pose in the world's axes, rotation about them (rad), then position (m);
     /// `None`: exact.
     pub pose_covariance: Option<Matrix6<f64>>,
@@ -94,8 +101,7 @@ impl CameraCalibration {
             cy: intrinsics.cy,
             distortion_model: distortion_model.into(),
             distortion,
-            // nalgebra stores columns first.
-            rotation: pose.rotation().matrix().transpose().as_slice().to_vec(),
+            rotation: rows_of(pose),
             position: Some(pose.position().into()),
             valid_from_ns: valid_from.nanos(),
             ..Default::default()
@@ -121,14 +127,26 @@ impl CameraCalibration {
         let geometry = |source| CalibrationError::Geometry { camera: name.clone(), source };
 
         let intrinsics = self.lens(&name)?;
-        if self.rotation.is_empty() && self.position.is_none() {
-            return Err(CalibrationError::NoPose { camera: name });
-        }
-        let rotation: [f64; 9] =
-            self.rotation.as_slice().try_into().map_err(|_| shape("rotation"))?;
-        let position = self.position.ok_or_else(|| shape("position"))?;
-        let pose =
-            Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)?;
+        let read_pose = |rotation: &[f64], position: Option<Vector3>| {
+            let rotation: [f64; 9] = rotation.try_into().map_err(|_| shape("rotation"))?;
+            let position = position.ok_or_else(|| shape("position"))?;
+            Pose::new(Matrix3::from_row_slice(&rotation), position.into()).map_err(geometry)
+        };
+        let is_bare = self.rotation.is_empty() && self.position.is_none();
+        let mount = match &self.mount {
+            None => None,
+            // A pose that stays and one that turns.
+            Some(_) if !is_bare => return Err(shape("mount")),
+            Some(mount) => {
+                let rest = read_pose(&mount.rotation, mount.position)?;
+                Some(mount.read(rest).map_err(geometry)?)
+            }
+        };
+        let pose = match &mount {
+            Some(mount) => *mount.rest(),
+            None if is_bare => return Err(CalibrationError::NoPose { camera: name }),
+            None => read_pose(&self.rotation, self.position)?,
+        };
         let camera = Camera::new(intrinsics, pose).map_err(geometry)?;
         let pose_covariance = match self.pose_covariance.as_slice() {
             [] => None,
@@ -156,12 +174,41 @@ impl CameraCalibration {
         Ok(Calibration {
             name,
             camera,
+            mount,
+            takes_cues: self.takes_cues,
             pose_covariance,
             lasting_noise: lasts.then_some(noise),
             clock_wander_s: self.clock_wander_s,
             datum,
             valid_from,
         })
+    }
+
+    /// The same calibration of a camera on a mount: its pose is that of the mount with both angles
+    /// at zero, and it looks where it is told to look.
+    #[must_use]
+    pub fn on_mount(mut self, mount: &PanTilt) -> Self {
+        let [azimuth_min, azimuth_max] = mount.azimuth();
+        let [elevation_min, elevation_max] = mount.elevation();
+        self.mount = Some(PanTiltMount {
+            rotation: rows_of(mount.rest()),
+            position: Some(mount.rest().position().into()),
+            azimuth_min,
+            azimuth_max,
+            elevation_min,
+            elevation_max,
+        });
+        self.rotation.clear();
+        self.position = None;
+        self.taking_cues()
+    }
+
+    /// The same calibration of a camera that looks for what it is told to look for.
+    #[must_use]
+    pub fn taking_cues(mut self) -> Self {
+        self.takes_cues = true;
+        self.hash = self.content_hash();
+        self
     }
 
     /// The camera's lens, whether or not its pose is known.
@@ -246,6 +293,41 @@ impl CameraCalibration {
     }
 }
 
+/// A rotation `world_from_camera` as nine elements, row by row.
+fn rows_of(pose: &Pose) -> Vec<f64> {
+    // nalgebra stores columns first.
+    pose.rotation().matrix().transpose().as_slice().to_vec()
+}
+
+impl Calibration {
+    /// The camera as it was turned for a frame, and where it pointed; the camera as it is for one that
+    /// stands still. `None` if it is on a mount and the frame does not say where it pointed.
+    pub fn pointed(&self, pointing: Option<&Pointing>) -> Option<Camera> {
+        let Some(mount) = &self.mount else { return Some(self.camera.clone()) };
+        Some(self.camera.posed(mount.pose(pointing?.angles()?)))
+    }
+}
+
+impl Pointing {
+    /// The angles, where they are possible.
+    pub fn angles(&self) -> Option<ScanAngles> {
+        let Self { azimuth, elevation, .. } = *self;
+        let within = |angle: f64, turns: f64| angle.abs() <= turns * std::f64::consts::TAU;
+        let possible = within(azimuth, 1.0) && within(elevation, 0.25);
+        possible.then_some(ScanAngles { azimuth, elevation })
+    }
+}
+
+impl PanTiltMount {
+    fn read(&self, rest: Pose) -> Result<PanTilt, GeometryError> {
+        PanTilt::new(
+            rest,
+            [self.azimuth_min, self.azimuth_max],
+            [self.elevation_min, self.elevation_max],
+        )
+    }
+}
+
 /// The covariance on the wire (rotation about the camera's axes) turned into the world's axes;
 /// `None` if it is no covariance.
 fn read_pose_covariance(values: &[f64; 36], camera: &Camera) -> Option<Matrix6<f64>> {
@@ -314,6 +396,43 @@ mod tests {
             assert!((ours - theirs).abs() < 1e-12);
         }
         assert_eq!(message.hash, message.content_hash());
+    }
+
+    fn mounted() -> CameraCalibration {
+        let camera = message().parse().unwrap().camera;
+        let mount = PanTilt::new(*camera.pose(), [-1.0, 2.0], [-0.2, 1.2]).unwrap();
+        CameraCalibration::new(&"north".parse().unwrap(), &camera, Timestamp::EPOCH)
+            .on_mount(&mount)
+    }
+
+    #[test]
+    fn a_mount_survives_its_message_and_a_reader_that_knows_none_refuses_the_camera() {
+        let parsed = mounted().parse().unwrap();
+        let mount = parsed.mount.unwrap();
+        assert_eq!((mount.azimuth(), mount.elevation()), ([-1.0, 2.0], [-0.2, 1.2]));
+        assert!(parsed.takes_cues && mount.rest() == parsed.camera.pose());
+        let as_older = CameraCalibration { mount: None, ..mounted() };
+        assert!(matches!(as_older.parse(), Err(CalibrationError::NoPose { .. })));
+        let both = CameraCalibration { rotation: message().rotation, ..mounted() };
+        assert!(matches!(both.parse(), Err(CalibrationError::Shape { part: "mount", .. })));
+        let mut torn = mounted();
+        torn.mount.as_mut().unwrap().elevation_max = f64::NAN;
+        assert!(matches!(torn.parse(), Err(CalibrationError::Geometry { .. })));
+    }
+
+    #[test]
+    fn a_camera_on_a_mount_is_where_its_frame_says_and_nowhere_without() {
+        let parsed = mounted().parse().unwrap();
+        let pointing = Pointing { azimuth: 0.3, elevation: 0.1, ..Default::default() };
+        let turned = parsed.pointed(Some(&pointing)).unwrap();
+        assert_eq!(turned.pose().position(), parsed.camera.pose().position());
+        assert!(turned.pose().rotation().angle_to(parsed.camera.pose().rotation()) > 0.25);
+        assert!(parsed.pointed(None).is_none());
+        let impossible = Pointing { elevation: 2.0, ..pointing };
+        assert!(parsed.pointed(Some(&impossible)).is_none());
+        // One that stands still does as if nothing had been said.
+        let still = message().parse().unwrap();
+        assert_eq!(still.pointed(Some(&pointing)).unwrap().pose(), still.camera.pose());
     }
 
     #[test]

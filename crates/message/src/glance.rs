@@ -1,7 +1,7 @@
 use crate::size::{Value, fields};
 use crate::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Health, Payload, Preview, Timestamp,
-    TrackEvent, TrackFrame, TruthFrame, VERSION,
+    BearingFrame, CameraCalibration, Channel, CueFrame, DecodeError, Health, Payload, Preview,
+    Timestamp, TrackEvent, TrackFrame, TruthFrame, VERSION,
 };
 
 /// What a recorder must know of a message: no more than that is read of it, so that a message of a
@@ -37,6 +37,7 @@ pub fn glance(channel: &Channel, bytes: &[u8]) -> Result<Option<Glance>, DecodeE
         }
         Channel::Tracks | Channel::Smoothed => of::<TrackFrame>(bytes),
         Channel::Events => of::<TrackEvent>(bytes),
+        Channel::Cues => of::<CueFrame>(bytes),
         Channel::Truth => of::<TruthFrame>(bytes),
         Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return Ok(None),
     };
@@ -99,6 +100,7 @@ mod tests {
             ),
             (Channel::Tracks, TrackFrame { time_ns: ns, ..Default::default() }.encode()),
             (Channel::Events, TrackEvent { time_ns: ns, ..Default::default() }.encode()),
+            (Channel::Cues, CueFrame { time_ns: ns, ..Default::default() }.encode()),
             (Channel::Truth, TruthFrame { time_ns: ns, ..Default::default() }.encode()),
         ];
         for (channel, bytes) in messages {

@@ -26,6 +26,8 @@ pub enum Channel {
     Smoothed,
     /// `fusion/events`: [`crate::TrackEvent`].
     Events,
+    /// `fusion/cues`: [`crate::CueFrame`], what each camera that takes cues should look for.
+    Cues,
     /// `fusion/health`: [`crate::Health`], once a second.
     FusionHealth,
     /// `fusion/alive`: a liveliness token, no message.
@@ -117,6 +119,7 @@ impl fmt::Display for Key {
             Channel::Tracks => write!(f, "{FUSION}/tracks"),
             Channel::Smoothed => write!(f, "{FUSION}/smoothed"),
             Channel::Events => write!(f, "{FUSION}/events"),
+            Channel::Cues => write!(f, "{FUSION}/cues"),
             Channel::FusionHealth => write!(f, "{FUSION}/health"),
             Channel::FusionAlive => write!(f, "{FUSION}/alive"),
             Channel::Truth => write!(f, "{TRUTH}/states"),
@@ -141,6 +144,7 @@ impl FromStr for Key {
             (FUSION, "tracks") => Channel::Tracks,
             (FUSION, "smoothed") => Channel::Smoothed,
             (FUSION, "events") => Channel::Events,
+            (FUSION, "cues") => Channel::Cues,
             (FUSION, "health") => Channel::FusionHealth,
             (FUSION, "alive") => Channel::FusionAlive,
             (TRUTH, "states") => Channel::Truth,
@@ -175,6 +179,7 @@ mod tests {
             Just(Channel::Tracks),
             Just(Channel::Smoothed),
             Just(Channel::Events),
+            Just(Channel::Cues),
             Just(Channel::FusionHealth),
             Just(Channel::FusionAlive),
             Just(Channel::Truth),

@@ -3,8 +3,8 @@ use thiserror::Error;
 
 use crate::size::{self, MAX_DECODED_BYTES, Repeated};
 use crate::{
-    BearingFrame, CameraCalibration, Health, Preview, TrackEvent, TrackFrame, TruthFrame, VERSION,
-    Version,
+    BearingFrame, CameraCalibration, CueFrame, Health, Preview, TrackEvent, TrackFrame, TruthFrame,
+    VERSION, Version,
 };
 
 /// A message that stands alone on the wire and in recordings.
@@ -73,6 +73,7 @@ payload! {
     CameraCalibration, time 14, NOTHING;
     TrackFrame, time 3, TRACK_FRAME;
     TrackEvent, time 2, NOTHING;
+    CueFrame, time 2, CUE_FRAME;
     Health, time 3, HEALTH;
     Preview, time 3, NOTHING;
     TruthFrame, time 2, TRUTH_FRAME;
@@ -189,6 +190,7 @@ mod tests {
             let _ = decode::<BearingFrame>(&bytes);
             let _ = decode::<TrackFrame>(&bytes);
             let _ = decode::<CameraCalibration>(&bytes);
+            let _ = decode::<CueFrame>(&bytes);
         }
     }
 }

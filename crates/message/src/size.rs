@@ -3,7 +3,9 @@
 use prost::DecodeError;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
-use crate::{BearingTrack, CameraHealth, CameraResidual, Counter, Track, TrueState};
+use crate::{
+    BearingTrack, CameraHealth, CameraResidual, Counter, Cue, Expected, TakenOver, Track, TrueState,
+};
 
 /// The longest message that is taken in or recorded, bytes. The largest true ones are previews
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB).
@@ -30,9 +32,11 @@ const fn list<T>(tag: u32, inside: &'static [Repeated]) -> Repeated {
 }
 
 pub(crate) const NOTHING: &[Repeated] = &[];
-pub(crate) const BEARING_FRAME: &[Repeated] = &[list::<BearingTrack>(8, NOTHING)];
+pub(crate) const BEARING_FRAME: &[Repeated] =
+    &[list::<BearingTrack>(8, NOTHING), list::<TakenOver>(10, NOTHING)];
 pub(crate) const TRACK_FRAME: &[Repeated] =
     &[list::<Track>(6, &[list::<CameraResidual>(6, NOTHING)])];
+pub(crate) const CUE_FRAME: &[Repeated] = &[list::<Cue>(4, &[list::<Expected>(2, NOTHING)])];
 pub(crate) const HEALTH: &[Repeated] = &[
     list::<Counter>(5, NOTHING),
     list::<CameraHealth>(7, NOTHING),
@@ -112,7 +116,8 @@ mod tests {
 
     use super::*;
     use crate::{
-        BearingFrame, Health, Payload, TrackFrame, TruthFrame, decode, file_descriptor_set,
+        BearingFrame, CueFrame, Health, Payload, TrackFrame, TruthFrame, decode,
+        file_descriptor_set,
     };
 
     /// The tags of the lists of messages and texts of a message, with the name of what is in them.
@@ -145,6 +150,7 @@ mod tests {
         agrees(&set, "BearingFrame", BearingFrame::LISTS);
         agrees(&set, "TrackFrame", TrackFrame::LISTS);
         agrees(&set, "Health", Health::LISTS);
+        agrees(&set, "CueFrame", CueFrame::LISTS);
         agrees(&set, "TruthFrame", TruthFrame::LISTS);
         for name in ["CameraCalibration", "TrackEvent", "Preview"] {
             agrees(&set, name, NOTHING);

@@ -1,6 +1,6 @@
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, Health, Payload, Preview, TrackEvent, TrackFrame,
-    TruthFrame,
+    BearingFrame, CameraCalibration, Channel, CueFrame, Health, Payload, Preview, TrackEvent,
+    TrackFrame, TruthFrame,
 };
 
 /// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.
@@ -14,6 +14,7 @@ pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
         }
         Channel::Tracks | Channel::Smoothed => TrackFrame::SCHEMA,
         Channel::Events => TrackEvent::SCHEMA,
+        Channel::Cues => CueFrame::SCHEMA,
         Channel::Truth => TruthFrame::SCHEMA,
         Channel::Alive(_) | Channel::FusionAlive | Channel::RecorderAlive => return None,
     })

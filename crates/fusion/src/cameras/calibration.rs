@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use crossfix_geometry::Camera;
+use crossfix_geometry::{Camera, PanTilt};
 use crossfix_message::Timestamp;
 use nalgebra::{Matrix6, Point3};
 
-use crate::uncertainty::LastingNoise;
+use crate::uncertainty::{CameraUncertainty, LastingNoise, PoseUncertainty};
 
 /// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of
 /// a clock that runs wild, those that lie farthest in the future are forgotten.
@@ -15,7 +15,14 @@ const MAX_UPCOMING: usize = 8;
 /// A camera as its calibration describes it.
 #[derive(Clone, Debug)]
 pub(crate) struct KnownCamera {
+    /// On a mount, with both angles at zero; of [`Self::pointed`], as it points.
     pub(crate) camera: Camera,
+    /// What turns it, if something does.
+    pub(crate) mount: Option<PanTilt>,
+    /// Whether it looks for what it is told to look for.
+    pub(crate) takes_cues: bool,
+    /// Whether it is being turned, so that it measures nothing.
+    pub(crate) is_turning: bool,
     /// Covariance of the pose in the world's axes: rotation (rad), then position (m).
     pub(crate) pose_covariance: Matrix6<f64>,
     /// The part of its bearings' noise that lasts.
@@ -33,11 +40,25 @@ impl KnownCamera {
         one.position() != two.position()
             || one.rotation() != two.rotation()
             || self.pose_covariance != other.pose_covariance
+            || self.mount != other.mount
+    }
+
+    /// What is uncertain of it as a whole, without its clock.
+    pub(crate) fn uncertainty(&self) -> CameraUncertainty {
+        CameraUncertainty {
+            pose: Some(PoseUncertainty::new(self.pose_covariance)),
+            clock_walk: self.clock_walk,
+            lasting: self.lasting,
+            axes: *self.camera.pose().rotation(),
+            ..CameraUncertainty::of_time(0.0)
+        }
     }
 
     /// Whether the camera should report a target at a place: in its image, and not too far away.
     pub(crate) fn expects(&self, place: Point3<f64>, max_range_m: f64) -> bool {
-        (place - self.camera.pose().position()).norm() <= max_range_m && self.camera.sees(place)
+        !self.is_turning
+            && (place - self.camera.pose().position()).norm() <= max_range_m
+            && self.camera.sees(place)
     }
 }
 
@@ -105,6 +126,9 @@ mod tests {
         let pose =
             Pose::looking_at(Point3::new(x, 0.0, 0.0), Point3::new(0.0, 100.0, 10.0)).unwrap();
         KnownCamera {
+            mount: None,
+            takes_cues: false,
+            is_turning: false,
             camera: Camera::new(intrinsics, pose).unwrap(),
             pose_covariance: Matrix6::identity(),
             lasting: LastingNoise::NONE,

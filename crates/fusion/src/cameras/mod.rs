@@ -8,6 +8,7 @@
 //! | how noisy its bearings are | third differences of its own bearings | `noise.rs` |
 //! | how much it reports that is nobody's | what no track takes | `strangers.rs` |
 //! | what stands in its view for good | what it reports in one place | `rooted.rs` |
+//! | where its mount points | its frames | `pointing.rs` |
 //! | whether it is left out | lines beside what others see, frames out of time | `standing.rs` |
 //!
 //! Its clock is not here: clocks are known against each other, and what is learnt of one is tied to
@@ -15,6 +16,7 @@
 
 mod calibration;
 mod noise;
+mod pointing;
 mod pose_scale;
 mod rooted;
 mod standing;
@@ -39,6 +41,7 @@ use watch::Watch;
 
 pub(crate) use calibration::KnownCamera;
 pub(crate) use noise::LastThree;
+pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::Sample;
 pub(crate) use rooted::Rooted;
 pub use standing::CameraStanding;
@@ -79,6 +82,8 @@ pub(crate) struct ClockChange {
 #[derive(Clone, Debug)]
 pub(crate) struct CameraState {
     calibrations: Calibrations,
+    /// Where its mount pointed in its newest exposure, and the camera as that turned it.
+    pointed: Option<(Pointed, KnownCamera)>,
     pose_scale: PoseScale,
     noise: WhiteNoise,
     strangers: Strangers,
@@ -97,6 +102,7 @@ impl CameraState {
         Self {
             pose_scale: PoseScale::new(known.is_declared),
             calibrations: Calibrations::first(known),
+            pointed: None,
             noise: WhiteNoise::default(),
             strangers: Strangers::default(),
             view: View::new(rooted_s),
@@ -107,9 +113,27 @@ impl CameraState {
         }
     }
 
-    /// As it stands at the exposure that is handled.
+    /// As it stands and points at the exposure that is handled.
     pub(crate) fn known(&self) -> &KnownCamera {
+        self.pointed.as_ref().map_or_else(|| self.calibrations.now(), |(_, known)| known)
+    }
+
+    /// As it stands, with the angles of a mount at zero.
+    pub(crate) fn at_rest(&self) -> &KnownCamera {
         self.calibrations.now()
+    }
+
+    /// Takes in where it pointed in an exposure; returns whether its mount has turned it since the
+    /// one before.
+    pub(crate) fn point(&mut self, exposure: &Exposure) -> bool {
+        let Some(now) = exposure.pointed else { return false };
+        let has_turned =
+            self.pointed.as_ref().is_none_or(|(before, _)| now.has_turned_from(before));
+        self.pointed = Some((now, self.calibrations.now().pointed(&now)));
+        if has_turned {
+            self.view = self.view.anew();
+        }
+        has_turned
     }
 
     /// How many times its reported covariances count.
@@ -191,6 +215,7 @@ impl CameraState {
 
     /// It has been moved: what was learnt of it was of how it stood before.
     fn move_on(&mut self) {
+        self.pointed = None;
         let known = self.known();
         self.pose_scale = PoseScale::new(known.is_declared);
         self.noise = WhiteNoise::default();
@@ -247,6 +272,11 @@ impl Cameras {
     /// A camera as it stands at the exposure that is handled.
     pub(crate) fn known(&self, name: &CameraName) -> Option<&KnownCamera> {
         Some(self.by_name.get(name)?.known())
+    }
+
+    /// Whether a mount turns it.
+    pub(crate) fn is_on_mount(&self, name: &CameraName) -> bool {
+        self.known(name).is_some_and(|known| known.mount.is_some())
     }
 
     pub(crate) fn get(&self, name: &CameraName) -> Option<&CameraState> {

@@ -8,6 +8,7 @@ fn exposure(camera: &str, time_s: f64) -> Exposure {
         sequence: 0,
         time: Timestamp::from_seconds(time_s),
         uncertainty: crate::uncertainty::CameraUncertainty::of_time(0.0),
+        pointed: None,
         clutter_per_sr: 1.0,
         correction_s: 0.0,
         sightings: vec![],

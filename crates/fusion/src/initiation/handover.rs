@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
-use crossfix_message::{CameraName, Solver, Timestamp};
+use crossfix_message::{CameraName, Cued, Solver, Timestamp};
 use nalgebra::{Matrix3, Vector3, Vector6};
 
 use super::one_target::OneTargetTest;
@@ -19,6 +19,7 @@ use super::{MAX_LINES, Start, lines_with_pose};
 use crate::cameras::KnownCamera;
 use crate::cameras::Rooted;
 use crate::cameras::view_sr;
+use crate::cueing::Known;
 use crate::motion::Motion;
 use crate::spatial::{Fix, LineId, Observability, TimedLine, VelocityKnowledge};
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
@@ -46,6 +47,9 @@ const TOGETHER_S: f64 = 1.0;
 const MARGIN: f64 = 8.0;
 /// A reading less likely than this (logarithm) is given up.
 const GIVEN_UP: f64 = -5.0;
+/// What one camera alone sees is hardly nearer than this, m: with the largest range it gives the
+/// middle of those that are possible.
+const NEAREST_M: f64 = 30.0;
 /// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others
 /// tried with one: time is bounded.
 const MAX_SEEN: usize = 20;
@@ -58,6 +62,8 @@ const MAX_TRIED: usize = 50;
 struct Seen {
     /// Two that begin with one exposure are told apart by it.
     number: u64,
+    /// The number that the camera gives it.
+    image_track: u64,
     sight: Sight,
     first: Timestamp,
     /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2),
@@ -141,6 +147,7 @@ impl Seen {
         let time = exposure.time;
         Self {
             number,
+            image_track: exposure.sightings[index].image_track,
             sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
             first: time,
             pose_variance: pose_variance(&line, exposure, index),
@@ -191,6 +198,18 @@ impl Seen {
         if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
             return None;
         }
+        let state = self.state_at(range, speed)?;
+        let observability = Observability::unexamined(6);
+        let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
+        let fix = Fix { time: sight.time, state, velocity, solver, observability };
+        Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
+    }
+
+    /// Where it is and how it moves if its range is about `range` (m), which is not known, as of its
+    /// last line; the target may be as fast as `speed` (m/s, standard deviation) along the
+    /// direction.
+    fn state_at(&self, range: f64, speed: f64) -> Option<KinematicState> {
+        let Self { sight, line: last, .. } = self;
         let along = sight.direction.into_inner();
         let velocity = (sight.rate - along * along.dot(&sight.rate)) * range;
         let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
@@ -211,11 +230,7 @@ impl Seen {
         add(3, 0, across * (tie * range.powi(2)));
         add(3, 3, across * (turning * range.powi(2)) + along_squared * speed.powi(2));
         let mean = stacked(last.line.origin.coords + along * range, velocity);
-        let state = KinematicState { mean, covariance };
-        let observability = Observability::unexamined(6);
-        let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
-        let fix = Fix { time: sight.time, state, velocity, solver, observability };
-        Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
+        Some(KinematicState { mean, covariance })
     }
 }
 
@@ -316,6 +331,28 @@ impl Handover {
         self.seen.remove(camera);
     }
 
+    /// What one camera alone sees for sure, as far as it is known now: its range is anywhere.
+    pub(super) fn known(&self, now: Timestamp) -> Vec<Known> {
+        let range = (NEAREST_M * self.max_range_m).sqrt();
+        let sure = self.seen.iter().flat_map(|(camera, seen)| {
+            let open =
+                |one: &&Seen| one.is_sure(&self.tracking) && !one.is_lost(now, &self.tracking);
+            seen.iter().filter(open).map(move |one| (camera, one))
+        });
+        let known = sure.filter_map(|(camera, one)| {
+            let state = one.state_at(range, self.speed)?;
+            let of =
+                Cued { track_id: 0, camera: camera.to_string(), image_track_id: one.image_track };
+            let seen_from = Some(one.line.line.origin);
+            let expected = |time: Timestamp| {
+                let ahead_s = time.seconds_since(one.sight.time);
+                state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
+            };
+            Some(Known::new(of, now, seen_from, expected))
+        });
+        known.collect()
+    }
+
     /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks
     /// that are sure now.
     pub(super) fn see(
@@ -403,6 +440,7 @@ impl Handover {
             one.lines += 1.0;
             one.pose_variance = pose_variance(&with_pose[index], exposure, index);
             one.line = with_pose[index].clone();
+            one.image_track = exposure.sightings[index].image_track;
             begun.push(Begun { index, number: one.number, first: one.first });
         }
         let mut place = 0..;

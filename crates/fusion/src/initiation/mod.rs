@@ -15,10 +15,11 @@ mod sight;
 use std::collections::BTreeSet;
 
 use crossfix_geometry::BearingModel;
-use crossfix_message::CameraName;
+use crossfix_message::{CameraName, Timestamp};
 use nalgebra::Vector3;
 
 use crate::cameras::{Cameras, KnownCamera};
+use crate::cueing::Known;
 use crate::motion::Motion;
 use crate::papers::Grouped;
 use crate::spatial::{LineId, TimedLine};
@@ -85,6 +86,14 @@ impl Initiator {
 
     /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns
     /// the tracks that begin with it of targets that cameras see one after another.
+    /// What one camera alone sees for sure, that no track is of, as far as it is known now.
+    pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
+        match self.method {
+            Method::Hypotheses(_) => self.handover.known(now),
+            Method::Grouped(_) => Vec::new(),
+        }
+    }
+
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,

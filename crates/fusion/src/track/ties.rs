@@ -305,6 +305,19 @@ impl Track {
         }
     }
 
+    /// A camera's mount has turned it: what of its errors lasts until then is drawn anew.
+    pub(crate) fn turn_camera(&mut self, camera: &CameraName) {
+        self.renew(camera);
+        let learns = self.learns(camera);
+        if let Some(ties) = self.ties.get_mut(camera) {
+            ties.last_three = LastThree::default();
+            if !learns {
+                ties.covariance.fixed_columns_mut::<2>(LASTING).fill(0.0);
+                ties.learnt.fixed_columns_mut::<2>(LASTING).fill(0.0);
+            }
+        }
+    }
+
     pub(super) fn third_difference(
         &mut self,
         camera: &CameraName,

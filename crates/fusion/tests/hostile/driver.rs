@@ -7,12 +7,12 @@ use crossfix_fusion::{
     Fusion, FusionConfig, InitiationMethod, Manoeuvres, Output, SpatialSolver, TrackStatus,
     Weighting,
 };
-use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose};
+use crossfix_geometry::{Bearing, Camera, Distortion, ImageSize, Intrinsics, PanTilt, Pose};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CameraCalibration, ImageTrackState, Timestamp, Track,
-    TrackEventKind, TrackState, Vector3,
+    BearingFrame, BearingTrack, CameraCalibration, Cue, Expected, ImageTrackState, Pointing,
+    Timestamp, Track, TrackEventKind, TrackState, Vector3,
 };
-use nalgebra::{Matrix6, Point3};
+use nalgebra::{Matrix2, Matrix6, Point3};
 
 /// Three cameras that see the targets, one beside the first, and something that is no name.
 const NAMES: [&str; 5] = ["a", "b", "c", "d", "no/name"];
@@ -240,6 +240,8 @@ struct Run<'a> {
     /// What each camera says of its time beside that, and how far its clock is ahead, ns.
     clock_sds: [f64; 5],
     ahead: [i64; 5],
+    /// Where each camera's mount points, as it says.
+    pointings: [Option<Pointing>; 5],
     sent: Vec<BearingFrame>,
     bearings: usize,
     rejected: BTreeMap<&'static str, u64>,
@@ -253,6 +255,7 @@ impl Run<'_> {
         // The byte was taken by 13 when there were 13 operations: those below 13 mean what they
         // meant.
         match self.bytes.next() {
+            255 if self.is_appended => self.mount(),
             kind if self.is_appended && kind >= 247 => self.of_cameras(kind),
             kind => self.operate_on(kind % 13),
         }
@@ -276,6 +279,31 @@ impl Run<'_> {
             // Up to a quarter of a second.
             _ => self.ahead[eye] = i64::from(choice) * 2_000_000 - 256_000_000,
         }
+    }
+
+    /// A camera on a mount, that points somewhere, or nowhere that can be; or that takes cues.
+    fn mount(&mut self) {
+        let (eye, choice) = (self.bytes.below(4), self.bytes.next());
+        let (angle, odd) = (f64::from(self.bytes.next() as i8) / 100.0, self.bytes.odd());
+        let Some((camera, Ok(name))) = camera(PLACES[eye]).zip(Some(NAMES[eye].parse())) else {
+            return;
+        };
+        let message = CameraCalibration::new(&name, &camera, Timestamp::EPOCH);
+        let mount = PanTilt::new(*camera.pose(), [-1.0, 1.0], [-0.5, 0.5]).unwrap();
+        let message = match choice & 3 {
+            0 => message.on_mount(&mount),
+            1 => message.taking_cues(),
+            2 => message.on_mount(&mount).with_pose_sd(odd, odd),
+            _ => message,
+        };
+        let _ = self.fusion.calibrate(&message);
+        let pointing = Pointing { azimuth: angle, settled: choice & 4 == 0, ..Default::default() };
+        self.pointings[eye] = match choice >> 3 & 3 {
+            0 => None,
+            1 => Some(Pointing { azimuth_sd: 1e-3, elevation_sd: 1e-3, ..pointing }),
+            2 => Some(Pointing { azimuth_sd: odd, elevation: odd, ..pointing }),
+            _ => Some(pointing),
+        };
     }
 
     fn operate_on(&mut self, kind: u8) {
@@ -356,6 +384,7 @@ impl Run<'_> {
             // What is odd of a standard deviation stays odd.
             capture_time_sd_s: if self.time_sd == 0.0 { self.clock_sds[eye] } else { self.time_sd },
             tracks,
+            pointing: self.pointings[eye],
             ..Default::default()
         };
         self.ingest(frame);
@@ -489,6 +518,7 @@ impl Run<'_> {
                         event.kind() != TrackEventKind::Born && self.born.contains(&event.track_id);
                     assert!(first || later, "each track is born once, and first of all: {event:?}");
                 }
+                Output::Cues(cues) => cues.cues.iter().for_each(assert_sound_cue),
                 Output::Camera(..) => {}
                 Output::Rejected(rejection) => {
                     *self.rejected.entry(rejection.reason.counter()).or_default() += 1;
@@ -563,6 +593,18 @@ fn assert_sound(track: &Track) {
     );
 }
 
+fn assert_sound_cue(cue: &Cue) {
+    assert!(cue.range_m > 0.0 && cue.log_range_sd >= 0.0, "{cue:?}");
+    assert!(!cue.ahead.is_empty(), "{cue:?}");
+    for Expected { bearing, covariance_xx: xx, covariance_xy: xy, covariance_yy: yy, .. } in
+        &cue.ahead
+    {
+        let covariance = Matrix2::new(*xx, *xy, *xy, *yy);
+        let vector = bearing.unwrap_or_default().into();
+        assert!(Bearing::new(vector, covariance).is_ok(), "{cue:?}");
+    }
+}
+
 /// Runs a fusion centre on bytes. Panics if it does, or if it answers with what cannot be.
 pub fn drive(data: &[u8]) {
     let (mut bytes, mut appendix) = split(data);
@@ -598,6 +640,7 @@ pub fn drive(data: &[u8]) {
         time_sd: 0.0,
         clock_sds,
         ahead,
+        pointings: [None; 5],
         sent: Vec::new(),
         bearings: 0,
         rejected: BTreeMap::new(),

@@ -23,6 +23,20 @@ pub struct Vector3 {
     #[prost(double, tag = "3")]
     pub z: f64,
 }
+/// What a cue is of, and which target a camera says that it has found by one: as far as is known, the same.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Cued {
+    /// The 3D track; 0 where there is none, as one camera alone has seen the target so far.
+    #[prost(uint64, tag = "1")]
+    pub track_id: u64,
+    /// That camera, and the number of what it follows.
+    #[prost(string, tag = "2")]
+    pub camera: ::prost::alloc::string::String,
+    #[prost(uint64, tag = "3")]
+    pub image_track_id: u64,
+}
 /// One 2D track in one exposure of one camera.
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(default)]
@@ -68,6 +82,40 @@ pub struct BearingTrack {
     #[prost(double, tag = "14")]
     pub certainty: f64,
 }
+/// Which of its tracks a camera takes for what it was told to look for. It is no evidence: whose a bearing is the
+/// fusion centre finds by where it points.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TakenOver {
+    /// Number of the camera's track.
+    #[prost(uint64, tag = "1")]
+    pub image_track_id: u64,
+    /// What it was told to look for.
+    #[prost(message, optional, tag = "2")]
+    pub of: ::core::option::Option<Cued>,
+}
+/// Where a camera on a mount pointed in the middle of an exposure. Its pose is that of its mount with both angles at
+/// zero, turned by the azimuth and then by the elevation: Klochko 2020, eq. 2.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Pointing {
+    /// About the mount's vertical axis, to the left; rad.
+    #[prost(double, tag = "1")]
+    pub azimuth: f64,
+    /// About the tilting axis, upwards; rad.
+    #[prost(double, tag = "2")]
+    pub elevation: f64,
+    /// Standard deviations of both, rad: of an error that stays the same until the mount has turned.
+    #[prost(double, tag = "3")]
+    pub azimuth_sd: f64,
+    #[prost(double, tag = "4")]
+    pub elevation_sd: f64,
+    /// Whether it stood still for the whole of the exposure. Where it did not, nothing is measured.
+    #[prost(bool, tag = "5")]
+    pub settled: bool,
+}
 /// All 2D tracks of one exposure of one camera.
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(default)]
@@ -96,6 +144,33 @@ pub struct BearingFrame {
     /// The tracks, in the order of their ids. None is a statement too: this exposure saw nothing.
     #[prost(message, repeated, tag = "8")]
     pub tracks: ::prost::alloc::vec::Vec<BearingTrack>,
+    /// Of a camera on a mount where it pointed; absent otherwise.
+    #[prost(message, optional, tag = "9")]
+    pub pointing: ::core::option::Option<Pointing>,
+    /// Of one that takes cues, what it has found by them.
+    #[prost(message, repeated, tag = "10")]
+    pub taken_over: ::prost::alloc::vec::Vec<TakenOver>,
+}
+/// What turns a camera about its own centre.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PanTiltMount {
+    /// Rotation world_from_camera with both angles at zero, nine elements, row by row.
+    #[prost(double, repeated, tag = "1")]
+    pub rotation: ::prost::alloc::vec::Vec<f64>,
+    /// The camera's centre in the world, metres.
+    #[prost(message, optional, tag = "2")]
+    pub position: ::core::option::Option<Vector3>,
+    /// How far it turns, rad. Azimuth to the left, elevation upwards.
+    #[prost(double, tag = "3")]
+    pub azimuth_min: f64,
+    #[prost(double, tag = "4")]
+    pub azimuth_max: f64,
+    #[prost(double, tag = "5")]
+    pub elevation_min: f64,
+    #[prost(double, tag = "6")]
+    pub elevation_max: f64,
 }
 /// Everything that turns a camera's pixels into sight lines of the world.
 #[derive(serde::Serialize, serde::Deserialize)]
@@ -157,6 +232,13 @@ pub struct CameraCalibration {
     /// not known, or part of the pose's.
     #[prost(message, optional, tag = "19")]
     pub datum: ::core::option::Option<SiteDatum>,
+    /// What turns the camera. Then `rotation` and `position` are empty, so that a reader that knows of no mounts refuses
+    /// the camera; the pose's covariance is about its axes with both angles at zero.
+    #[prost(message, optional, tag = "20")]
+    pub mount: ::core::option::Option<PanTiltMount>,
+    /// It looks for what it is told to look for: see CueFrame.
+    #[prost(bool, tag = "21")]
+    pub takes_cues: bool,
 }
 /// What all that a site says of places and times may be off by, alike.
 #[derive(serde::Serialize, serde::Deserialize)]
@@ -273,6 +355,59 @@ pub struct TrackEvent {
     /// The track it was merged into, where it was.
     #[prost(uint64, tag = "5")]
     pub other_id: u64,
+}
+/// Where a camera should see a target at a time.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Expected {
+    /// By the camera's own clock.
+    #[prost(sfixed64, tag = "1")]
+    pub time_ns: i64,
+    /// Unit vector in the camera's frame; of one on a mount, in its frame with both angles at zero.
+    #[prost(message, optional, tag = "2")]
+    pub bearing: ::core::option::Option<Vector3>,
+    /// Covariance along the tangents, as a bearing's: the camera's own errors are in it; rad^2.
+    #[prost(double, tag = "3")]
+    pub covariance_xx: f64,
+    #[prost(double, tag = "4")]
+    pub covariance_xy: f64,
+    #[prost(double, tag = "5")]
+    pub covariance_yy: f64,
+}
+/// One target that a camera should look for.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Cue {
+    #[prost(message, optional, tag = "1")]
+    pub of: ::core::option::Option<Cued>,
+    /// Now and in the next seconds, in the order of time.
+    #[prost(message, repeated, tag = "2")]
+    pub ahead: ::prost::alloc::vec::Vec<Expected>,
+    /// How far away it is, m, and the standard deviation of that's logarithm: where only one other camera sees it, it
+    /// may be anywhere on a line.
+    #[prost(double, tag = "3")]
+    pub range_m: f64,
+    #[prost(double, tag = "4")]
+    pub log_range_sd: f64,
+}
+/// What one camera should look for, from the fusion centre, ten times a second of the data.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CueFrame {
+    #[prost(message, optional, tag = "1")]
+    pub version: ::core::option::Option<Version>,
+    /// Of the data so far.
+    #[prost(sfixed64, tag = "2")]
+    pub time_ns: i64,
+    /// Name of the camera.
+    #[prost(string, tag = "3")]
+    pub camera: ::prost::alloc::string::String,
+    /// The target that is best looked for comes first. None: there is nothing to look for.
+    #[prost(message, repeated, tag = "4")]
+    pub cues: ::prost::alloc::vec::Vec<Cue>,
 }
 /// A number that a component counts, since its start.
 #[derive(serde::Serialize, serde::Deserialize)]

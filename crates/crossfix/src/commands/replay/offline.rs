@@ -107,9 +107,11 @@ impl OfflineFusion {
     fn take(&mut self, entry: &Entry) -> anyhow::Result<()> {
         match &entry.key.channel {
             // What an earlier fusion made of the bearings.
-            Channel::Tracks | Channel::Smoothed | Channel::Events | Channel::FusionHealth => {
-                return Ok(());
-            }
+            Channel::Tracks
+            | Channel::Smoothed
+            | Channel::Events
+            | Channel::Cues
+            | Channel::FusionHealth => return Ok(()),
             Channel::Bearings(_) => self.frames += 1,
             _ => {}
         }
@@ -140,6 +142,10 @@ impl OfflineFusion {
                     let number = TrackNumber(event.track_id);
                     tracing::debug!("{time}: track {number} {}", event.kind().as_str_name());
                     self.put(Channel::Events, time, event.encode())?;
+                }
+                Output::Cues(cues) => {
+                    let time = Timestamp::from_nanos(cues.time_ns);
+                    self.put(Channel::Cues, time, cues.encode())?;
                 }
                 Output::Tracks(_) | Output::Camera(..) | Output::Rejected(_) => {}
             }

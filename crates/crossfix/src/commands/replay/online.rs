@@ -32,6 +32,7 @@ fn is_cameras(channel: &Channel) -> bool {
         Channel::Tracks
             | Channel::Smoothed
             | Channel::Events
+            | Channel::Cues
             | Channel::FusionHealth
             | Channel::RecorderHealth
     )

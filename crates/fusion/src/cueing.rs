@@ -1,0 +1,271 @@
+//! What cameras that look where they are told should look for.
+//!
+//! One camera hands angles over, the other turns there, searches, and locks (Klochko's first paper,
+//! chapter 2; for a scanning thermal receiver Klochko 2020, eq. 3). Here all cameras together hand
+//! over, so that it is a place in space that is looked for, seen from where the other camera stands.
+//! Where one camera alone sees a target its range is unknown, and the cue is a stripe: the other
+//! camera's view of the first one's sight line.
+
+use std::collections::BTreeMap;
+
+use crossfix_filter::KinematicState;
+use crossfix_geometry::{BearingModel, tangent_basis, turn_vector};
+use crossfix_message::{
+    CameraName, Cue, CueFrame, Cued, Expected, Payload, Timestamp, Vector3 as WireVector,
+};
+use nalgebra::{Matrix2, Matrix3, Point3, Rotation3, Unit, Vector3, Vector6};
+
+use crate::cameras::KnownCamera;
+use crate::range_chart::Chart;
+use crate::uncertainty::SharedTies;
+
+/// A camera is told this often, s of data time: a target at 100 m that flies at 20 m/s has gone on
+/// by 20 mrad.
+const EVERY_S: f64 = 0.1;
+/// For so long ahead it is told where the target should be, s: a head that turns for a second, and
+/// one that is not told anew for another, still knows.
+const AHEAD_S: [f64; 5] = [0.0, 0.25, 0.5, 1.0, 2.0];
+/// So many targets at most: one camera looks for one at a time, and what it is on must be among them.
+const MOST_CUES: usize = 32;
+/// Places and weights by which a normal variable's mean and variance are formed of five (Gauss and
+/// Hermite): exact up to the ninth power.
+const NODES: [(f64, f64); 5] = [
+    (0.0, 8.0 / 15.0),
+    (1.355_626_179_974_266, 0.222_075_922_005_612_6),
+    (-1.355_626_179_974_266, 0.222_075_922_005_612_6),
+    (2.856_970_013_872_806, 0.011_257_411_327_720_69),
+    (-2.856_970_013_872_806, 0.011_257_411_327_720_69),
+];
+
+/// A target as far as it is known, as of a time.
+#[derive(Clone, Debug)]
+pub(crate) struct Known {
+    /// Which.
+    pub(crate) of: Cued,
+    /// Where it is and how it moves, now and ahead.
+    pub(crate) ahead: [KinematicState; AHEAD_S.len()],
+    /// Where the camera stands that alone sees it; `None` if several do.
+    pub(crate) seen_from: Option<Point3<f64>>,
+}
+
+impl Known {
+    /// A target by what is expected of it at times from `now` on.
+    pub(crate) fn new(
+        of: Cued,
+        now: Timestamp,
+        seen_from: Option<Point3<f64>>,
+        expected: impl Fn(Timestamp) -> KinematicState,
+    ) -> Self {
+        Self { of, ahead: AHEAD_S.map(|ahead_s| expected(now.plus_seconds(ahead_s))), seen_from }
+    }
+}
+
+/// When each camera was told last.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Cueing {
+    told: BTreeMap<CameraName, Timestamp>,
+}
+
+impl Cueing {
+    /// Whether it is time to tell a camera.
+    pub(crate) fn is_due(&mut self, camera: &CameraName, now: Timestamp) -> bool {
+        let told = self.told.get(camera);
+        // Where time has gone back, it is time as well.
+        let due = told.is_none_or(|told| !(0.0..EVERY_S).contains(&now.seconds_since(*told)));
+        if due {
+            self.told.insert(camera.clone(), now);
+        }
+        due
+    }
+}
+
+/// What a camera should look for, the nearest first. `ahead_s` is what its clock is ahead by.
+pub(crate) fn cues(
+    camera: &CameraName,
+    known: &KnownCamera,
+    (now, ahead_s): (Timestamp, f64),
+    targets: &[Known],
+    max_range_m: f64,
+) -> CueFrame {
+    let own_now = now.plus_seconds(ahead_s);
+    let mut cues: Vec<Cue> = targets
+        .iter()
+        .filter_map(|target| cue(known, own_now, target))
+        .filter(|cue| cue.range_m <= max_range_m)
+        .collect();
+    cues.sort_by(|one, other| one.range_m.total_cmp(&other.range_m));
+    cues.truncate(MOST_CUES);
+    let frame =
+        CueFrame { time_ns: now.nanos(), camera: camera.to_string(), cues, ..Default::default() };
+    frame.stamped()
+}
+
+/// `None` if it lies at the camera itself.
+fn cue(known: &KnownCamera, own_now: Timestamp, target: &Known) -> Option<Cue> {
+    let origin = known.camera.pose().position();
+    let here = &target.ahead[0];
+    let away = here.position() - origin;
+    let range_m = away.norm();
+    let along = away.dot(&(here.position_covariance() * away)).max(0.0);
+    let ahead = target.ahead.iter().zip(AHEAD_S).map(|(state, ahead_s)| {
+        expected(known, state, target.seen_from, own_now.plus_seconds(ahead_s))
+    });
+    Some(Cue {
+        of: Some(target.of.clone()),
+        ahead: ahead.collect::<Option<_>>()?,
+        range_m,
+        log_range_sd: along.sqrt() / range_m.powi(2),
+    })
+}
+
+/// Where the camera should see a state, in its own frame.
+fn expected(
+    known: &KnownCamera,
+    state: &KinematicState,
+    seen_from: Option<Point3<f64>>,
+    time: Timestamp,
+) -> Option<Expected> {
+    let origin = known.camera.pose().position();
+    let (direction, covariance) = seen(state, origin, seen_from.filter(|from| *from != origin))?;
+    let model = BearingModel::along(direction, (state.position() - origin).norm());
+    let shared = known.uncertainty().shared(&model, state.velocity());
+    let to_world: &Rotation3<f64> = known.camera.pose().rotation();
+    let own = to_world.inverse() * direction;
+    // Both have tangents of their own at the direction.
+    let turn = (to_world.matrix() * tangent_basis(&own)).transpose() * model.basis;
+    let covariance = turn * (covariance + shared) * turn.transpose();
+    Some(Expected {
+        time_ns: time.nanos(),
+        bearing: Some(WireVector::from(own.into_inner())),
+        covariance_xx: covariance.m11,
+        covariance_xy: covariance.m12,
+        covariance_yy: covariance.m22,
+    })
+}
+
+/// Mean direction and covariance (rad^2, along the direction's tangents) in which a state is seen
+/// from `origin`. Where one camera alone sees the target, at `seen_from`, what is unknown is the
+/// logarithm of its range from there, and the moments are those over that.
+fn seen(
+    state: &KinematicState,
+    origin: Point3<f64>,
+    seen_from: Option<Point3<f64>>,
+) -> Option<(Unit<Vector3<f64>>, Matrix2<f64>)> {
+    let places = match seen_from.and_then(|from| Chart::by_range(from, state)) {
+        Some(chart) => along_range(&chart, state),
+        None => vec![(1.0, state.position(), state.position_covariance())],
+    };
+    let models: Vec<_> = places
+        .into_iter()
+        .filter_map(|(weight, place, spread)| {
+            Some((weight, BearingModel::new(origin, place)?, spread))
+        })
+        .collect();
+    let sum: Vector3<f64> =
+        models.iter().map(|(weight, model, _)| model.direction.into_inner() * *weight).sum();
+    let direction = Unit::try_new(sum, 1e-9)?;
+    let tangents = tangent_basis(&direction).transpose();
+    let mut covariance = Matrix2::zeros();
+    for (weight, model, spread) in models {
+        // Along great circles: a stripe may be longer than a tangent plane is flat.
+        let turn = Rotation3::rotation_between(&model.direction, &direction)?;
+        let aside = tangents * turn_vector(&turn).cross(&-direction.into_inner());
+        let by = tangents * (turn.matrix() * model.basis) * model.by_position();
+        covariance += (aside * aside.transpose() + by * spread * by.transpose()) * weight;
+    }
+    Some((direction, covariance))
+}
+
+/// Places along a range that is not known, with their weights, and what is unknown of each beside.
+fn along_range(chart: &Chart, state: &KinematicState) -> Vec<(f64, Point3<f64>, Matrix3<f64>)> {
+    let (covariance, _) = chart.expressed(&state.covariance, &SharedTies::zeros());
+    let variance = covariance.m33;
+    if variance <= 0.0 {
+        return vec![(1.0, state.position(), state.position_covariance())];
+    }
+    let tied: Vector6<f64> = covariance.column(2).into_owned();
+    let left = covariance - tied * tied.transpose() / variance;
+    let place = |(node, weight): (f64, f64)| {
+        let point = chart.point(&(tied * (node / variance.sqrt())));
+        let left = left.fixed_view::<3, 3>(0, 0);
+        (weight, point.place, point.place_by * left * point.place_by.transpose())
+    };
+    NODES.map(place).to_vec()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix6;
+
+    use super::*;
+
+    fn state(place: Point3<f64>, covariance: Matrix3<f64>) -> KinematicState {
+        let mut all = Matrix6::identity() * 0.01;
+        all.fixed_view_mut::<3, 3>(0, 0).copy_from(&covariance);
+        let mut mean = Vector6::zeros();
+        mean.fixed_rows_mut::<3>(0).copy_from(&place.coords);
+        KinematicState { mean, covariance: all }
+    }
+
+    #[test]
+    fn the_nodes_are_a_normal_variables() {
+        let moment = |power: i32| -> f64 { NODES.iter().map(|(x, w)| w * x.powi(power)).sum() };
+        for (power, value) in [(0, 1.0), (1, 0.0), (2, 1.0), (4, 3.0), (6, 15.0), (8, 105.0)] {
+            assert!((moment(power) - value).abs() < 1e-9, "{power}: {}", moment(power));
+        }
+    }
+
+    #[test]
+    fn a_place_is_seen_as_wide_as_it_is_unknown_and_far_away() {
+        let place =
+            state(Point3::new(0.0, 200.0, 0.0), Matrix3::from_diagonal(&[4.0, 9.0, 1.0].into()));
+        let (direction, covariance) = seen(&place, Point3::origin(), None).unwrap();
+        assert!((direction.into_inner() - Vector3::y()).norm() < 1e-12);
+        let by_axis =
+            tangent_basis(&direction) * covariance * tangent_basis(&direction).transpose();
+        assert!((by_axis[(0, 0)] - 1e-4).abs() < 1e-9, "{by_axis}");
+        assert!((by_axis[(2, 2)] - 0.25e-4).abs() < 1e-9, "{by_axis}");
+    }
+
+    /// What one camera alone sees is a stripe for another: as long as drawn ranges make it.
+    #[test]
+    fn an_unknown_range_is_a_stripe_along_the_others_sight_line() {
+        let (one, other) = (Point3::origin(), Point3::new(100.0, 0.0, 0.0));
+        // 300 m, within a factor of 1.5 or so, and a milliradian across.
+        let log_sd: f64 = 0.4;
+        let spread = Matrix3::from_diagonal(&[0.09, (300.0 * log_sd).powi(2), 0.09].into());
+        let target = state(Point3::new(0.0, 300.0, 0.0), spread);
+        let (direction, covariance) = seen(&target, other, Some(one)).unwrap();
+        // By a thousand ranges of even probability.
+        let angles: Vec<f64> = (0..1000)
+            .map(|k| {
+                let share = (f64::from(k) + 0.5) / 1000.0;
+                let range = 300.0 * (log_sd * normal_quantile(share)).exp();
+                f64::atan2(range, -100.0)
+            })
+            .collect();
+        let mean = angles.iter().sum::<f64>() / 1000.0;
+        let variance = angles.iter().map(|angle| (angle - mean).powi(2)).sum::<f64>() / 1000.0;
+        let found = f64::atan2(direction.y, direction.x);
+        assert!((found - mean).abs() < 0.1 * variance.sqrt(), "{found} {mean}");
+        let axes = covariance.symmetric_eigen();
+        let (long, short) = (axes.eigenvalues.max().sqrt(), axes.eigenvalues.min().sqrt());
+        assert!((long / variance.sqrt() - 1.0).abs() < 0.1, "{long} {}", variance.sqrt());
+        assert!(short < 0.002, "{short}");
+        // For the camera that sees it, it is no stripe.
+        let (_, covariance) = seen(&target, one, None).unwrap();
+        assert!(covariance.trace().sqrt() < 0.002);
+    }
+
+    /// Of a normal variable, by summing its density.
+    fn normal_quantile(share: f64) -> f64 {
+        let (mut x, mut below) = (-6.0, 0.0);
+        while below < share {
+            let step = 1e-3;
+            below +=
+                (-f64::powi(x + step / 2.0, 2) / 2.0).exp() / std::f64::consts::TAU.sqrt() * step;
+            x += step;
+        }
+        x
+    }
+}
