@@ -216,7 +216,7 @@ impl Centre {
                     self.repeats.warn(&kind, Instant::now(), || format!("not used: {rejection}"));
                 }
                 Output::Camera(camera, standing) => report_camera(camera, *standing),
-                Output::Event(_) | Output::Smoothed(_) => {}
+                Output::Event(_) | Output::Smoothed(_) | Output::Cues(_) => {}
             }
         }
         outputs

@@ -35,6 +35,7 @@ mod recorded;
 mod repeats;
 #[cfg(feature = "centre")]
 mod scenario;
+mod seeker;
 mod service;
 mod shutdown;
 

@@ -17,6 +17,7 @@
 
 mod circuit;
 mod clock;
+mod mount;
 mod path;
 mod render;
 mod scene;
@@ -26,6 +27,7 @@ mod sky;
 mod world;
 
 pub use clock::SimulatedClock;
+pub use mount::{MountState, SceneMount, SimulatedMount};
 pub use path::FlightPath;
 pub use render::RenderedFrame;
 pub use scene::{Scene, SceneCamera, SceneError, SceneTarget};

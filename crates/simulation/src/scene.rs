@@ -6,7 +6,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::{FlightPath, SimulatedClock, World};
+use crate::{FlightPath, SceneMount, SimulatedClock, World};
 
 /// A scene as it is written in a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -69,6 +69,9 @@ pub struct SceneCamera {
     /// Its clock.
     #[serde(default)]
     pub clock: SimulatedClock,
+    /// What turns it, if something does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mount: Option<SceneMount>,
 }
 
 /// What is wrong with a scene.
@@ -190,6 +193,22 @@ impl Scene {
                 (0.0..=1.0).contains(&exposure),
                 "from 0 to 1 s",
             )?;
+            if let Some(mount) = &camera.mount {
+                let rate = mount.rate_deg_per_s;
+                number(
+                    whose("mount.rate_deg_per_s"),
+                    rate,
+                    (0.01..=1000.0).contains(&rate),
+                    "from 0.01 to 1000 degrees a second",
+                )?;
+                let sd = mount.angle_sd_mrad;
+                number(
+                    whose("mount.angle_sd_mrad"),
+                    sd,
+                    (0.0..=100.0).contains(&sd),
+                    "from 0 to 100 mrad",
+                )?;
+            }
             let most = camera.size_px.iter().copied().max().unwrap_or(0);
             number(whose("size_px"), f64::from(most), most <= 8192, "at most 8192 px")?;
             if !seen.insert(camera.name.to_string()) {

@@ -11,33 +11,97 @@ const CLOUDS: f32 = 22.0;
 const COARSEST: usize = 160;
 const OCTAVES: u32 = 5;
 
+/// Knots of the coarsest clouds and all others after which they come again, where a camera turns.
+const PERIOD: usize = 64;
+
 /// A sky of a size, row by row.
 pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut samples: Vec<f32> = (0..width * height)
-        .map(|index| {
-            let up = 1.0 - (index / width) as f32 / height as f32;
-            GRADIENT[0] + (GRADIENT[1] - GRADIENT[0]) * up
-        })
-        .collect();
+    let mut samples = gradient(width, height);
     for octave in 0..OCTAVES {
-        let cell = (COARSEST >> octave).max(2);
-        let strength = CLOUDS / (1 << octave) as f32;
+        let (cell, strength) = cell_and_strength(octave);
         let columns = width / cell + 2;
         let knots: Vec<f32> =
             (0..columns * (height / cell + 2)).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
         for (index, sample) in samples.iter_mut().enumerate() {
             let (x, y) = (index % width, index / width);
-            let smooth = |offset: usize| {
-                let t = offset as f32 / cell as f32;
-                t * t * (3.0 - 2.0 * t)
-            };
-            let (tx, ty) = (smooth(x % cell), smooth(y % cell));
             let corner = |dx: usize, dy: usize| knots[(y / cell + dy) * columns + x / cell + dx];
-            let upper = corner(0, 0) * (1.0 - tx) + corner(1, 0) * tx;
-            let lower = corner(0, 1) * (1.0 - tx) + corner(1, 1) * tx;
-            *sample += strength * (upper * (1.0 - ty) + lower * ty);
+            *sample += strength * between(corner, [x % cell, y % cell], cell);
         }
     }
     samples
+}
+
+/// Brightness that falls from the horizon's side to the zenith's.
+fn gradient(width: usize, height: usize) -> Vec<f32> {
+    let level = |index: usize| {
+        let up = 1.0 - (index / width) as f32 / height as f32;
+        GRADIENT[0] + (GRADIENT[1] - GRADIENT[0]) * up
+    };
+    (0..width * height).map(level).collect()
+}
+
+/// Size (pixels) and strength (levels) of an octave's clouds.
+fn cell_and_strength(octave: u32) -> (usize, f32) {
+    ((COARSEST >> octave).max(2), CLOUDS / (1 << octave) as f32)
+}
+
+/// Between the knots at the corners of a cell, smoothly.
+fn between(corner: impl Fn(usize, usize) -> f32, [x, y]: [usize; 2], cell: usize) -> f32 {
+    let smooth = |offset: usize| {
+        let t = offset as f32 / cell as f32;
+        t * t * (3.0 - 2.0 * t)
+    };
+    let (tx, ty) = (smooth(x), smooth(y));
+    let upper = corner(0, 0) * (1.0 - tx) + corner(1, 0) * tx;
+    let lower = corner(0, 1) * (1.0 - tx) + corner(1, 1) * tx;
+    upper * (1.0 - ty) + lower * ty
+}
+
+/// A sky all about, of which a camera that turns sees a part: clouds that come again and again.
+#[derive(Clone, Debug)]
+pub(crate) struct Panorama {
+    octaves: Vec<Vec<f32>>,
+}
+
+impl Panorama {
+    pub(crate) fn new(seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut knots = || (0..PERIOD * PERIOD).map(|_| rng.random::<f32>() * 2.0 - 1.0).collect();
+        Self { octaves: (0..OCTAVES).map(|_| knots()).collect() }
+    }
+
+    /// The part that begins so many pixels to the right and below of its middle, row by row.
+    pub(crate) fn part(&self, [left, top]: [i64; 2], width: usize, height: usize) -> Vec<f32> {
+        let mut samples = gradient(width, height);
+        for (octave, knots) in (0..).zip(&self.octaves) {
+            let (cell, strength) = cell_and_strength(octave);
+            let around = (cell * PERIOD) as i64;
+            for (index, sample) in samples.iter_mut().enumerate() {
+                let place =
+                    |from: i64, offset: usize| (from + offset as i64).rem_euclid(around) as usize;
+                let (x, y) = (place(left, index % width), place(top, index / width));
+                let corner = |dx: usize, dy: usize| {
+                    knots[(y / cell + dy) % PERIOD * PERIOD + (x / cell + dx) % PERIOD]
+                };
+                *sample += strength * between(corner, [x % cell, y % cell], cell);
+            }
+        }
+        samples
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panorama_seen_from_a_little_aside_is_the_same_sky_moved() {
+        let panorama = Panorama::new(5);
+        let (here, there) = (panorama.part([-70, 30], 60, 40), panorama.part([-60, 30], 60, 40));
+        for y in 0..40 {
+            assert_eq!(here[y * 60 + 10..y * 60 + 60], there[y * 60..y * 60 + 50]);
+        }
+        assert_ne!(here, there);
+    }
 }

@@ -1,4 +1,4 @@
-use crossfix_geometry::Camera;
+use crossfix_geometry::{Camera, PanTilt, ScanAngles};
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Vector3};
 use rand::SeedableRng;
@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::render::{Appearance, draw};
-use crate::sky::sky;
-use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget};
+use crate::sky::{Panorama, sky};
+use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget, SimulatedMount};
 
 /// Where a target is.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,7 +33,9 @@ pub struct World {
 pub struct SimulatedCamera {
     description: SceneCamera,
     camera: Camera,
+    pan_tilt: Option<PanTilt>,
     sky: Vec<f32>,
+    panorama: Option<Panorama>,
     seed: u64,
     targets: Vec<SceneTarget>,
     duration_s: f64,
@@ -42,17 +44,20 @@ pub struct SimulatedCamera {
 impl World {
     pub(crate) fn new(scene: &Scene) -> Result<Self, SceneError> {
         let camera = |(index, description): (usize, &SceneCamera)| {
-            let camera = description.camera().map_err(|source| SceneError::Camera {
-                camera: description.name.clone(),
-                source,
-            })?;
+            let impossible =
+                |source| SceneError::Camera { camera: description.name.clone(), source };
+            let camera = description.camera().map_err(impossible)?;
+            let mount = description.mount.as_ref();
+            let pan_tilt = mount.map(|mount| mount.pan_tilt(*camera.pose())).transpose();
             // Each camera its own random numbers, from the one seed.
             let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
             let [width, height] = description.size_px.map(|side| side as usize);
             Ok(SimulatedCamera {
                 description: description.clone(),
                 camera,
+                pan_tilt: pan_tilt.map_err(impossible)?,
                 sky: sky(width, height, seed),
+                panorama: mount.map(|_| Panorama::new(seed)),
                 seed,
                 targets: scene.targets.clone(),
                 duration_s: scene.duration_s,
@@ -103,6 +108,16 @@ impl SimulatedCamera {
         &self.camera
     }
 
+    /// What turns it, if something does.
+    pub fn pan_tilt(&self) -> Option<&PanTilt> {
+        self.pan_tilt.as_ref()
+    }
+
+    /// The mount that turns it, at rest, if one does.
+    pub fn mount(&self) -> Option<SimulatedMount> {
+        self.description.mount.as_ref().map(|mount| SimulatedMount::new(mount, self.seed))
+    }
+
     /// What the scene says of it.
     pub fn description(&self) -> &SceneCamera {
         &self.description
@@ -119,13 +134,30 @@ impl SimulatedCamera {
         self.description.phase_s + index as f64 / self.description.rate_hz
     }
 
-    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise.
+    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise. Of a camera on a
+    /// mount, at rest.
     pub fn frame(&self, index: u64) -> RenderedFrame {
+        self.render(index, &self.camera, self.sky.clone())
+    }
+
+    /// Renders a frame of a camera whose mount points somewhere; of one without, [`Self::frame`].
+    pub fn frame_pointing(&self, index: u64, angles: ScanAngles) -> RenderedFrame {
+        let (Some(pan_tilt), Some(panorama)) = (&self.pan_tilt, &self.panorama) else {
+            return self.frame(index);
+        };
+        let [width, height] = self.description.size_px.map(|side| side as usize);
+        // Turned to the left what is there comes in from the left, turned upwards from above.
+        let aside = |angle: f64| -(angle * self.description.focal_px).round() as i64;
+        let part = [aside(angles.azimuth), aside(angles.elevation)];
+        let camera = self.camera.posed(pan_tilt.pose(angles));
+        self.render(index, &camera, panorama.part(part, width, height))
+    }
+
+    fn render(&self, index: u64, camera: &Camera, mut image: Vec<f32>) -> RenderedFrame {
         let [width, height] = self.description.size_px.map(|side| side as usize);
         let true_s = self.true_time(index);
-        let mut image = self.sky.clone();
         for target in &self.targets {
-            if let Some(appearance) = self.appearance(target, true_s) {
+            if let Some(appearance) = self.appearance(camera, target, true_s) {
                 draw(&mut image, width, height, &appearance);
             }
         }
@@ -144,16 +176,16 @@ impl SimulatedCamera {
     }
 
     /// How a target appears at a time; `None` before it has come or behind the camera.
-    fn appearance(&self, target: &SceneTarget, t: f64) -> Option<Appearance> {
+    fn appearance(&self, camera: &Camera, target: &SceneTarget, t: f64) -> Option<Appearance> {
         if t < target.appears_s {
             return None;
         }
         let half = self.description.exposure_s / 2.0;
         let place = |t: f64| {
-            let pixel = self.camera.project(target.path.state(t).0)?;
+            let pixel = camera.project(target.path.state(t).0)?;
             Some([pixel.x(), pixel.y()])
         };
-        let range = (target.path.state(t).0 - self.camera.pose().position()).norm();
+        let range = (target.path.state(t).0 - camera.pose().position()).norm();
         Some(Appearance {
             from: place(t - half)?,
             to: place(t + half)?,
@@ -195,6 +227,32 @@ mod tests {
             let sky = camera.sky[index];
             assert!(f32::from(frame.brightness[index]) < sky - 30.0, "target {}", target.id);
         }
+    }
+
+    #[test]
+    fn a_camera_that_is_turned_to_a_target_has_it_in_the_middle() {
+        let mut scene: Scene =
+            toml::from_str(include_str!("../../../configs/demo/scene.toml")).unwrap();
+        scene.cameras[0].mount = Some(crate::SceneMount {
+            azimuth_deg: [-170.0, 170.0],
+            elevation_deg: [-20.0, 80.0],
+            rate_deg_per_s: 60.0,
+            angle_sd_mrad: 0.0,
+        });
+        let world = scene.build().unwrap();
+        let camera = &world.cameras()[0];
+        let index = 50;
+        let target = world.truth(camera.true_time(index))[0].position;
+        let pan_tilt = camera.pan_tilt().unwrap();
+        let direction = pan_tilt.rest().camera_from_world(target);
+        let angles = pan_tilt.aim(&nalgebra::Unit::new_normalize(direction));
+        let frame = camera.frame_pointing(index, angles);
+        let at = |x: usize, y: usize| f32::from(frame.brightness[y * frame.width + x]);
+        let (x, y) = (frame.width / 2, frame.height / 2);
+        assert!(at(x, y) < at(x - 60, y) - 30.0 && at(x, y) < at(x + 60, y) - 30.0);
+        // What is beside it moves with the turn.
+        let turned = ScanAngles { azimuth: angles.azimuth + 0.02, ..angles };
+        assert_ne!(frame.brightness, camera.frame_pointing(index, turned).brightness);
     }
 
     #[test]

@@ -280,6 +280,17 @@ impl ImageTracker {
         }
     }
 
+    /// The camera has been turned since the last image: nothing of it is in the next one where it
+    /// was. What was followed is given up, and the numbers of tracks go on.
+    pub fn look_elsewhere(&mut self) {
+        self.followed.clear();
+        self.tracks.clear();
+        self.snapshot = None;
+        self.scene.clear();
+        self.detector = self.config.detector.clone().map(Detector::new);
+        self.last = None;
+    }
+
     /// Images that were refused.
     pub fn refused(&self) -> u64 {
         self.refused

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail, ensure};
 use crossfix_calibration::intrinsics_to_yaml;
 use crossfix_message::{CameraName, Channel, Key, TrackFrame, TrackNumber, TrackState, decode};
-use crossfix_simulation::{Scene, World};
+use crossfix_simulation::{Scene, SimulatedCamera, World};
 use crossfix_transport::{Link, NetworkConfig, Role};
 use crossfix_vision::{DetectorConfig, TrackerConfig};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -15,8 +15,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::commands::evaluate::{Question, evaluate, render};
 use crate::commands::view::save_recording;
 use crate::config::{
-    self, CameraFile, ClockConfig, ClockSourceName, FusionFile, PoseConfig, SourceConfig,
-    StreamConfig,
+    self, CameraFile, ClockConfig, ClockSourceName, FusionFile, MountConfig, PoseConfig,
+    SourceConfig, StreamConfig,
 };
 use crate::output;
 use crate::pace::wall_seconds;
@@ -24,6 +24,11 @@ use crate::shutdown::{LEAVE, Shutdown};
 
 /// The scene that the demo plays, as in `configs/demo`.
 const SCENE: &str = include_str!("../../../../configs/demo/scene.toml");
+/// The camera that is told where to look.
+const NARROW: &str = include_str!("../../../../configs/demo/narrow.toml");
+/// How well the pose of a camera on a mount at rest has been found, mrad and m: as by a flight of ten
+/// minutes. As little as a careful survey knows would make it no better than the wide ones.
+const MOUNTED_POSE_SD: (f64, f64) = (0.1, 0.02);
 /// How long children may take to come up, and to stop.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Time between the last component's coming up and the first frame, s.
@@ -37,7 +42,7 @@ const SETTLING_S: f64 = 1.5;
 /// recorder as processes joined by Zenoh on this machine, and holds the tracks against the truth.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix demo --duration 20 --output demo-output\n  crossfix demo --live"
+    after_help = "Examples:\n  crossfix demo --duration 20 --output demo-output\n  crossfix demo --live\n  crossfix demo --hand-off"
 )]
 pub struct Args {
     /// Seed of sky and noise.
@@ -53,6 +58,10 @@ pub struct Args {
     /// (RTSP, H.264), are told the cameras' clocks by them, and find the targets.
     #[arg(long)]
     live: bool,
+    /// Let a fourth camera, with a narrow view on a mount that turns, look for the targets where the
+    /// fusion centre tells it to.
+    #[arg(long, conflicts_with = "live")]
+    hand_off: bool,
     /// Open the live viewer (Rerun), where one is installed.
     #[arg(long)]
     view: bool,
@@ -156,6 +165,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     );
     let shutdown = Shutdown::listen();
     let mut scene: Scene = config::parse(SCENE, &[])?;
+    if args.hand_off {
+        scene.cameras.push(config::parse(NARROW, &[])?);
+    }
     scene.seed = args.seed;
     scene.duration_s = args.duration;
     let world = scene.build()?;
@@ -296,7 +308,7 @@ fn progress_bar(duration: f64) -> ProgressBar {
     if let Ok(style) = style {
         bar.set_style(style);
     }
-    bar.set_message("starting three agents, the fusion centre and the recorder");
+    bar.set_message("starting the agents, the fusion centre and the recorder");
     bar
 }
 
@@ -370,6 +382,20 @@ fn write(path: &Path, text: &str) -> anyhow::Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
+/// The pose of a camera of the scene, as a person would give it.
+fn pose_of(camera: &SimulatedCamera) -> PoseConfig {
+    let pose = PoseConfig::of(camera.camera().pose());
+    if camera.pan_tilt().is_none() {
+        return pose;
+    }
+    let (rotation_sd_mrad, position_sd_m) = MOUNTED_POSE_SD;
+    PoseConfig {
+        rotation_sd_mrad: Some(rotation_sd_mrad),
+        position_sd_m: Some(position_sd_m),
+        ..pose
+    }
+}
+
 /// Writes the site's files, as a person would.
 fn write_files(
     folder: &Path,
@@ -403,7 +429,7 @@ fn write_files(
             network: "network.toml".into(),
             calibration: None,
             intrinsics: Some(format!("{name}.yaml").into()),
-            pose: Some(PoseConfig::of(camera.camera().pose())),
+            pose: Some(pose_of(camera)),
             source: match &files.streams {
                 Some(Streams { address, .. }) => SourceConfig::Stream(StreamConfig::open_to_all(
                     format!("rtsp://{address}/{name}"),
@@ -421,6 +447,8 @@ fn write_files(
                 sd_s: files.streams.is_none().then_some(1e-4),
             },
             preview: Default::default(),
+            mount: camera.description().mount.as_ref().map(MountConfig::of),
+            takes_cues: false,
             boxes: Vec::new(),
             tracker: TrackerConfig {
                 detector: Some(DetectorConfig::default()),

@@ -46,6 +46,7 @@ struct Station {
     tracks: LinkPublisher,
     smoothed: LinkPublisher,
     events: LinkPublisher,
+    cues: LinkPublisher,
     health: HealthReporter,
     reception: Reception,
     lookout: Lookout,
@@ -71,6 +72,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
         smoothed: link.publisher(Channel::Smoothed, Delivery::Queued)?,
         events: link.publisher(Channel::Events, Delivery::Queued)?,
+        cues: link.publisher(Channel::Cues, Delivery::Queued)?,
         health: HealthReporter::new(&args.health, &link, Channel::FusionHealth, Delivery::Queued)?,
         reception: Reception::default(),
         lookout,
@@ -89,8 +91,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     service::stopping();
     station.finish(&mut subscription, &shutdown)?;
     let frames = station.centre.frames();
-    let Station { link, tracks, smoothed, events, health, lookout, .. } = station;
-    drop((alive, subscription, tracks, smoothed, events, health, lookout));
+    let Station { link, tracks, smoothed, events, cues, health, lookout, .. } = station;
+    drop((alive, subscription, tracks, smoothed, events, cues, health, lookout));
     link.close(LEAVE)?;
     output::line(format!("fusion centre: {frames} track frames published"));
     Ok(())
@@ -175,6 +177,7 @@ impl Station {
                     tracing::info!("track {number} {}", event.kind().as_str_name());
                     self.events.put(event.encode())?;
                 }
+                Output::Cues(cues) => self.cues.put(cues.encode())?,
                 Output::Rejected(_) | Output::Camera(..) => {}
             }
         }

@@ -14,6 +14,7 @@ use crossfix_vision::{DetectorConfig, PixelBox, TrackerConfig};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
+use super::mount::MountConfig;
 use super::{Kind, SourceConfig};
 use crate::calibrated::Calibrated;
 use crate::recorded;
@@ -37,6 +38,14 @@ pub struct CameraFile {
     pub intrinsics: Option<PathBuf>,
     /// Where it stands and looks.
     pub pose: Option<PoseConfig>,
+    /// What turns it, if something does: then it looks for what the fusion centre tells it to look
+    /// for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mount: Option<MountConfig>,
+    /// Whether it says which of its tracks is what the fusion centre tells it to look for, if nothing
+    /// turns it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub takes_cues: bool,
     /// Where its pictures come from.
     pub source: SourceConfig,
     /// What its capture times are worth.
@@ -188,6 +197,7 @@ impl CameraFile {
         self.check().with_context(wrong)?;
         if let Some(calibrated) = self.calibrated().with_context(wrong)? {
             self.check_boxes(calibrated.camera()).with_context(wrong)?;
+            self.pan_tilt(calibrated.camera().pose()).with_context(wrong)?;
             return Ok(calibrated.camera().clone());
         }
         match (&self.intrinsics, &self.pose, &self.source) {
@@ -196,6 +206,7 @@ impl CameraFile {
                 let pose = pose.pose().context("section [pose]").with_context(wrong)?;
                 let camera = Camera::new(intrinsics, pose)?;
                 self.check_lens(&camera).with_context(wrong)?;
+                self.pan_tilt(camera.pose()).with_context(wrong)?;
                 Ok(camera)
             }
             (None, None, SourceConfig::Recording { path, .. }) => {

@@ -4,6 +4,7 @@ mod camera;
 mod file;
 #[cfg(feature = "centre")]
 mod fusion;
+mod mount;
 mod site;
 mod source;
 mod stream;
@@ -12,6 +13,7 @@ pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig};
 pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
+pub use mount::MountConfig;
 pub use site::{Site, load_cameras, load_network};
 pub use source::SourceConfig;
 pub use stream::{GstreamerConfig, StreamConfig};

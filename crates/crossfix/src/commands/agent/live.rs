@@ -125,12 +125,10 @@ impl Agent {
             TimedBy::Arrival | TimedBy::ArrivalAgainstCamera { .. } => (false, frame.capture),
         };
         let time = watch.even_time(live);
-        let tracks = watch.tracker.step(&image, time);
-        let (mut message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
+        let mut message = self.see(&mut watch.tracker, &image, (frame.index, time), capture);
         if !is_by_camera {
             message.clock_source = ClockSource::Arrival.into();
         }
-        self.unseen_bearings += unseen;
         self.publish(message)?;
         if let Some(stream) = &mut self.stream {
             if stream.is_lost() {

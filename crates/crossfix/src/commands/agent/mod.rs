@@ -1,5 +1,6 @@
 mod live;
 mod reload;
+mod seeking;
 #[cfg(feature = "centre")]
 mod simulated;
 mod start;
@@ -15,6 +16,7 @@ use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfi
 use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
 
+use self::seeking::Seeking;
 use self::start::Start;
 use self::stream_health::StreamHealth;
 use crate::calibrated::Calibrated;
@@ -97,6 +99,8 @@ struct Agent {
     now: Timestamp,
     /// How its stream does, if it watches one.
     stream: Option<StreamHealth>,
+    /// What it looks for, if it takes cues.
+    seeking: Option<Seeking>,
     repeats: Repeats,
     shutdown: Shutdown,
 }
@@ -183,6 +187,7 @@ impl Agent {
             scene_begins: Timestamp::EPOCH,
             now: Timestamp::EPOCH,
             stream: None,
+            seeking: None,
             repeats: Repeats::default(),
             shutdown,
         })
@@ -219,6 +224,7 @@ impl Agent {
                 Some(calibrated) => calibrated.message(valid_from),
                 None => file.calibration(&self.identity.camera, valid_from)?,
             };
+            let message = file.with_mount(message, self.identity.camera.pose())?;
             self.calibration = message.encode();
             self.now = valid_from;
         }
@@ -249,12 +255,14 @@ impl Agent {
                     sd_s: file.clock_sd_s(),
                 };
                 let mut source = crossfix_video::open(path, clock)?;
+                self.begin_to_seek(file, None)?;
                 self.watch(file, source.as_mut(), begins, start, *speed)
             }
             SourceConfig::Stream(_)
             | SourceConfig::Usb { .. }
             | SourceConfig::Gige { .. }
             | SourceConfig::Gstreamer(_) => {
+                self.begin_to_seek(file, None)?;
                 match file.live(Some(self.identity.camera.model().intrinsics().size))? {
                     Some(camera) => self.watch_live(file, camera, begins),
                     None => Ok(()),
@@ -349,6 +357,7 @@ impl Agent {
         if let Some(calibrated) = &self.calibrated {
             self.unseen_bearings += calibrated.apply(&mut frame);
         }
+        self.seek(&mut frame);
         self.now = Timestamp::from_nanos(frame.capture_time_ns);
         self.keep_up()?;
         self.frames += 1;
@@ -396,14 +405,12 @@ impl Agent {
             let Some(image) = brightness(&frame) else {
                 continue;
             };
-            let tracks = tracker.step(&image, capture.time);
+            let message = self.see(&mut tracker, &image, (frame.index, capture.time), capture);
             if !start.is_caught_up(since_s, pace.behind(since_s)) {
                 self.keep_up()?;
                 continue;
             }
             self.note_behind(pace.behind(since_s));
-            let (message, unseen) = self.identity.bearing_frame(frame.index, capture, tracks);
-            self.unseen_bearings += unseen;
             self.publish(message)?;
             self.show(file, &mut shown, &image, capture)?;
         }
@@ -493,8 +500,8 @@ impl Agent {
         let name = self.identity.name.clone();
         let (frames, bad) = (self.frames, self.bad_frames);
         let leave = if self.shutdown.requested() { LEAVE } else { LONG_LEAVE };
-        let Self { alive, bearings, calibrations, health, previews, link, .. } = self;
-        drop((alive, bearings, calibrations, health, previews));
+        let Self { alive, bearings, calibrations, health, previews, seeking, link, .. } = self;
+        drop((alive, bearings, calibrations, health, previews, seeking));
         link.close(leave)?;
         output::line(format!("camera `{name}`: {frames} frames published, {bad} bad frames"));
         seen?;

@@ -30,6 +30,8 @@ impl Again {
             ("clock.source", new.clock.source != old.clock.source),
             ("clock.sd_s", by_arrival && new.clock.sd_s != old.clock.sd_s),
             ("boxes", new.boxes != old.boxes),
+            ("mount", new.mount != old.mount),
+            ("takes_cues", new.takes_cues != old.takes_cues),
         ] {
             if is_other {
                 waits.push(key);
@@ -40,6 +42,8 @@ impl Again {
         file.network.clone_from(&old.network);
         file.source.clone_from(&old.source);
         file.clock.source = old.clock.source;
+        file.mount.clone_from(&old.mount);
+        file.takes_cues = old.takes_cues;
         Ok(Self { file, waits })
     }
 }
@@ -96,6 +100,7 @@ impl Agent {
             Some(calibrated) => calibrated.message(calibrated.common(now)),
             None => file.calibration(&camera, now)?,
         };
+        let message = file.with_mount(message, camera.pose())?;
         if file.tracker != watch.file.tracker {
             watch.tracker = ImageTracker::new(file.tracker.clone())?;
             tracing::info!("targets are found anew, by other parameters");

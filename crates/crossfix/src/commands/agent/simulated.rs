@@ -1,22 +1,73 @@
 //! Cameras of a scene, and the truth of it.
 
 use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::Context;
+use crossfix_geometry::ScanAngles;
 use crossfix_message::{Channel, Payload, Timestamp, TrueState, TruthFrame};
-use crossfix_simulation::{Scene, SimulatedCamera, World};
+use crossfix_simulation::{MountState, Scene, SimulatedCamera, SimulatedMount, World};
 use crossfix_transport::{Delivery, Link, LinkPublisher};
 use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
 
+use super::seeking::Mount;
 use super::{Agent, Start};
 use crate::config::{self, CameraFile};
 use crate::pace::Pace;
 use crate::shutdown::Shutdown;
 
+/// What turns a simulated camera, and when the camera took its newest frame (s) with where it
+/// pointed then.
+#[derive(Debug)]
+struct Turned {
+    mount: SimulatedMount,
+    newest: Option<(f64, MountState)>,
+}
+
+/// A simulated mount, as the camera and the agent share it.
+#[derive(Clone, Debug)]
+struct SharedMount(Arc<Mutex<Turned>>);
+
+impl SharedMount {
+    fn new(mount: SimulatedMount) -> Self {
+        Self(Arc::new(Mutex::new(Turned { mount, newest: None })))
+    }
+
+    fn with<T>(&self, act: impl FnOnce(&mut Turned) -> T) -> T {
+        // Whoever panics has not left it half turned.
+        act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Where it points in an exposure about a time, s.
+    fn expose(&self, t: f64, exposure_s: f64) -> ScanAngles {
+        self.with(|turned| {
+            let [begin, middle] = [t - exposure_s / 2.0, t].map(|t| turned.mount.at(t));
+            let settled = begin.settled && middle.settled;
+            turned.newest = Some((t, MountState { settled, ..middle }));
+            middle.truth
+        })
+    }
+}
+
+impl Mount for SharedMount {
+    fn aim(&mut self, angles: ScanAngles) {
+        self.with(|turned| {
+            let now = turned.newest.map_or(0.0, |(t, _)| t);
+            turned.mount.aim(now, angles);
+        });
+    }
+
+    fn at(&mut self, _: Timestamp) -> Option<(ScanAngles, bool)> {
+        // Each frame is looked at before the next one is taken.
+        self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)))
+    }
+}
+
 /// A simulated camera as a source of frames, with the times that its own clock shows.
 struct SimulatedSource {
     world: World,
     camera: SimulatedCamera,
+    mount: Option<SharedMount>,
     start: Timestamp,
     next: u64,
 }
@@ -31,7 +82,8 @@ impl SimulatedSource {
             .camera(file.name.as_str())
             .with_context(|| format!("the scene {} has no camera `{}`", path.display(), file.name))?
             .clone();
-        Ok(Self { world, camera, start: Timestamp::from_seconds(start), next: 0 })
+        let mount = camera.mount().map(SharedMount::new);
+        Ok(Self { world, camera, mount, start: Timestamp::from_seconds(start), next: 0 })
     }
 }
 
@@ -40,7 +92,14 @@ impl FrameSource for SimulatedSource {
         if self.next >= self.camera.frames() {
             return Ok(None);
         }
-        let rendered = self.camera.frame(self.next);
+        let rendered = match &self.mount {
+            None => self.camera.frame(self.next),
+            Some(mount) => {
+                let exposure_s = self.camera.description().exposure_s;
+                let angles = mount.expose(self.camera.true_time(self.next), exposure_s);
+                self.camera.frame_pointing(self.next, angles)
+            }
+        };
         self.next += 1;
         Ok(Some(Frame {
             index: rendered.index,
@@ -63,6 +122,8 @@ impl Agent {
         start: &Start,
     ) -> anyhow::Result<()> {
         let mut source = SimulatedSource::open(scene, file, start.wall_s)?;
+        let mount = source.mount.clone().map(|mount| Box::new(mount) as Box<dyn Mount>);
+        self.begin_to_seek(file, mount)?;
         let truth = if publish_truth {
             Some(TruthPublisher::new(&self.link, source.world.clone(), start.wall_s)?)
         } else {

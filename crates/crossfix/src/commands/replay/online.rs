@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use crossfix_message::{
-    BearingFrame, CameraName, Channel, Health, Payload, Preview, Timestamp, TrackEvent, TrackFrame,
-    TruthFrame, decode,
+    BearingFrame, CameraName, Channel, CueFrame, Health, Payload, Preview, Timestamp, TrackEvent,
+    TrackFrame, TruthFrame, decode,
 };
 use crossfix_recording::Entry;
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
@@ -196,6 +196,13 @@ impl Pass {
             Channel::Events => {
                 let mut message: TrackEvent = decode(data).ok()?;
                 moved(&mut message.time_ns);
+                message.encode_unstamped()
+            }
+            Channel::Cues => {
+                let mut message: CueFrame = decode(data).ok()?;
+                moved(&mut message.time_ns);
+                let ahead = message.cues.iter_mut().flat_map(|cue| &mut cue.ahead);
+                ahead.for_each(|expected| moved(&mut expected.time_ns));
                 message.encode_unstamped()
             }
             Channel::Truth => {

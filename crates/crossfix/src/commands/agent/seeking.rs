@@ -1,0 +1,135 @@
+//! An agent whose camera looks for what the fusion centre tells it to look for.
+
+use std::time::Duration;
+
+use anyhow::ensure;
+use crossfix_correlation::Plane;
+use crossfix_geometry::ScanAngles;
+use crossfix_message::{BearingFrame, Channel, CueFrame, Key, Pointing, Timestamp, decode};
+use crossfix_transport::Subscription;
+use crossfix_video::CaptureTime;
+use crossfix_vision::ImageTracker;
+
+use super::Agent;
+use crate::config::CameraFile;
+use crate::seeker::{Orders, Seeker};
+
+/// What turns a camera, as an agent sees it.
+pub trait Mount: Send {
+    /// Tells it to turn to where it says that these angles are.
+    fn aim(&mut self, angles: ScanAngles);
+
+    /// Where it says that it pointed when an image was taken, by the agent's clock, and whether it
+    /// stood still; `None` where it says nothing.
+    fn at(&mut self, time: Timestamp) -> Option<(ScanAngles, bool)>;
+}
+
+/// A camera that looks for what it is told to look for.
+pub(super) struct Seeking {
+    seeker: Seeker,
+    cues: Subscription,
+    mount: Option<Box<dyn Mount>>,
+    angle_sd_rad: f64,
+    /// Whether its mount stood still for the image before.
+    was_settled: bool,
+    /// What it has taken over last, so that it is said once.
+    said: Option<u64>,
+}
+
+impl Seeking {
+    /// Where the mount pointed in an image.
+    fn pointing(&mut self, time: Timestamp) -> Option<Pointing> {
+        let (ScanAngles { azimuth, elevation }, settled) = self.mount.as_mut()?.at(time)?;
+        let (azimuth_sd, elevation_sd) = (self.angle_sd_rad, self.angle_sd_rad);
+        Some(Pointing { azimuth, elevation, azimuth_sd, elevation_sd, settled })
+    }
+
+    /// Takes in what has been said, and looks at a frame by it: says in the frame what it takes
+    /// over, and tells the mount where to turn.
+    fn look(&mut self, frame: &mut BearingFrame) {
+        while let Some(received) = self.cues.next(Duration::ZERO) {
+            // What is malformed moves no camera.
+            let Ok(cues) = decode::<CueFrame>(&received.data) else { continue };
+            if cues.camera == frame.camera {
+                self.seeker.hear(cues);
+            }
+        }
+        let at = frame.pointing.map(|pointing| {
+            let Pointing { azimuth, elevation, settled, .. } = pointing;
+            (ScanAngles { azimuth, elevation }, settled)
+        });
+        let time = Timestamp::from_nanos(frame.capture_time_ns);
+        let Orders { aim, taken_over } = self.seeker.look(time, at, &frame.tracks);
+        if let (Some(mount), Some(aim)) = (&mut self.mount, aim) {
+            mount.aim(aim);
+        }
+        if let Some(taken) = &taken_over
+            && self.said != Some(taken.image_track_id)
+        {
+            self.said = Some(taken.image_track_id);
+            let of = taken.of.as_ref().map_or(0, |of| of.track_id);
+            let number = crossfix_message::TrackNumber(of);
+            tracing::info!("its track {} is taken for track {number}", taken.image_track_id);
+        }
+        frame.taken_over.extend(taken_over);
+    }
+}
+
+impl Agent {
+    /// Begins to listen to cues, if the camera's file says so; with what turns the camera, if that
+    /// can be told to turn.
+    pub(super) fn begin_to_seek(
+        &mut self,
+        file: &CameraFile,
+        mount: Option<Box<dyn Mount>>,
+    ) -> anyhow::Result<()> {
+        if !file.looks_for_cues() {
+            return Ok(());
+        }
+        ensure!(
+            file.mount.is_none() || mount.is_some(),
+            "section [mount]: nothing turns this source's camera"
+        );
+        let camera = &self.identity.camera;
+        let cues = Key::new(self.link.site().clone(), Channel::Cues).to_string();
+        self.seeking = Some(Seeking {
+            seeker: Seeker::new(camera.model(), file.pan_tilt(camera.pose())?),
+            cues: self.link.subscribe(&[cues])?,
+            mount: mount.filter(|_| file.mount.is_some()),
+            angle_sd_rad: file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3),
+            was_settled: true,
+            said: None,
+        });
+        Ok(())
+    }
+
+    /// Follows targets into an image of a number; `time` is the tracker's. While a mount turns its
+    /// camera nothing is followed: what moves then is everything.
+    pub(super) fn see(
+        &mut self,
+        tracker: &mut ImageTracker,
+        image: &Plane,
+        (index, time): (u64, Timestamp),
+        capture: CaptureTime,
+    ) -> BearingFrame {
+        let pointing = self.seeking.as_mut().and_then(|seeking| seeking.pointing(capture.time));
+        let is_settled = pointing.is_none_or(|pointing| pointing.settled);
+        if let Some(seeking) = &mut self.seeking {
+            let was_settled = std::mem::replace(&mut seeking.was_settled, is_settled);
+            if was_settled && !is_settled {
+                tracker.look_elsewhere();
+            }
+        }
+        let tracks = if is_settled { tracker.step(image, time) } else { &[] };
+        let (frame, unseen) = self.identity.bearing_frame(index, capture, tracks);
+        self.unseen_bearings += unseen;
+        BearingFrame { pointing, ..frame }
+    }
+
+    /// Looks at a frame by what the fusion centre has said.
+    pub(super) fn seek(&mut self, frame: &mut BearingFrame) {
+        if let Some(seeking) = &mut self.seeking {
+            seeking.look(frame);
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! A mount that turns a camera of a scene: it takes time, and its angles are not quite what it says.
+
+use crossfix_geometry::{GeometryError, PanTilt, Pose, ScanAngles};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+/// What turns a camera of a scene. At rest it looks where the camera does.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneMount {
+    /// How far it turns to the left (least and most), degrees.
+    pub azimuth_deg: [f64; 2],
+    /// How far it turns upwards (least and most), degrees.
+    pub elevation_deg: [f64; 2],
+    /// How fast it turns about each axis, degrees a second.
+    pub rate_deg_per_s: f64,
+    /// Standard deviation of what each angle is off by, anew after each turn, mrad.
+    #[serde(default)]
+    pub angle_sd_mrad: f64,
+}
+
+impl SceneMount {
+    /// Its geometry, by the camera's pose at rest.
+    ///
+    /// # Errors
+    /// [`GeometryError::Reach`] where no mount turns so.
+    pub fn pan_tilt(&self, rest: Pose) -> Result<PanTilt, GeometryError> {
+        let radians = |degrees: [f64; 2]| degrees.map(f64::to_radians);
+        PanTilt::new(rest, radians(self.azimuth_deg), radians(self.elevation_deg))
+    }
+}
+
+/// Where a mount points at a time, and where it says that it does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MountState {
+    /// Where it points.
+    pub truth: ScanAngles,
+    /// Where it says.
+    pub said: ScanAngles,
+    /// Whether it stands still.
+    pub settled: bool,
+}
+
+/// A mount in action.
+///
+/// ```
+/// use crossfix_geometry::ScanAngles;
+/// use crossfix_simulation::{SceneMount, SimulatedMount};
+///
+/// let mount = SceneMount {
+///     azimuth_deg: [-90.0, 90.0],
+///     elevation_deg: [-10.0, 80.0],
+///     rate_deg_per_s: 57.3,
+///     angle_sd_mrad: 0.1,
+/// };
+/// let mut mount = SimulatedMount::new(&mount, 7);
+/// mount.aim(1.0, ScanAngles { azimuth: 0.5, elevation: 0.1 });
+/// assert!(!mount.at(1.2).settled);
+/// let there = mount.at(1.6);
+/// assert!(there.settled && (there.truth.azimuth - 0.5).abs() < 1e-3);
+/// ```
+#[derive(Clone, Debug)]
+pub struct SimulatedMount {
+    rate: f64,
+    angle_sd: f64,
+    noise: ChaCha8Rng,
+    /// What it says is so far off, to the left and upwards, rad.
+    off: [f64; 2],
+    from: ScanAngles,
+    to: ScanAngles,
+    began_s: f64,
+}
+
+impl SimulatedMount {
+    /// A mount at rest, with random errors of a seed.
+    pub fn new(mount: &SceneMount, seed: u64) -> Self {
+        let rest = ScanAngles { azimuth: 0.0, elevation: 0.0 };
+        let mut at_rest = Self {
+            rate: mount.rate_deg_per_s.to_radians(),
+            angle_sd: mount.angle_sd_mrad * 1e-3,
+            noise: ChaCha8Rng::seed_from_u64(seed),
+            off: [0.0; 2],
+            from: rest,
+            to: rest,
+            began_s: f64::NEG_INFINITY,
+        };
+        at_rest.draw();
+        at_rest
+    }
+
+    fn draw(&mut self) {
+        self.off = self.off.map(|_| {
+            let drawn: f64 = StandardNormal.sample(&mut self.noise);
+            drawn * self.angle_sd
+        });
+    }
+
+    /// Begins to turn to where it is told, by what it says, at a time (s); from where it is by then.
+    pub fn aim(&mut self, t: f64, to: ScanAngles) {
+        if to != self.to {
+            (self.from, self.to, self.began_s) = (self.at(t).said, to, t);
+            self.draw();
+        }
+    }
+
+    /// Where it points at a time (s), if it is told nothing else.
+    pub fn at(&self, t: f64) -> MountState {
+        let reach = (self.rate * (t - self.began_s)).max(0.0);
+        let on_the_way = |from: f64, to: f64| {
+            if (to - from).abs() <= reach { to } else { from + reach.copysign(to - from) }
+        };
+        let said = ScanAngles {
+            azimuth: on_the_way(self.from.azimuth, self.to.azimuth),
+            elevation: on_the_way(self.from.elevation, self.to.elevation),
+        };
+        let truth = ScanAngles {
+            azimuth: said.azimuth + self.off[0],
+            elevation: said.elevation + self.off[1],
+        };
+        MountState { truth, said, settled: said == self.to }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mount(angle_sd_mrad: f64) -> SimulatedMount {
+        let mount = SceneMount {
+            azimuth_deg: [-170.0, 170.0],
+            elevation_deg: [-10.0, 80.0],
+            rate_deg_per_s: 1f64.to_degrees(),
+            angle_sd_mrad,
+        };
+        SimulatedMount::new(&mount, 3)
+    }
+
+    #[test]
+    fn it_turns_at_its_rate_and_may_be_told_otherwise_on_the_way() {
+        let mut mount = mount(0.0);
+        mount.aim(10.0, ScanAngles { azimuth: 1.0, elevation: 0.2 });
+        let half = mount.at(10.5);
+        assert!(!half.settled && (half.said.azimuth - 0.5).abs() < 1e-12);
+        assert!((half.said.elevation - 0.2).abs() < 1e-12);
+        // No multiple of its step, and there all the same.
+        assert!(mount.at(11.7).settled);
+        mount.aim(10.5, ScanAngles { azimuth: 0.0, elevation: 0.2 });
+        assert!(!mount.at(10.9).settled);
+        assert_eq!(mount.at(11.1).truth.azimuth, 0.0);
+        assert!(mount.at(11.1).settled);
+    }
+
+    #[test]
+    fn what_it_is_off_by_is_the_same_until_it_turns_and_as_large_as_it_says() {
+        let mut mount = mount(0.5);
+        let mut squares = 0.0;
+        for k in 0..500 {
+            let t = f64::from(k) * 10.0;
+            mount.aim(t, ScanAngles { azimuth: f64::from(k % 7) * 0.1, elevation: 0.1 });
+            let off = |t: f64| mount.at(t).truth.azimuth - mount.at(t).said.azimuth;
+            assert!((off(t + 5.0) - off(t + 9.0)).abs() < 1e-15);
+            squares += off(t + 5.0).powi(2);
+        }
+        let sd = (squares / 500.0).sqrt();
+        // A deviation of n draws is known to one in the root of 2 n.
+        assert!((sd / 0.5e-3 - 1.0).abs() < 4.0 / 1000f64.sqrt(), "{sd}");
+    }
+}
