@@ -132,14 +132,14 @@ pub fn own_time(frame: &BearingFrame, camera: &CalibratedCamera) -> Timestamp {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use crossfix_message::BearingTrack;
 
     use super::*;
 
     /// A camera that looks along its z axis, whose clock is half a minute behind, with a read-out of
     /// 20 ms.
-    const SITE: &str = r#"
+    pub(crate) const SITE: &str = r#"
         form = 1
         [[camera]]
         name = "north"

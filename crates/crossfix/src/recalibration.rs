@@ -6,7 +6,9 @@ use std::collections::{BTreeMap, BinaryHeap};
 use std::path::Path;
 
 use crossfix_calibration::{CalibratedCamera, SiteCalibration};
-use crossfix_message::{BearingFrame, Channel, Payload, Preview, Timestamp, decode};
+use crossfix_message::{
+    BearingFrame, CameraCalibration, Channel, Payload, Preview, Timestamp, decode,
+};
 use crossfix_recording::Entry;
 
 use crate::calibrated::{self, middle_time, recalibrate};
@@ -40,7 +42,15 @@ impl Recalibration {
         let (data_time, data) = match &entry.key.channel {
             Channel::Calibration(name) => {
                 let camera = self.site.camera(name)?;
-                (Timestamp::EPOCH, self.site.message(camera, Timestamp::EPOCH).encode())
+                let message = self.site.message(camera, Timestamp::EPOCH);
+                // The file knows no mounts: its pose is that at rest.
+                let recorded = decode::<CameraCalibration>(&entry.data).unwrap_or_default();
+                let message = match recorded.parse().ok().and_then(|known| known.mount) {
+                    Some(mount) => message.on_mount(&mount.resting_at(*camera.camera.pose())),
+                    None if recorded.takes_cues => message.taking_cues(),
+                    None => message,
+                };
+                (Timestamp::EPOCH, message.encode())
             }
             Channel::Bearings(name) => {
                 let mut frame: BearingFrame = decode(&entry.data).ok()?;
@@ -151,5 +161,50 @@ impl Reordered {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_geometry::{PanTilt, Pose, ScanAngles};
+    use crossfix_message::{CameraName, Key, Pointing};
+    use nalgebra::{Point3, Vector3};
+
+    use super::*;
+    use crate::calibrated::tests::SITE;
+
+    /// Whether a camera takes cues, and its mount's reach, are its agent's to say.
+    #[test]
+    fn a_camera_on_a_mount_stays_on_it_and_its_rest_is_the_new_pose() {
+        let site = SiteCalibration::from_toml(SITE).unwrap();
+        let new = site.cameras()[0].camera.clone();
+        let recalibration = Recalibration::of(site);
+        let name: CameraName = "north".parse().unwrap();
+        let of = |message: CameraCalibration| {
+            let channel = Channel::Calibration(name.clone());
+            let key = Key::new("site".parse().unwrap(), channel);
+            let entry = Entry {
+                key,
+                data_time: Timestamp::EPOCH,
+                arrival: Timestamp::EPOCH,
+                data: message.encode(),
+            };
+            decode::<CameraCalibration>(&recalibration.applied(entry).data).unwrap()
+        };
+        let old = Pose::looking_at(Point3::origin(), Point3::new(0.0, 1.0, 0.0)).unwrap();
+        let recorded = CameraCalibration::new(&name, &new.posed(old), Timestamp::EPOCH);
+        let mount = PanTilt::new(old, [-1.0, 1.5], [-0.2, 1.2]).unwrap();
+
+        let turned = of(recorded.clone().on_mount(&mount)).parse().unwrap();
+        assert_eq!(turned.mount.unwrap().azimuth(), [-1.0, 1.5]);
+        let pointing = Pointing { azimuth: 0.5, elevation: 0.1, ..Default::default() };
+        let axis = turned.pointed(Some(&pointing)).unwrap().pose().rotation() * Vector3::z();
+        let angles = ScanAngles { azimuth: 0.5, elevation: 0.1 };
+        let expected = mount.resting_at(*new.pose()).pose(angles).rotation() * Vector3::z();
+        assert!((axis - expected).norm() < 1e-12, "{axis}");
+
+        let standing = of(recorded.clone().taking_cues());
+        assert!(standing.takes_cues && standing.mount.is_none());
+        assert!(!of(recorded).takes_cues);
     }
 }

@@ -50,6 +50,12 @@ impl PanTilt {
         }
     }
 
+    /// The same mount with another pose at zero angles.
+    #[must_use]
+    pub fn resting_at(self, rest: Pose) -> Self {
+        Self { rest, ..self }
+    }
+
     /// The camera's pose with both angles at zero.
     pub fn rest(&self) -> &Pose {
         &self.rest

@@ -30,7 +30,33 @@ pub(crate) fn f32s(v: &Vector3<f64>) -> [f32; 3] {
     [v.x as f32, v.y as f32, v.z as f32]
 }
 
-/// A camera: its pose, and a frustum whose image has sides scaled by `scale`.
+/// Where a camera stands and looks.
+fn transform(camera: &Camera) -> Transform3D {
+    let matrix = camera.pose().rotation().matrix();
+    let column = |i: usize| [matrix[(0, i)] as f32, matrix[(1, i)] as f32, matrix[(2, i)] as f32];
+    let position = f32s(&camera.pose().position().coords);
+    Transform3D::from_translation_mat3x3(position, [column(0), column(1), column(2)])
+}
+
+/// A camera that nothing turns: where it looks for all times.
+pub(crate) fn fixed_pose(
+    stream: &RecordingStream,
+    name: &str,
+    camera: &Camera,
+) -> Result<(), ViewError> {
+    Ok(stream.log_static(format!("world/cameras/{name}"), &transform(camera))?)
+}
+
+/// A camera on a mount: where it looks from now on.
+pub(crate) fn turned_pose(
+    stream: &RecordingStream,
+    name: &str,
+    camera: &Camera,
+) -> Result<(), ViewError> {
+    Ok(stream.log(format!("world/cameras/{name}"), &transform(camera))?)
+}
+
+/// A camera: its place, and a frustum whose image has sides scaled by `scale`.
 pub(crate) fn camera(
     stream: &RecordingStream,
     name: &str,
@@ -38,14 +64,7 @@ pub(crate) fn camera(
     camera: &Camera,
     scale: f64,
 ) -> Result<(), ViewError> {
-    let matrix = camera.pose().rotation().matrix();
-    let column = |i: usize| [matrix[(0, i)] as f32, matrix[(1, i)] as f32, matrix[(2, i)] as f32];
-    let columns = [column(0), column(1), column(2)];
     let position = f32s(&camera.pose().position().coords);
-    stream.log_static(
-        format!("world/cameras/{name}"),
-        &Transform3D::from_translation_mat3x3(position, columns),
-    )?;
     stream.log_static(
         format!("world/names/{name}"),
         &Points3D::new([position])

@@ -3,8 +3,8 @@ use std::time::Duration;
 
 use crossfix_geometry::Camera;
 use crossfix_message::{
-    BearingFrame, CameraCalibration, Channel, DecodeError, Health, ImageTrackState, Preview,
-    Timestamp, Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
+    BearingFrame, Calibration, CameraCalibration, Channel, DecodeError, Health, ImageTrackState,
+    Preview, Timestamp, Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
 };
 use nalgebra::{Point3, Vector3};
 use rerun::RecordingStream;
@@ -47,12 +47,29 @@ enum Shown {
 
 struct CameraView {
     index: u64,
+    calibration: Calibration,
+    /// As it looks now: on a mount, as its last frame said.
     camera: Camera,
     scale: f64,
     /// Of the calibration that is drawn.
     hash: Vec<u8>,
     /// Where in its images targets were.
     region: Option<Region>,
+}
+
+impl CameraView {
+    /// Turns a camera on a mount to where a frame says that it looked.
+    fn point(&mut self, stream: &RecordingStream, frame: &BearingFrame) -> Result<(), ViewError> {
+        if self.calibration.mount.is_none() {
+            return Ok(());
+        }
+        // What says nothing of it is the fusion's to report.
+        let Some(pointed) = self.calibration.pointed(frame.pointing.as_ref()) else {
+            return Ok(());
+        };
+        self.camera = pointed;
+        draw::turned_pose(stream, &frame.camera, &self.camera)
+    }
 }
 
 /// Where a track is drawn.
@@ -169,13 +186,18 @@ impl Picture {
         let view = self.cameras.entry(name.clone()).or_insert(CameraView {
             index: known,
             camera: parsed.camera.clone(),
+            calibration: parsed.clone(),
             scale: 1.0,
             hash: Vec::new(),
             region: None,
         });
-        view.camera = parsed.camera;
         if new || view.hash != message.hash {
             view.hash.clone_from(&message.hash);
+            view.camera = parsed.camera.clone();
+            if parsed.mount.is_none() {
+                draw::fixed_pose(&self.stream, &name, &view.camera)?;
+            }
+            view.calibration = parsed;
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
             draw::residual_plot(&self.stream, &name, view.index)?;
             self.lay_out(Shown::WholeImages)?;
@@ -237,6 +259,7 @@ impl Picture {
         if !self.limiter.allows(&format!("lines/{}", frame.camera), time, LINE_RATE_HZ) {
             return Ok(());
         }
+        view.point(&self.stream, frame)?;
         // As far as the farthest track, so that the crossings are seen.
         let origin = view.camera.pose().position();
         let placed =
@@ -412,7 +435,8 @@ impl Picture {
 
 #[cfg(test)]
 mod tests {
-    use crossfix_message::{BearingFrame, Payload, Track, Vector3};
+    use crossfix_geometry::{Distortion, ImageSize, Intrinsics, PanTilt, Pose};
+    use crossfix_message::{BearingFrame, CameraName, Payload, Pointing, Track};
     use rerun::RecordingStreamBuilder;
 
     use super::*;
@@ -426,7 +450,7 @@ mod tests {
     }
 
     fn track(time_s: f64) -> Vec<u8> {
-        let place = Some(Vector3 { x: 1.0, y: 2.0, z: 3.0 });
+        let place = Some(Vector3::new(1.0, 2.0, 3.0).into());
         let track = Track {
             id: 1,
             state: TrackState::Confirmed.into(),
@@ -468,5 +492,42 @@ mod tests {
         // Fused long after it was recorded.
         tell(&mut picture, &north, 1.79e9, &bearings(10.1));
         assert_eq!(picture.drawn.len(), 1);
+    }
+
+    #[test]
+    fn a_camera_on_a_mount_is_drawn_as_its_last_frame_says() {
+        let mut picture = picture();
+        let name: CameraName = "north".parse().unwrap();
+        let rest = Pose::looking_at(Point3::origin(), Point3::new(0.0, 100.0, 0.0)).unwrap();
+        let lens = Intrinsics {
+            size: ImageSize { width: 640, height: 480 },
+            fx: 3000.0,
+            fy: 3000.0,
+            cx: 319.5,
+            cy: 239.5,
+            distortion: Distortion::None,
+        };
+        let mount = PanTilt::new(rest, [-2.0, 2.0], [-0.2, 1.2]).unwrap();
+        let camera = Camera::new(lens, rest).unwrap();
+        let message =
+            CameraCalibration::new(&name, &camera, Timestamp::EPOCH).on_mount(&mount).encode();
+        tell(&mut picture, &Channel::Calibration(name.clone()), 1.0, &message);
+        let mut look = |azimuth: f64, time_s: f64| {
+            let frame = BearingFrame {
+                camera: name.to_string(),
+                capture_time_ns: Timestamp::from_seconds(time_s).nanos(),
+                pointing: Some(Pointing { azimuth, ..Default::default() }),
+                ..Default::default()
+            };
+            tell(&mut picture, &Channel::Bearings(name.clone()), time_s, &frame.encode());
+            // The calibration is told again and again; it does not turn the camera back.
+            tell(&mut picture, &Channel::Calibration(name.clone()), time_s, &message);
+            picture.cameras["north"].camera.pose().rotation() * Vector3::z()
+        };
+        // To the left of north is west.
+        for (azimuth, time_s) in [(0.0, 2.0), (0.5, 3.0), (-0.5, 4.0)] {
+            let axis = look(azimuth, time_s);
+            assert!((axis - Vector3::new(-azimuth.sin(), azimuth.cos(), 0.0)).norm() < 1e-9);
+        }
     }
 }

@@ -319,6 +319,12 @@ fn seen(
 ) -> anyhow::Result<Seen> {
     let known = |name: &CameraName| prior.and_then(|site| site.camera(name));
     let described = described(recording)?;
+    for name in described.iter().filter(|(_, camera)| camera.is_on_mount).map(|(name, _)| name) {
+        tracing::warn!(
+            "camera `{name}` is on a mount and is left out: a flight calibrates cameras that stand \
+             still"
+        );
+    }
     for (name, described) in &described {
         described.check_against(known(name)).with_context(|| {
             format!("the bearings of camera `{name}` in {}", recording.display())
@@ -328,6 +334,7 @@ fn seen(
     let mut lacks = Lacks::default();
     recorded::for_each(recording, &mut lacks, |lacks, entry| {
         if let Channel::Bearings(name) = &entry.key.channel
+            && described.get(name).is_none_or(|camera| !camera.is_on_mount)
             && let Some(frame) = lacks.read::<BearingFrame>(&entry.data)
         {
             let is_corrected = described.get(name).is_some_and(|camera| camera.is_corrected);
@@ -366,6 +373,8 @@ struct Described {
     lens: Intrinsics,
     /// Whether its times are common ones: only a flight finds a clock's wander.
     is_corrected: bool,
+    /// Whether something turns it.
+    is_on_mount: bool,
 }
 
 impl Described {
@@ -398,7 +407,8 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>
             && let Some(message) = lacks.read::<CameraCalibration>(&entry.data)
         {
             let is_corrected = message.datum.is_some() || message.clock_wander_s > 0.0;
-            cameras.insert(name.clone(), Described { lens: message.lens(name)?, is_corrected });
+            let (lens, is_on_mount) = (message.lens(name)?, message.mount.is_some());
+            cameras.insert(name.clone(), Described { lens, is_corrected, is_on_mount });
         }
         Ok(())
     })?;

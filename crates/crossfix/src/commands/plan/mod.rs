@@ -140,7 +140,16 @@ impl Args {
             }
             Ok(camera)
         };
-        config::load_cameras(&self.site)?.into_iter().map(planned).collect()
+        let (turned, still): (Vec<_>, Vec<_>) = config::load_cameras(&self.site)?
+            .into_iter()
+            .partition(|(_, file)| file.mount.is_some());
+        for (_, file) in turned {
+            tracing::warn!(
+                "camera `{}` is on a mount and is left out: it sees where it is told to look",
+                file.name
+            );
+        }
+        still.into_iter().map(planned).collect()
     }
 }
 
