@@ -22,6 +22,8 @@ mod logging;
 mod lookout;
 mod metrics;
 mod network;
+#[cfg(feature = "onvif")]
+mod onvif;
 mod output;
 mod pace;
 mod parts;

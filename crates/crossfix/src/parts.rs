@@ -23,7 +23,7 @@ pub fn no_pictures() -> anyhow::Error {
 }
 
 /// The error of asking for a part that is left out.
-#[cfg(not(all(feature = "centre", feature = "viewer")))]
+#[cfg(not(all(feature = "centre", feature = "viewer", feature = "onvif")))]
 pub fn is_left_out(part: &str, feature: &str) -> anyhow::Error {
     anyhow::anyhow!("this build leaves out {part}: build it with `--features {feature}`")
 }

@@ -40,6 +40,16 @@ const SEARCHED_SDS: f64 = 2.0;
 /// A stripe of more views than this has its nearest ones looked at, s.
 const MOST_VIEWS: i32 = 40;
 
+/// What turns a camera, as an agent sees it.
+pub trait Mount: Send {
+    /// Tells it to turn to where it says that these angles are.
+    fn aim(&mut self, angles: ScanAngles);
+
+    /// Where it says that it pointed in the newest image, and whether it stood still; `None` where it
+    /// says nothing.
+    fn pointed(&mut self) -> Option<(ScanAngles, bool)>;
+}
+
 /// Where something should be at a time, in the camera's frame at rest.
 #[derive(Clone, Copy, Debug)]
 struct Place {

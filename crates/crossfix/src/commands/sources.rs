@@ -9,10 +9,16 @@ use crossfix_video::{
 use serde::Serialize;
 
 use crate::commands::numbers;
+#[cfg(feature = "onvif")]
+use crate::config;
 use crate::config::{CameraFile, SourceConfig};
 use crate::eye::jpeg;
+#[cfg(feature = "onvif")]
+use crate::onvif;
 use crate::output::{self, Draft};
 use crate::pace::wall_seconds;
+#[cfg(not(feature = "onvif"))]
+use crate::parts;
 use crate::shutdown::Shutdown;
 
 /// How often is looked whether it is to stop.
@@ -25,22 +31,29 @@ const MOST_TROUBLES: usize = 10;
 /// Try a camera: what it sends, how often, and what its clock is worth.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix sources rtsp://10.0.0.5/stream1\n  crossfix sources -c configs/site/north.toml --picture north.jpg\n  crossfix sources\n  crossfix sources /dev/video0 --size 1280x720"
+    after_help = "Examples:\n  crossfix sources rtsp://10.0.0.5/stream1\n  crossfix sources -c configs/site/north.toml --picture north.jpg\n  crossfix sources\n  crossfix sources /dev/video0 --size 1280x720\n  crossfix sources http://10.0.0.5/onvif/device_service --user eye --password-file password"
 )]
 pub struct Args {
     /// The stream, rtsp://HOST/PATH. One that wants to know who asks is better tried with -c: a
     /// command line can be read by others.
     ///
-    /// Or a camera of this host, /dev/video0, or an industrial one, gige://10.0.0.7. Without, those of this
-    /// host are listed.
+    /// Or a camera of this host, /dev/video0, or an industrial one, gige://10.0.0.7. Of a network camera's
+    /// device service (ONVIF), http://HOST/PATH, its streams are listed. Without, those of this host are.
     #[arg(conflicts_with = "config")]
     url: Option<String>,
     /// A camera's configuration (TOML) whose stream is tried.
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// List industrial cameras (GigE Vision), too: asks all on this host's networks by a broadcast.
+    /// List industrial cameras (GigE Vision), too, and network cameras (ONVIF) where the build has them:
+    /// asks all on this host's networks.
     #[arg(long, conflicts_with_all = ["url", "config"])]
     lan: bool,
+    /// Who asks a network camera for its streams (ONVIF).
+    #[arg(long, requires = "password_file", conflicts_with = "config")]
+    user: Option<String>,
+    /// The file whose first line is the password.
+    #[arg(long, value_name = "FILE", requires = "user")]
+    password_file: Option<PathBuf>,
     /// Ask for datagrams.
     #[arg(long, conflicts_with = "config")]
     udp: bool,
@@ -124,6 +137,9 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    if let Some(service) = args.url.as_deref().filter(|url| url.starts_with("http")) {
+        return describe(service, args);
+    }
     let Some(camera) = camera(args)? else { return list(args) };
     let address = camera.address();
     let (tried, last) = try_out(camera, args.seconds);
@@ -190,6 +206,31 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     Ok(Some(LiveCamera::Stream(RtspCamera::new(options))))
 }
 
+/// Says what a network camera shows, and whether something turns it.
+#[cfg(feature = "onvif")]
+fn describe(service: &str, args: &Args) -> anyhow::Result<()> {
+    let service = service.parse().context("this is no address")?;
+    let login = config::login("", args.user.as_deref(), args.password_file.as_deref())?;
+    let camera = onvif::describe(&service, login.as_ref())?;
+    if args.json {
+        return output::json(&camera);
+    }
+    output::line(&camera.name);
+    for onvif::Stream { profile, url } in &camera.streams {
+        output::line(format!("  stream    {url}  {profile}"));
+    }
+    if let Some([pan, tilt]) = camera.position {
+        output::line(format!("  mount     says pan {pan}, tilt {tilt}, of -1 to 1"));
+    }
+    Ok(())
+}
+
+/// Says that this build cannot.
+#[cfg(not(feature = "onvif"))]
+fn describe(_: &str, _: &Args) -> anyhow::Result<()> {
+    Err(parts::is_left_out("network cameras by ONVIF", "onvif"))
+}
+
 /// Says which cameras hang on this host and, where it is to ask, which are on its networks.
 fn list(args: &Args) -> anyhow::Result<()> {
     let own = usb_cameras().into_iter();
@@ -200,6 +241,12 @@ fn list(args: &Args) -> anyhow::Result<()> {
             .map_err(|what| anyhow!("nobody on the network can be asked: {what}"))?;
         let listed = |(address, name)| Listed { device: format!("gige://{address}"), name };
         cameras.extend(found.into_iter().map(listed));
+        #[cfg(feature = "onvif")]
+        cameras.extend(
+            onvif::cameras(ANSWERED_WITHIN)?
+                .into_iter()
+                .map(|(device, name)| Listed { device, name }),
+        );
     }
     if args.json {
         return output::json(&cameras);

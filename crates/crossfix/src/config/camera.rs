@@ -161,6 +161,9 @@ impl CameraFile {
         file.network = folder.join(&file.network);
         file.intrinsics = file.intrinsics.map(|intrinsics| folder.join(intrinsics));
         file.calibration = file.calibration.map(|calibration| folder.join(calibration));
+        if let Some(onvif) = file.mount.as_mut().and_then(|mount| mount.onvif.as_mut()) {
+            onvif.password_file = onvif.password_file.take().map(|file| folder.join(file));
+        }
         match &mut file.source {
             SourceConfig::Video { path, .. } | SourceConfig::Recording { path, .. } => {
                 *path = folder.join(&*path);

@@ -13,7 +13,9 @@ pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig};
 pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
-pub use mount::MountConfig;
+pub use mount::{MountConfig, OnvifConfig};
 pub use site::{Site, load_cameras, load_network};
 pub use source::SourceConfig;
+#[cfg(feature = "onvif")]
+pub use stream::login;
 pub use stream::{GstreamerConfig, StreamConfig};

@@ -1,13 +1,18 @@
 //! Cameras that look where they are told.
 
+use std::path::PathBuf;
+
 use anyhow::{Context, ensure};
 use crossfix_geometry::{PanTilt, Pose};
 use crossfix_message::CameraCalibration;
 #[cfg(feature = "centre")]
 use crossfix_simulation::SceneMount;
+use crossfix_video::Login;
 use serde::{Deserialize, Serialize};
+use url::Url;
 
 use super::CameraFile;
+use super::stream::login;
 
 /// No mount knows its angles better, mrad: a tenth of an arc second.
 const LEAST_SD_MRAD: f64 = 0.001;
@@ -23,6 +28,64 @@ pub struct MountConfig {
     /// Standard deviation of each angle that it says, mrad: of an error that stays the same until it
     /// turns again. 0.001 to 500.
     pub angle_sd_mrad: f64,
+    /// How it is told where to turn, if it is a network camera's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub onvif: Option<OnvifConfig>,
+}
+
+/// A mount that is turned by ONVIF, which says where it points as numbers from -1 to 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OnvifConfig {
+    /// Its device service, as `crossfix sources --lan` lists it: http://HOST/onvif/device_service.
+    pub url: Url,
+    /// Who asks.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub user: Option<String>,
+    /// The file whose first line is the password.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub password_file: Option<PathBuf>,
+    /// The azimuths at which it says that its pan is -1 and 1, degrees. Azimuths count to the left, most
+    /// cameras' pans to the right. -720 to 720.
+    pub pan_deg: [f64; 2],
+    /// The elevations at which it says that its tilt is -1 and 1, degrees. -360 to 360.
+    pub tilt_deg: [f64; 2],
+    /// The zoom for which the lens is calibrated, 0 to 1: it is kept there. Absent: the zoom at which
+    /// it is found.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zoom: Option<f64>,
+}
+
+impl OnvifConfig {
+    /// Who asks, if it wants to know.
+    pub fn login(&self) -> anyhow::Result<Option<Login>> {
+        login("mount.onvif.", self.user.as_deref(), self.password_file.as_deref())
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
+        let is_whole = matches!(self.url.scheme(), "http" | "https") && self.url.has_host();
+        ensure!(is_whole, "key `mount.onvif.url` does not begin with http://HOST/");
+        ensure!(
+            self.url.username().is_empty() && self.url.password().is_none(),
+            "key `mount.onvif.url` names a user: give `mount.onvif.user` and \
+             `mount.onvif.password_file`"
+        );
+        for (key, [least, most], bound) in
+            [("pan_deg", self.pan_deg, 720.0), ("tilt_deg", self.tilt_deg, 360.0)]
+        {
+            let within = |angle: f64| (-bound..=bound).contains(&angle);
+            ensure!(
+                within(least) && within(most) && (most - least).abs() >= 1.0,
+                "key `mount.onvif.{key}` is [{least}, {most}]: it must be two different angles from \
+                 -{bound} to {bound}"
+            );
+        }
+        ensure!(
+            self.zoom.is_none_or(|zoom| (0.0..=1.0).contains(&zoom)),
+            "key `mount.onvif.zoom` must be from 0 to 1"
+        );
+        Ok(())
+    }
 }
 
 impl MountConfig {
@@ -30,7 +93,12 @@ impl MountConfig {
     #[cfg(feature = "centre")]
     pub fn of(mount: &SceneMount) -> Self {
         let SceneMount { azimuth_deg, elevation_deg, angle_sd_mrad, .. } = *mount;
-        Self { azimuth_deg, elevation_deg, angle_sd_mrad: angle_sd_mrad.max(LEAST_SD_MRAD) }
+        Self {
+            azimuth_deg,
+            elevation_deg,
+            angle_sd_mrad: angle_sd_mrad.max(LEAST_SD_MRAD),
+            onvif: None,
+        }
     }
 
     /// Its geometry, by the camera's pose at rest.
@@ -40,6 +108,7 @@ impl MountConfig {
             "key `mount.angle_sd_mrad` is {}: it must be from 0.001 to 500",
             self.angle_sd_mrad
         );
+        self.onvif.as_ref().map_or(Ok(()), OnvifConfig::check)?;
         let radians = |degrees: [f64; 2]| degrees.map(f64::to_radians);
         PanTilt::new(rest, radians(self.azimuth_deg), radians(self.elevation_deg))
             .context("keys `mount.azimuth_deg`, `mount.elevation_deg`")

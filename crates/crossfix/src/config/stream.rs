@@ -107,7 +107,7 @@ impl StreamConfig {
     }
 
     fn login(&self, in_url: Option<&Login>) -> anyhow::Result<Option<Login>> {
-        let by_file = login(self.user.as_deref(), self.password_file.as_deref())?;
+        let by_file = login("source.", self.user.as_deref(), self.password_file.as_deref())?;
         ensure!(
             in_url.is_none() || by_file.is_none(),
             "the user is in `source.url`: leave out `source.user` and `source.password_file`"
@@ -116,16 +116,20 @@ impl StreamConfig {
     }
 }
 
-/// Who asks, with the password in the first line of a file.
-fn login(user: Option<&str>, password_file: Option<&Path>) -> anyhow::Result<Option<Login>> {
+/// Who asks, with the password in the first line of a file, by keys that begin so.
+pub fn login(
+    prefix: &str,
+    user: Option<&str>,
+    password_file: Option<&Path>,
+) -> anyhow::Result<Option<Login>> {
     match (user, password_file) {
         (None, None) => Ok(None),
         (Some(user), Some(file)) => {
             let text = std::fs::read_to_string(file)
-                .with_context(|| format!("key `source.password_file`: {}", file.display()))?;
+                .with_context(|| format!("key `{prefix}password_file`: {}", file.display()))?;
             Ok(Some(Login::new(user, text.lines().next().unwrap_or_default())))
         }
-        _ => bail!("give both `source.user` and `source.password_file`"),
+        _ => bail!("give both `{prefix}user` and `{prefix}password_file`"),
     }
 }
 
@@ -183,7 +187,7 @@ impl GstreamerConfig {
     pub(super) fn options(&self, by_arrival_sd_s: Option<f64>) -> anyhow::Result<GstreamerOptions> {
         Ok(GstreamerOptions {
             pipeline: self.pipeline.clone(),
-            login: login(self.user.as_deref(), self.password_file.as_deref())?,
+            login: login("source.", self.user.as_deref(), self.password_file.as_deref())?,
             heeds_reports: by_arrival_sd_s.is_none(),
             latency: Latency {
                 mean_s: self.latency_s,

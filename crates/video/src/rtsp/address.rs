@@ -27,7 +27,8 @@ impl Login {
         &self.user
     }
 
-    pub(crate) fn password(&self) -> &str {
+    /// The password, to be shown to the camera alone.
+    pub fn password(&self) -> &str {
         &self.password
     }
 }

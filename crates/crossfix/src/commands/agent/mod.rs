@@ -262,7 +262,7 @@ impl Agent {
             | SourceConfig::Usb { .. }
             | SourceConfig::Gige { .. }
             | SourceConfig::Gstreamer(_) => {
-                self.begin_to_seek(file, None)?;
+                self.begin_to_seek(file, seeking::mount_of(file)?)?;
                 match file.live(Some(self.identity.camera.model().intrinsics().size))? {
                     Some(camera) => self.watch_live(file, camera, begins),
                     None => Ok(()),

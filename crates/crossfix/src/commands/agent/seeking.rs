@@ -12,17 +12,11 @@ use crossfix_vision::ImageTracker;
 
 use super::Agent;
 use crate::config::CameraFile;
-use crate::seeker::{Orders, Seeker};
-
-/// What turns a camera, as an agent sees it.
-pub trait Mount: Send {
-    /// Tells it to turn to where it says that these angles are.
-    fn aim(&mut self, angles: ScanAngles);
-
-    /// Where it says that it pointed when an image was taken, by the agent's clock, and whether it
-    /// stood still; `None` where it says nothing.
-    fn at(&mut self, time: Timestamp) -> Option<(ScanAngles, bool)>;
-}
+#[cfg(feature = "onvif")]
+use crate::onvif::OnvifMount;
+#[cfg(not(feature = "onvif"))]
+use crate::parts;
+use crate::seeker::{Mount, Orders, Seeker};
 
 /// A camera that looks for what it is told to look for.
 pub(super) struct Seeking {
@@ -37,9 +31,9 @@ pub(super) struct Seeking {
 }
 
 impl Seeking {
-    /// Where the mount pointed in an image.
-    fn pointing(&mut self, time: Timestamp) -> Option<Pointing> {
-        let (ScanAngles { azimuth, elevation }, settled) = self.mount.as_mut()?.at(time)?;
+    /// Where the mount pointed in the newest image.
+    fn pointing(&mut self) -> Option<Pointing> {
+        let (ScanAngles { azimuth, elevation }, settled) = self.mount.as_mut()?.pointed()?;
         let (azimuth_sd, elevation_sd) = (self.angle_sd_rad, self.angle_sd_rad);
         Some(Pointing { azimuth, elevation, azimuth_sd, elevation_sd, settled })
     }
@@ -75,6 +69,22 @@ impl Seeking {
     }
 }
 
+/// What turns a live camera, if its file says how it is told.
+#[cfg(feature = "onvif")]
+pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount>>> {
+    let Some(mount) = &file.mount else { return Ok(None) };
+    let Some(onvif) = &mount.onvif else { return Ok(None) };
+    let head = OnvifMount::start(onvif, mount.angle_sd_mrad * 1e-3)?;
+    Ok(Some(Box::new(head)))
+}
+
+/// What turns a live camera: this build cannot tell it.
+#[cfg(not(feature = "onvif"))]
+pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount>>> {
+    let told = file.mount.as_ref().is_some_and(|mount| mount.onvif.is_some());
+    if told { Err(parts::is_left_out("mounts by ONVIF", "onvif")) } else { Ok(None) }
+}
+
 impl Agent {
     /// Begins to listen to cues, if the camera's file says so; with what turns the camera, if that
     /// can be told to turn.
@@ -88,7 +98,7 @@ impl Agent {
         }
         ensure!(
             file.mount.is_none() || mount.is_some(),
-            "section [mount]: nothing turns this source's camera"
+            "section [mount]: nothing turns this source's camera; [mount.onvif] turns network cameras"
         );
         let camera = &self.identity.camera;
         let cues = Key::new(self.link.site().clone(), Channel::Cues).to_string();
@@ -112,7 +122,7 @@ impl Agent {
         (index, time): (u64, Timestamp),
         capture: CaptureTime,
     ) -> BearingFrame {
-        let pointing = self.seeking.as_mut().and_then(|seeking| seeking.pointing(capture.time));
+        let pointing = self.seeking.as_mut().and_then(Seeking::pointing);
         let is_settled = pointing.is_none_or(|pointing| pointing.settled);
         if let Some(seeking) = &mut self.seeking {
             let was_settled = std::mem::replace(&mut seeking.was_settled, is_settled);

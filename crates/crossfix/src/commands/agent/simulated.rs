@@ -10,10 +10,10 @@ use crossfix_simulation::{MountState, Scene, SimulatedCamera, SimulatedMount, Wo
 use crossfix_transport::{Delivery, Link, LinkPublisher};
 use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
 
-use super::seeking::Mount;
 use super::{Agent, Start};
 use crate::config::{self, CameraFile};
 use crate::pace::Pace;
+use crate::seeker::Mount;
 use crate::shutdown::Shutdown;
 
 /// What turns a simulated camera, and when the camera took its newest frame (s) with where it
@@ -57,7 +57,7 @@ impl Mount for SharedMount {
         });
     }
 
-    fn at(&mut self, _: Timestamp) -> Option<(ScanAngles, bool)> {
+    fn pointed(&mut self) -> Option<(ScanAngles, bool)> {
         // Each frame is looked at before the next one is taken.
         self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)))
     }

@@ -14,7 +14,9 @@ use crossfix_video::decoding_time;
 use serde::Serialize;
 
 use super::sources::{Tried, try_out};
-use crate::config::{self, CameraFile, Kind, load_network};
+use crate::config::{self, CameraFile, Kind, OnvifConfig, load_network};
+#[cfg(feature = "onvif")]
+use crate::onvif;
 use crate::output;
 
 /// How long a camera is watched, s: until it has said what its clock shows.
@@ -141,6 +143,9 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
             Err(error) => Finding::new("pictures", Verdict::Fail, format!("{error:#}")),
         }),
     }
+    if let Some(onvif) = file.mount.as_ref().and_then(|mount| mount.onvif.as_ref()) {
+        findings.push(of_mount(onvif));
+    }
     findings.push(clock::host_clock());
     let network = load_network(&file.network)?;
     findings.push(match network.cameras.get(&file.name) {
@@ -152,6 +157,29 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     });
     findings.extend(network.routers.iter().map(|router| of_endpoint("router", router)));
     Ok(findings)
+}
+
+/// Whether what turns the camera says where it points.
+#[cfg(feature = "onvif")]
+fn of_mount(mount: &OnvifConfig) -> Finding {
+    let asked = mount.login().and_then(|login| onvif::describe(&mount.url, login.as_ref()));
+    match asked {
+        Ok(onvif::Described { name, position: Some([pan, tilt]), .. }) => {
+            let found = format!("{name} says pan {pan}, tilt {tilt}");
+            Finding::new("mount", Verdict::Pass, found)
+        }
+        Ok(_) => Finding::new("mount", Verdict::Fail, "it does not say where it points")
+            .mend("bearings need its angles: another mount, or none"),
+        Err(error) => Finding::new("mount", Verdict::Fail, format!("{error:#}"))
+            .mend(format!("try it by `crossfix sources {}`", mount.url)),
+    }
+}
+
+/// That this build cannot ask it.
+#[cfg(not(feature = "onvif"))]
+fn of_mount(_: &OnvifConfig) -> Finding {
+    Finding::new("mount", Verdict::Fail, "this build leaves out mounts by ONVIF")
+        .mend("build it with `--features onvif`")
 }
 
 /// What a watched stream says of its camera, whose clock is declared to be so far ahead.

@@ -1,0 +1,442 @@
+//! What turns a network camera, and where it says that it points.
+//!
+//! A mount by ONVIF is told a place and goes there in its own time; asked, it says where it is and
+//! whether it moves, a network's delay later. So what it says is where an image was taken only if it
+//! has stood still for as long as an image takes to come, and while it does not, nothing is.
+
+use std::convert::Infallible;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use crossfix_geometry::ScanAngles;
+use crossfix_video::Login;
+use tokio::sync::oneshot;
+use url::Url;
+
+use super::{Device, answered, runtime};
+use crate::config::OnvifConfig;
+use crate::repeats::Repeats;
+use crate::seeker::Mount;
+
+/// How often it is asked where it is. Twice as often burdens a camera's small host; half as often
+/// makes each turn a tenth of a second longer.
+const ASKED_EVERY: Duration = Duration::from_millis(100);
+/// How long an image takes to come at most: from the exposure through encoder, network and decoder.
+/// With less than a camera takes, images of a turn are taken for those of where it ended.
+const IMAGE_COMES_WITHIN: Duration = Duration::from_millis(500);
+/// What it said so long ago is where it was.
+const SAID_HOLDS: Duration = Duration::from_secs(1);
+/// If it has not moved by then, it goes no farther.
+const BEGINS_WITHIN: Duration = Duration::from_secs(1);
+/// It has arrived, or stands still, within so many deviations of its angles.
+const SAME_SDS: f64 = 3.0;
+/// Zooms farther apart are not the same: a hundredth is one of focal length, too, on most lenses.
+const SAME_ZOOM: f32 = 0.01;
+/// It is asked again after a failure, at first and at last: some lock who errs too often.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(60);
+
+/// What a mount's angles are by the positions that it says, each from -1 to 1.
+#[derive(Clone, Copy, Debug)]
+struct Scale {
+    /// Azimuth at a pan of -1 and 1, rad.
+    pan: [f64; 2],
+    /// Elevation at a tilt of -1 and 1, rad.
+    tilt: [f64; 2],
+}
+
+impl Scale {
+    fn angles(&self, [pan, tilt]: [f32; 2]) -> ScanAngles {
+        let at = |[least, most]: [f64; 2], place: f32| {
+            least + (most - least) * (f64::from(place) + 1.0) / 2.0
+        };
+        ScanAngles { azimuth: at(self.pan, pan), elevation: at(self.tilt, tilt) }
+    }
+
+    fn position(&self, angles: ScanAngles) -> [f32; 2] {
+        let of = |[least, most]: [f64; 2], angle: f64| {
+            (2.0 * (angle - least) / (most - least) - 1.0).clamp(-1.0, 1.0) as f32
+        };
+        [of(self.pan, angles.azimuth), of(self.tilt, angles.elevation)]
+    }
+}
+
+/// Where a head was told to turn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Order {
+    to: ScanAngles,
+    /// Since when it knows; `None` while it has not been told.
+    sent: Option<Instant>,
+}
+
+/// Where a head points, by what it has said.
+#[derive(Clone, Copy, Debug)]
+struct Pointed {
+    /// Angles that differ by less are the same, rad.
+    same_rad: f64,
+    /// What it said last, and when.
+    said: Option<(ScanAngles, Instant)>,
+    /// Where it has stood still, and since when.
+    still: Option<(ScanAngles, Instant)>,
+    order: Option<Order>,
+}
+
+impl Pointed {
+    fn new(angle_sd_rad: f64) -> Self {
+        Self { same_rad: SAME_SDS * angle_sd_rad, said: None, still: None, order: None }
+    }
+
+    fn order(&mut self, to: ScanAngles) {
+        self.order = Some(Order { to, sent: None });
+    }
+
+    /// It has been told to turn, unless it is to turn elsewhere by now.
+    fn told(&mut self, to: ScanAngles, now: Instant) {
+        if let Some(order) = self.order.as_mut().filter(|order| order.to == to) {
+            order.sent = Some(now);
+        }
+    }
+
+    /// It says where it is, and whether it moves.
+    fn hear(&mut self, angles: ScanAngles, moves: bool, now: Instant) {
+        let same = |other: ScanAngles| {
+            (angles.azimuth - other.azimuth).abs() <= self.same_rad
+                && (angles.elevation - other.elevation).abs() <= self.same_rad
+        };
+        let stays = !moves && self.still.is_some_and(|(there, _)| same(there));
+        if !stays {
+            self.still = (!moves).then_some((angles, now));
+        }
+        self.said = Some((angles, now));
+        let Some(Order { to, sent: Some(sent) }) = self.order else { return };
+        if !stays {
+            // It may stop short of where it was told to go: the wait begins anew where it stops.
+            self.order = Some(Order { to, sent: Some(now) });
+        } else if same(to) || now.duration_since(sent) > BEGINS_WITHIN {
+            self.order = None;
+        }
+    }
+
+    /// It says nothing, or its lens is another.
+    fn lose(&mut self) {
+        (self.said, self.still) = (None, None);
+    }
+
+    /// Where it pointed in the newest image, and whether it stood still.
+    fn at(&self, now: Instant) -> Option<(ScanAngles, bool)> {
+        let (angles, said) = self.said?;
+        let since = self.still.filter(|_| self.order.is_none()).map(|(_, since)| since);
+        let settled = since.is_some_and(|since| now.duration_since(since) > IMAGE_COMES_WITHIN);
+        (now.duration_since(said) < SAID_HOLDS).then_some((angles, settled))
+    }
+}
+
+/// What an agent and the thread that asks the mount share.
+#[derive(Clone, Debug)]
+struct Shared(Arc<Mutex<Pointed>>);
+
+impl Shared {
+    fn with<T>(&self, act: impl FnOnce(&mut Pointed) -> T) -> T {
+        // Whoever panics has not left it half told.
+        act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// How a mount is reached.
+struct Reach {
+    address: Url,
+    login: Option<Login>,
+    scale: Scale,
+    zoom: Option<f32>,
+}
+
+/// A mount that is turned by ONVIF, and asked where it points ten times a second. It is asked again
+/// for as long as it lives, whatever becomes of it.
+#[derive(Debug)]
+pub struct OnvifMount {
+    shared: Shared,
+    /// Ends the thread when it is dropped.
+    stop: Option<oneshot::Sender<Infallible>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl OnvifMount {
+    /// Begins to ask it.
+    ///
+    /// # Errors
+    /// If the password cannot be read, or the host has no threads left.
+    pub fn start(config: &OnvifConfig, angle_sd_rad: f64) -> anyhow::Result<Self> {
+        let radians = |degrees: [f64; 2]| degrees.map(f64::to_radians);
+        let reach = Reach {
+            address: config.url.clone(),
+            login: config.login()?,
+            scale: Scale { pan: radians(config.pan_deg), tilt: radians(config.tilt_deg) },
+            zoom: config.zoom.map(|zoom| zoom as f32),
+        };
+        let shared = Shared(Arc::new(Mutex::new(Pointed::new(angle_sd_rad))));
+        let (stop, stopped) = oneshot::channel();
+        let runtime = runtime()?;
+        let asked = shared.clone();
+        let thread = std::thread::Builder::new().name("mount".to_owned()).spawn(move || {
+            runtime.spawn(ask_for_ever(asked, reach));
+            // What is under way ends with the runtime.
+            let _ = runtime.block_on(stopped);
+        });
+        let thread = thread.context("no thread for the mount")?;
+        Ok(Self { shared, stop: Some(stop), thread: Some(thread) })
+    }
+}
+
+impl Drop for OnvifMount {
+    fn drop(&mut self) {
+        self.stop = None;
+        if let Some(thread) = self.thread.take() {
+            // It has said what it had to say.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Mount for OnvifMount {
+    fn aim(&mut self, angles: ScanAngles) {
+        self.shared.with(|pointed| pointed.order(angles));
+    }
+
+    fn pointed(&mut self) -> Option<(ScanAngles, bool)> {
+        self.shared.with(|pointed| pointed.at(Instant::now()))
+    }
+}
+
+/// Asks a mount for ever, ever less often while it does not answer.
+async fn ask_for_ever(shared: Shared, reach: Reach) {
+    let mut repeats = Repeats::default();
+    let mut pause = FIRST_PAUSE;
+    loop {
+        let mut answered = false;
+        let Err(error) = ask(&shared, &reach, &mut answered).await;
+        shared.with(Pointed::lose);
+        repeats.warn("lost", Instant::now(), || {
+            format!("the mount at {}: {error:#}; going on", reach.address)
+        });
+        pause = if answered { FIRST_PAUSE } else { (2 * pause).min(LONGEST_PAUSE) };
+        tokio::time::sleep(pause).await;
+        repeats.remind(Instant::now());
+    }
+}
+
+/// Asks a mount where it points, and tells it where to turn, until it does not answer.
+async fn ask(
+    shared: &Shared,
+    reach: &Reach,
+    has_answered: &mut bool,
+) -> anyhow::Result<Infallible> {
+    let Reach { address, login, scale, zoom } = reach;
+    let device = Device::connect(address, login.as_ref()).await?;
+    let (head, profile) = device.profile_of_head().await?;
+    let mut zoom = *zoom;
+    let mut set = None::<Instant>;
+    loop {
+        let status = answered(device.client.ptz_get_status(head.as_str(), &profile)).await?;
+        let position = status.pan.zip(status.tilt).map(|(pan, tilt)| [pan, tilt]);
+        let position = position.context("it does not say where it points, so it is of no use")?;
+        if !*has_answered {
+            tracing::info!("the mount at {address} says where it points");
+        }
+        *has_answered = true;
+        // The lens is calibrated for one zoom; whoever has turned it has made it another.
+        let now = Instant::now();
+        let wanted_zoom = *zoom.get_or_insert(status.zoom.unwrap_or(0.0));
+        let zoomed = status.zoom.is_some_and(|zoom| (zoom - wanted_zoom).abs() > SAME_ZOOM);
+        if zoomed {
+            shared.with(Pointed::lose);
+        } else {
+            let moves = status.pan_tilt_status == "MOVING" || status.zoom_status == "MOVING";
+            shared.with(|pointed| pointed.hear(scale.angles(position), moves, now));
+        }
+        let order = shared.with(|pointed| pointed.order).filter(|order| order.sent.is_none());
+        let is_due = set.is_none_or(|at| now.duration_since(at) > BEGINS_WITHIN);
+        if order.is_some() || (zoomed && is_due) {
+            let [pan, tilt] = order.map_or(position, |order| scale.position(order.to));
+            let moved =
+                device.client.ptz_absolute_move(head.as_str(), &profile, pan, tilt, wanted_zoom);
+            answered(moved).await?;
+            set = Some(now);
+            if let Some(order) = order {
+                shared.with(|pointed| pointed.told(order.to, Instant::now()));
+            }
+        }
+        tokio::time::sleep(ASKED_EVERY).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::stub::{PASSWORD, Stub, USER};
+    use super::super::{Stream, describe};
+    use super::*;
+
+    const ANGLE_SD_RAD: f64 = 1e-3;
+
+    fn degrees(azimuth: f64, elevation: f64) -> ScanAngles {
+        ScanAngles { azimuth: azimuth.to_radians(), elevation: elevation.to_radians() }
+    }
+
+    fn config(stub: &Stub, password: &str) -> (OnvifConfig, tempfile::NamedTempFile) {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), password).unwrap();
+        let config = OnvifConfig {
+            url: stub.url().parse().unwrap(),
+            user: Some(USER.to_owned()),
+            password_file: Some(file.path().to_owned()),
+            pan_deg: [180.0, -180.0],
+            tilt_deg: [0.0, 90.0],
+            zoom: Some(0.5),
+        };
+        (config, file)
+    }
+
+    /// Waits for what it says; what it said last if that does not come.
+    fn until(
+        mount: &mut OnvifMount,
+        seconds: f64,
+        mut holds: impl FnMut(Option<(ScanAngles, bool)>) -> bool,
+    ) -> Option<(ScanAngles, bool)> {
+        let begun = Instant::now();
+        loop {
+            let pointed = mount.pointed();
+            if holds(pointed) || begun.elapsed().as_secs_f64() > seconds {
+                return pointed;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    fn settled(pointed: Option<(ScanAngles, bool)>) -> bool {
+        pointed.is_some_and(|(_, settled)| settled)
+    }
+
+    #[test]
+    fn a_position_is_an_angle_and_back() {
+        let scale = Scale { pan: [3.0, -3.0], tilt: [-0.5, 1.5] };
+        let angles = scale.angles([0.5, -0.5]);
+        assert!((angles.azimuth + 1.5).abs() < 1e-12 && angles.elevation.abs() < 1e-12);
+        let [pan, tilt] = scale.position(angles);
+        assert!((pan - 0.5).abs() < 1e-6 && (tilt + 0.5).abs() < 1e-6);
+        // As far as it goes.
+        assert_eq!(scale.position(ScanAngles { azimuth: 9.0, elevation: 9.0 }), [-1.0, 1.0]);
+    }
+
+    /// A tenth of a second each: where it is, whether it says that it moves, whether it is settled.
+    #[test]
+    fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
+        let begun = Instant::now();
+        let at = |tenth: u32| begun + ASKED_EVERY * tenth;
+        let mut pointed = Pointed::new(ANGLE_SD_RAD);
+        let hear = |pointed: &mut Pointed, tenth: u32, azimuth: f64, moves: bool| {
+            pointed.hear(degrees(azimuth, 0.0), moves, at(tenth));
+            pointed.at(at(tenth)).unwrap().1
+        };
+        let settled: Vec<bool> = (0..8).map(|k| hear(&mut pointed, k, 10.0, false)).collect();
+        assert_eq!(settled, [false, false, false, false, false, false, true, true]);
+        // Told to turn, it is not settled, though it stands for a while and does not say that it
+        // moves.
+        pointed.order(degrees(20.0, 0.0));
+        assert!(!hear(&mut pointed, 8, 10.0, false));
+        pointed.told(degrees(20.0, 0.0), at(8));
+        for (tenth, azimuth) in [(9, 10.0), (10, 10.0), (11, 12.0), (12, 16.0), (13, 20.0)] {
+            assert!(!hear(&mut pointed, tenth, azimuth, false), "{tenth}");
+        }
+        let first = (14..30).find(|k| hear(&mut pointed, *k, 20.0, false));
+        assert_eq!(first, Some(19), "half a second after it was there");
+        // It drifts by less than the deviations at a time, and is seen to.
+        let drifts = (30..45).map(|k| hear(&mut pointed, k, 20.0 + 0.1 * f64::from(k - 29), false));
+        assert!(drifts.skip(2).all(|settled| !settled));
+        // It never begins: told that it may go no farther, it stands where it is.
+        let stands: Vec<bool> = (45..60).map(|k| hear(&mut pointed, k, 21.5, false)).collect();
+        assert!(stands[8]);
+        pointed.order(degrees(90.0, 0.0));
+        pointed.told(degrees(90.0, 0.0), at(60));
+        let first = (60..90).find(|k| hear(&mut pointed, *k, 21.5, false));
+        assert_eq!(first, Some(71));
+        // What was said long ago says nothing.
+        assert!(pointed.at(at(82)).is_none());
+    }
+
+    #[test]
+    fn it_turns_where_it_is_told_and_says_where_it_is_when_it_stands() {
+        let stub = Stub::start(0);
+        let (config, _file) = config(&stub, PASSWORD);
+        let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
+        let (rest, _) = until(&mut mount, 6.0, settled).unwrap();
+        assert!((rest.azimuth - 0.0).abs() < 1e-3 && (rest.elevation - 0.785).abs() < 1e-3);
+        // The zoom of its lens is set once.
+        assert_eq!(stub.state.lock().unwrap().zoom, 0.5);
+
+        let aim = degrees(-72.0, 18.0);
+        mount.aim(aim);
+        assert!(!settled(mount.pointed()));
+        let told = Instant::now();
+        let mut last_moved = told;
+        // What is said to be settled is where it is, and was for as long as an image takes.
+        let (there, _) = until(&mut mount, 6.0, |pointed| {
+            if stub.state.lock().unwrap().position().1 {
+                last_moved = Instant::now();
+            }
+            settled(pointed)
+        })
+        .unwrap();
+        assert!((there.azimuth - aim.azimuth).abs() < 4e-4, "{there:?}");
+        assert!((there.elevation - aim.elevation).abs() < 4e-4, "{there:?}");
+        assert!(last_moved > told && last_moved.elapsed() > IMAGE_COMES_WITHIN);
+        assert!(last_moved.elapsed() < 4 * IMAGE_COMES_WITHIN);
+
+        // Somebody zooms: another lens, until it is set back.
+        stub.state.lock().unwrap().zoom = 0.9;
+        assert!(until(&mut mount, 3.0, |pointed| pointed.is_none()).is_none());
+        assert!(settled(until(&mut mount, 6.0, settled)));
+        assert_eq!(stub.state.lock().unwrap().zoom, 0.5);
+    }
+
+    #[test]
+    fn a_mount_that_is_gone_points_nowhere_and_is_asked_again() {
+        let stub = Stub::start(0);
+        let (config, _file) = config(&stub, PASSWORD);
+        let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
+        assert!(settled(until(&mut mount, 6.0, settled)));
+        let port = stub.port;
+        drop(stub);
+        assert!(until(&mut mount, 6.0, |pointed| pointed.is_none()).is_none());
+        mount.aim(degrees(30.0, 50.0));
+        let stub = Stub::start(port);
+        let (there, _) = until(&mut mount, 15.0, settled).unwrap();
+        assert!((there.azimuth - 30f64.to_radians()).abs() < 1e-3, "told late: {there:?}");
+        // It goes on, and says nothing more of where it is.
+        stub.state.lock().unwrap().says = false;
+        assert!(until(&mut mount, 6.0, |pointed| pointed.is_none()).is_none());
+    }
+
+    #[test]
+    fn a_wrong_password_is_refused_and_shown_nowhere() {
+        let stub = Stub::start(0);
+        let (config, _file) = config(&stub, "wrong-one");
+        let login = config.login().unwrap();
+        let error = format!("{:#}", describe(&config.url, login.as_ref()).unwrap_err());
+        assert!(error.contains("not Authorized") && !error.contains("wrong-one"), "{error}");
+        let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
+        assert!(until(&mut mount, 1.5, |pointed| pointed.is_some()).is_none());
+    }
+
+    #[test]
+    fn a_camera_says_its_streams_and_where_it_points() {
+        let stub = Stub::start(0);
+        let (config, _file) = config(&stub, PASSWORD);
+        let login = config.login().unwrap();
+        let camera = describe(&config.url, login.as_ref()).unwrap();
+        assert_eq!(camera.name, "Stub One");
+        let main = Stream { profile: "main".to_owned(), url: "rtsp://127.0.0.1/main".to_owned() };
+        assert_eq!(camera.streams[1], main);
+        assert_eq!(camera.position, Some([0.0, 0.0]));
+    }
+}

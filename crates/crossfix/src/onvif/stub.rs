@@ -1,0 +1,204 @@
+//! A network camera on a mount, as far as its device, media and mount services are asked.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use sha1::{Digest, Sha1};
+
+pub const USER: &str = "eye";
+pub const PASSWORD: &str = "hunter2";
+/// It turns so fast, of its range a second.
+const RATE: f64 = 0.8;
+/// It begins to turn so long after it was told.
+const BEGINS_AFTER: Duration = Duration::from_millis(150);
+
+/// Where the mount is and goes.
+#[derive(Clone, Copy, Debug)]
+pub struct State {
+    from: [f64; 2],
+    to: [f64; 2],
+    told: Instant,
+    pub zoom: f64,
+    /// Whether it says where it is.
+    pub says: bool,
+    pub moves: usize,
+}
+
+impl State {
+    /// Pan and tilt now, and whether they change.
+    pub fn position(&self) -> ([f64; 2], bool) {
+        let passed = self.told.elapsed().saturating_sub(BEGINS_AFTER).as_secs_f64();
+        let turned = |k: usize| {
+            let way = self.to[k] - self.from[k];
+            self.from[k] + way.clamp(-RATE * passed, RATE * passed)
+        };
+        let now = [turned(0), turned(1)];
+        (now, now != self.to && passed > 0.0)
+    }
+}
+
+/// The camera, until it is dropped.
+pub struct Stub {
+    pub state: Arc<Mutex<State>>,
+    pub port: u16,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Stub {
+    /// On a port of this host; 0 is any.
+    pub fn start(port: u16) -> Self {
+        let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let state = State {
+            from: [0.0; 2],
+            to: [0.0; 2],
+            told: Instant::now(),
+            zoom: 0.0,
+            says: true,
+            moves: 0,
+        };
+        let (state, stop) = (Arc::new(Mutex::new(state)), Arc::new(AtomicBool::new(false)));
+        let (shared, ends) = (state.clone(), stop.clone());
+        let thread = std::thread::spawn(move || {
+            while let Ok((stream, _)) = listener.accept() {
+                if ends.load(Ordering::Relaxed) {
+                    return;
+                }
+                // Who asks is answered once on each connection.
+                let _ = answer(&stream, &shared);
+            }
+        });
+        Self { state, port, stop, thread: Some(thread) }
+    }
+
+    pub fn url(&self) -> String {
+        format!("http://127.0.0.1:{}/onvif/device_service", self.port)
+    }
+}
+
+impl Drop for Stub {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let _ = TcpStream::connect(("127.0.0.1", self.port));
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+fn answer(stream: &TcpStream, state: &Mutex<State>) -> std::io::Result<()> {
+    let mut reader = BufReader::new(stream);
+    let mut length = 0;
+    for line in reader.by_ref().lines() {
+        let line = line?.to_lowercase();
+        if let Some(value) = line.strip_prefix("content-length:") {
+            length = value.trim().parse().unwrap();
+        }
+        if line.is_empty() {
+            break;
+        }
+    }
+    let mut request = vec![0; length];
+    reader.read_exact(&mut request)?;
+    let (status, body) = reply(&String::from_utf8_lossy(&request), state);
+    let text = format!(
+        "<s:Envelope xmlns:s=\"http://www.w3.org/2003/05/soap-envelope\"><s:Body>{body}</s:Body>\
+         </s:Envelope>"
+    );
+    let mut stream = stream;
+    write!(
+        stream,
+        "HTTP/1.1 {status}\r\nContent-Type: application/soap+xml\r\nContent-Length: {}\r\n\
+         Connection: close\r\n\r\n{text}",
+        text.len()
+    )
+}
+
+/// What stands between an element's tags, whatever its prefix.
+fn element<'a>(text: &'a str, name: &str) -> Option<&'a str> {
+    let begin = [">", " "].iter().filter_map(|end| text.find(&format!(":{name}{end}"))).min()?;
+    let inside = &text[begin..][text[begin..].find('>')? + 1..];
+    Some(&inside[..inside.find("</")?])
+}
+
+fn attribute(text: &str, element: &str, name: &str) -> Option<f64> {
+    let begin = text.find(&format!(":{element} "))?;
+    let tag = &text[begin..][..text[begin..].find('>')?];
+    let value = &tag[tag.find(&format!(" {name}=\""))? + name.len() + 3..];
+    value[..value.find('"')?].parse().ok()
+}
+
+/// Whether the request proves that who asks knows the password (WS-Security, `PasswordDigest`).
+fn knows_password(request: &str) -> bool {
+    let proof = || {
+        let nonce = STANDARD.decode(element(request, "Nonce")?).ok()?;
+        let mut digest = Sha1::new();
+        digest.update(&nonce);
+        digest.update(element(request, "Created")?);
+        digest.update(PASSWORD);
+        let proved = STANDARD.encode(digest.finalize()) == element(request, "Password")?;
+        Some(proved && element(request, "Username")? == USER)
+    };
+    proof().unwrap_or(false)
+}
+
+fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
+    let asks = |what: &str| {
+        request.contains(&format!(":{what}>")) || request.contains(&format!(":{what}/>"))
+    };
+    if asks("GetSystemDateAndTime") {
+        let body = "<SystemDateAndTime><DateTimeType>NTP</DateTimeType></SystemDateAndTime>";
+        return (
+            "200 OK",
+            format!("<GetSystemDateAndTimeResponse>{body}</GetSystemDateAndTimeResponse>"),
+        );
+    }
+    if !knows_password(request) {
+        let fault = "<s:Fault><s:Code><s:Value>s:Sender</s:Value></s:Code><s:Reason>\
+                     <s:Text>Sender not Authorized</s:Text></s:Reason></s:Fault>";
+        return ("400 Bad Request", fault.to_owned());
+    }
+    let mut state = state.lock().unwrap();
+    let (name, body) = if asks("GetCapabilities") {
+        // As many do, it says an address that is true nowhere.
+        let at = |service: &str| format!("<XAddr>http://0.0.0.0/onvif/{service}</XAddr>");
+        let [media, ptz] = ["media", "ptz"].map(at);
+        let body = format!("<Capabilities><Media>{media}</Media><PTZ>{ptz}</PTZ></Capabilities>");
+        ("GetCapabilities", body)
+    } else if asks("GetDeviceInformation") {
+        ("GetDeviceInformation", "<Manufacturer>Stub</Manufacturer><Model>One</Model>".to_owned())
+    } else if asks("GetProfiles") {
+        let body = "<Profiles token=\"plain\"><Name>still</Name></Profiles>\
+                    <Profiles token=\"main\"><Name>main</Name><PTZConfiguration token=\"t\"/></Profiles>";
+        ("GetProfiles", body.to_owned())
+    } else if asks("GetStreamUri") {
+        ("GetStreamUri", "<MediaUri><Uri>rtsp://127.0.0.1/main</Uri></MediaUri>".to_owned())
+    } else if asks("GetStatus") {
+        let ([pan, tilt], moves) = state.position();
+        let place = format!(
+            "<Position><PanTilt x=\"{pan:.4}\" y=\"{tilt:.4}\"/><Zoom x=\"{}\"/></Position>",
+            state.zoom
+        );
+        let moves = if moves { "MOVING" } else { "IDLE" };
+        let place = if state.says { place } else { String::new() };
+        let body = format!(
+            "<PTZStatus>{place}<MoveStatus><PanTilt>{moves}</PanTilt></MoveStatus></PTZStatus>"
+        );
+        ("GetStatus", body)
+    } else if asks("AbsoluteMove") {
+        let of = |element, name| attribute(request, element, name).unwrap();
+        let (from, _) = state.position();
+        let to = [of("PanTilt", "x"), of("PanTilt", "y")];
+        let (zoom, moves) = (of("Zoom", "x"), state.moves + 1);
+        *state = State { from, to, told: Instant::now(), zoom, says: state.says, moves };
+        ("AbsoluteMove", String::new())
+    } else {
+        return ("400 Bad Request", String::new());
+    };
+    ("200 OK", format!("<{name}Response>{body}</{name}Response>"))
+}
