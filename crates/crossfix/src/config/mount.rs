@@ -7,11 +7,13 @@ use crossfix_geometry::{PanTilt, Pose};
 use crossfix_message::CameraCalibration;
 #[cfg(feature = "centre")]
 use crossfix_simulation::SceneMount;
+#[cfg(feature = "onvif")]
 use crossfix_video::Login;
 use serde::{Deserialize, Serialize};
 use url::Url;
 
 use super::CameraFile;
+#[cfg(feature = "onvif")]
 use super::stream::login;
 
 /// No mount knows its angles better, mrad: a tenth of an arc second.
@@ -58,6 +60,7 @@ pub struct OnvifConfig {
 
 impl OnvifConfig {
     /// Who asks, if it wants to know.
+    #[cfg(feature = "onvif")]
     pub fn login(&self) -> anyhow::Result<Option<Login>> {
         login("mount.onvif.", self.user.as_deref(), self.password_file.as_deref())
     }
