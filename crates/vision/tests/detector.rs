@@ -269,6 +269,42 @@ fn a_camera_that_turns_away_finds_nothing_in_the_turn_and_the_target_after_it() 
     assert!(seen >= 28, "in {seen} of 30 images");
 }
 
+/// A mount has turned the camera: the target is another place of another scene, and what was followed
+/// before is no track there.
+#[test]
+fn told_that_it_looks_elsewhere_it_begins_anew() {
+    fn turned(x: f64, y: f64, time_s: f64) -> f64 {
+        let x = if time_s < 3.0 { x } else { x + 500.0 };
+        clouds(x, y, 0.0) + 20.0 * (x * 0.4).sin() * (y * 0.5).cos()
+    }
+    let spot = |time_s: f64| {
+        let x = if time_s < 3.0 { 60.0 * (time_s - 1.0) } else { 300.0 - 60.0 * (time_s - 3.0) };
+        let y = if time_s < 3.0 { 60.0 } else { 150.0 };
+        Spot { x, y, spread: [4.0, 3.0], brighter: 100.0 }
+    };
+    let mut world = World::new(320, 240, 2.0, turned, 22);
+    let mut tracker = tracker();
+    let (mut before, mut after, mut found_s) = (None, None, None);
+    for frame in 0..150 {
+        let time_s = f64::from(frame) / RATE_HZ;
+        if frame == 90 {
+            tracker.look_elsewhere();
+        }
+        let image = world.image(time_s, &from(1.0, spot)(time_s));
+        for track in tracker.step(&image, Timestamp::from_seconds(time_s)) {
+            assert!(is_at(track, &spot(time_s), 8.0), "at {time_s}: {track:?}");
+            if time_s < 3.0 {
+                before.get_or_insert(track.id);
+            } else {
+                after.get_or_insert(track.id);
+                found_s.get_or_insert(time_s - 3.0);
+            }
+        }
+    }
+    assert!(found_s.is_some_and(|found_s| found_s < 1.0), "{found_s:?}");
+    assert!(before.is_some() && after > before, "{before:?} {after:?}: its numbers go on");
+}
+
 #[test]
 fn fifty_at_once_are_found_and_keep_their_numbers() {
     let mut world = World::new(640, 480, 3.0, sky, 22);
