@@ -298,6 +298,9 @@ impl Fusion {
                 .calibrate(&moved, self.cameras.known(&moved).map(|known| known.pose_covariance));
             self.initiator.forget(&moved);
         }
+        if let Some(change) = self.cameras.clock_change(exposure) {
+            self.tracker.set_clock(&exposure.camera, change);
+        }
         let Some(camera) = self.cameras.get_mut(&exposure.camera) else {
             return;
         };
@@ -307,9 +310,6 @@ impl Fusion {
         }
         let mut exposure = exposure.clone();
         camera.tell(&mut exposure, self.config.tracking.clutter_per_sr);
-        if let Some(change) = camera.clock_change(&exposure) {
-            self.tracker.set_clock(&exposure.camera, change);
-        }
         let mut changes = Vec::new();
         let (fittings, used) = if camera.is_excluded() {
             self.counters.count("exposures_of_excluded_cameras");

@@ -171,7 +171,7 @@ impl CameraState {
     }
 
     /// How its clock has changed since the tracks were told, by an exposure; `None` if little.
-    pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
+    fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
         let now = ToldClock {
             source: exposure.uncertainty.clock_source,
             sd_s: exposure.uncertainty.time_sd_s,
@@ -309,6 +309,14 @@ impl Cameras {
             }
         }
         moved
+    }
+
+    /// How the clock of an exposure's camera has changed since the tracks were told; `None` if
+    /// little.
+    pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
+        let change = self.by_name.get_mut(&exposure.camera)?.clock_change(exposure)?;
+        self.watch.forget_clock(&exposure.camera);
+        Some(change)
     }
 
     /// Learns from an exposure how far its camera can be believed.

@@ -48,6 +48,8 @@ const LEAST_TOGETHER: usize = 3;
 
 /// Errors of a camera: rotation and place, and its clock, each in its own deviations.
 const ERRORS: usize = 7;
+/// The clock's among them.
+const CLOCK: usize = 6;
 
 /// What the lines say of a camera's having been moved.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,25 +100,33 @@ impl Memory {
         self.pull.resize_vertically_mut(errors, 0.0);
     }
 
-    /// Forgets a camera's errors, from this on: what was said of the others' counts for as much as it
-    /// says where these may have been anything (the Schur complement).
-    fn forget(&mut self, first: usize) {
-        let information = std::mem::take(&mut self.information);
-        let own = information.view((first, first), (ERRORS, ERRORS)).into_owned();
-        let own_pull = self.pull.rows(first, ERRORS).into_owned();
-        let ties = information.columns(first, ERRORS).into_owned().remove_rows(first, ERRORS);
-        let mut left = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
-        let mut pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
+    /// Forgets so many errors, from one on: they are others from now on. What was said of all else
+    /// counts for as much as it says where these may have been anything (the Schur complement).
+    fn forget(&mut self, first: usize, count: usize) {
+        let own = self.information.view((first, first), (count, count)).into_owned();
+        let own_pull = self.pull.rows(first, count).into_owned();
+        let mut ties = self.information.columns(first, count).into_owned();
         // Not all of them need have been seen at all.
-        let least = DMatrix::identity(ERRORS, ERRORS) * UNSEEN;
+        let least = DMatrix::identity(count, count) * UNSEEN;
         if let Some(factor) = (own + least).cholesky() {
-            left -= &ties * factor.solve(&ties.transpose());
-            pull -= &ties * factor.solve(&own_pull);
+            self.information -= &ties * factor.solve(&ties.transpose());
+            self.pull -= &ties * factor.solve(&own_pull);
         } else {
-            left.fill(0.0);
-            pull.fill(0.0);
+            self.information.fill(0.0);
+            self.pull.fill(0.0);
         }
-        (self.information, self.pull) = (left, pull);
+        ties.fill(0.0);
+        self.information.columns_mut(first, count).copy_from(&ties);
+        self.information.rows_mut(first, count).copy_from(&ties.transpose());
+        self.pull.rows_mut(first, count).fill(0.0);
+    }
+
+    /// Knows of a camera's errors, from this on, no more.
+    fn remove(&mut self, first: usize) {
+        self.forget(first, ERRORS);
+        let information = std::mem::take(&mut self.information);
+        self.information = information.remove_rows(first, ERRORS).remove_columns(first, ERRORS);
+        self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
     }
 
     /// Mean and covariance of the errors if no camera has been moved.
@@ -160,7 +170,7 @@ impl Watched {
     fn by_errors(&self, sample: &Sample) -> SMatrix<f64, 2, ERRORS> {
         let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
         by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
-        by.set_column(6, &sample.clock);
+        by.set_column(CLOCK, &sample.clock);
         by
     }
 
@@ -231,7 +241,7 @@ impl Watched {
 
 impl Watch {
     fn place_of(&mut self, name: &CameraName, declared: &Matrix6<f64>) -> usize {
-        if let Some(place) = self.cameras.iter().position(|camera| camera.name == *name) {
+        if let Some(place) = self.known(name) {
             return place;
         }
         self.cameras.push(Watched::new(name.clone(), declared));
@@ -240,13 +250,26 @@ impl Watch {
         self.cameras.len() - 1
     }
 
+    /// Where a camera is among those watched.
+    fn known(&self, name: &CameraName) -> Option<usize> {
+        self.cameras.iter().position(|camera| camera.name == *name)
+    }
+
     /// A camera stands elsewhere, or is known otherwise: what was seen was of how it stood.
     pub(super) fn forget(&mut self, name: &CameraName) {
-        let Some(place) = self.cameras.iter().position(|camera| camera.name == *name) else {
-            return;
-        };
-        self.cameras.remove(place);
-        self.memories.iter_mut().for_each(|memory| memory.forget(ERRORS * place));
+        if let Some(place) = self.known(name) {
+            self.cameras.remove(place);
+            self.memories.iter_mut().for_each(|memory| memory.remove(ERRORS * place));
+        }
+    }
+
+    /// A camera's clock is known otherwise than it was, so that what it is off by is another error,
+    /// too: the same one on both sides would turn the camera.
+    pub(super) fn forget_clock(&mut self, name: &CameraName) {
+        if let Some(place) = self.known(name) {
+            let clock = ERRORS * place + CLOCK;
+            self.memories.iter_mut().for_each(|memory| memory.forget(clock, 1));
+        }
     }
 
     /// Forgets by as much as the time since the last draw asks for.

@@ -78,6 +78,8 @@ pub(super) struct Drawn {
     pose: Matrix2<f64>,
     by_pose: Matrix2x6<f64>,
     clock: Vector2<f64>,
+    /// What the clock may be off by, s.
+    time_sd_s: f64,
 }
 
 impl Drawn {
@@ -99,12 +101,14 @@ impl Drawn {
             pose: uncertainty.declared_pose(&innovation.model),
             by_pose: innovation.model.by_pose(),
             clock: innovation.model.by_time(velocity) * uncertainty.time_sd_s,
+            time_sd_s: uncertainty.time_sd_s,
         }
     }
 
     /// The mean, of a target whose velocity is known to `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> Sample {
-        let moved = self.by_position * (speed * DRAW_S / 10.0);
+        // What it moves beside its velocity in the time of the draw, and in what the clock is off by.
+        let moved = self.by_position * speed * (DRAW_S / 10.0).hypot(self.time_sd_s);
         let white = self.noise / self.count + moved * moved.transpose();
         Sample {
             camera: camera.clone(),
@@ -292,9 +296,11 @@ impl Track {
         camera: &CameraName,
         ClockChange { ahead, ratio }: ClockChange,
     ) {
-        let Some(ties) = self.ties.get(camera) else {
+        let Some(ties) = self.ties.get_mut(camera) else {
             return;
         };
+        // What has been gathered is of the clock as it was known before.
+        (ties.drawn, ties.beside) = (None, None);
         let moved = ties.covariance.column(OF_CLOCK) * ahead;
         self.imm.shift(&moved);
         self.shift_learnt(camera, OF_CLOCK, ahead);
