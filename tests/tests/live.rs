@@ -68,7 +68,8 @@ fn counter(health: &Health, name: &str) -> u64 {
 fn three_network_cameras_are_a_site() {
     let address = free_address();
     let site = live_site(16.0, &address);
-    let (fusion, recorder) = (site.start_fusion(), site.start_recorder("live.mcap"));
+    let fusion = site.start_logged(&["fuse", "-c", &site.path("fusion.toml")], "fusion.log");
+    let recorder = site.start_recorder("live.mcap");
     let agents: Vec<Process> = ["north", "east", "west"].map(|name| agent(&site, name)).into();
     let begins = format!("{:.3}", now_seconds() + 2.0);
     let truth = site.path("truth.mcap");
@@ -90,6 +91,8 @@ fn three_network_cameras_are_a_site() {
         assert_eq!(counter(last, "bad_frames"), 0, "{last:?}");
         assert!(!site.text(&format!("{name}.log")).contains("hunter2"));
     }
+    // That a clock became known in the flight turns no camera.
+    assert!(!site.text("fusion.log").contains("has been moved"), "{}", site.text("fusion.log"));
     let live = site.path("live.mcap");
     let found = succeed(&["evaluate", &live, "--truth", &truth, "--skip-s", "4", "--json"]);
     let found: serde_json::Value = serde_json::from_str(&found).unwrap();

@@ -63,7 +63,7 @@ pub(crate) struct Sample {
     /// ... and what a deviation of its clock shifts it by, rad.
     pub(crate) clock: Vector2<f64>,
     /// Covariance of white noise of draws that averages out as slowly, rad^2: some of it lasts from
-    /// one to the next.
+    /// one to the next, and `clock` is as sure as the velocity.
     pub(crate) slow_noise: Matrix2<f64>,
 }
 

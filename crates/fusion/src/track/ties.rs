@@ -107,9 +107,11 @@ impl Drawn {
 
     /// The mean, of a target whose velocity is known to `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> Sample {
-        // What it moves beside its velocity in the time of the draw, and in what the clock is off by.
-        let moved = self.by_position * speed * (DRAW_S / 10.0).hypot(self.time_sd_s);
+        let moved = self.by_position * (speed * DRAW_S / 10.0);
         let white = self.noise / self.count + moved * moved.transpose();
+        // What the clock shifts it by is reckoned with a velocity that is no better known.
+        let by_speed = self.by_position * (speed * self.time_sd_s);
+        let lasting = Matrix2::identity() * self.lasting.as_white(DRAW_S);
         Sample {
             camera: camera.clone(),
             offset: self.offsets / self.count,
@@ -118,7 +120,7 @@ impl Drawn {
             pose: self.pose,
             by_pose: self.by_pose,
             clock: self.clock,
-            slow_noise: white + Matrix2::identity() * self.lasting.as_white(DRAW_S),
+            slow_noise: white + lasting + by_speed * by_speed.transpose(),
         }
     }
 }
@@ -296,11 +298,9 @@ impl Track {
         camera: &CameraName,
         ClockChange { ahead, ratio }: ClockChange,
     ) {
-        let Some(ties) = self.ties.get_mut(camera) else {
+        let Some(ties) = self.ties.get(camera) else {
             return;
         };
-        // What has been gathered is of the clock as it was known before.
-        (ties.drawn, ties.beside) = (None, None);
         let moved = ties.covariance.column(OF_CLOCK) * ahead;
         self.imm.shift(&moved);
         self.shift_learnt(camera, OF_CLOCK, ahead);
