@@ -25,6 +25,7 @@ struct Said {
     /// When each camera gave its newest bearing.
     bearings: Vec<Timestamp>,
     state: Option<KinematicState>,
+    time_sd_s: f64,
 }
 
 /// A track's state, if the message holds one that makes sense.
@@ -44,7 +45,8 @@ impl TrackHistory {
         for track in &frame.tracks {
             let bearings =
                 track.residuals.iter().map(|r| Timestamp::from_nanos(r.time_ns)).collect();
-            let said = Said { status: track.state(), bearings, state: state(track) };
+            let (status, state) = (track.state(), state(track));
+            let said = Said { status, bearings, state, time_sd_s: frame.time_sd_s };
             self.tracks.entry(track.id).or_default().insert(time, said);
         }
     }
@@ -66,7 +68,7 @@ impl TrackHistory {
             let state = said.state.as_ref()?.predicted(time.seconds_since(then), 0.0);
             let lately = |bearing: &&Timestamp| time.seconds_since(**bearing) <= LATELY_S;
             let cameras = said.bearings.iter().filter(lately).count();
-            Some(Estimate { id, status: said.status, cameras, state })
+            Some(Estimate { id, status: said.status, cameras, state, time_sd_s: said.time_sd_s })
         });
         said.filter(|said| said.status != TrackState::Lost).collect()
     }

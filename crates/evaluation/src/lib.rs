@@ -11,7 +11,7 @@
 //! let mut evaluator = Evaluator::new(5.0);
 //! let truth = [TrueTarget { id: 1, position: Point3::new(0.0, 0.0, 50.0), velocity: Vector3::zeros() }];
 //! let state = KinematicState { mean: Vector6::new(0.3, 0.0, 50.4, 0.0, 0.0, 0.0), covariance: Matrix6::identity() };
-//! let said = Estimate { id: 7, status: TrackState::Confirmed, cameras: 3, state };
+//! let said = Estimate { id: 7, status: TrackState::Confirmed, cameras: 3, state, time_sd_s: 0.0 };
 //! evaluator.add(Timestamp::EPOCH, &truth, &[said]);
 //! let report = evaluator.report();
 //! assert!((report.position_rmse_m.unwrap() - 0.5).abs() < 1e-12);

@@ -38,6 +38,8 @@ pub struct Estimate {
     pub cameras: usize,
     /// Its state.
     pub state: KinematicState,
+    /// Standard deviation of the time at which it was there, s: 0 if the track does not say.
+    pub time_sd_s: f64,
 }
 
 impl Estimate {
@@ -364,7 +366,7 @@ mod tests {
     fn estimate(id: u64, x: f64) -> Estimate {
         let mean = Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0);
         let state = KinematicState { mean, covariance: Matrix6::identity() };
-        Estimate { id, status: TrackState::Confirmed, cameras: 3, state }
+        Estimate { id, status: TrackState::Confirmed, cameras: 3, state, time_sd_s: 0.0 }
     }
 
     #[test]

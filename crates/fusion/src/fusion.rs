@@ -283,6 +283,12 @@ impl Fusion {
         }
     }
 
+    /// The standard deviation of an exposure's time against true time, s.
+    fn true_time_sd_s(&self, exposure: &Exposure) -> f64 {
+        let clock = self.clock(&exposure.camera);
+        clock.map_or(exposure.uncertainty.time_sd_s, |clock| clock.sd_s)
+    }
+
     /// What is known of a camera's clock, if clocks are in doubt.
     fn clock(&self, camera: &CameraName) -> Option<ClockEstimate> {
         if self.clocks.is_needed() { self.clocks.estimate(camera) } else { None }
@@ -461,6 +467,7 @@ impl Fusion {
                 camera: exposure.camera.to_string(),
                 camera_sequence: exposure.sequence,
                 tracks,
+                time_sd_s: self.true_time_sd_s(exposure),
                 ..Default::default()
             };
             self.sequence += 1;

@@ -11,12 +11,17 @@ mod paths;
 mod tally;
 
 use bound::{Way, bound};
-use common::{Path, Scene, found, fusion_of, site};
-use crossfix_fusion::{CameraStanding, ClockEstimate, Fusion, FusionConfig};
+use common::{Path, Scene, found, fusion_of, site, straight};
+use crossfix_fusion::{CameraStanding, ClockEstimate, Fusion, FusionConfig, Output};
+use crossfix_message::Timestamp;
+use nalgebra::{Point3, Vector3};
 use paths::{
     a_minute_in_sight, circle, fast_pass, pass, racing, scene, shuttle, six, six_passes, spiral,
     weaving,
 };
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 use tally::{Clock, Tally, random_clocks};
 
 /// Flights before three cameras, two of which have random clocks.
@@ -346,4 +351,47 @@ fn table() {
             println!("{}", tally.line(&name));
         }
     }
+}
+
+/// What all clocks are off by together shows in no sight line: tracks are early or late by it, and say
+/// by how much they may be.
+#[test]
+fn tracks_say_how_sure_their_time_is() {
+    const CLOCK_SD_S: f64 = 0.05;
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let mut squares = Vec::new();
+    for seed in 0..30 {
+        let path = || straight([-40.0, -10.0, 45.0], [12.0, 4.0, 0.5]);
+        let scene = Scene::new(vec![path()], 6.0);
+        let offsets: [f64; 3] = std::array::from_fn(|_| {
+            CLOCK_SD_S * Distribution::<f64>::sample(&StandardNormal, &mut random)
+        });
+        let mut frames = scene.frames(seed);
+        for frame in &mut frames {
+            let place =
+                scene.eyes.iter().position(|eye| eye.name.as_str() == frame.camera).unwrap();
+            frame.capture_time_ns += (offsets[place] * 1e9) as i64;
+            frame.capture_time_sd_s = CLOCK_SD_S;
+        }
+        frames.sort_by_key(|frame| frame.capture_time_ns);
+        let mut fusion = fusion_of(FusionConfig::default(), &scene.eyes);
+        let outputs: Vec<Output> = frames.iter().flat_map(|frame| fusion.ingest(frame)).collect();
+        let last = outputs.iter().rev().find_map(|output| match output {
+            Output::Tracks(frame) => Some(frame),
+            _ => None,
+        });
+        let last = last.unwrap();
+        let [track] = last.tracks.as_slice() else { panic!("{:?}", last.tracks) };
+        let time_s = Timestamp::from_nanos(last.time_ns).seconds();
+        let off = Point3::from(track.position.unwrap()) - path()(time_s).unwrap();
+        let velocity = Vector3::from(track.velocity.unwrap());
+        let late_s = off.dot(&velocity) / velocity.norm_squared();
+        // Three independent clocks.
+        let expected = CLOCK_SD_S / 3f64.sqrt();
+        assert!((last.time_sd_s / expected - 1.0).abs() < 0.1, "{} {expected}", last.time_sd_s);
+        squares.push((late_s / last.time_sd_s).powi(2));
+    }
+    let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+    // Chi-square of thirty: within three and a half standard errors.
+    assert!((mean - 1.0).abs() < 3.5 * (2.0 / squares.len() as f64).sqrt(), "{mean}");
 }

@@ -44,4 +44,4 @@ mod wire {
 }
 
 /// The version of the message definitions that this build speaks.
-pub const VERSION: Version = Version { major: 1, minor: 5 };
+pub const VERSION: Version = Version { major: 1, minor: 6 };

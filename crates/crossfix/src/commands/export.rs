@@ -10,10 +10,11 @@ use crate::recorded::{self, Lacks};
 
 /// Write the confirmed tracks of a recording as a table.
 ///
-/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m: seconds since the Unix epoch, metres,
-/// metres per second, what the track is (confirmed or coasting; with --all also tentative and
-/// one-camera), how many cameras have given it a bearing within the second before, and the root of
-/// the sum of the position's variances, metres. With --times, the state of each track at those
+/// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m,time_sd_s: seconds since the Unix epoch,
+/// metres, metres per second, what the track is (confirmed or coasting; with --all also tentative
+/// and one-camera), how many cameras have given it a bearing within the second before, the root of
+/// the sum of the position's variances, metres, and the standard deviation of t, which is not in
+/// these: what all clocks are off by together, seconds. With --times, the state of each track at those
 /// times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -76,7 +77,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut writer = csv::Writer::from_path(draft.path())
         .with_context(|| format!("cannot write {}", args.csv.display()))?;
     writer.write_record([
-        "t", "track_id", "x", "y", "z", "vx", "vy", "vz", "state", "cameras", "sd_m",
+        "t",
+        "track_id",
+        "x",
+        "y",
+        "z",
+        "vx",
+        "vy",
+        "vz",
+        "state",
+        "cameras",
+        "sd_m",
+        "time_sd_s",
     ])?;
     let mut rows = 0_u64;
     let mut write = |time: f64, estimates: &[Estimate]| -> anyhow::Result<()> {
@@ -86,6 +98,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             record.push(word(estimate.status).to_owned());
             record.push(estimate.cameras.to_string());
             record.push(format!("{:.6}", estimate.position_sd_m()));
+            record.push(format!("{:.6}", estimate.time_sd_s));
             writer.write_record(&record)?;
             rows += 1;
         }

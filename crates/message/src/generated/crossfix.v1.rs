@@ -338,6 +338,11 @@ pub struct TrackFrame {
     /// Ordered by id.
     #[prost(message, repeated, tag = "6")]
     pub tracks: ::prost::alloc::vec::Vec<Track>,
+    /// Standard deviation of time_ns against true time, seconds. What all clocks are off by together no
+    /// track can tell, and it is not in the tracks' covariances: a target may be farther along its way, or
+    /// less far, by its speed times this. 0: not said.
+    #[prost(double, tag = "7")]
+    pub time_sd_s: f64,
 }
 /// Something happened to a track.
 #[derive(serde::Serialize, serde::Deserialize)]
