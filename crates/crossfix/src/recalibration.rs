@@ -44,8 +44,10 @@ impl Recalibration {
                 let camera = self.site.camera(name)?;
                 let message = self.site.message(camera, Timestamp::EPOCH);
                 // The file knows no mounts: its pose is that at rest.
-                let recorded = decode::<CameraCalibration>(&entry.data).unwrap_or_default();
-                let message = match recorded.parse().ok().and_then(|known| known.mount) {
+                // What cannot be read, which may have been on one, stays as it is.
+                let recorded = decode::<CameraCalibration>(&entry.data).ok()?;
+                let mount = recorded.parse().ok().map(|known| known.mount);
+                let message = match mount.or(recorded.mount.is_none().then_some(None))? {
                     Some(mount) => message.on_mount(&mount.resting_at(*camera.camera.pose())),
                     None if recorded.takes_cues => message.taking_cues(),
                     None => message,

@@ -10,7 +10,7 @@ use std::f64::consts::TAU;
 
 use crossfix_geometry::{CameraModel, PanTilt, ScanAngles, tangent_basis, turn_vector};
 use crossfix_message::{
-    BearingTrack, Cue, CueFrame, Cued, Expected, ImageTrackState, TakenOver, Timestamp,
+    BearingTrack, CameraName, Cue, CueFrame, Cued, Expected, ImageTrackState, TakenOver, Timestamp,
 };
 use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
 
@@ -28,26 +28,43 @@ const RUNNER_UP: f64 = 6.0;
 /// turns again. With more of it a target that turns has left the image before the head has; with
 /// less it turns all the time.
 const OFF_MIDDLE: f64 = 0.6;
+/// A turn by less than this of half the view shows nothing new.
+const LEAST_TURN: f64 = 0.1;
 /// The head aims so far ahead at most, s: targets turn.
 const LONGEST_LEAD_S: f64 = 1.5;
-/// How long a head stares where a target may be, s, before it looks at the next place of a stripe: a
-/// detector takes half a second to find what moves.
+/// How long a head stares where a target may be, s, before it looks at the next place of a stripe, from
+/// when it stands there: a detector takes half a second to find what moves.
 const STARE_S: f64 = 1.5;
 /// Views of a stripe lie so close together, as a share of the view.
 const STEP: f64 = 0.8;
 /// A stripe is looked along to so many deviations on both sides: 19 of 20 targets are there.
 const SEARCHED_SDS: f64 = 2.0;
-/// A stripe of more views than this has its nearest ones looked at, s.
+/// A stripe of more views than this has its nearest ones looked at.
 const MOST_VIEWS: i32 = 40;
+/// More cues, or more times of one, than a fusion centre tells are of none.
+const MOST_CUES: usize = 64;
+const MOST_TIMES: usize = 16;
+
+/// Where a camera pointed in an image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pointed {
+    /// Where it always does: nothing turns it.
+    Fixed,
+    /// Nobody knows: its mount says nothing.
+    Unknown,
+    /// Where its mount says, which turns it.
+    Turning(ScanAngles),
+    /// Where its mount says, which stood still.
+    Settled(ScanAngles),
+}
 
 /// What turns a camera, as an agent sees it.
 pub trait Mount: Send {
     /// Tells it to turn to where it says that these angles are.
     fn aim(&mut self, angles: ScanAngles);
 
-    /// Where it says that it pointed in the newest image, and whether it stood still; `None` where it
-    /// says nothing.
-    fn pointed(&mut self) -> Option<(ScanAngles, bool)>;
+    /// Where it pointed in the newest image.
+    fn pointed(&mut self) -> Pointed;
 }
 
 /// Where something should be at a time, in the camera's frame at rest.
@@ -67,11 +84,12 @@ pub struct Orders {
     pub taken_over: Option<TakenOver>,
 }
 
-/// The views along a stripe that have been looked at.
+/// The view along a stripe that is looked at.
 #[derive(Clone, Copy, Debug)]
 struct Search {
     view: i32,
-    since: Timestamp,
+    /// Since when the head has stood there; `None` on its way.
+    since: Option<Timestamp>,
 }
 
 /// A track that may be the target.
@@ -85,11 +103,14 @@ struct Candidate {
 #[derive(Debug)]
 pub struct Seeker {
     mount: Option<PanTilt>,
+    /// What each angle that the mount says is off by, rad.
+    angle_sd_rad: f64,
     /// Half of the shorter side of the view, rad.
     half_view: f64,
     cues: CueFrame,
-    /// What it is on.
+    /// What it is on, and where that was last, in the frame at rest.
     of: Option<Cued>,
+    last: Option<Unit<Vector3<f64>>>,
     candidate: Option<Candidate>,
     search: Option<Search>,
     /// Where its mount was told to point last.
@@ -98,46 +119,48 @@ pub struct Seeker {
 
 impl Seeker {
     /// For a camera that a mount turns, or that stands still.
-    pub fn new(model: &CameraModel, mount: Option<PanTilt>) -> Self {
+    pub fn new(model: &CameraModel, mount: Option<PanTilt>, angle_sd_rad: f64) -> Self {
         let lens = model.intrinsics();
         let half_view = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
         let half_view =
             half_view(lens.size.width, lens.fx).min(half_view(lens.size.height, lens.fy));
         Self {
             mount,
+            angle_sd_rad,
             half_view,
             cues: CueFrame::default(),
             of: None,
+            last: None,
             candidate: None,
             search: None,
             ordered: None,
         }
     }
 
-    /// Takes in what the fusion centre says.
+    /// Takes in what the fusion centre says; what it never would is no cue.
     pub fn hear(&mut self, cues: CueFrame) {
         self.cues = cues;
+        self.cues.cues.truncate(MOST_CUES);
+        self.cues.cues.retain(|cue| {
+            let is_named =
+                |of: &Cued| of.camera.is_empty() || of.camera.parse::<CameraName>().is_ok();
+            cue.of.as_ref().is_some_and(is_named) && cue.ahead.len() <= MOST_TIMES
+        });
     }
 
-    /// What to do, by the tracks of an image that was taken at a time by the camera's clock; `at` is
-    /// where its mount pointed then and whether it stood still.
-    pub fn look(
-        &mut self,
-        time: Timestamp,
-        at: Option<(ScanAngles, bool)>,
-        tracks: &[BearingTrack],
-    ) -> Orders {
-        let Some(cue) = self.choose(time) else { return Orders::default() };
-        let Some(now) = place_at(&cue, time) else { return Orders::default() };
-        let angles = at.map_or(ScanAngles { azimuth: 0.0, elevation: 0.0 }, |(angles, _)| angles);
-        let is_settled = at.is_none_or(|(_, is_settled)| is_settled);
-        let taken = if is_settled { self.recognise(&now, angles, tracks) } else { None };
-        // While it turns, what counts is where it will stand.
-        let ordered = self.ordered.filter(|_| !is_settled).unwrap_or(angles);
-        let aim = match (self.mount, at) {
-            (Some(mount), Some(_)) => self.aim(&mount, (ordered, is_settled), &cue, &now, time),
-            _ => None,
+    /// What to do, by the tracks of an image that was taken at a time by the camera's clock, and where
+    /// it pointed then.
+    pub fn look(&mut self, time: Timestamp, pointed: Pointed, tracks: &[BearingTrack]) -> Orders {
+        let Some((cue, now)) = self.choose(time) else { return Orders::default() };
+        self.last = Some(now.direction);
+        let taken = match pointed {
+            Pointed::Fixed => {
+                self.recognise(&now, ScanAngles { azimuth: 0.0, elevation: 0.0 }, tracks)
+            }
+            Pointed::Settled(angles) => self.recognise(&now, angles, tracks),
+            Pointed::Unknown | Pointed::Turning(_) => None,
         };
+        let aim = self.mount.and_then(|mount| self.aim(&mount, pointed, &cue, &now, time));
         if aim.is_some() {
             // Of another view nothing is known.
             (self.candidate, self.ordered) = (None, aim);
@@ -147,18 +170,40 @@ impl Seeker {
         Orders { aim, taken_over }
     }
 
-    /// The cue of what it is on; if there is none any more, of what is best looked for.
-    fn choose(&mut self, time: Timestamp) -> Option<Cue> {
-        let same = self.cues.cues.iter().find(|cue| cue.of == self.of && cue.of.is_some());
-        let cue = same.or(self.cues.cues.first()).cloned();
-        let is_new = cue.as_ref().is_none_or(|cue| cue.of != self.of);
-        if is_new {
+    /// The cue of what it is on, and where that is; if there is none any more, or it is a poor one that
+    /// nothing was found of, of what is best looked for.
+    fn choose(&mut self, time: Timestamp) -> Option<(Cue, Place)> {
+        let is_sure = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
+        let is_found = self.candidate.is_some_and(|candidate| candidate.images >= IMAGES);
+        let reached: Vec<(&Cue, Place)> = self
+            .cues
+            .cues
+            .iter()
+            .filter_map(|cue| Some((cue, place_at(cue, time)?)))
+            .filter(|(cue, place)| is_valid(cue, time) && self.reaches(place))
+            .collect();
+        let sure = || reached.iter().filter(|(cue, _)| is_sure(cue));
+        let same = reached.iter().find(|(cue, _)| cue.of == self.of);
+        let same = same.filter(|(cue, _)| is_sure(cue) || is_found || sure().next().is_none());
+        // What one camera saw becomes a track, and what it is on has another name: it is where it was.
+        let away = |place: &Place| self.last.map_or(TAU, |last| last.angle(&place.direction));
+        let beside = sure().min_by(|a, b| away(&a.1).total_cmp(&away(&b.1)));
+        let beside = beside.filter(|(_, place)| away(place) < self.half_view);
+        let best = same.or(beside).or_else(|| sure().next()).or(reached.first());
+        let (cue, place) = best.map(|(cue, place)| ((*cue).clone(), *place))?;
+        if cue.of != self.of {
             (self.candidate, self.search) = (None, None);
+            self.of = cue.of.clone();
         }
-        let cue = cue?;
-        self.of = cue.of.clone();
-        let said = cue.ahead.first().map(|first| Timestamp::from_nanos(first.time_ns))?;
-        (time.seconds_since(said) <= VALID_S).then_some(cue)
+        Some((cue, place))
+    }
+
+    /// Whether a place can be brought into view.
+    fn reaches(&self, place: &Place) -> bool {
+        let Some(mount) = &self.mount else { return true };
+        let nearest = axis(mount, mount.aim(&place.direction));
+        let (_, long_sd) = long_axis(place);
+        nearest.angle(&place.direction) < self.half_view + SEARCHED_SDS * long_sd
     }
 
     /// The track that is where the cue has the target, if it has been for some images.
@@ -170,8 +215,13 @@ impl Seeker {
     ) -> Option<u64> {
         let turned = self.mount.map_or_else(Rotation3::identity, |mount| turn_of(&mount, angles));
         let seen = tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
+        let angle_sd_rad = self.mount.map_or(0.0, |_| self.angle_sd_rad);
+        let now = Place {
+            covariance: now.covariance + Matrix2::identity() * angle_sd_rad.powi(2),
+            ..*now
+        };
         let mut near: Vec<(f64, u64)> = seen
-            .filter_map(|track| Some((squared_distance(now, &turned, track)?, track.track_id)))
+            .filter_map(|track| Some((squared_distance(&now, &turned, track)?, track.track_id)))
             .filter(|(squared, _)| *squared <= GATE)
             .collect();
         near.sort_by(|one, other| one.0.total_cmp(&other.0));
@@ -198,31 +248,46 @@ impl Seeker {
     fn aim(
         &mut self,
         mount: &PanTilt,
-        (angles, is_settled): (ScanAngles, bool),
+        pointed: Pointed,
         cue: &Cue,
         now: &Place,
         time: Timestamp,
     ) -> Option<ScanAngles> {
-        let (axis, long_sd) = long_axis(now);
+        let (angles, is_settled) = match pointed {
+            Pointed::Settled(angles) => (angles, true),
+            // While it turns, what counts is where it will stand.
+            Pointed::Turning(angles) => (self.ordered.unwrap_or(angles), false),
+            Pointed::Fixed | Pointed::Unknown => return None,
+        };
+        let (long_axis, long_sd) = long_axis(now);
         if long_sd * SEARCHED_SDS > self.half_view {
             // A view along a stripe is looked at once the head is there.
-            let search = Some((axis, long_sd)).filter(|_| is_settled);
-            return search.and_then(|stripe| self.search(mount, angles, now, stripe, time));
+            let stripe = Some((long_axis, long_sd)).filter(|_| is_settled);
+            return stripe.and_then(|stripe| self.search(mount, angles, now, stripe, time));
         }
         self.search = None;
         let soon = place_at(cue, time.plus_seconds(0.5))?;
         let rate = now.direction.angle(&soon.direction) / 0.5;
-        let looks_along = turn_of(mount, angles) * Vector3::z();
         let may_be_off = OFF_MIDDLE * self.half_view + if is_settled { 0.0 } else { rate };
-        if now.direction.angle(&looks_along) < may_be_off {
+        if now.direction.angle(&axis(mount, angles)) < may_be_off {
             return None;
         }
         // It comes in on one side and leaves on the other.
         let lead_s = (OFF_MIDDLE * self.half_view / rate.max(1e-6)).min(LONGEST_LEAD_S);
         let there = place_at(cue, time.plus_seconds(lead_s))?;
-        let aim = mount.aim(&there.direction);
-        // As near as it can be already.
-        (aim != angles).then_some(aim)
+        self.worth_turning(mount, angles, mount.aim(&there.direction))
+    }
+
+    /// An aim, if it shows something else; where a target is as near as the mount brings it already, none
+    /// does.
+    fn worth_turning(
+        &self,
+        mount: &PanTilt,
+        angles: ScanAngles,
+        aim: ScanAngles,
+    ) -> Option<ScanAngles> {
+        let turn = axis(mount, aim).angle(&axis(mount, angles));
+        (turn > LEAST_TURN * self.half_view).then_some(aim)
     }
 
     /// The next view along a stripe, from the middle to both ends and again.
@@ -240,19 +305,34 @@ impl Seeker {
         }
         let step = 2.0 * self.half_view * STEP;
         let ends = (((long_sd * SEARCHED_SDS) / step).ceil() as i32).min(MOST_VIEWS / 2);
-        let search = match self.search {
-            None => Search { view: 0, since: time },
-            Some(search) if time.seconds_since(search.since) < STARE_S => return None,
-            Some(search) => Search { view: (search.view + 1) % (2 * ends + 1), since: time },
+        let view = match &mut self.search {
+            None => 0,
+            Some(search) => {
+                let since = *search.since.get_or_insert(time);
+                if time.seconds_since(since) < STARE_S {
+                    return None;
+                }
+                (search.view + 1) % (2 * ends + 1)
+            }
         };
-        self.search = Some(search);
+        self.search = Some(Search { view, since: None });
         // 0, 1, -1, 2, -2, ...
-        let side = if search.view % 2 == 1 { 1.0 } else { -1.0 };
-        let offset = side * f64::from((search.view + 1) / 2) * step;
+        let side = if view % 2 == 1 { 1.0 } else { -1.0 };
+        let offset = side * f64::from((view + 1) / 2) * step;
         let turn = Rotation3::new(now.direction.cross(&axis) * offset);
-        let aim = mount.aim(&(turn * now.direction));
-        (aim != angles).then_some(aim)
+        self.worth_turning(mount, angles, mount.aim(&(turn * now.direction)))
     }
+}
+
+/// Where the camera looks along with its mount at angles, in its frame at rest.
+fn axis(mount: &PanTilt, angles: ScanAngles) -> Vector3<f64> {
+    turn_of(mount, angles) * Vector3::z()
+}
+
+/// Whether a cue is of about now.
+fn is_valid(cue: &Cue, time: Timestamp) -> bool {
+    let said = cue.ahead.first().map(|first| Timestamp::from_nanos(first.time_ns));
+    said.is_some_and(|said| time.seconds_since(said).abs() <= VALID_S)
 }
 
 /// From the camera's frame as it is turned to that at rest.
@@ -381,27 +461,27 @@ mod tests {
 
     #[test]
     fn it_turns_ahead_of_the_target_and_stares_while_that_crosses_the_view() {
-        let mut seeker = Seeker::new(&model(), Some(mount()));
-        assert_eq!(seeker.look(seconds(0.9), Some((REST, true)), &[]), Orders::default());
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+        assert_eq!(seeker.look(seconds(0.9), Pointed::Settled(REST), &[]), Orders::default());
         seeker.hear(cue(1.0, 0.8, 0.05, [1e-3; 2]));
-        let aim = seeker.look(seconds(1.0), Some((REST, true)), &[]).aim.unwrap();
+        let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
         assert!(aim.azimuth > 0.82 && aim.azimuth < 0.88, "{aim:?}");
         assert!((aim.elevation - 0.2).abs() < 1e-4);
         // On the way it is told nothing else, but where the target is quite elsewhere; and there it
         // stays until the target is past.
         let half = ScanAngles { azimuth: 0.4, elevation: 0.1 };
-        assert_eq!(seeker.look(seconds(1.1), Some((half, false)), &[]).aim, None);
+        assert_eq!(seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim, None);
         seeker.hear(cue(1.1, -0.8, 0.05, [1e-3; 2]));
-        let other = seeker.look(seconds(1.1), Some((half, false)), &[]).aim.unwrap();
+        let other = seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
         assert!(other.azimuth < -0.7, "{other:?}");
         seeker.hear(cue(1.1, 0.805, 0.05, [1e-3; 2]));
-        let aim = seeker.look(seconds(1.1), Some((half, false)), &[]).aim.unwrap();
+        let aim = seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim.unwrap();
         assert!((aim.azimuth - 0.854).abs() < 1e-3, "{aim:?}");
         let turned: Vec<f64> = (0..40)
             .map(|k| 1.2 + 0.1 * f64::from(k))
             .filter(|&t| {
                 seeker.hear(cue(t, 0.8 + 0.05 * (t - 1.0), 0.05, [1e-3; 2]));
-                seeker.look(seconds(t), Some((aim, true)), &[]).aim.is_some()
+                seeker.look(seconds(t), Pointed::Settled(aim), &[]).aim.is_some()
             })
             .collect();
         assert!((2.5..3.3).contains(&turned[0]), "{turned:?}");
@@ -409,11 +489,11 @@ mod tests {
 
     #[test]
     fn a_track_is_taken_over_when_it_has_been_where_the_cue_is_for_three_images() {
-        let mut seeker = Seeker::new(&model(), Some(mount()));
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
         seeker.hear(cue(1.0, 0.5, 0.0, [1e-3; 2]));
         let at = ScanAngles { azimuth: 0.48, elevation: 0.21 };
         let look = |seeker: &mut Seeker, tracks: &[BearingTrack]| {
-            let orders = seeker.look(seconds(1.1), Some((at, true)), tracks);
+            let orders = seeker.look(seconds(1.1), Pointed::Settled(at), tracks);
             orders.taken_over.map(|taken| (taken.image_track_id, taken.of.unwrap().track_id))
         };
         let (target, bird) = (track(3, at, 0.5005, 0.2), track(4, at, 0.47, 0.2));
@@ -423,19 +503,19 @@ mod tests {
         // One that passes as near is no rival any more; one that was there from the first is.
         let rival = track(5, at, 0.4998, 0.2);
         assert_eq!(look(&mut seeker, &[rival, target]), Some((3, 7)));
-        let mut seeker = Seeker::new(&model(), Some(mount()));
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
         seeker.hear(cue(1.0, 0.5, 0.0, [1e-3; 2]));
         assert!((0..10).all(|_| look(&mut seeker, &[rival, target]).is_none()));
     }
 
     #[test]
     fn a_stripe_is_looked_along_from_its_middle_to_both_ends() {
-        let mut seeker = Seeker::new(&model(), Some(mount()));
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
         let (mut at, mut views) = (REST, Vec::new());
         for k in 0..200 {
             let t = 0.1 * f64::from(k);
             seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-3]));
-            if let Some(aim) = seeker.look(seconds(t), Some((at, true)), &[]).aim {
+            if let Some(aim) = seeker.look(seconds(t), Pointed::Settled(at), &[]).aim {
                 at = aim;
                 views.push(aim.azimuth - 0.6);
             }
@@ -453,7 +533,7 @@ mod tests {
         let orders: Vec<Orders> = looks
             .map(|t| {
                 seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-1]));
-                seeker.look(seconds(t), Some((at, true)), &[seen])
+                seeker.look(seconds(t), Pointed::Settled(at), &[seen])
             })
             .collect();
         assert!(orders.iter().skip(3).all(|orders| orders.aim.is_none()));
@@ -462,9 +542,9 @@ mod tests {
 
     #[test]
     fn old_and_impossible_cues_move_nothing() {
-        let mut seeker = Seeker::new(&model(), Some(mount()));
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
         seeker.hear(cue(1.0, 0.8, 0.05, [1e-3; 2]));
-        assert_eq!(seeker.look(seconds(4.0), Some((REST, true)), &[]), Orders::default());
+        assert_eq!(seeker.look(seconds(4.0), Pointed::Settled(REST), &[]), Orders::default());
         let spoil: [fn(&mut Expected); 5] = [
             |one| one.bearing = None,
             |one| one.bearing = Some(Vector3::zeros().into()),
@@ -476,22 +556,147 @@ mod tests {
             let mut cues = cue(1.0, 0.8, 0.05, [1e-3; 2]);
             cues.cues[0].ahead.iter_mut().for_each(spoil);
             seeker.hear(cues);
-            assert_eq!(seeker.look(seconds(1.0), Some((REST, true)), &[]), Orders::default());
+            assert_eq!(seeker.look(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
         }
         let mut empty = cue(1.0, 0.8, 0.05, [1e-3; 2]);
         empty.cues[0].ahead.clear();
         seeker.hear(empty);
-        assert_eq!(seeker.look(seconds(1.0), Some((REST, true)), &[]), Orders::default());
+        assert_eq!(seeker.look(seconds(1.0), Pointed::Settled(REST), &[]), Orders::default());
     }
 
     #[test]
     fn a_camera_that_stands_still_takes_over_and_turns_nothing() {
-        let mut seeker = Seeker::new(&model(), None);
+        let mut seeker = Seeker::new(&model(), None, 0.0);
         seeker.hear(cue(1.0, 0.02, 0.0, [1e-3; 2]));
         let seen = track(3, REST, 0.02, 0.2);
         let orders: Vec<Orders> =
-            (0..3).map(|_| seeker.look(seconds(1.1), None, &[seen])).collect();
+            (0..3).map(|_| seeker.look(seconds(1.1), Pointed::Fixed, &[seen])).collect();
         assert!(orders.iter().all(|orders| orders.aim.is_none()));
         assert_eq!(orders[2].taken_over.as_ref().unwrap().image_track_id, 3);
+    }
+
+    /// The angles that a mount says are off by a good deal more than the cue is.
+    #[test]
+    fn what_the_angles_are_off_by_widens_the_gate() {
+        for (angle_sd_rad, taken) in [(0.0, false), (3e-3, true)] {
+            let mut seeker = Seeker::new(&model(), Some(mount()), angle_sd_rad);
+            seeker.hear(cue(1.0, 0.5, 0.0, [6e-4; 2]));
+            let (said, truth) = (0.5, 0.504);
+            let [at, really] = [said, truth].map(|azimuth| ScanAngles { azimuth, elevation: 0.2 });
+            let target = track(3, really, 0.5, 0.2);
+            let looks = (0..4).map(|_| seeker.look(seconds(1.1), Pointed::Settled(at), &[target]));
+            assert_eq!(looks.last().unwrap().taken_over.is_some(), taken);
+        }
+    }
+
+    /// A mount that turns by so much a second, and stands still for so long before it says so.
+    fn stares(slow_rad_per_s: f64, settles_s: f64) -> Vec<f64> {
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+        let (mut at, mut to, mut arrives) = (REST, REST, 0.0);
+        let mut stood: Vec<f64> = Vec::new();
+        for k in 0..600 {
+            let t = 0.05 * f64::from(k);
+            seeker.hear(cue(t, 0.6, 0.0, [0.3, 1e-3]));
+            let pointed = if t < arrives { Pointed::Turning(at) } else { Pointed::Settled(to) };
+            if t >= arrives {
+                at = to;
+                *stood.last_mut().unwrap_or(&mut 0.0) += 0.05;
+            }
+            if let Some(aim) = seeker.look(seconds(t), pointed, &[]).aim {
+                assert!(t >= arrives, "it is told nothing else on its way");
+                arrives = t + (aim.azimuth - at.azimuth).abs() / slow_rad_per_s + settles_s;
+                to = aim;
+                stood.push(0.0);
+            }
+        }
+        stood
+    }
+
+    #[test]
+    fn a_slow_head_stares_as_long_at_each_view_of_a_stripe_as_a_quick_one() {
+        for (slow_rad_per_s, settles_s) in [(50.0, 0.0), (0.5, 0.9), (0.2, 2.0)] {
+            let stood = stares(slow_rad_per_s, settles_s);
+            let whole = &stood[..stood.len() - 1];
+            assert!(whole.len() >= 2 && whole.iter().all(|s| (1.4..1.7).contains(s)), "{stood:?}");
+        }
+    }
+
+    #[test]
+    fn what_the_mount_does_not_reach_is_left_for_what_it_does() {
+        let reach = mount();
+        let mut seeker = Seeker::new(&model(), Some(reach), 0.0);
+        // Behind it, as near as it comes to it, another in reach.
+        let mut cues = cue(1.0, 3.12, 0.02, [1e-3; 2]);
+        cues.cues.push(cue(1.0, 1.0, 0.02, [1e-3; 2]).cues.remove(0));
+        cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
+        seeker.hear(cues);
+        let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
+        assert!((0.9..1.1).contains(&aim.azimuth), "{aim:?}");
+        // At the end of the reach, where the mount says a little else than what it was told.
+        let mut seeker = Seeker::new(&model(), Some(reach), 0.0);
+        let mut turns = 0;
+        let mut at = REST;
+        for k in 0..100 {
+            let t = 1.0 + 0.05 * f64::from(k);
+            seeker.hear(cue(t, 3.05, 0.0, [1e-3; 2]));
+            if let Some(aim) = seeker.look(seconds(t), Pointed::Settled(at), &[]).aim {
+                turns += 1;
+                at = ScanAngles { azimuth: aim.azimuth + 1e-4, ..aim };
+            }
+        }
+        assert_eq!(turns, 1);
+    }
+
+    #[test]
+    fn a_track_is_preferred_to_what_one_camera_saw_unless_that_is_found() {
+        let of_one = |time_s: f64| {
+            let mut cues = cue(time_s, 0.3, 0.0, [1e-2; 2]);
+            cues.cues[0].of = Some(Cued { camera: "north".into(), ..Default::default() });
+            cues
+        };
+        let both = |time_s: f64| {
+            let mut cues = of_one(time_s);
+            cues.cues.push(cue(time_s, -0.5, 0.0, [1e-3; 2]).cues.remove(0));
+            cues
+        };
+        let at = ScanAngles { azimuth: 0.3, elevation: 0.2 };
+        let seen = track(4, at, 0.3, 0.2);
+        for (tracks, leaves) in [(&[][..], true), (&[seen][..], false)] {
+            let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+            for k in 0..4 {
+                let t = 1.0 + 0.1 * f64::from(k);
+                seeker.hear(of_one(t));
+                seeker.look(seconds(t), Pointed::Settled(at), tracks);
+            }
+            seeker.hear(both(1.4));
+            let aim = seeker.look(seconds(1.4), Pointed::Settled(at), tracks).aim;
+            assert_eq!(aim.is_some_and(|aim| aim.azimuth < 0.0), leaves, "{aim:?}");
+            // What it has found becomes a track beside another: it stays on it.
+            if !leaves {
+                let mut cues = cue(1.5, -0.5, 0.0, [1e-3; 2]);
+                cues.cues.push(cue(1.5, 0.301, 0.0, [1e-3; 2]).cues.remove(0));
+                cues.cues[1].of = Some(Cued { track_id: 9, ..Default::default() });
+                seeker.hear(cues);
+                assert_eq!(seeker.look(seconds(1.5), Pointed::Settled(at), tracks).aim, None);
+            }
+        }
+    }
+
+    #[test]
+    fn while_nobody_knows_where_it_points_nothing_is_taken_over_and_nothing_turned() {
+        let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+        seeker.hear(cue(1.0, 0.02, 0.0, [1e-3; 2]));
+        let seen = track(3, REST, 0.02, 0.2);
+        assert!((0..9).all(|_| {
+            seeker.look(seconds(1.1), Pointed::Unknown, &[seen]) == Orders::default()
+        }));
+        // Who it is of is copied into every frame.
+        let mut long = cue(1.0, 0.02, 0.0, [1e-3; 2]);
+        long.cues[0].of = Some(Cued { camera: "x".repeat(1 << 20), ..Default::default() });
+        seeker.hear(long);
+        assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
+        // Of a future that is not near.
+        seeker.hear(cue(9.0, 0.02, 0.0, [1e-3; 2]));
+        assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
     }
 }

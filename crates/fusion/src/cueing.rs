@@ -17,7 +17,7 @@ use nalgebra::{Matrix2, Matrix3, Point3, Rotation3, Unit, Vector3, Vector6};
 
 use crate::cameras::KnownCamera;
 use crate::range_chart::Chart;
-use crate::uncertainty::SharedTies;
+use crate::uncertainty::{CameraUncertainty, SharedTies};
 
 /// A camera is told this often, s of data time: a target at 100 m that flies at 20 m/s has gone on
 /// by 20 mrad.
@@ -79,21 +79,36 @@ impl Cueing {
     }
 }
 
-/// What a camera should look for, the nearest first. `ahead_s` is what its clock is ahead by.
+/// A camera's clock, as far as it is known.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OwnClock {
+    /// What it is ahead by, s.
+    pub(crate) ahead_s: f64,
+    /// The standard deviation of that against the other cameras' clocks, s.
+    pub(crate) sd_s: f64,
+}
+
+/// What a camera should look for: tracks, and then what one other camera alone sees; the nearest first.
 pub(crate) fn cues(
     camera: &CameraName,
     known: &KnownCamera,
-    (now, ahead_s): (Timestamp, f64),
+    (now, clock): (Timestamp, OwnClock),
     targets: &[Known],
     max_range_m: f64,
 ) -> CueFrame {
-    let own_now = now.plus_seconds(ahead_s);
-    let mut cues: Vec<Cue> = targets
-        .iter()
-        .filter_map(|target| cue(known, own_now, target))
+    let own_now = now.plus_seconds(clock.ahead_s);
+    let uncertainty = CameraUncertainty { time_sd_s: clock.sd_s, ..known.uncertainty() };
+    // What it alone sees it need not be told.
+    let others = targets.iter().filter(|target| target.of.camera != camera.as_str());
+    let mut cues: Vec<Cue> = others
+        .filter_map(|target| cue((known, &uncertainty), own_now, target))
         .filter(|cue| cue.range_m <= max_range_m)
         .collect();
-    cues.sort_by(|one, other| one.range_m.total_cmp(&other.range_m));
+    let is_track = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
+    cues.sort_by(|one, other| {
+        let by_range = one.range_m.total_cmp(&other.range_m);
+        is_track(other).cmp(&is_track(one)).then(by_range)
+    });
     cues.truncate(MOST_CUES);
     let frame =
         CueFrame { time_ns: now.nanos(), camera: camera.to_string(), cues, ..Default::default() };
@@ -101,14 +116,18 @@ pub(crate) fn cues(
 }
 
 /// `None` if it lies at the camera itself.
-fn cue(known: &KnownCamera, own_now: Timestamp, target: &Known) -> Option<Cue> {
-    let origin = known.camera.pose().position();
+fn cue(
+    camera: (&KnownCamera, &CameraUncertainty),
+    own_now: Timestamp,
+    target: &Known,
+) -> Option<Cue> {
+    let origin = camera.0.camera.pose().position();
     let here = &target.ahead[0];
     let away = here.position() - origin;
     let range_m = away.norm();
     let along = away.dot(&(here.position_covariance() * away)).max(0.0);
     let ahead = target.ahead.iter().zip(AHEAD_S).map(|(state, ahead_s)| {
-        expected(known, state, target.seen_from, own_now.plus_seconds(ahead_s))
+        expected(camera, state, target.seen_from, own_now.plus_seconds(ahead_s))
     });
     Some(Cue {
         of: Some(target.of.clone()),
@@ -120,7 +139,7 @@ fn cue(known: &KnownCamera, own_now: Timestamp, target: &Known) -> Option<Cue> {
 
 /// Where the camera should see a state, in its own frame.
 fn expected(
-    known: &KnownCamera,
+    (known, uncertainty): (&KnownCamera, &CameraUncertainty),
     state: &KinematicState,
     seen_from: Option<Point3<f64>>,
     time: Timestamp,
@@ -128,7 +147,7 @@ fn expected(
     let origin = known.camera.pose().position();
     let (direction, covariance) = seen(state, origin, seen_from.filter(|from| *from != origin))?;
     let model = BearingModel::along(direction, (state.position() - origin).norm());
-    let shared = known.uncertainty().shared(&model, state.velocity());
+    let shared = uncertainty.shared(&model, state.velocity());
     let to_world: &Rotation3<f64> = known.camera.pose().rotation();
     let own = to_world.inverse() * direction;
     // Both have tangents of their own at the direction.

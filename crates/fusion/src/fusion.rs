@@ -10,7 +10,7 @@ use crossfix_message::{
 
 use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, Sample};
 use crate::clocks::{ClockEstimate, ClockEstimator};
-use crate::cueing::{self, Cueing};
+use crate::cueing::{self, Cueing, OwnClock};
 use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
@@ -497,9 +497,12 @@ impl Fusion {
         let mut targets = tracker.known(now);
         targets.extend(initiator.known(now));
         for (name, known) in due {
-            let ahead_s = clocks.estimate(name).map_or(0.0, |clock| clock.offset_s);
+            let [ahead_s, sd_s] = clocks
+                .estimate(name)
+                .map_or([0.0; 2], |clock| [clock.offset_s, clock.relative_sd_s]);
+            let clock = OwnClock { ahead_s, sd_s };
             let max_range_m = config.initiation.max_range_m;
-            let cues = cueing::cues(name, known, (now, ahead_s), &targets, max_range_m);
+            let cues = cueing::cues(name, known, (now, clock), &targets, max_range_m);
             outputs.push(Output::Cues(cues));
         }
     }

@@ -9,7 +9,7 @@ use common::{Eye, Path, Scene, calibration, eye, found, fusion_of, site, straigh
 use crossfix_fusion::{Fusion, FusionConfig, Output};
 use crossfix_geometry::{PanTilt, ScanAngles, tangent_basis};
 use crossfix_message::{
-    BearingFrame, BearingTrack, CueFrame, ImageTrackState, Pointing, Timestamp,
+    BearingFrame, BearingTrack, CueFrame, Expected, ImageTrackState, Pointing, Timestamp,
 };
 use nalgebra::{Matrix2, Matrix6, Unit, Vector2, Vector3, Vector6};
 use rand::SeedableRng;
@@ -42,6 +42,10 @@ struct Head {
     said: ScanAngles,
     turning: u32,
     cues: Option<CueFrame>,
+    /// Whether its detector takes what goes by in a turn for targets.
+    sees_ghosts: bool,
+    /// What its clock is said to be off by, s.
+    clock_sd_s: f64,
     frames: u64,
     noise: ChaCha8Rng,
 }
@@ -52,7 +56,18 @@ impl Head {
         let mount = PanTilt::new(*eye.camera.pose(), [-3.2, 3.2], [-0.5, 1.5]).unwrap();
         let rest = ScanAngles { azimuth: 0.0, elevation: 0.0 };
         let noise = ChaCha8Rng::seed_from_u64(seed);
-        Self { eye, mount, truth: rest, said: rest, turning: 0, cues: None, frames: 0, noise }
+        Self {
+            eye,
+            mount,
+            truth: rest,
+            said: rest,
+            turning: 0,
+            cues: None,
+            sees_ghosts: false,
+            clock_sd_s: 0.0,
+            frames: 0,
+            noise,
+        }
     }
 
     fn normal(&mut self) -> f64 {
@@ -99,8 +114,10 @@ impl Head {
         let camera = self.eye.camera.posed(self.mount.pose(self.truth));
         let noise = Vector2::new(self.normal(), self.normal()) * NARROW_SD_RAD;
         let place = path(t).filter(|place| self.turning == 0 && camera.sees(*place));
-        let track = place.map(|place| {
-            let exact = Unit::new_normalize(camera.pose().camera_from_world(place));
+        let seen = place.map(|place| camera.pose().camera_from_world(place));
+        let ghost = (self.turning > 0 && self.sees_ghosts).then(|| Vector3::new(0.01, 0.02, 1.0));
+        let track = seen.or(ghost).map(|seen| {
+            let exact = Unit::new_normalize(seen);
             let towards = (exact.into_inner() + tangent_basis(&exact) * noise).normalize();
             BearingTrack {
                 track_id: 1,
@@ -116,6 +133,7 @@ impl Head {
             camera: self.eye.name.to_string(),
             sequence: self.frames,
             capture_time_ns: time_ns,
+            capture_time_sd_s: self.clock_sd_s,
             tracks: track.into_iter().collect(),
             pointing: Some(Pointing {
                 azimuth: self.said.azimuth,
@@ -325,16 +343,50 @@ fn a_camera_on_a_mount_that_does_not_say_where_it_points_is_refused_frame_by_fra
     assert_eq!(fusion.counters().get("rejected_pointing"), 4);
 }
 
-/// While it turns it has seen nothing, and so it has missed nothing: tracks live on.
+/// While it turns it has seen nothing, and so it has missed nothing: a track of two cameras that it
+/// should see, too, lives on; and what its detector makes of the turn is not used.
 #[test]
 fn a_turning_camera_misses_nothing() {
-    let scene = Scene::new(vec![straight([-30.0, 5.0, 40.0], [4.0, 2.0, 0.5])], 10.0);
+    let mut scene = Scene::new(vec![straight([-30.0, 5.0, 40.0], [4.0, 2.0, 0.5])], 10.0);
+    scene.eyes.truncate(2);
     let mut head = Head::new(3);
-    let mut seen = 0;
+    // It looks where the target is.
+    let towards = head.mount.rest().camera_from_world((scene.paths[0])(5.0).unwrap());
+    head.said = head.mount.aim(&Unit::new_normalize(towards));
+    (head.truth, head.turning, head.sees_ghosts) = (head.said, 5, true);
+    let (mut looks, mut seen, mut ghosts) = (0, 0, 0);
     run(&scene, &mut head, 3, |head, fusion, _| {
-        // It turns for ever, and says so, with what its detector makes of that.
+        // It turns for ever, and says so.
         head.turning = 5;
-        seen += u32::from(found(fusion, &scene.paths[0]).is_some());
+        let after_start = fusion.now().is_some_and(|now| now.seconds() > 3.0);
+        looks += u32::from(after_start);
+        seen += u32::from(after_start && found(fusion, &scene.paths[0]).is_some());
+        ghosts = fusion.counters().get("bearings_while_turning");
     });
-    assert!(seen > 300, "{seen}");
+    assert_eq!(seen, looks);
+    assert!(looks > 150 && ghosts > 80, "{looks} {ghosts}");
+}
+
+/// Where its clock may be off the target may be elsewhere in its images.
+#[test]
+fn a_cue_is_as_wide_as_the_cameras_clock_makes_it() {
+    let path = || straight([-30.0, 5.0, 40.0], [8.0, 2.0, 0.5]);
+    let widest = |clock_sd_s: f64| {
+        let scene = Scene::new(vec![path()], 4.0);
+        let mut head = Head::new(5);
+        head.clock_sd_s = clock_sd_s;
+        let mut widest = 0.0;
+        run(&scene, &mut head, 5, |head, _, cues| {
+            // It stays where it is, and sees nothing by which its clock could be learnt.
+            head.cues = None;
+            if let Some(cue) = cues.as_ref().and_then(|cues| cues.cues.first()) {
+                let Expected { covariance_xx, covariance_yy, .. } = cue.ahead[0];
+                widest = (covariance_xx + covariance_yy).sqrt();
+            }
+        });
+        widest
+    };
+    let (exact, unsure) = (widest(0.0), widest(0.1));
+    // 8 m/s at some 165 m for a tenth of a second, across or so.
+    assert!(exact < 2e-3 && (2e-3..8e-3).contains(&unsure), "{exact} {unsure}");
 }

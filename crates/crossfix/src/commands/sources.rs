@@ -9,9 +9,7 @@ use crossfix_video::{
 use serde::Serialize;
 
 use crate::commands::numbers;
-#[cfg(feature = "onvif")]
-use crate::config;
-use crate::config::{CameraFile, SourceConfig};
+use crate::config::{self, CameraFile, SourceConfig};
 use crate::eye::jpeg;
 #[cfg(feature = "onvif")]
 use crate::onvif;
@@ -48,7 +46,7 @@ pub struct Args {
     /// asks all on this host's networks.
     #[arg(long, conflicts_with_all = ["url", "config"])]
     lan: bool,
-    /// Who asks a network camera for its streams (ONVIF).
+    /// Who asks a network camera, if it is not in the address.
     #[arg(long, requires = "password_file", conflicts_with = "config")]
     user: Option<String>,
     /// The file whose first line is the password.
@@ -199,7 +197,13 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
         };
         return Ok(Some(LiveCamera::Gige(GigeCamera::new(options))));
     }
-    let (address, login) = StreamAddress::parse(address)?;
+    let (address, in_address) = StreamAddress::parse(address)?;
+    let login = config::login("", args.user.as_deref(), args.password_file.as_deref())?;
+    ensure!(
+        in_address.is_none() || login.is_none(),
+        "the address names a user: leave out --user and --password-file"
+    );
+    let login = in_address.or(login);
     let transport = if args.udp { RtspTransport::Udp } else { RtspTransport::Tcp };
     let latency = Latency::default();
     let options = RtspOptions { address, login, transport, heeds_reports: true, latency };

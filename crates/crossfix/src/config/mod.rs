@@ -16,6 +16,4 @@ pub use fusion::FusionFile;
 pub use mount::{MountConfig, OnvifConfig};
 pub use site::{Site, load_cameras, load_network};
 pub use source::SourceConfig;
-#[cfg(feature = "onvif")]
-pub use stream::login;
-pub use stream::{GstreamerConfig, StreamConfig};
+pub use stream::{GstreamerConfig, StreamConfig, login};

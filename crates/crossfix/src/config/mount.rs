@@ -111,7 +111,20 @@ impl MountConfig {
             "key `mount.angle_sd_mrad` is {}: it must be from 0.001 to 500",
             self.angle_sd_mrad
         );
-        self.onvif.as_ref().map_or(Ok(()), OnvifConfig::check)?;
+        if let Some(onvif) = &self.onvif {
+            onvif.check()?;
+            for (key, [least, most], of) in [
+                ("azimuth_deg", self.azimuth_deg, onvif.pan_deg),
+                ("elevation_deg", self.elevation_deg, onvif.tilt_deg),
+            ] {
+                let (from, to) = (of[0].min(of[1]), of[0].max(of[1]));
+                ensure!(
+                    from <= least && most <= to,
+                    "key `mount.{key}` is [{least}, {most}], and the mount says places from {from} to \
+                     {to} only (`mount.onvif`)"
+                );
+            }
+        }
         let radians = |degrees: [f64; 2]| degrees.map(f64::to_radians);
         PanTilt::new(rest, radians(self.azimuth_deg), radians(self.elevation_deg))
             .context("keys `mount.azimuth_deg`, `mount.elevation_deg`")

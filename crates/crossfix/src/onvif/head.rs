@@ -18,7 +18,7 @@ use url::Url;
 use super::{Device, answered, runtime};
 use crate::config::OnvifConfig;
 use crate::repeats::Repeats;
-use crate::seeker::Mount;
+use crate::seeker::{Mount, Pointed};
 
 /// How often it is asked where it is. Twice as often burdens a camera's small host; half as often
 /// makes each turn a tenth of a second longer.
@@ -30,6 +30,8 @@ const IMAGE_COMES_WITHIN: Duration = Duration::from_millis(500);
 const SAID_HOLDS: Duration = Duration::from_secs(1);
 /// If it has not moved by then, it goes no farther.
 const BEGINS_WITHIN: Duration = Duration::from_secs(1);
+/// A mount that has refused to turn is not asked to for so long, so that its camera sees meanwhile.
+const ASKED_TO_TURN_AGAIN: Duration = Duration::from_secs(5);
 /// It has arrived, or stands still, within so many deviations of its angles.
 const SAME_SDS: f64 = 3.0;
 /// Zooms farther apart are not the same: a hundredth is one of focal length, too, on most lenses.
@@ -73,7 +75,7 @@ struct Order {
 
 /// Where a head points, by what it has said.
 #[derive(Clone, Copy, Debug)]
-struct Pointed {
+struct Head {
     /// Angles that differ by less are the same, rad.
     same_rad: f64,
     /// What it said last, and when.
@@ -81,15 +83,31 @@ struct Pointed {
     /// Where it has stood still, and since when.
     still: Option<(ScanAngles, Instant)>,
     order: Option<Order>,
+    /// When it refused to turn last.
+    refused: Option<Instant>,
 }
 
-impl Pointed {
+impl Head {
     fn new(angle_sd_rad: f64) -> Self {
-        Self { same_rad: SAME_SDS * angle_sd_rad, said: None, still: None, order: None }
+        Self {
+            same_rad: SAME_SDS * angle_sd_rad,
+            said: None,
+            still: None,
+            order: None,
+            refused: None,
+        }
     }
 
-    fn order(&mut self, to: ScanAngles) {
-        self.order = Some(Order { to, sent: None });
+    fn order(&mut self, to: ScanAngles, now: Instant) {
+        let since_s = |refused: Instant| now.duration_since(refused);
+        if self.refused.is_none_or(|refused| since_s(refused) > ASKED_TO_TURN_AGAIN) {
+            self.order = Some(Order { to, sent: None });
+        }
+    }
+
+    /// It does not turn there: it goes on where it is.
+    fn refuse(&mut self, now: Instant) {
+        (self.order, self.refused) = (None, Some(now));
     }
 
     /// It has been told to turn, unless it is to turn elsewhere by now.
@@ -124,21 +142,25 @@ impl Pointed {
         (self.said, self.still) = (None, None);
     }
 
-    /// Where it pointed in the newest image, and whether it stood still.
-    fn at(&self, now: Instant) -> Option<(ScanAngles, bool)> {
-        let (angles, said) = self.said?;
+    /// Where it pointed in the newest image.
+    fn at(&self, now: Instant) -> Pointed {
+        let said = self.said.filter(|(_, said)| now.duration_since(*said) < SAID_HOLDS);
+        let Some((angles, _)) = said else { return Pointed::Unknown };
         let since = self.still.filter(|_| self.order.is_none()).map(|(_, since)| since);
-        let settled = since.is_some_and(|since| now.duration_since(since) > IMAGE_COMES_WITHIN);
-        (now.duration_since(said) < SAID_HOLDS).then_some((angles, settled))
+        if since.is_some_and(|since| now.duration_since(since) > IMAGE_COMES_WITHIN) {
+            Pointed::Settled(angles)
+        } else {
+            Pointed::Turning(angles)
+        }
     }
 }
 
 /// What an agent and the thread that asks the mount share.
 #[derive(Clone, Debug)]
-struct Shared(Arc<Mutex<Pointed>>);
+struct Shared(Arc<Mutex<Head>>);
 
 impl Shared {
-    fn with<T>(&self, act: impl FnOnce(&mut Pointed) -> T) -> T {
+    fn with<T>(&self, act: impl FnOnce(&mut Head) -> T) -> T {
         // Whoever panics has not left it half told.
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -149,7 +171,16 @@ struct Reach {
     address: Url,
     login: Option<Login>,
     scale: Scale,
+    /// That of the lens: as it is declared, or else as the mount says it first.
     zoom: Option<f32>,
+}
+
+impl Reach {
+    /// Whether somebody has made the lens another than that which is calibrated.
+    fn is_zoomed(&mut self, said: Option<f32>) -> bool {
+        let Some(said) = said else { return false };
+        (said - *self.zoom.get_or_insert(said)).abs() > SAME_ZOOM
+    }
 }
 
 /// A mount that is turned by ONVIF, and asked where it points ten times a second. It is asked again
@@ -175,7 +206,7 @@ impl OnvifMount {
             scale: Scale { pan: radians(config.pan_deg), tilt: radians(config.tilt_deg) },
             zoom: config.zoom.map(|zoom| zoom as f32),
         };
-        let shared = Shared(Arc::new(Mutex::new(Pointed::new(angle_sd_rad))));
+        let shared = Shared(Arc::new(Mutex::new(Head::new(angle_sd_rad))));
         let (stop, stopped) = oneshot::channel();
         let runtime = runtime()?;
         let asked = shared.clone();
@@ -201,22 +232,22 @@ impl Drop for OnvifMount {
 
 impl Mount for OnvifMount {
     fn aim(&mut self, angles: ScanAngles) {
-        self.shared.with(|pointed| pointed.order(angles));
+        self.shared.with(|head| head.order(angles, Instant::now()));
     }
 
-    fn pointed(&mut self) -> Option<(ScanAngles, bool)> {
-        self.shared.with(|pointed| pointed.at(Instant::now()))
+    fn pointed(&mut self) -> Pointed {
+        self.shared.with(|head| head.at(Instant::now()))
     }
 }
 
 /// Asks a mount for ever, ever less often while it does not answer.
-async fn ask_for_ever(shared: Shared, reach: Reach) {
+async fn ask_for_ever(shared: Shared, mut reach: Reach) {
     let mut repeats = Repeats::default();
     let mut pause = FIRST_PAUSE;
     loop {
         let mut answered = false;
-        let Err(error) = ask(&shared, &reach, &mut answered).await;
-        shared.with(Pointed::lose);
+        let Err(error) = ask(&shared, &mut reach, &mut repeats, &mut answered).await;
+        shared.with(Head::lose);
         repeats.warn("lost", Instant::now(), || {
             format!("the mount at {}: {error:#}; going on", reach.address)
         });
@@ -229,42 +260,45 @@ async fn ask_for_ever(shared: Shared, reach: Reach) {
 /// Asks a mount where it points, and tells it where to turn, until it does not answer.
 async fn ask(
     shared: &Shared,
-    reach: &Reach,
+    reach: &mut Reach,
+    repeats: &mut Repeats,
     has_answered: &mut bool,
 ) -> anyhow::Result<Infallible> {
-    let Reach { address, login, scale, zoom } = reach;
-    let device = Device::connect(address, login.as_ref()).await?;
+    let device = Device::connect(&reach.address, reach.login.as_ref()).await?;
     let (head, profile) = device.profile_of_head().await?;
-    let mut zoom = *zoom;
-    let mut set = None::<Instant>;
+    let mut zoom_set = None::<Instant>;
     loop {
         let status = answered(device.client.ptz_get_status(head.as_str(), &profile)).await?;
         let position = status.pan.zip(status.tilt).map(|(pan, tilt)| [pan, tilt]);
         let position = position.context("it does not say where it points, so it is of no use")?;
-        if !*has_answered {
-            tracing::info!("the mount at {address} says where it points");
+        if !std::mem::replace(has_answered, true) {
+            tracing::info!("the mount at {} says where it points", reach.address);
         }
-        *has_answered = true;
-        // The lens is calibrated for one zoom; whoever has turned it has made it another.
         let now = Instant::now();
-        let wanted_zoom = *zoom.get_or_insert(status.zoom.unwrap_or(0.0));
-        let zoomed = status.zoom.is_some_and(|zoom| (zoom - wanted_zoom).abs() > SAME_ZOOM);
-        if zoomed {
-            shared.with(Pointed::lose);
+        let is_zoomed = reach.is_zoomed(status.zoom);
+        if is_zoomed {
+            shared.with(Head::lose);
         } else {
             let moves = status.pan_tilt_status == "MOVING" || status.zoom_status == "MOVING";
-            shared.with(|pointed| pointed.hear(scale.angles(position), moves, now));
+            let angles = reach.scale.angles(position);
+            shared.with(|head| head.hear(angles, moves, now));
         }
-        let order = shared.with(|pointed| pointed.order).filter(|order| order.sent.is_none());
-        let is_due = set.is_none_or(|at| now.duration_since(at) > BEGINS_WITHIN);
-        if order.is_some() || (zoomed && is_due) {
-            let [pan, tilt] = order.map_or(position, |order| scale.position(order.to));
-            let moved =
-                device.client.ptz_absolute_move(head.as_str(), &profile, pan, tilt, wanted_zoom);
-            answered(moved).await?;
-            set = Some(now);
-            if let Some(order) = order {
-                shared.with(|pointed| pointed.told(order.to, Instant::now()));
+        let order = shared.with(|head| head.order).filter(|order| order.sent.is_none());
+        let is_due = zoom_set.is_none_or(|at| now.duration_since(at) > ASKED_TO_TURN_AGAIN);
+        if order.is_some() || (is_zoomed && is_due) {
+            zoom_set = Some(now);
+            let [pan, tilt] = order.map_or(position, |order| reach.scale.position(order.to));
+            let zoom = reach.zoom.unwrap_or(0.0);
+            let moved = device.client.ptz_absolute_move(head.as_str(), &profile, pan, tilt, zoom);
+            match (answered(moved).await, order) {
+                (Ok(()), Some(order)) => shared.with(|head| head.told(order.to, Instant::now())),
+                (Ok(()), None) => {}
+                (Err(error), _) => {
+                    shared.with(|head| head.refuse(Instant::now()));
+                    repeats.warn("refused", Instant::now(), || {
+                        format!("the mount at {} does not turn: {error:#}", reach.address)
+                    });
+                }
             }
         }
         tokio::time::sleep(ASKED_EVERY).await;
@@ -273,7 +307,7 @@ async fn ask(
 
 #[cfg(test)]
 mod tests {
-    use super::super::stub::{PASSWORD, Stub, USER};
+    use super::super::stub::{PASSWORD, Reply, Stub, USER};
     use super::super::{Stream, describe};
     use super::*;
 
@@ -301,8 +335,8 @@ mod tests {
     fn until(
         mount: &mut OnvifMount,
         seconds: f64,
-        mut holds: impl FnMut(Option<(ScanAngles, bool)>) -> bool,
-    ) -> Option<(ScanAngles, bool)> {
+        mut holds: impl FnMut(Pointed) -> bool,
+    ) -> Pointed {
         let begun = Instant::now();
         loop {
             let pointed = mount.pointed();
@@ -313,8 +347,20 @@ mod tests {
         }
     }
 
-    fn settled(pointed: Option<(ScanAngles, bool)>) -> bool {
-        pointed.is_some_and(|(_, settled)| settled)
+    fn is_settled(pointed: Pointed) -> bool {
+        matches!(pointed, Pointed::Settled(_))
+    }
+
+    fn is_unknown(pointed: Pointed) -> bool {
+        pointed == Pointed::Unknown
+    }
+
+    /// Where it has settled.
+    fn settled(pointed: Pointed) -> ScanAngles {
+        match pointed {
+            Pointed::Settled(angles) => angles,
+            other => panic!("{other:?}"),
+        }
     }
 
     #[test]
@@ -333,16 +379,16 @@ mod tests {
     fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
         let begun = Instant::now();
         let at = |tenth: u32| begun + ASKED_EVERY * tenth;
-        let mut pointed = Pointed::new(ANGLE_SD_RAD);
-        let hear = |pointed: &mut Pointed, tenth: u32, azimuth: f64, moves: bool| {
+        let mut pointed = Head::new(ANGLE_SD_RAD);
+        let hear = |pointed: &mut Head, tenth: u32, azimuth: f64, moves: bool| {
             pointed.hear(degrees(azimuth, 0.0), moves, at(tenth));
-            pointed.at(at(tenth)).unwrap().1
+            is_settled(pointed.at(at(tenth)))
         };
         let settled: Vec<bool> = (0..8).map(|k| hear(&mut pointed, k, 10.0, false)).collect();
         assert_eq!(settled, [false, false, false, false, false, false, true, true]);
         // Told to turn, it is not settled, though it stands for a while and does not say that it
         // moves.
-        pointed.order(degrees(20.0, 0.0));
+        pointed.order(degrees(20.0, 0.0), at(7));
         assert!(!hear(&mut pointed, 8, 10.0, false));
         pointed.told(degrees(20.0, 0.0), at(8));
         for (tenth, azimuth) in [(9, 10.0), (10, 10.0), (11, 12.0), (12, 16.0), (13, 20.0)] {
@@ -356,12 +402,18 @@ mod tests {
         // It never begins: told that it may go no farther, it stands where it is.
         let stands: Vec<bool> = (45..60).map(|k| hear(&mut pointed, k, 21.5, false)).collect();
         assert!(stands[8]);
-        pointed.order(degrees(90.0, 0.0));
+        pointed.order(degrees(90.0, 0.0), at(59));
         pointed.told(degrees(90.0, 0.0), at(60));
         let first = (60..90).find(|k| hear(&mut pointed, *k, 21.5, false));
         assert_eq!(first, Some(71));
+        // It refuses to turn: it sees on where it is, and is not asked again at once.
+        pointed.order(degrees(95.0, 0.0), at(72));
+        pointed.refuse(at(73));
+        assert!(hear(&mut pointed, 74, 21.5, false));
+        pointed.order(degrees(95.0, 0.0), at(75));
+        assert!(hear(&mut pointed, 76, 21.5, false));
         // What was said long ago says nothing.
-        assert!(pointed.at(at(82)).is_none());
+        assert!(is_unknown(pointed.at(at(100))));
     }
 
     #[test]
@@ -369,24 +421,23 @@ mod tests {
         let stub = Stub::start(0);
         let (config, _file) = config(&stub, PASSWORD);
         let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
-        let (rest, _) = until(&mut mount, 6.0, settled).unwrap();
+        let rest = settled(until(&mut mount, 6.0, is_settled));
         assert!((rest.azimuth - 0.0).abs() < 1e-3 && (rest.elevation - 0.785).abs() < 1e-3);
         // The zoom of its lens is set once.
         assert_eq!(stub.state.lock().unwrap().zoom, 0.5);
 
         let aim = degrees(-72.0, 18.0);
         mount.aim(aim);
-        assert!(!settled(mount.pointed()));
+        assert!(!is_settled(mount.pointed()));
         let told = Instant::now();
         let mut last_moved = told;
         // What is said to be settled is where it is, and was for as long as an image takes.
-        let (there, _) = until(&mut mount, 6.0, |pointed| {
+        let there = settled(until(&mut mount, 6.0, |pointed| {
             if stub.state.lock().unwrap().position().1 {
                 last_moved = Instant::now();
             }
-            settled(pointed)
-        })
-        .unwrap();
+            is_settled(pointed)
+        }));
         assert!((there.azimuth - aim.azimuth).abs() < 4e-4, "{there:?}");
         assert!((there.elevation - aim.elevation).abs() < 4e-4, "{there:?}");
         assert!(last_moved > told && last_moved.elapsed() > IMAGE_COMES_WITHIN);
@@ -394,8 +445,8 @@ mod tests {
 
         // Somebody zooms: another lens, until it is set back.
         stub.state.lock().unwrap().zoom = 0.9;
-        assert!(until(&mut mount, 3.0, |pointed| pointed.is_none()).is_none());
-        assert!(settled(until(&mut mount, 6.0, settled)));
+        assert!(is_unknown(until(&mut mount, 3.0, is_unknown)));
+        settled(until(&mut mount, 9.0, is_settled));
         assert_eq!(stub.state.lock().unwrap().zoom, 0.5);
     }
 
@@ -404,17 +455,17 @@ mod tests {
         let stub = Stub::start(0);
         let (config, _file) = config(&stub, PASSWORD);
         let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
-        assert!(settled(until(&mut mount, 6.0, settled)));
+        settled(until(&mut mount, 9.0, is_settled));
         let port = stub.port;
         drop(stub);
-        assert!(until(&mut mount, 6.0, |pointed| pointed.is_none()).is_none());
+        assert!(is_unknown(until(&mut mount, 6.0, is_unknown)));
         mount.aim(degrees(30.0, 50.0));
         let stub = Stub::start(port);
-        let (there, _) = until(&mut mount, 15.0, settled).unwrap();
+        let there = settled(until(&mut mount, 15.0, is_settled));
         assert!((there.azimuth - 30f64.to_radians()).abs() < 1e-3, "told late: {there:?}");
         // It goes on, and says nothing more of where it is.
         stub.state.lock().unwrap().says = false;
-        assert!(until(&mut mount, 6.0, |pointed| pointed.is_none()).is_none());
+        assert!(is_unknown(until(&mut mount, 6.0, is_unknown)));
     }
 
     #[test]
@@ -425,7 +476,7 @@ mod tests {
         let error = format!("{:#}", describe(&config.url, login.as_ref()).unwrap_err());
         assert!(error.contains("not Authorized") && !error.contains("wrong-one"), "{error}");
         let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
-        assert!(until(&mut mount, 1.5, |pointed| pointed.is_some()).is_none());
+        assert!(is_unknown(until(&mut mount, 1.5, |pointed| !is_unknown(pointed))));
     }
 
     #[test]
@@ -438,5 +489,41 @@ mod tests {
         let main = Stream { profile: "main".to_owned(), url: "rtsp://127.0.0.1/main".to_owned() };
         assert_eq!(camera.streams[1], main);
         assert_eq!(camera.position, Some([0.0, 0.0]));
+    }
+
+    #[test]
+    fn a_mount_that_refuses_to_turn_sees_on_where_it_is() {
+        let stub = Stub::start(0);
+        stub.state.lock().unwrap().refuses = true;
+        let (config, _file) = config(&stub, PASSWORD);
+        let config = OnvifConfig { zoom: None, ..config };
+        let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
+        let rest = settled(until(&mut mount, 6.0, is_settled));
+        mount.aim(degrees(30.0, 50.0));
+        assert!(!is_settled(mount.pointed()));
+        assert_eq!(settled(until(&mut mount, 6.0, is_settled)), rest);
+        assert_eq!(stub.state.lock().unwrap().moves, 1, "asked once");
+    }
+
+    /// Neither asked for more than it should say, nor sent elsewhere with what proves who asks.
+    #[test]
+    fn a_camera_that_answers_too_much_too_deeply_or_with_another_address_is_no_camera() {
+        let stub = Stub::start(0);
+        let (config, _file) = config(&stub, PASSWORD);
+        let login = config.login().unwrap();
+        let elsewhere = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        elsewhere.set_nonblocking(true).unwrap();
+        let address = elsewhere.local_addr().unwrap();
+        let deep = format!("{}{}", "<a>".repeat(20_000), "</a>".repeat(20_000));
+        for (reply, what) in [
+            (Reply::Body("x".repeat(10 << 20)), "too long"),
+            (Reply::Body(deep), "too deep"),
+            (Reply::Redirect(format!("http://{address}/onvif/device_service")), "307"),
+        ] {
+            stub.state.lock().unwrap().instead = Some(reply);
+            let error = format!("{:#}", describe(&config.url, login.as_ref()).unwrap_err());
+            assert!(error.contains(what), "{what}: {error}");
+        }
+        assert!(elsewhere.accept().is_err(), "nobody was asked there");
     }
 }

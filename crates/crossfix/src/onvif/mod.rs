@@ -3,18 +3,19 @@
 mod head;
 #[cfg(test)]
 mod stub;
+mod transport;
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail, ensure};
 use crossfix_video::Login;
-use oxvif::transport::{HttpTransport, Transport};
 use oxvif::{OnvifClient, OnvifError};
 use tokio::runtime::Runtime;
 use url::Url;
 
 pub use head::OnvifMount;
+use transport::ToCamera;
 
 /// A camera answers within this, or it is not there, s.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
@@ -108,7 +109,8 @@ impl Device {
     async fn connect(address: &Url, login: Option<&Login>) -> anyhow::Result<Self> {
         let named = !address.username().is_empty() || address.password().is_some();
         ensure!(!named, "who asks does not belong into its address, which is shown");
-        let mut client = OnvifClient::new(address.as_str()).with_transport(transport(login)?);
+        let mut client =
+            OnvifClient::new(address.as_str()).with_transport(Arc::new(ToCamera::new(login)?));
         if let Some(login) = login {
             // Who asks is proved with the time, by the camera's clock.
             let ahead_s = match answered(client.get_system_date_and_time()).await {
@@ -134,17 +136,6 @@ impl Device {
         let turned = turned.context("none of its profiles is of something that turns")?;
         Ok((head.clone(), turned.token))
     }
-}
-
-/// What carries questions over the network. The client's own cannot fail but by a panic.
-fn transport(login: Option<&Login>) -> anyhow::Result<Arc<dyn Transport>> {
-    let http = std::panic::catch_unwind(HttpTransport::new).map_err(|_| {
-        anyhow!("this host trusts nobody, so nobody can be asked: install ca-certificates")
-    })?;
-    Ok(match login {
-        Some(login) => Arc::new(http.with_credentials(login.user(), login.password())),
-        None => Arc::new(http),
-    })
 }
 
 /// A service as it is reached from here: cameras say addresses that are true where they are, and who

@@ -18,8 +18,15 @@ const RATE: f64 = 0.8;
 /// It begins to turn so long after it was told.
 const BEGINS_AFTER: Duration = Duration::from_millis(150);
 
+/// What it answers in the place of what it is asked.
+#[derive(Clone, Debug)]
+pub enum Reply {
+    Body(String),
+    Redirect(String),
+}
+
 /// Where the mount is and goes.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct State {
     from: [f64; 2],
     to: [f64; 2],
@@ -27,7 +34,11 @@ pub struct State {
     pub zoom: f64,
     /// Whether it says where it is.
     pub says: bool,
+    /// Whether it refuses to turn.
+    pub refuses: bool,
+    /// How often it was told to turn.
     pub moves: usize,
+    pub instead: Option<Reply>,
 }
 
 impl State {
@@ -62,7 +73,9 @@ impl Stub {
             told: Instant::now(),
             zoom: 0.0,
             says: true,
+            refuses: false,
             moves: 0,
+            instead: None,
         };
         let (state, stop) = (Arc::new(Mutex::new(state)), Arc::new(AtomicBool::new(false)));
         let (shared, ends) = (state.clone(), stop.clone());
@@ -105,7 +118,17 @@ fn answer(stream: &TcpStream, state: &Mutex<State>) -> std::io::Result<()> {
     }
     let mut request = vec![0; length];
     reader.read_exact(&mut request)?;
-    let (status, body) = reply(&String::from_utf8_lossy(&request), state);
+    let instead = state.lock().unwrap().instead.clone();
+    let (status, body, more) = match instead {
+        Some(Reply::Body(body)) => ("200 OK", body, String::new()),
+        Some(Reply::Redirect(to)) => {
+            ("307 Temporary Redirect", String::new(), format!("Location: {to}\r\n"))
+        }
+        None => {
+            let (status, body) = reply(&String::from_utf8_lossy(&request), state);
+            (status, body, String::new())
+        }
+    };
     let text = format!(
         "<s:Envelope xmlns:s=\"http://www.w3.org/2003/05/soap-envelope\"><s:Body>{body}</s:Body>\
          </s:Envelope>"
@@ -113,7 +136,7 @@ fn answer(stream: &TcpStream, state: &Mutex<State>) -> std::io::Result<()> {
     let mut stream = stream;
     write!(
         stream,
-        "HTTP/1.1 {status}\r\nContent-Type: application/soap+xml\r\nContent-Length: {}\r\n\
+        "HTTP/1.1 {status}\r\nContent-Type: application/soap+xml\r\nContent-Length: {}\r\n{more}\
          Connection: close\r\n\r\n{text}",
         text.len()
     )
@@ -147,6 +170,13 @@ fn knows_password(request: &str) -> bool {
     proof().unwrap_or(false)
 }
 
+fn fault(reason: &str) -> String {
+    format!(
+        "<s:Fault><s:Code><s:Value>s:Sender</s:Value></s:Code><s:Reason><s:Text>{reason}</s:Text>\
+         </s:Reason></s:Fault>"
+    )
+}
+
 fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
     let asks = |what: &str| {
         request.contains(&format!(":{what}>")) || request.contains(&format!(":{what}/>"))
@@ -159,9 +189,7 @@ fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
         );
     }
     if !knows_password(request) {
-        let fault = "<s:Fault><s:Code><s:Value>s:Sender</s:Value></s:Code><s:Reason>\
-                     <s:Text>Sender not Authorized</s:Text></s:Reason></s:Fault>";
-        return ("400 Bad Request", fault.to_owned());
+        return ("400 Bad Request", fault("Sender not Authorized"));
     }
     let mut state = state.lock().unwrap();
     let (name, body) = if asks("GetCapabilities") {
@@ -194,8 +222,12 @@ fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
         let of = |element, name| attribute(request, element, name).unwrap();
         let (from, _) = state.position();
         let to = [of("PanTilt", "x"), of("PanTilt", "y")];
-        let (zoom, moves) = (of("Zoom", "x"), state.moves + 1);
-        *state = State { from, to, told: Instant::now(), zoom, says: state.says, moves };
+        state.moves += 1;
+        if state.refuses {
+            return ("500 Internal Server Error", fault("Position out of bounds"));
+        }
+        let (told, zoom) = (Instant::now(), of("Zoom", "x"));
+        *state = State { from, to, told, zoom, ..state.clone() };
         ("AbsoluteMove", String::new())
     } else {
         return ("400 Bad Request", String::new());

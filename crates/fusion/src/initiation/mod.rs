@@ -84,8 +84,6 @@ impl Initiator {
         self.handover.forget_camera(camera);
     }
 
-    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns
-    /// the tracks that begin with it of targets that cameras see one after another.
     /// What one camera alone sees for sure, that no track is of, as far as it is known now.
     pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
         match self.method {
@@ -94,6 +92,8 @@ impl Initiator {
         }
     }
 
+    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns
+    /// the tracks that begin with it of targets that cameras see one after another.
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,

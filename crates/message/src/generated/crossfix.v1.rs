@@ -372,7 +372,8 @@ pub struct Expected {
     /// Unit vector in the camera's frame; of one on a mount, in its frame with both angles at zero.
     #[prost(message, optional, tag = "2")]
     pub bearing: ::core::option::Option<Vector3>,
-    /// Covariance along the tangents, as a bearing's: the camera's own errors are in it; rad^2.
+    /// Covariance along the tangents, as a bearing's: what the camera's pose and clock may be off by is in it, what
+    /// its mount's angles are is not; rad^2.
     #[prost(double, tag = "3")]
     pub covariance_xx: f64,
     #[prost(double, tag = "4")]

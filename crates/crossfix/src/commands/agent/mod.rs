@@ -92,6 +92,8 @@ struct Agent {
     frames: u64,
     bad_frames: u64,
     unseen_bearings: u64,
+    /// Images of which the mount did not say where they were taken.
+    without_pointing: u64,
     /// Tracks in its newest frame.
     tracks: u32,
     behind: Duration,
@@ -182,6 +184,7 @@ impl Agent {
             frames: 0,
             bad_frames: 0,
             unseen_bearings: 0,
+            without_pointing: 0,
             tracks: 0,
             behind: Duration::ZERO,
             scene_begins: Timestamp::EPOCH,
@@ -302,6 +305,7 @@ impl Agent {
         let mut counters = vec![
             ("bad_frames", self.bad_frames),
             ("behind_ms", u64::try_from(self.behind.as_millis()).unwrap_or(u64::MAX)),
+            ("frames_without_pointing", self.without_pointing),
             ("unseen_bearings", self.unseen_bearings),
         ];
         counters.extend(self.stream.as_mut().map(StreamHealth::counters).unwrap_or_default());
@@ -336,7 +340,8 @@ impl Agent {
             )
         });
         let stream = self.stream.as_ref().map(|stream| stream.problems(Instant::now()));
-        behind.into_iter().chain(stream.unwrap_or_default()).collect()
+        let mount = self.trouble_of_mount();
+        behind.into_iter().chain(mount).chain(stream.unwrap_or_default()).collect()
     }
 
     /// Notes how far behind the source the agent is.

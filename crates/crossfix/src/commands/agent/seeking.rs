@@ -16,7 +16,10 @@ use crate::config::CameraFile;
 use crate::onvif::OnvifMount;
 #[cfg(not(feature = "onvif"))]
 use crate::parts;
-use crate::seeker::{Mount, Orders, Seeker};
+use crate::seeker::{Mount, Orders, Pointed, Seeker};
+
+/// A view is the same while the angles that a mount says are within so many of their deviations.
+const SAME_SDS: f64 = 3.0;
 
 /// A camera that looks for what it is told to look for.
 pub(super) struct Seeking {
@@ -24,16 +27,44 @@ pub(super) struct Seeking {
     cues: Subscription,
     mount: Option<Box<dyn Mount>>,
     angle_sd_rad: f64,
-    /// Whether its mount stood still for the image before.
-    was_settled: bool,
+    /// Where it pointed in the newest image, ...
+    pointed: Pointed,
+    /// ... and in those that the tracker knows, all of one view; `None` if there are none.
+    view: Option<ScanAngles>,
     /// What it has taken over last, so that it is said once.
     said: Option<u64>,
 }
 
 impl Seeking {
-    /// Where the mount pointed in the newest image.
-    fn pointing(&mut self) -> Option<Pointing> {
-        let (ScanAngles { azimuth, elevation }, settled) = self.mount.as_mut()?.pointed()?;
+    /// Asks the mount where it pointed in the newest image; says whether that is another view than
+    /// the tracker knows.
+    fn point(&mut self) -> bool {
+        self.pointed = self.mount.as_mut().map_or(Pointed::Fixed, |mount| mount.pointed());
+        let before = self.view;
+        self.view = match self.pointed {
+            Pointed::Fixed => return false,
+            Pointed::Unknown | Pointed::Turning(_) => None,
+            Pointed::Settled(angles) => {
+                Some(before.filter(|at| self.is_same(*at, angles)).unwrap_or(angles))
+            }
+        };
+        before.is_some() && self.view != before
+    }
+
+    /// Whether two angles are the same, as far as the mount knows them.
+    fn is_same(&self, one: ScanAngles, other: ScanAngles) -> bool {
+        let within = SAME_SDS * self.angle_sd_rad;
+        (one.azimuth - other.azimuth).abs() <= within
+            && (one.elevation - other.elevation).abs() <= within
+    }
+
+    /// What is to be said of where it pointed.
+    fn pointing(&self) -> Option<Pointing> {
+        let (ScanAngles { azimuth, elevation }, settled) = match self.pointed {
+            Pointed::Fixed | Pointed::Unknown => return None,
+            Pointed::Turning(angles) => (angles, false),
+            Pointed::Settled(angles) => (angles, true),
+        };
         let (azimuth_sd, elevation_sd) = (self.angle_sd_rad, self.angle_sd_rad);
         Some(Pointing { azimuth, elevation, azimuth_sd, elevation_sd, settled })
     }
@@ -48,12 +79,8 @@ impl Seeking {
                 self.seeker.hear(cues);
             }
         }
-        let at = frame.pointing.map(|pointing| {
-            let Pointing { azimuth, elevation, settled, .. } = pointing;
-            (ScanAngles { azimuth, elevation }, settled)
-        });
         let time = Timestamp::from_nanos(frame.capture_time_ns);
-        let Orders { aim, taken_over } = self.seeker.look(time, at, &frame.tracks);
+        let Orders { aim, taken_over } = self.seeker.look(time, self.pointed, &frame.tracks);
         if let (Some(mount), Some(aim)) = (&mut self.mount, aim) {
             mount.aim(aim);
         }
@@ -101,13 +128,15 @@ impl Agent {
             "section [mount]: nothing turns this source's camera; [mount.onvif] turns network cameras"
         );
         let camera = &self.identity.camera;
+        let angle_sd_rad = file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3);
         let cues = Key::new(self.link.site().clone(), Channel::Cues).to_string();
         self.seeking = Some(Seeking {
-            seeker: Seeker::new(camera.model(), file.pan_tilt(camera.pose())?),
+            seeker: Seeker::new(camera.model(), file.pan_tilt(camera.pose())?, angle_sd_rad),
             cues: self.link.subscribe(&[cues])?,
             mount: mount.filter(|_| file.mount.is_some()),
-            angle_sd_rad: file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3),
-            was_settled: true,
+            angle_sd_rad,
+            pointed: Pointed::Fixed,
+            view: None,
             said: None,
         });
         Ok(())
@@ -122,18 +151,24 @@ impl Agent {
         (index, time): (u64, Timestamp),
         capture: CaptureTime,
     ) -> BearingFrame {
-        let pointing = self.seeking.as_mut().and_then(Seeking::pointing);
-        let is_settled = pointing.is_none_or(|pointing| pointing.settled);
-        if let Some(seeking) = &mut self.seeking {
-            let was_settled = std::mem::replace(&mut seeking.was_settled, is_settled);
-            if was_settled && !is_settled {
-                tracker.look_elsewhere();
-            }
+        if self.seeking.as_mut().is_some_and(Seeking::point) {
+            tracker.look_elsewhere();
         }
+        let pointed = self.seeking.as_ref().map_or(Pointed::Fixed, |seeking| seeking.pointed);
+        let is_settled = matches!(pointed, Pointed::Fixed | Pointed::Settled(_));
+        self.without_pointing += u64::from(pointed == Pointed::Unknown);
         let tracks = if is_settled { tracker.step(image, time) } else { &[] };
         let (frame, unseen) = self.identity.bearing_frame(index, capture, tracks);
         self.unseen_bearings += unseen;
+        let pointing = self.seeking.as_ref().and_then(Seeking::pointing);
         BearingFrame { pointing, ..frame }
+    }
+
+    /// What is wrong with what turns the camera.
+    pub(super) fn trouble_of_mount(&self) -> Option<String> {
+        let seeking = self.seeking.as_ref()?;
+        (seeking.pointed == Pointed::Unknown)
+            .then(|| "its mount does not say where it points: its images are of no use".to_owned())
     }
 
     /// Looks at a frame by what the fusion centre has said.

@@ -13,7 +13,7 @@ use crossfix_video::{CaptureTime, Frame, FrameSource, Pixels, VideoError};
 use super::{Agent, Start};
 use crate::config::{self, CameraFile};
 use crate::pace::Pace;
-use crate::seeker::Mount;
+use crate::seeker::{Mount, Pointed};
 use crate::shutdown::Shutdown;
 
 /// What turns a simulated camera, and when the camera took its newest frame (s) with where it
@@ -57,9 +57,15 @@ impl Mount for SharedMount {
         });
     }
 
-    fn pointed(&mut self) -> Option<(ScanAngles, bool)> {
+    fn pointed(&mut self) -> Pointed {
         // Each frame is looked at before the next one is taken.
-        self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)))
+        let newest =
+            self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)));
+        match newest {
+            Some((angles, true)) => Pointed::Settled(angles),
+            Some((angles, false)) => Pointed::Turning(angles),
+            None => Pointed::Unknown,
+        }
     }
 }
 

@@ -1,0 +1,110 @@
+//! Questions to a camera over HTTP, no further than a camera is to be trusted: it sends nobody
+//! elsewhere, and its answers are short and not deep.
+
+use anyhow::Context;
+use async_trait::async_trait;
+use crossfix_video::Login;
+use diqwest::{DigestAuthSession, WithDigestAuth};
+use oxvif::transport::{Transport, TransportError};
+use reqwest::redirect::Policy;
+use reqwest::{Client, Response};
+
+/// The longest answer of a camera that is read, bytes: profiles of the most talkative are a fifth of
+/// it. With half of it some would be refused; without a bound a camera fills the memory.
+const LONGEST: usize = 256 << 10;
+/// The deepest nesting of an answer: ONVIF's own is fifteen or so. What reads it takes a part of the
+/// stack for each.
+const DEEPEST: usize = 64;
+
+/// HTTP to a camera.
+pub struct ToCamera {
+    client: Client,
+    digest: Option<DigestAuthSession>,
+}
+
+impl ToCamera {
+    /// As somebody, or as nobody.
+    ///
+    /// # Errors
+    /// If this host has no certificates of authorities.
+    pub fn new(login: Option<&Login>) -> anyhow::Result<Self> {
+        // Who asks is proved in every question: no other host is to be told it.
+        let client = Client::builder().redirect(Policy::none()).build();
+        let client =
+            client.context("nobody can be asked by HTTP: are ca-certificates installed?")?;
+        let digest = login.map(|login| DigestAuthSession::new(login.user(), login.password()));
+        Ok(Self { client, digest })
+    }
+}
+
+#[async_trait]
+impl Transport for ToCamera {
+    async fn soap_post(
+        &self,
+        url: &str,
+        action: &str,
+        body: String,
+    ) -> Result<String, TransportError> {
+        let content = format!("application/soap+xml; charset=utf-8; action=\"{action}\"");
+        let request = self.client.post(url).header("Content-Type", content).body(body);
+        let answer = match &self.digest {
+            None => request.send().await?,
+            Some(digest) => {
+                request.send_digest_auth(digest).await.map_err(|error| match error {
+                    diqwest::error::Error::Reqwest(error) => TransportError::Http(error),
+                    other => TransportError::HttpStatus { status: 401, body: other.to_string() },
+                })?
+            }
+        };
+        let status = answer.status().as_u16();
+        let refused = |body: String| TransportError::HttpStatus { status, body };
+        let text =
+            read(answer).await?.ok_or_else(|| refused("its answer is too long".to_owned()))?;
+        if depth(&text) > DEEPEST {
+            return Err(refused("its answer is too deep".to_owned()));
+        }
+        // Those with a fault say why.
+        if matches!(status, 200 | 400 | 500) { Ok(text) } else { Err(refused(text)) }
+    }
+}
+
+/// An answer, if it is no longer than it should be.
+async fn read(mut answer: Response) -> Result<Option<String>, TransportError> {
+    let mut bytes = Vec::new();
+    while let Some(chunk) = answer.chunk().await? {
+        if bytes.len() + chunk.len() > LONGEST {
+            return Ok(None);
+        }
+        bytes.extend_from_slice(&chunk);
+    }
+    Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
+}
+
+/// How deeply elements are nested, at least.
+fn depth(text: &str) -> usize {
+    let (mut open, mut deepest) = (0_usize, 0);
+    let bytes = text.as_bytes();
+    for (at, pair) in bytes.windows(2).enumerate() {
+        match pair {
+            b"</" | b"/>" => open = open.saturating_sub(1),
+            [b'<', next] if !matches!(next, b'?' | b'!') && bytes.get(at + 1) != Some(&b'/') => {
+                open += 1;
+                deepest = deepest.max(open);
+            }
+            _ => {}
+        }
+    }
+    deepest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn elements_within_one_another_are_counted() {
+        assert_eq!(depth("<?xml version='1.0'?><a><b/><c x='1'><d>t</d></c><!-- <z> --></a>"), 3);
+        assert_eq!(depth(&"<a>".repeat(1000)), 1000);
+        assert_eq!(depth("no element"), 0);
+    }
+}
