@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -9,7 +10,7 @@ use crossfix_message::{
     BearingFrame, CameraCalibration, Channel, Health, Key, Payload, Preview, Timestamp, TrackFrame,
     Version, decode,
 };
-use crossfix_recording::{Entry, RecordingReader, RecordingWriter};
+use crossfix_recording::{Entry, RecordingInfo, RecordingReader, RecordingWriter};
 use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
 use crossfix_transport::{Delivery, Link, Role};
 
@@ -47,6 +48,140 @@ fn a_recorder_that_is_started_again_goes_on_under_a_new_name() {
     std::thread::sleep(Duration::from_secs(1));
     assert!(overwritten.stop());
     RecordingReader::open(Path::new(&site.path("today.mcap"))).unwrap();
+}
+
+/// The recordings of a site that begin so, by their names.
+fn recordings(site: &Site, begin: &str) -> Vec<String> {
+    let folder = Path::new(&site.path("network.toml")).parent().unwrap().to_owned();
+    let names = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
+    let names = names.map(|name| name.into_string().unwrap());
+    let mut recordings: Vec<String> =
+        names.filter(|name| name.starts_with(begin) && name.ends_with(".mcap")).collect();
+    recordings.sort();
+    recordings
+}
+
+#[test]
+fn recordings_that_follow_one_another_are_each_whole_and_nothing_is_lost_between_them() {
+    let site = Site::new(16.0);
+    let (network, output) = (site.path("network.toml"), site.path("rolling.mcap"));
+    let recorder = site.start(&["record", "-c", &network, "-o", &output, "--rotate-min", "0.05"]);
+    let fusion = site.start_fusion();
+    let mut agents = site.start_agents(now_seconds() + 3.0, &["--wait-for-recorder"]);
+    assert!(agents.iter_mut().all(|agent| agent.wait()));
+    assert!(fusion.stop() && recorder.stop());
+
+    let files = recordings(&site, "rolling-");
+    assert!(files.len() >= 3, "{files:?}");
+    let is_bearing = |channel: &Channel| matches!(channel, Channel::Bearings(_));
+    let mut recorded = Vec::new();
+    for (place, file) in files.iter().enumerate() {
+        let path = site.path(file);
+        let info = RecordingInfo::of(Path::new(&path)).unwrap();
+        assert!(info.damage.is_none() && info.source.is_some(), "{file}: {info:?}");
+        let bearings = messages(Path::new(&path), is_bearing);
+        if place > 0 && !bearings.is_empty() {
+            // Whoever opens this one alone has the cameras before their first bearing.
+            let begins = messages(Path::new(&path), |_| true);
+            let first = begins.iter().position(|entry| is_bearing(&entry.key.channel)).unwrap();
+            let known: BTreeSet<&Channel> =
+                begins[..first].iter().map(|entry| &entry.key.channel).collect();
+            let calibrated = known.iter().filter(|one| matches!(one, Channel::Calibration(_)));
+            assert_eq!(calibrated.count(), 3, "{file}: {known:?}");
+            assert!(known.contains(&Channel::FusionHealth), "{file}: {known:?}");
+        }
+        recorded.extend(bearings);
+    }
+    let sent = messages(Path::new(&site.path("source.mcap")), is_bearing);
+    let ordered = |mut entries: Vec<Entry>| -> Vec<(Key, Vec<u8>)> {
+        entries.sort_by_key(|entry| (entry.data_time, entry.key.clone()));
+        entries.into_iter().map(|entry| (entry.key, entry.data)).collect()
+    };
+    let topics = |entries: &[(Key, Vec<u8>)]| -> Vec<Channel> {
+        entries.iter().map(|(key, _)| key.channel.clone()).collect()
+    };
+    let (recorded, sent) = (ordered(recorded), ordered(sent));
+    assert!(topics(&recorded) == topics(&sent), "{} of {}", recorded.len(), sent.len());
+
+    // Those of earlier runs go first.
+    let again = site.start(&[
+        "record",
+        "-c",
+        &network,
+        "-o",
+        &output,
+        "--rotate-min",
+        "60",
+        "--quota-gb",
+        "1e-9",
+    ]);
+    let deadline = Instant::now() + PATIENCE;
+    while recordings(&site, "rolling-").iter().any(|file| files.contains(file)) {
+        assert!(Instant::now() < deadline, "{:?}", recordings(&site, "rolling-"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    assert!(again.stop());
+    assert_eq!(recordings(&site, "rolling-").len(), 1, "that which was written stays");
+    assert!(Path::new(&site.path("source.mcap")).exists());
+}
+
+#[test]
+fn a_disk_without_room_loses_pictures_and_says_so() {
+    let site = Site::new(8.0);
+    let (network, output) = (site.path("network.toml"), site.path("live.mcap"));
+    // What no disk has is to be left free, so that a tenth of it is not there either.
+    let arguments = ["record", "-c", &network, "-o", &output, "--leave-free-gb", "1e9"];
+    let recorder = site.start_logged(&arguments, "recorder.log");
+    let mut agents = site.start_agents(now_seconds() + 3.0, &["--wait-for-recorder"]);
+    assert!(agents.iter_mut().all(|agent| agent.wait()));
+    assert!(recorder.stop());
+    assert!(
+        site.text("recorder.log").contains("the disk is full"),
+        "{}",
+        site.text("recorder.log")
+    );
+    let counted = |wanted: &dyn Fn(&Channel) -> bool| {
+        messages(Path::new(&output), |channel| wanted(channel)).len()
+    };
+    let sent = messages(Path::new(&site.path("source.mcap")), |channel| {
+        matches!(channel, Channel::Bearings(_))
+    });
+    assert_eq!(counted(&|channel| matches!(channel, Channel::Bearings(_))), sent.len());
+    let info = succeed(&["info", &output]);
+    assert!(info.contains("received_no_room") && info.contains("the disk is full"), "{info}");
+}
+
+#[test]
+fn what_is_left_of_a_torn_recording_becomes_a_whole_one() {
+    // Some chunks.
+    let site = Site::new(90.0);
+    let whole = std::fs::read(site.path("source.mcap")).unwrap();
+    let mut hurt = whole[..whole.len() * 2 / 3].to_vec();
+    // Damaged in the middle, too.
+    let middle = hurt.len() / 2;
+    hurt[middle..middle + 40].fill(0x5a);
+    std::fs::write(site.path("hurt.mcap"), &hurt).unwrap();
+    let (from, to) = (site.path("hurt.mcap"), site.path("whole.mcap"));
+    let said = succeed(&["recover", &from, "-o", &to]);
+    assert!(said.contains("read back; damaged at byte"), "{said}");
+    let info = RecordingInfo::of(Path::new(&to)).unwrap();
+    assert!(info.damage.is_none(), "{info:?}");
+    let all = |file: &str| {
+        let mut entries = Vec::new();
+        let reader = RecordingReader::open(Path::new(&site.path(file))).unwrap();
+        let take = |entry| {
+            entries.push(entry);
+            Ok::<_, std::convert::Infallible>(())
+        };
+        reader.for_each(take).unwrap();
+        entries
+    };
+    assert!(all("whole.mcap") == all("hurt.mcap") && all("whole.mcap").len() > 100);
+    // What was there stays if there is nothing to recover.
+    site.write("nothing.mcap", "no recording");
+    stderr(&["recover", &site.path("nothing.mcap"), "-o", &to], 1);
+    stderr(&["recover", &to, "-o", &to], 1);
+    assert!(all("whole.mcap") == all("hurt.mcap"));
 }
 
 #[test]

@@ -8,6 +8,7 @@ pub mod doctor;
 pub mod info;
 pub mod numbers;
 pub mod record;
+pub mod recover;
 pub mod sources;
 pub mod track;
 
@@ -43,6 +44,7 @@ pub enum Command {
     Sources(sources::Args),
     Track(track::Args),
     Record(record::Args),
+    Recover(recover::Args),
     Info(info::Args),
     Check(check::Args),
     Doctor(doctor::Args),
@@ -94,6 +96,7 @@ impl Command {
             Self::Sources(args) => sources::run(&args),
             Self::Track(args) => track::run(&args),
             Self::Record(args) => record::run(&args),
+            Self::Recover(args) => recover::run(&args),
             Self::Info(args) => info::run(&args),
             Self::Check(args) => check::run(&args),
             Self::Doctor(args) => doctor::run(&args),

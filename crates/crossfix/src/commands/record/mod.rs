@@ -1,15 +1,19 @@
 mod data_time;
+mod files;
 mod recorder;
+mod syncing;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{Channel, Key};
-use crossfix_recording::{RecordingError, RecordingWriter, Source};
+use crossfix_recording::Source;
 use crossfix_transport::{Delivery, Role, Subscription};
 
+use self::files::{Files, Limits};
 use self::recorder::{FileWriter, Recorder};
+use self::syncing::Syncing;
 use crate::config;
 use crate::health::{self, HealthArgs, HealthReporter};
 use crate::lookout::Lookout;
@@ -22,7 +26,9 @@ const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix record -c configs/site/network.toml -o today.mcap")]
+#[command(
+    after_help = "Examples:\n  crossfix record -c configs/site/network.toml -o today.mcap\n  crossfix record -c configs/site/network.toml -o site.mcap --rotate-min 10 --quota-gb 200"
+)]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -35,6 +41,8 @@ pub struct Args {
     #[arg(long)]
     overwrite: bool,
     #[command(flatten)]
+    limits: Limits,
+    #[command(flatten)]
     health: HealthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
@@ -44,62 +52,76 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
+    let mut files = Files::new(&args.output, args.overwrite, args.limits)?;
     // The file comes last: what cannot record must not touch it.
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
     let cameras: Vec<_> = network.cameras.keys().cloned().collect();
-    let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
-    let mut subscription = link.subscribe(&[Key::everything_of(link.site())])?;
-    let mut health =
+    let lookout = Lookout::for_cameras(&link, &network, &cameras)?;
+    let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
+    let health =
         HealthReporter::new(&args.health, &link, Channel::RecorderHealth, Delivery::Queued)?;
-    let (mut writer, path) = create(&args.output, args.overwrite)?;
-    writer.sign(&Source {
-        run: link.run().to_string(),
-        host: network::host(),
-        ..Source::of("record")
-    })?;
-    let mut recorder = Recorder::new(writer, &network, link.run());
+    let source =
+        Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") };
+    let mut recorder = Recorder::new(begin(&mut files, &source)?, &network, link.run());
     let alive = link.declare_alive(Channel::RecorderAlive)?;
-    tracing::info!("recording `{}` to {}, run {}", link.site(), path.display(), link.run());
+    let path = files.path().display().to_string();
+    tracing::info!("recording `{}` to {path}, run {}", link.site(), link.run());
 
-    service::ready(&format!("recording to {}", path.display()));
-    let recorded = work(&mut recorder, &mut subscription, &mut lookout, &mut health, &shutdown)
+    service::ready(&format!("recording to {path}"));
+    let mut disk = Disk { files, source, syncing: Syncing::start()? };
+    let mut parts = (subscription, lookout, health);
+    let recorded = work(&mut recorder, &mut disk, &mut parts, &shutdown)
         .context("recording has stopped; the rest of the site goes on");
-    drop((subscription, alive, health, lookout));
+    drop((parts, alive));
     let finished = recorded.and_then(|()| Ok(recorder.finish()?));
     link.close(LEAVE)?;
-    output::line(format!("{} messages recorded to {}", finished?, path.display()));
+    let path = disk.files.path().display();
+    output::line(match finished? {
+        (messages, 1) => format!("{messages} messages recorded to {path}"),
+        (messages, files) => format!("{messages} messages recorded to {files} files, last {path}"),
+    });
     Ok(())
 }
 
-/// A new file under the name that was asked for, or under the first of `today-2.mcap`,
-/// `today-3.mcap` .. that is free: a recorder that is started again must not destroy what it
-/// recorded before.
-fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)> {
-    // A device or a pipe has nothing that could be lost.
-    if overwrite || (asked.exists() && !asked.is_file()) {
-        return Ok((RecordingWriter::create(asked)?, asked.to_owned()));
-    }
-    for path in output::names(asked) {
-        match RecordingWriter::create_new(&path) {
-            Err(RecordingError::Exists { .. }) => {}
-            Err(error) => return Err(error.into()),
-            Ok(writer) => {
-                output::say_other_name(asked, &path);
-                return Ok((writer, path));
+/// Begins a file, and says in it who writes it.
+fn begin(files: &mut Files, source: &Source) -> anyhow::Result<FileWriter> {
+    let mut writer = files.create()?;
+    writer.sign(source)?;
+    Ok(writer)
+}
+
+/// Where recordings go.
+struct Disk {
+    files: Files,
+    source: Source,
+    syncing: Syncing,
+}
+
+impl Disk {
+    /// What is to be done each second: what was flushed survives a crash of the machine's programs,
+    /// and soon one of the machine; a file that is full gives way to the next.
+    fn keep(&mut self, recorder: &mut Recorder) -> anyhow::Result<()> {
+        recorder.flush()?;
+        self.syncing.ask(self.files.path());
+        if self.files.is_full() {
+            match begin(&mut self.files, &self.source) {
+                Ok(writer) => recorder.go_on(writer)?,
+                // Better one file that is too long.
+                Err(error) => recorder.note_trouble(&error),
             }
         }
+        recorder.heed(self.files.make_room());
+        Ok(())
     }
-    anyhow::bail!("{} is there, and so is every other name of it that was tried", asked.display())
 }
 
 /// Records until it is asked to stop, and for a moment what is still on its way.
 fn work(
     recorder: &mut Recorder,
-    subscription: &mut Subscription,
-    lookout: &mut Lookout,
-    reporter: &mut HealthReporter,
+    disk: &mut Disk,
+    (subscription, lookout, reporter): &mut (Subscription, Lookout, HealthReporter),
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
     let mut said_at = Instant::now();
@@ -118,8 +140,7 @@ fn work(
             lookout.look(said_at);
             let health = recorder.health(subscription.refused(), false, reporter)?;
             reporter.say(&health)?;
-            // What was flushed survives a crash of the machine's programs.
-            recorder.flush()?;
+            disk.keep(recorder)?;
         }
     }
     service::stopping();

@@ -1,4 +1,4 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::BufWriter;
 use std::time::Instant;
@@ -10,6 +10,7 @@ use crossfix_recording::{Entry, RecordingError, RecordingWriter};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
 use super::data_time::{DataTime, Said};
+use super::files::Room;
 use crate::health::HealthReporter;
 use crate::network::rivalry;
 use crate::pace::wall_seconds;
@@ -34,6 +35,12 @@ pub struct Recorder {
     reception: Reception,
     repeats: Repeats,
     counts: Counts,
+    /// What each file must begin with: the cameras' newest calibrations, and the fusion centre's
+    /// newest word on their clocks.
+    standing: BTreeMap<Key, Entry>,
+    room: Room,
+    /// Of the files before this one: how many, and how many messages are in them.
+    before: (u64, u64),
 }
 
 /// What was not recorded, or not as it should be.
@@ -44,6 +51,32 @@ struct Counts {
     malformed: u64,
     /// Of a newer major version: recorded all the same.
     newer: u64,
+    /// That the disk had no room for.
+    no_room: u64,
+}
+
+/// What a disk without room for everything costs.
+fn lacking(room: Room) -> Option<&'static str> {
+    match room {
+        Room::Pictures => None,
+        Room::Messages => Some("the disk is full: pictures are not recorded"),
+        Room::Tracks => {
+            Some("the disk is full: only bearings, calibrations and tracks are recorded")
+        }
+    }
+}
+
+/// What a disk must have room for if a message is to be recorded.
+fn room_for(channel: &Channel) -> Room {
+    match channel {
+        Channel::Bearings(_)
+        | Channel::Calibration(_)
+        | Channel::Tracks
+        | Channel::Events
+        | Channel::RecorderHealth => Room::Tracks,
+        Channel::Preview(_) => Room::Pictures,
+        _ => Room::Messages,
+    }
 }
 
 impl Recorder {
@@ -60,7 +93,38 @@ impl Recorder {
             reception: Reception::default(),
             repeats: Repeats::default(),
             counts: Counts::default(),
+            standing: BTreeMap::new(),
+            room: Room::default(),
+            before: (0, 0),
         }
+    }
+
+    /// Goes on in another file, which begins with what holds still.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if one of the files cannot be written.
+    pub fn go_on(&mut self, writer: FileWriter) -> Result<(), RecordingError> {
+        let full = std::mem::replace(&mut self.writer, writer);
+        let (files, messages) = self.before;
+        self.before = (files + 1, messages + full.finish()?);
+        let said = self.times.now();
+        for entry in self.standing.clone().into_values() {
+            self.write(entry, said)?;
+        }
+        Ok(())
+    }
+
+    /// Records from now on what there is room for.
+    pub fn heed(&mut self, room: Room) {
+        if room != self.room {
+            tracing::warn!("{}", lacking(room).unwrap_or("the disk has room for everything again"));
+        }
+        self.room = room;
+    }
+
+    /// Something went wrong that ends nothing.
+    pub fn note_trouble(&mut self, error: &anyhow::Error) {
+        self.repeats.warn("next file", Instant::now(), || format!("no new file: {error:#}"));
     }
 
     /// Records a message, if it is one of the site's.
@@ -103,6 +167,10 @@ impl Recorder {
                 return Ok(());
             }
         };
+        if self.room < room_for(&key.channel) {
+            self.counts.no_room += 1;
+            return Ok(());
+        }
         let arrival = Timestamp::from_seconds(wall_seconds());
         let said = if seen.is_readable {
             self.times.of(&key.channel, seen.time)
@@ -143,6 +211,9 @@ impl Recorder {
     }
 
     fn put(&mut self, entry: &Entry) -> Result<(), RecordingError> {
+        if matches!(entry.key.channel, Channel::Calibration(_) | Channel::FusionHealth) {
+            self.standing.insert(entry.key.clone(), entry.clone());
+        }
         match self.writer.write(entry) {
             Err(error @ RecordingError::TooLong { .. }) => {
                 self.counts.malformed += 1;
@@ -170,10 +241,12 @@ impl Recorder {
             ("received_foreign_camera", self.counts.foreign),
             ("received_malformed", self.counts.malformed),
             ("received_missing", self.reception.missing()),
+            ("received_no_room", self.counts.no_room),
             ("received_newer_version", self.counts.newer),
             ("received_too_long", refused.too_long),
         ];
         let mut problems = Vec::new();
+        problems.extend(lacking(self.room).map(str::to_owned));
         for (key, runs) in self.reception.rivals(now) {
             let rivalry = rivalry(key, runs);
             self.repeats.warn(&format!("rivals {key}"), now, || rivalry.clone());
@@ -186,7 +259,7 @@ impl Recorder {
         let health = Health {
             component: "recorder".to_owned(),
             time_ns: time.nanos(),
-            handled: self.writer.messages(),
+            handled: self.before.1 + self.writer.messages(),
             counters: counted
                 .into_iter()
                 .map(|(name, value)| Counter { name: name.to_owned(), value })
@@ -215,15 +288,16 @@ impl Recorder {
         self.writer.flush()
     }
 
-    /// Ends the file with its index; returns how many messages are in it.
+    /// Ends the file with its index; returns how many messages were recorded, to how many files.
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
-    pub fn finish(mut self) -> Result<u64, RecordingError> {
+    pub fn finish(mut self) -> Result<(u64, u64), RecordingError> {
         // Nothing ever said what time it is in the data: it is that of the wall.
         for held in std::mem::take(&mut self.held) {
             self.put(&Entry { data_time: held.arrival, ..held })?;
         }
-        self.writer.finish()
+        let (files, messages) = self.before;
+        Ok((messages + self.writer.finish()?, files + 1))
     }
 }

@@ -1,0 +1,330 @@
+//! The files of a recorder, one after the other, and how much of them and of the disk is used.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{bail, ensure};
+use crossfix_recording::{RecordingError, RecordingWriter};
+use time::OffsetDateTime;
+
+use super::recorder::FileWriter;
+use crate::commands::numbers;
+use crate::output;
+
+const MB: f64 = 1e6;
+const GB: f64 = 1e9;
+/// With this share of what is to be left free, only what tracks can be made of is recorded.
+const LAST_SHARE: f64 = 0.1;
+
+/// How large and how long a file gets, and how much all of them may take.
+#[derive(Clone, Copy, Debug, clap::Args)]
+pub struct Limits {
+    /// Begin a new file whenever one is so large, MB. Files are named by when they begin:
+    /// today-20261125T221700Z.mcap.
+    #[arg(long, value_name = "MB", value_parser = numbers::positive)]
+    rotate_mb: Option<f64>,
+    /// Begin a new file after so many minutes.
+    #[arg(long, value_name = "MINUTES", value_parser = numbers::positive)]
+    rotate_min: Option<f64>,
+    /// Remove the oldest of the files that are named so, also those of earlier runs, when together
+    /// they take more, GB.
+    #[arg(long, value_name = "GB", value_parser = numbers::positive)]
+    quota_gb: Option<f64>,
+    /// What is left free on the disk, GB. With less of it the oldest of these files goes; where there
+    /// is none, pictures are not recorded, and with a tenth of it, nothing but bearings,
+    /// calibrations and tracks.
+    #[arg(long, value_name = "GB", default_value_t = 0.5, value_parser = numbers::not_negative)]
+    leave_free_gb: f64,
+}
+
+impl Limits {
+    fn rotates(&self) -> bool {
+        self.rotate_mb.is_some() || self.rotate_min.is_some()
+    }
+}
+
+/// What the disk has room for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Room {
+    /// Bearings, calibrations and tracks.
+    Tracks,
+    /// All but pictures.
+    Messages,
+    /// Everything.
+    #[default]
+    Pictures,
+}
+
+impl Room {
+    /// With so many bytes free, of so many that are to be left.
+    fn of(free: f64, left: f64) -> Self {
+        if free < left * LAST_SHARE {
+            Self::Tracks
+        } else if free < left {
+            Self::Messages
+        } else {
+            Self::Pictures
+        }
+    }
+}
+
+/// The file that is written.
+#[derive(Debug)]
+struct Current {
+    path: PathBuf,
+    begun: Instant,
+}
+
+/// The files of a recorder.
+#[derive(Debug)]
+pub struct Files {
+    asked: PathBuf,
+    overwrite: bool,
+    limits: Limits,
+    current: Option<Current>,
+}
+
+impl Files {
+    /// Files under a name, or under names that begin as it does.
+    ///
+    /// # Errors
+    /// If what is asked for does not go together.
+    pub fn new(asked: &Path, overwrite: bool, limits: Limits) -> anyhow::Result<Self> {
+        ensure!(
+            limits.rotates() || limits.quota_gb.is_none(),
+            "--quota-gb removes files by their age: give --rotate-min or --rotate-mb, too"
+        );
+        ensure!(
+            !(limits.rotates() && overwrite),
+            "--overwrite replaces one file: with --rotate-min or --rotate-mb each has a name of its own"
+        );
+        Ok(Self { asked: asked.to_owned(), overwrite, limits, current: None })
+    }
+
+    /// Begins the next file.
+    ///
+    /// # Errors
+    /// If it cannot be made; the one before stays the one that is written.
+    pub fn create(&mut self) -> anyhow::Result<FileWriter> {
+        let (writer, path) = if self.limits.rotates() {
+            create_new(&self.named(OffsetDateTime::now_utc()))?
+        } else {
+            create(&self.asked, self.overwrite)?
+        };
+        self.current = Some(Current { path, begun: Instant::now() });
+        Ok(writer)
+    }
+
+    /// The file that is written.
+    pub fn path(&self) -> &Path {
+        self.current.as_ref().map_or(&self.asked, |current| &current.path)
+    }
+
+    /// Whether it is time for the next one.
+    pub fn is_full(&self) -> bool {
+        let Some(Current { path, begun }) = &self.current else { return false };
+        let Limits { rotate_mb, rotate_min, .. } = self.limits;
+        let is_long = rotate_min.is_some_and(|min| begun.elapsed().as_secs_f64() >= min * 60.0);
+        is_long || rotate_mb.is_some_and(|mb| bytes(path) >= mb * MB)
+    }
+
+    /// Removes old files until the quota and the disk allow for what is there; says what there is room
+    /// for.
+    pub fn make_room(&self) -> Room {
+        let left = self.limits.leave_free_gb * GB;
+        let quota = self.limits.quota_gb.map_or(f64::INFINITY, |gb| gb * GB);
+        let mut older = if self.limits.rotates() { self.older() } else { Vec::new() };
+        let mut taken =
+            older.iter().chain([&self.path().to_owned()]).map(|path| bytes(path)).sum::<f64>();
+        older.reverse();
+        loop {
+            let free = self.free();
+            if taken <= quota && free >= left {
+                return Room::Pictures;
+            }
+            let Some(oldest) = older.pop() else { return Room::of(free, left) };
+            let its = bytes(&oldest);
+            match std::fs::remove_file(&oldest) {
+                Ok(()) => {
+                    tracing::info!("{} is removed to make room", oldest.display());
+                    taken -= its;
+                }
+                Err(error) => {
+                    tracing::warn!("{} cannot be removed: {error}", oldest.display());
+                }
+            }
+        }
+    }
+
+    /// What is free on its disk, bytes; where nobody says, enough.
+    fn free(&self) -> f64 {
+        let folder = self.path().parent().filter(|folder| !folder.as_os_str().is_empty());
+        let disk = nix::sys::statvfs::statvfs(folder.unwrap_or(Path::new(".")));
+        disk.map_or(f64::INFINITY, |disk| {
+            disk.blocks_available() as f64 * disk.fragment_size() as f64
+        })
+    }
+
+    /// The name of a file that begins at a time.
+    fn named(&self, begins: OffsetDateTime) -> PathBuf {
+        let (stem, extension) = parts(&self.asked);
+        let (year, month, day) = begins.to_calendar_date();
+        let (hour, minute, second) = begins.to_hms();
+        let month = u8::from(month);
+        self.asked.with_file_name(format!(
+            "{stem}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}Z{extension}"
+        ))
+    }
+
+    /// The other files that are named so, the oldest first.
+    fn older(&self) -> Vec<PathBuf> {
+        let folder = self.asked.parent().filter(|folder| !folder.as_os_str().is_empty());
+        let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else {
+            return Vec::new();
+        };
+        let (stem, extension) = parts(&self.asked);
+        let mut named: Vec<(String, PathBuf)> = entries
+            .filter_map(|entry| {
+                let name = entry.ok()?.file_name().into_string().ok()?;
+                let begins =
+                    name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&extension)?;
+                is_a_beginning(begins)
+                    .then(|| (begins.to_owned(), self.asked.with_file_name(&name)))
+            })
+            .filter(|(_, path)| path.file_name() != self.path().file_name() && path.is_file())
+            .collect();
+        named.sort();
+        named.into_iter().map(|(_, path)| path).collect()
+    }
+}
+
+/// Whether a text is when a file began, as it stands in its name; with a number behind it if two began
+/// in one second.
+fn is_a_beginning(text: &str) -> bool {
+    let (time, number) = text.split_once('-').unwrap_or((text, "2"));
+    let is_time = time.len() == 16
+        && time.char_indices().all(|(place, letter)| match place {
+            8 => letter == 'T',
+            15 => letter == 'Z',
+            _ => letter.is_ascii_digit(),
+        });
+    is_time && !number.is_empty() && number.chars().all(|letter| letter.is_ascii_digit())
+}
+
+/// A file's name before and behind what is put in.
+fn parts(asked: &Path) -> (String, String) {
+    let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy()));
+    (stem, extension.unwrap_or_default())
+}
+
+fn bytes(path: &Path) -> f64 {
+    std::fs::metadata(path).map_or(0.0, |file| file.len() as f64)
+}
+
+/// A new file under the name that was asked for, or under the first of `today-2.mcap`,
+/// `today-3.mcap` .. that is free: a recorder that is started again must not destroy what it
+/// recorded before.
+fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)> {
+    // A device or a pipe has nothing that could be lost.
+    if overwrite || (asked.exists() && !asked.is_file()) {
+        return Ok((RecordingWriter::create(asked)?, asked.to_owned()));
+    }
+    let (writer, path) = create_new(asked)?;
+    output::say_other_name(asked, &path);
+    Ok((writer, path))
+}
+
+/// A new file under the first name that is free.
+fn create_new(asked: &Path) -> anyhow::Result<(FileWriter, PathBuf)> {
+    for path in output::names(asked) {
+        match RecordingWriter::create_new(&path) {
+            Err(RecordingError::Exists { .. }) => {}
+            Err(error) => return Err(error.into()),
+            Ok(writer) => return Ok((writer, path)),
+        }
+    }
+    bail!("{} is there, and so is every other name of it that was tried", asked.display())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn limits(quota_gb: Option<f64>) -> Limits {
+        Limits { rotate_mb: Some(1.0), rotate_min: None, quota_gb, leave_free_gb: 0.0 }
+    }
+
+    fn at(second: i64) -> OffsetDateTime {
+        OffsetDateTime::from_unix_timestamp(1_795_644_000 + second).unwrap()
+    }
+
+    #[test]
+    fn the_oldest_files_go_and_nothing_that_is_not_the_recorders() {
+        let folder = tempfile::tempdir().unwrap();
+        let asked = folder.path().join("site.mcap");
+        let mut files = Files::new(&asked, false, limits(Some(2.5e-3))).unwrap();
+        let others = [
+            "site.mcap",
+            "site-2.mcap",
+            "site-20261125.mcap",
+            "other-20261125T210000Z.mcap",
+            "site-20261125T210000Z.mcap.part",
+            "site-2026112xT210000Z.mcap",
+            "site-20261125T210000Z-x.mcap",
+        ];
+        for name in others {
+            std::fs::write(folder.path().join(name), vec![0; 1_000_000]).unwrap();
+        }
+        let old: Vec<PathBuf> = [0, 1, 2, 3].map(|k| files.named(at(k * 60))).into();
+        for path in &old {
+            std::fs::write(path, vec![0; 1_000_000]).unwrap();
+        }
+        drop(files.create().unwrap());
+        assert_eq!(files.make_room(), Room::Pictures);
+        let stays: Vec<bool> = old.iter().map(|path| path.exists()).collect();
+        assert_eq!(stays, [false, false, true, true]);
+        assert!(
+            others.iter().all(|name| folder.path().join(name).exists()) && files.path().exists()
+        );
+    }
+
+    #[test]
+    fn files_of_one_second_have_names_of_their_own_and_are_the_recorders() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut files = Files::new(&folder.path().join("a.mcap"), false, limits(None)).unwrap();
+        for _ in 0..3 {
+            drop(files.create().unwrap());
+        }
+        assert_eq!(files.older().len(), 2);
+        assert!(!files.is_full());
+        std::fs::write(files.path(), vec![0; 1_000_000]).unwrap();
+        assert!(files.is_full());
+    }
+
+    #[test]
+    fn a_disk_that_fills_loses_pictures_first_and_bearings_last() {
+        for (free, room) in [(2.0, Room::Pictures), (0.9, Room::Messages), (0.05, Room::Tracks)] {
+            assert_eq!(Room::of(free, 1.0), room);
+        }
+        // More than any disk has.
+        let folder = tempfile::tempdir().unwrap();
+        let endless = Limits { leave_free_gb: 1e12, ..limits(None) };
+        let mut files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
+        drop((files.create().unwrap(), files.create().unwrap()));
+        assert_eq!(files.make_room(), Room::Tracks);
+        assert_eq!(
+            files.older().len(),
+            0,
+            "the older one is gone, and the one that is written is not"
+        );
+        assert!(files.path().exists());
+    }
+
+    #[test]
+    fn limits_that_do_not_go_together_are_refused() {
+        let alone = Limits { rotate_mb: None, ..limits(Some(1.0)) };
+        assert!(Files::new(Path::new("a.mcap"), false, alone).is_err());
+        assert!(Files::new(Path::new("a.mcap"), true, limits(None)).is_err());
+    }
+}

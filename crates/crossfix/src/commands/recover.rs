@@ -1,0 +1,80 @@
+use std::convert::Infallible;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_recording::{Entry, ReadReport, RecordingReader, RecordingWriter, Source};
+
+use crate::output::{self, Draft};
+use crate::recorded::{self, Lacks};
+
+/// Make a whole recording of a torn or damaged one: all that can be read of it, with an index. What
+/// was written is read back before it gets its name.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  crossfix recover torn.mcap -o whole.mcap")]
+pub struct Args {
+    /// The recording (MCAP) that is torn or damaged.
+    recording: PathBuf,
+    /// The recording (MCAP) to write.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+/// What was read, to be compared: how many messages, and all of them in their order.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct Tally {
+    messages: u64,
+    all: u64,
+}
+
+impl Tally {
+    fn see(&mut self, entry: &Entry) {
+        let Entry { key, data_time, arrival, data } = entry;
+        let mut hasher = DefaultHasher::new();
+        (self.all, key, data_time.nanos(), arrival.nanos(), data).hash(&mut hasher);
+        (self.messages, self.all) = (self.messages + 1, hasher.finish());
+    }
+
+    /// What a whole file holds.
+    fn of(path: &Path) -> anyhow::Result<(Self, ReadReport)> {
+        let mut tally = Self::default();
+        let report = RecordingReader::open(path)?.for_each(|entry| {
+            tally.see(&entry);
+            Ok::<_, Infallible>(())
+        })?;
+        Ok((tally, report))
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let draft = Draft::new(&args.output, &[&args.recording])?;
+    ensure!(
+        !args.output.exists() || args.output.is_file(),
+        "{} cannot be read back",
+        args.output.display()
+    );
+    let mut writer = RecordingWriter::create(draft.path())?;
+    writer.sign(&Source::of("recover"))?;
+    let (mut tally, mut lacks) = (Tally::default(), Lacks::default());
+    recorded::for_each(&args.recording, &mut lacks, |_, entry| {
+        tally.see(&entry);
+        Ok(writer.write(&entry)?)
+    })?;
+    writer.finish()?;
+    lacks.ensure_found(tally.messages > 0, "message of Crossfix", &args.recording)?;
+    let (read_back, report) = Tally::of(draft.path()).context("what was written cannot be read")?;
+    ensure!(
+        read_back == tally && report.damage.is_none(),
+        "what was written is not what was read: {} of {} messages; nothing is kept",
+        read_back.messages,
+        tally.messages
+    );
+    draft.keep()?;
+    let lost = lacks.damage.map_or("it was whole".to_owned(), |damage| format!("damaged {damage}"));
+    output::line(format!(
+        "{} messages recovered to {}, and read back; {lost}",
+        tally.messages,
+        args.output.display()
+    ));
+    Ok(())
+}
