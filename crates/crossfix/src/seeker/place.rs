@@ -1,0 +1,71 @@
+//! Where a target should be, by a cue, and how far a track is from there.
+
+use std::f64::consts::TAU;
+
+use crossfix_geometry::{tangent_basis, turn_vector};
+use crossfix_message::{BearingTrack, Cue, Expected, Timestamp};
+use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
+
+/// Where something should be at a time, in the camera's frame at rest.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    pub(super) direction: Unit<Vector3<f64>>,
+    /// Along the tangents of the direction, rad^2.
+    pub(super) covariance: Matrix2<f64>,
+}
+
+/// The longer axis of where something may be, and its deviation, rad.
+pub(super) fn long_axis(place: &Place) -> (Vector3<f64>, f64) {
+    let axes = SymmetricEigen::new(place.covariance);
+    let (index, variance) = axes.eigenvalues.argmax();
+    let axis = tangent_basis(&place.direction) * axes.eigenvectors.column(index);
+    (axis, variance.max(0.0).sqrt())
+}
+
+/// How far a track is from where something should be, squared in the deviations of both.
+pub(super) fn squared_distance(
+    expected: &Place,
+    turned: &Rotation3<f64>,
+    track: &BearingTrack,
+) -> Option<f64> {
+    let own = Unit::try_new(Vector3::from(track.bearing?), 1e-6)?;
+    let direction = turned * own;
+    let tangents = tangent_basis(&expected.direction).transpose();
+    let turn = Rotation3::rotation_between(&expected.direction, &direction)?;
+    let offset: Vector2<f64> = tangents * turn_vector(&turn).cross(&expected.direction);
+    let [xx, xy, yy] = [track.covariance_xx, track.covariance_xy, track.covariance_yy];
+    // The track's tangents as they lie in those of the expectation.
+    let carried = turn.inverse() * (turned.matrix() * tangent_basis(&own));
+    let to_expected = tangents * carried;
+    let own = to_expected * Matrix2::new(xx, xy, xy, yy) * to_expected.transpose();
+    let squared = offset.dot(&((expected.covariance + own).try_inverse()? * offset));
+    (squared >= 0.0).then_some(squared)
+}
+
+/// Where a cue has its target at a time: between what it says of the times about it.
+pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
+    let seconds = |one: &Expected| Timestamp::from_nanos(one.time_ns).seconds_since(time);
+    let after = cue.ahead.iter().position(|one| seconds(one) >= 0.0);
+    let after = after.unwrap_or(cue.ahead.len().checked_sub(1)?).max(1);
+    let [Some(one), other] = [cue.ahead.get(after - 1), cue.ahead.get(after)] else { return None };
+    let (from, to) = (read(one)?, read(other.unwrap_or(one))?);
+    let (from_s, to_s) = (seconds(one), other.map_or(0.0, seconds));
+    let share = if to_s > from_s { -from_s / (to_s - from_s) } else { 0.0 };
+    // What is earlier than it says is as it says.
+    let share = share.clamp(0.0, 1.5);
+    let turn = Rotation3::rotation_between(&from.direction, &to.direction)?;
+    let part = Rotation3::new(turn_vector(&turn) * share);
+    Some(Place {
+        direction: part * from.direction,
+        covariance: from.covariance * (1.0 - share.min(1.0)) + to.covariance * share.min(1.0),
+    })
+}
+
+fn read(expected: &Expected) -> Option<Place> {
+    let direction = Unit::try_new(Vector3::from(expected.bearing?), 1e-6)?;
+    let [xx, xy, yy] = [expected.covariance_xx, expected.covariance_xy, expected.covariance_yy];
+    let covariance = Matrix2::new(xx, xy, xy, yy);
+    let possible = covariance.cholesky().is_some() && covariance.trace() < TAU.powi(2);
+    let finite = direction.iter().all(|part| part.is_finite());
+    (possible && finite).then_some(Place { direction, covariance })
+}
