@@ -1,5 +1,7 @@
 //! The files of a recorder, one after the other, and how much of them and of the disk is used.
 
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -7,9 +9,11 @@ use anyhow::{bail, ensure};
 use crossfix_recording::{RecordingError, RecordingWriter};
 use time::OffsetDateTime;
 
-use super::recorder::FileWriter;
 use crate::commands::numbers;
 use crate::output;
+
+/// Where a recording goes.
+pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
 const MB: f64 = 1e6;
 const GB: f64 = 1e9;

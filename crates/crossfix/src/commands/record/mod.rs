@@ -11,8 +11,8 @@ use crossfix_message::{Channel, Key};
 use crossfix_recording::Source;
 use crossfix_transport::{Delivery, Role, Subscription};
 
-use self::files::{Files, Limits};
-use self::recorder::{FileWriter, Recorder};
+use self::files::{FileWriter, Files, Limits};
+use self::recorder::Recorder;
 use self::syncing::Syncing;
 use crate::config;
 use crate::health::{self, HealthArgs, HealthReporter};

@@ -1,16 +1,14 @@
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::BufWriter;
 use std::time::Instant;
 
 use crossfix_message::{
     CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, glance,
 };
-use crossfix_recording::{Entry, RecordingError, RecordingWriter};
+use crossfix_recording::{Entry, RecordingError};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
 use super::data_time::{DataTime, Said};
-use super::files::Room;
+use super::files::{FileWriter, Room};
 use crate::health::HealthReporter;
 use crate::network::rivalry;
 use crate::pace::wall_seconds;
@@ -19,9 +17,6 @@ use crate::repeats::Repeats;
 /// Bytes of messages that are held until there are data that say what time it is: what a site of a
 /// hundred cameras says of itself in minutes. More is written down with the time of its arrival.
 const MOST_HELD_BYTES: usize = 8 << 20;
-
-/// Where a recording goes.
-pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
 /// What the recorder has to do with a message: no clock but that of its arrival, no network.
 pub struct Recorder {
