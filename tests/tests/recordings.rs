@@ -3,7 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot set itself up has failed")]
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
@@ -11,7 +12,7 @@ use crossfix_message::{
     Version, decode,
 };
 use crossfix_recording::{Entry, RecordingInfo, RecordingReader, RecordingWriter};
-use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, succeed};
+use crossfix_tests::{PATIENCE, Site, crossfix, messages, now_seconds, program, succeed};
 use crossfix_transport::{Delivery, Link, Role};
 
 fn stderr(arguments: &[&str], code: i32) -> String {
@@ -50,15 +51,33 @@ fn a_recorder_that_is_started_again_goes_on_under_a_new_name() {
     RecordingReader::open(Path::new(&site.path("today.mcap"))).unwrap();
 }
 
-/// The recordings of a site that begin so, by their names.
-fn recordings(site: &Site, begin: &str) -> Vec<String> {
-    let folder = Path::new(&site.path("network.toml")).parent().unwrap().to_owned();
+/// The recordings of a folder that begin so, by their names.
+fn recordings_in(folder: &Path, begin: &str) -> Vec<String> {
     let names = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
     let names = names.map(|name| name.into_string().unwrap());
     let mut recordings: Vec<String> =
         names.filter(|name| name.starts_with(begin) && name.ends_with(".mcap")).collect();
     recordings.sort();
     recordings
+}
+
+fn recordings(site: &Site, begin: &str) -> Vec<String> {
+    recordings_in(&folder_of(site), begin)
+}
+
+fn folder_of(site: &Site) -> PathBuf {
+    Path::new(&site.path("network.toml")).parent().unwrap().to_owned()
+}
+
+/// All that can be read of a recording, whole or torn.
+fn entries(recording: &Path) -> Vec<Entry> {
+    let mut entries = Vec::new();
+    let take = |entry| {
+        entries.push(entry);
+        Ok::<_, std::convert::Infallible>(())
+    };
+    RecordingReader::open(recording).unwrap().for_each(take).unwrap();
+    entries
 }
 
 #[test]
@@ -151,6 +170,57 @@ fn a_disk_without_room_loses_pictures_and_says_so() {
     assert!(info.contains("received_no_room") && info.contains("the disk is full"), "{info}");
 }
 
+/// Full before anybody looked: what was recorded first goes, and it goes on.
+#[test]
+fn a_disk_that_is_full_at_once_costs_the_oldest_recording() {
+    let unshared = Command::new("unshare").args(["-m", "true"]).status();
+    if !unshared.is_ok_and(|status| status.success()) {
+        eprintln!("SKIPPED: no disk of one's own can be mounted here (unshare -m, as root)");
+        return;
+    }
+    let site = Site::new(16.0);
+    let folder = folder_of(&site);
+    ["disk", "out"].iter().for_each(|name| std::fs::create_dir(folder.join(name)).unwrap());
+    // A disk of its own, with two recordings of before and next to no room.
+    let script = r#"
+        mount -t tmpfs -o size=1m tmpfs disk
+        head -c 480000 /dev/zero > disk/site-20200101T000000Z.mcap
+        head -c 480000 /dev/zero > disk/site-20200102T000000Z.mcap
+        "$0" record -c network.toml -o disk/site.mcap --rotate-min 60 --leave-free-gb 0 &
+        recorder=$!
+        trap 'kill -TERM $recorder' TERM
+        wait $recorder
+        wait $recorder
+        ended=$?
+        cp disk/*.mcap out/
+        exit $ended
+    "#;
+    let log = std::fs::File::create(site.path("recorder.log")).unwrap();
+    let mut recorder = Command::new("unshare")
+        .args(["-m", "bash", "-c", script])
+        .arg(program())
+        .current_dir(&folder)
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    assert!(site.wait_for_line("recorder.log", "recording `test`", PATIENCE));
+    let mut agents = site.start_agents(now_seconds() + 1.0, &["--no-wait"]);
+    assert!(agents.iter_mut().all(|agent| agent.wait()));
+    Command::new("kill").arg(recorder.id().to_string()).status().unwrap();
+    assert!(recorder.wait().unwrap().success(), "{}", site.text("recorder.log"));
+
+    let files = recordings_in(&folder.join("out"), "site-");
+    assert_eq!(files[0], "site-20200102T000000Z.mcap", "{}", site.text("recorder.log"));
+    assert_eq!(files.len(), 3, "one that was torn, and one after it: {files:?}");
+    let is_bearing = |entry: &Entry| matches!(entry.key.channel, Channel::Bearings(_));
+    let recorded = files[1..].iter().flat_map(|file| entries(&folder.join("out").join(file)));
+    let recorded = recorded.filter(is_bearing).count();
+    let sent = entries(&folder.join("source.mcap")).into_iter().filter(is_bearing).count();
+    // What was written in the second before is lost, twice as much in these times.
+    assert!(recorded > sent - sent * 3 / 16, "{recorded} of {sent}");
+    assert!(site.text("recorder.log").contains("is removed to make room"));
+}
+
 #[test]
 fn what_is_left_of_a_torn_recording_becomes_a_whole_one() {
     // Some chunks.
@@ -166,16 +236,8 @@ fn what_is_left_of_a_torn_recording_becomes_a_whole_one() {
     assert!(said.contains("read back; damaged at byte"), "{said}");
     let info = RecordingInfo::of(Path::new(&to)).unwrap();
     assert!(info.damage.is_none(), "{info:?}");
-    let all = |file: &str| {
-        let mut entries = Vec::new();
-        let reader = RecordingReader::open(Path::new(&site.path(file))).unwrap();
-        let take = |entry| {
-            entries.push(entry);
-            Ok::<_, std::convert::Infallible>(())
-        };
-        reader.for_each(take).unwrap();
-        entries
-    };
+    assert_eq!(info.source.unwrap().command, "recover of simulate");
+    let all = |file: &str| entries(Path::new(&site.path(file)));
     assert!(all("whole.mcap") == all("hurt.mcap") && all("whole.mcap").len() > 100);
     // What was there stays if there is nothing to recover.
     site.write("nothing.mcap", "no recording");

@@ -93,7 +93,9 @@ fn the_units_start_what_there_is() {
         assert_eq!(words[0], "/usr/bin/crossfix");
         let help = succeed(&[words[1], "--help"]);
         for option in words[2..].iter().filter(|word| word.starts_with('-')) {
-            assert!(help.contains(&format!("{option}, --")), "{line}");
+            let is_long = option.starts_with("--");
+            let shown = if is_long { format!("{option} ") } else { format!("{option}, --") };
+            assert!(help.contains(&shown), "{line}");
         }
         assert!(text.contains("Type=notify") && text.contains("WatchdogSec="), "{line}");
         seen += 1;

@@ -45,6 +45,11 @@ const STEP: f64 = 0.8;
 const SEARCHED_SDS: f64 = 2.0;
 /// A stripe of more views than this has its nearest ones looked at.
 const MOST_VIEWS: i32 = 40;
+/// What has not been seen for so long is seen no more, s: a detector misses one now and then.
+const MISSED_S: f64 = 0.5;
+/// What was found so lately is still what it looks for, s, though a surer target is told of: a turn and
+/// a stare.
+const FOUND_S: f64 = 4.0;
 /// More cues, or more times of one, than a fusion centre tells are of none.
 const MOST_CUES: usize = 64;
 const MOST_TIMES: usize = 16;
@@ -69,6 +74,11 @@ pub trait Mount: Send {
 
     /// Where it pointed in the newest image.
     fn pointed(&mut self) -> Pointed;
+
+    /// Whether it turns where it is told at present.
+    fn obeys(&self) -> bool {
+        true
+    }
 }
 
 /// What a camera should do, by what it has seen.
@@ -93,6 +103,7 @@ struct Search {
 struct Candidate {
     image_track: u64,
     images: u32,
+    seen: Timestamp,
 }
 
 /// Looks for what it is told to look for.
@@ -101,14 +112,18 @@ pub struct Seeker {
     mount: Option<PanTilt>,
     /// What each angle that the mount says is off by, rad.
     angle_sd_rad: f64,
-    /// Half of the shorter side of the view, rad.
+    /// Half of the shorter side of the view, and of its diagonal, rad.
     half_view: f64,
+    half_diagonal: f64,
     cues: CueFrame,
     /// What it is on, and where that was last, in the frame at rest.
     of: Option<Cued>,
     last: Option<Unit<Vector3<f64>>>,
     candidate: Option<Candidate>,
+    /// When it was found last, in this view or in one before.
+    found: Option<Timestamp>,
     search: Option<Search>,
+    holds: bool,
     /// Where its mount was told to point last.
     ordered: Option<ScanAngles>,
 }
@@ -120,15 +135,20 @@ impl Seeker {
         let half_view = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
         let half_view =
             half_view(lens.size.width, lens.fx).min(half_view(lens.size.height, lens.fy));
+        let [x, y] = [f64::from(lens.size.width) / lens.fx, f64::from(lens.size.height) / lens.fy];
+        let half_diagonal = (x.hypot(y) / 2.0).atan();
         Self {
             mount,
             angle_sd_rad,
             half_view,
+            half_diagonal,
             cues: CueFrame::default(),
             of: None,
             last: None,
             candidate: None,
+            found: None,
             search: None,
+            holds: false,
             ordered: None,
         }
     }
@@ -144,6 +164,11 @@ impl Seeker {
         });
     }
 
+    /// Its mount does not turn at present: it sees on where it is.
+    pub fn hold(&mut self, holds: bool) {
+        self.holds = holds;
+    }
+
     /// What to do, by the tracks of an image that was taken at a time by the camera's clock, and where
     /// it pointed then.
     pub fn look(&mut self, time: Timestamp, pointed: Pointed, tracks: &[BearingTrack]) -> Orders {
@@ -151,12 +176,17 @@ impl Seeker {
         self.last = Some(now.direction);
         let taken = match pointed {
             Pointed::Fixed => {
-                self.recognise(&now, ScanAngles { azimuth: 0.0, elevation: 0.0 }, tracks)
+                let at_rest = ScanAngles { azimuth: 0.0, elevation: 0.0 };
+                self.recognise(&now, at_rest, tracks, time)
             }
-            Pointed::Settled(angles) => self.recognise(&now, angles, tracks),
+            Pointed::Settled(angles) => self.recognise(&now, angles, tracks, time),
             Pointed::Unknown | Pointed::Turning(_) => None,
         };
-        let aim = self.mount.and_then(|mount| self.aim(&mount, pointed, &cue, &now, time));
+        if taken.is_some() {
+            self.found = Some(time);
+        }
+        let mount = self.mount.filter(|_| !self.holds);
+        let aim = mount.and_then(|mount| self.aim(&mount, pointed, &cue, &now, time));
         if aim.is_some() {
             // Of another view nothing is known.
             (self.candidate, self.ordered) = (None, aim);
@@ -170,7 +200,7 @@ impl Seeker {
     /// nothing was found of, of what is best looked for.
     fn choose(&mut self, time: Timestamp) -> Option<(Cue, Place)> {
         let is_sure = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
-        let is_found = self.candidate.is_some_and(|candidate| candidate.images >= IMAGES);
+        let is_found = self.found.is_some_and(|found| is_lately(found, time, FOUND_S));
         let reached: Vec<(&Cue, Place)> = self
             .cues
             .cues
@@ -188,7 +218,7 @@ impl Seeker {
         let best = same.or(beside).or_else(|| sure().next()).or(reached.first());
         let (cue, place) = best.map(|(cue, place)| ((*cue).clone(), *place))?;
         if cue.of != self.of {
-            (self.candidate, self.search) = (None, None);
+            (self.candidate, self.found, self.search) = (None, None, None);
             self.of = cue.of.clone();
         }
         Some((cue, place))
@@ -196,10 +226,12 @@ impl Seeker {
 
     /// Whether a place can be brought into view.
     fn reaches(&self, place: &Place) -> bool {
-        let Some(mount) = &self.mount else { return true };
-        let nearest = axis(mount, mount.aim(&place.direction));
         let (_, long_sd) = long_axis(place);
-        nearest.angle(&place.direction) < self.half_view + SEARCHED_SDS * long_sd
+        let (nearest, view) = match &self.mount {
+            Some(mount) => (axis(mount, mount.aim(&place.direction)), self.half_view),
+            None => (Vector3::z(), self.half_diagonal),
+        };
+        nearest.angle(&place.direction) < view + SEARCHED_SDS * long_sd
     }
 
     /// The track that is where the cue has the target, if it has been for some images.
@@ -208,6 +240,7 @@ impl Seeker {
         now: &Place,
         angles: ScanAngles,
         tracks: &[BearingTrack],
+        time: Timestamp,
     ) -> Option<u64> {
         let turned = self.mount.map_or_else(Rotation3::identity, |mount| turn_of(&mount, angles));
         let seen = tracks.iter().filter(|track| track.state() == ImageTrackState::Tracking);
@@ -230,14 +263,15 @@ impl Seeker {
             [(nearest, first), (next, _), ..] if next > nearest + RUNNER_UP => Some(first),
             _ => None,
         };
-        let image_track = known.map_or(clear, |candidate| Some(candidate.image_track));
-        self.candidate = image_track.map(|image_track| {
-            let before = self.candidate.filter(|before| before.image_track == image_track);
-            Candidate { image_track, images: before.map_or(1, |before| before.images + 1) }
-        });
-        self.candidate
-            .filter(|candidate| candidate.images >= IMAGES)
-            .map(|candidate| candidate.image_track)
+        let Some(image_track) = known.map_or(clear, |candidate| Some(candidate.image_track)) else {
+            // A detector misses one now and then.
+            self.candidate = self.candidate.filter(|before| is_lately(before.seen, time, MISSED_S));
+            return None;
+        };
+        let before = self.candidate.filter(|before| before.image_track == image_track);
+        let images = before.map_or(1, |before| before.images + 1);
+        self.candidate = Some(Candidate { image_track, images, seen: time });
+        (images >= IMAGES).then_some(image_track)
     }
 
     /// Where to point from now on, if that is elsewhere than where it does or soon will.
@@ -296,7 +330,7 @@ impl Seeker {
         time: Timestamp,
     ) -> Option<ScanAngles> {
         // What is recognised is stared at: two cameras together will soon know where it is.
-        if self.candidate.is_some() {
+        if self.candidate.is_some() || self.found.is_some_and(|f| is_lately(f, time, STARE_S)) {
             return None;
         }
         let step = 2.0 * self.half_view * STEP;
@@ -323,6 +357,11 @@ impl Seeker {
 /// Where the camera looks along with its mount at angles, in its frame at rest.
 fn axis(mount: &PanTilt, angles: ScanAngles) -> Vector3<f64> {
     turn_of(mount, angles) * Vector3::z()
+}
+
+/// Whether a time lies no more than so many seconds back.
+fn is_lately(then: Timestamp, now: Timestamp, seconds: f64) -> bool {
+    (0.0..=seconds).contains(&now.seconds_since(then))
 }
 
 /// Whether a cue is of about now.

@@ -3,13 +3,15 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use crossfix_recording::{Entry, ReadReport, RecordingReader, RecordingWriter, Source};
+use crossfix_recording::{
+    Entry, ReadReport, RecordingInfo, RecordingReader, RecordingWriter, Source,
+};
 
 use crate::output::{self, Draft};
-use crate::recorded::{self, Lacks};
+use crate::recorded::Lacks;
 
-/// Make a whole recording of a torn or damaged one: all that can be read of it, with an index. What
-/// was written is read back before it gets its name.
+/// Make a whole recording of a torn or damaged one: all of Crossfix's that can be read of it, with an
+/// index. What was written is read back before it gets its name.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  crossfix recover torn.mcap -o whole.mcap")]
 pub struct Args {
@@ -53,14 +55,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         "{} cannot be read back",
         args.output.display()
     );
-    let mut writer = RecordingWriter::create(draft.path())?;
-    writer.sign(&Source::of("recover"))?;
-    let (mut tally, mut lacks) = (Tally::default(), Lacks::default());
-    recorded::for_each(&args.recording, &mut lacks, |_, entry| {
-        tally.see(&entry);
-        Ok(writer.write(&entry)?)
-    })?;
-    writer.finish()?;
+    let (tally, read) = rewrite(&args.recording, draft.path())?;
+    let lacks = Lacks { damage: read.damage, ..Lacks::default() };
     lacks.ensure_found(tally.messages > 0, "message of Crossfix", &args.recording)?;
     let (read_back, report) = Tally::of(draft.path()).context("what was written cannot be read")?;
     ensure!(
@@ -70,11 +66,31 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         tally.messages
     );
     draft.keep()?;
-    let lost = lacks.damage.map_or("it was whole".to_owned(), |damage| format!("damaged {damage}"));
+    let mut lost =
+        lacks.damage.map_or("it was whole".to_owned(), |damage| format!("damaged {damage}"));
+    if read.foreign > 0 {
+        lost = format!("{lost}; {} messages that are not Crossfix's were left out", read.foreign);
+    }
     output::line(format!(
         "{} messages recovered to {}, and read back; {lost}",
         tally.messages,
         args.output.display()
     ));
     Ok(())
+}
+
+/// Writes what can be read of a recording, and whose it is.
+fn rewrite(from: &Path, to: &Path) -> anyhow::Result<(Tally, ReadReport)> {
+    let Source { command, run, host, .. } = RecordingInfo::of(from)?.source.unwrap_or_default();
+    let own = Source::of("recover");
+    let command = format!("{} of {command}", own.command);
+    let mut writer = RecordingWriter::create(to)?;
+    writer.sign(&Source { command, run, host, ..own })?;
+    let mut tally = Tally::default();
+    let report = RecordingReader::open(from)?.for_each(|entry| {
+        tally.see(&entry);
+        writer.write(&entry)
+    })?;
+    writer.finish()?;
+    Ok((tally, report))
 }

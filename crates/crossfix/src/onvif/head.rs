@@ -98,11 +98,13 @@ impl Head {
         }
     }
 
-    fn order(&mut self, to: ScanAngles, now: Instant) {
-        let since_s = |refused: Instant| now.duration_since(refused);
-        if self.refused.is_none_or(|refused| since_s(refused) > ASKED_TO_TURN_AGAIN) {
-            self.order = Some(Order { to, sent: None });
-        }
+    fn order(&mut self, to: ScanAngles) {
+        self.order = Some(Order { to, sent: None });
+    }
+
+    /// Whether it has not refused to turn of late.
+    fn obeys(&self, now: Instant) -> bool {
+        self.refused.is_none_or(|refused| now.duration_since(refused) > ASKED_TO_TURN_AGAIN)
     }
 
     /// It does not turn there: it goes on where it is.
@@ -232,7 +234,11 @@ impl Drop for OnvifMount {
 
 impl Mount for OnvifMount {
     fn aim(&mut self, angles: ScanAngles) {
-        self.shared.with(|head| head.order(angles, Instant::now()));
+        self.shared.with(|head| head.order(angles));
+    }
+
+    fn obeys(&self) -> bool {
+        self.shared.with(|head| head.obeys(Instant::now()))
     }
 
     fn pointed(&mut self) -> Pointed {

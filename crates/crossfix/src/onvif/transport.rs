@@ -80,21 +80,42 @@ async fn read(mut answer: Response) -> Result<Option<String>, TransportError> {
     Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
 }
 
-/// How deeply elements are nested, at least.
+/// How deeply elements are nested.
 fn depth(text: &str) -> usize {
     let (mut open, mut deepest) = (0_usize, 0);
-    let bytes = text.as_bytes();
-    for (at, pair) in bytes.windows(2).enumerate() {
-        match pair {
-            b"</" | b"/>" => open = open.saturating_sub(1),
-            [b'<', next] if !matches!(next, b'?' | b'!') && bytes.get(at + 1) != Some(&b'/') => {
-                open += 1;
-                deepest = deepest.max(open);
-            }
+    let mut rest = text;
+    while let Some(begin) = rest.find('<') {
+        rest = &rest[begin..];
+        // What is written in these is no element, whatever it looks like.
+        let aside = [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>"), ("<!", ">"), ("</", ">")];
+        if let Some((begin, end)) = aside.iter().find(|(begin, _)| rest.starts_with(begin)) {
+            open = open.saturating_sub(usize::from(*begin == "</"));
+            let inside = &rest[begin.len()..];
+            rest = inside.find(end).map_or("", |at| &inside[at + end.len()..]);
+            continue;
+        }
+        let end = end_of_tag(rest);
+        if !rest[..end].ends_with('/') {
+            open += 1;
+            deepest = deepest.max(open);
+        }
+        rest = &rest[end..];
+    }
+    deepest
+}
+
+/// Where a tag ends that begins here: at a `>` that stands in no quotes.
+fn end_of_tag(text: &str) -> usize {
+    let mut quote = None;
+    for (at, letter) in text.char_indices() {
+        match (quote, letter) {
+            (None, '>') => return at,
+            (None, '"' | '\'') => quote = Some(letter),
+            (Some(begun), _) if begun == letter => quote = None,
             _ => {}
         }
     }
-    deepest
+    text.len()
 }
 
 #[cfg(test)]
@@ -106,5 +127,11 @@ mod tests {
         assert_eq!(depth("<?xml version='1.0'?><a><b/><c x='1'><d>t</d></c><!-- <z> --></a>"), 3);
         assert_eq!(depth(&"<a>".repeat(1000)), 1000);
         assert_eq!(depth("no element"), 0);
+        // What only looks like an end is none.
+        for hides in
+            ["<b x=\"/>/></a></a>\"/>", "<!-- </a></a> -->", "<![CDATA[</a></a>]]>", "<?x </a> ?>"]
+        {
+            assert_eq!(depth(&format!("<a>{hides}").repeat(100)), 100, "{hides}");
+        }
     }
 }

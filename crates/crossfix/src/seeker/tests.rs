@@ -166,14 +166,58 @@ fn old_and_impossible_cues_move_nothing() {
 }
 
 #[test]
-fn a_camera_that_stands_still_takes_over_and_turns_nothing() {
-    let mut seeker = Seeker::new(&model(), None, 0.0);
-    seeker.hear(cue(1.0, 0.02, 0.0, [1e-3; 2]));
+fn a_camera_that_stands_still_takes_over_what_it_sees_and_turns_nothing() {
+    let wide = Intrinsics { fx: 1000.0, fy: 1000.0, ..*model().intrinsics() };
+    let mut seeker = Seeker::new(&CameraModel::new(wide).unwrap(), None, 0.0);
+    // Another target is nearer, and beside its image.
+    let mut cues = cue(1.0, 1.5, 0.0, [1e-3; 2]);
+    cues.cues.push(cue(1.0, 0.02, 0.0, [1e-3; 2]).cues.remove(0));
+    cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
+    seeker.hear(cues);
     let seen = track(3, REST, 0.02, 0.2);
     let orders: Vec<Orders> =
         (0..3).map(|_| seeker.look(seconds(1.1), Pointed::Fixed, &[seen])).collect();
     assert!(orders.iter().all(|orders| orders.aim.is_none()));
-    assert_eq!(orders[2].taken_over.as_ref().unwrap().image_track_id, 3);
+    let taken = orders[2].taken_over.as_ref().unwrap();
+    assert_eq!((taken.image_track_id, taken.of.as_ref().unwrap().track_id), (3, 8));
+}
+
+/// A detector misses an image, and the mount does not obey: it stays on what it has found.
+#[test]
+fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody_heeds() {
+    let stripe = |t: f64| {
+        let mut cues = cue(t, 0.3, 0.0, [0.3, 1e-1]);
+        cues.cues[0].of = Some(Cued { camera: "north".into(), ..Default::default() });
+        cues
+    };
+    let at = ScanAngles { azimuth: 0.3, elevation: 0.2 };
+    let seen = track(4, at, 0.3, 0.2);
+    let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+    for k in 0..60 {
+        let t = 1.0 + 0.05 * f64::from(k);
+        seeker.hear(stripe(t));
+        let missed = [20, 30, 31].contains(&k);
+        let tracks = if missed { &[][..] } else { std::slice::from_ref(&seen) };
+        let orders = seeker.look(seconds(t), Pointed::Settled(at), tracks);
+        assert_eq!(orders.aim, None, "{k}");
+        assert_eq!(orders.taken_over.is_some(), k >= 2 && !missed, "{k}");
+    }
+    // Out of the middle, and it may not turn.
+    let aside = ScanAngles { azimuth: 0.3 - 0.06, elevation: 0.2 };
+    let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
+    seeker.hold(true);
+    let seen = track(4, aside, 0.3, 0.2);
+    let looks: Vec<Orders> = (0..5)
+        .map(|k| {
+            let t = 1.0 + 0.05 * f64::from(k);
+            seeker.hear(cue(t, 0.3, 0.0, [1e-3; 2]));
+            seeker.look(seconds(t), Pointed::Settled(aside), &[seen])
+        })
+        .collect();
+    assert!(looks.iter().all(|orders| orders.aim.is_none()) && looks[4].taken_over.is_some());
+    seeker.hold(false);
+    let orders = seeker.look(seconds(1.25), Pointed::Settled(aside), &[seen]);
+    assert!(orders.aim.is_some());
 }
 
 /// The angles that a mount says are off by a good deal more than the cue is.

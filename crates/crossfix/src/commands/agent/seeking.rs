@@ -79,6 +79,7 @@ impl Seeking {
                 self.seeker.hear(cues);
             }
         }
+        self.seeker.hold(self.mount.as_ref().is_some_and(|mount| !mount.obeys()));
         let time = Timestamp::from_nanos(frame.capture_time_ns);
         let Orders { aim, taken_over } = self.seeker.look(time, self.pointed, &frame.tracks);
         if let (Some(mount), Some(aim)) = (&mut self.mount, aim) {

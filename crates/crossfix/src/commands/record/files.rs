@@ -6,17 +6,20 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{bail, ensure};
-use crossfix_recording::{RecordingError, RecordingWriter};
+use crossfix_recording::{RecordingError, RecordingWriter, Source};
 use time::OffsetDateTime;
 
 use crate::commands::numbers;
 use crate::output;
+use crate::repeats::Repeats;
 
 /// Where a recording goes.
 pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
 const MB: f64 = 1e6;
 const GB: f64 = 1e9;
+/// So many old recordings are removed one after the other that make no room, and no more.
+const MOST_IN_VAIN: u32 = 10;
 /// With this share of what is to be left free, only what tracks can be made of is recorded.
 const LAST_SHARE: f64 = 0.1;
 
@@ -77,6 +80,15 @@ impl Room {
 struct Current {
     path: PathBuf,
     begun: Instant,
+    /// Held as long as it is written: no other recorder removes it.
+    _lock: Option<File>,
+}
+
+/// What has been removed to make room, and what was free before, bytes.
+#[derive(Clone, Copy, Debug)]
+struct Removed {
+    bytes: f64,
+    free_before: f64,
 }
 
 /// The files of a recorder.
@@ -86,6 +98,14 @@ pub struct Files {
     overwrite: bool,
     limits: Limits,
     current: Option<Current>,
+    /// Those that this run has ended, in their order: clocks may have been set meanwhile.
+    ended: Vec<PathBuf>,
+    /// The others that are named so, with their sizes, bytes; the oldest last.
+    older: Vec<(PathBuf, f64)>,
+    removed: Option<Removed>,
+    /// How many files have been removed one after the other that made no room.
+    in_vain: u32,
+    repeats: Repeats,
 }
 
 impl Files {
@@ -102,20 +122,41 @@ impl Files {
             !(limits.rotates() && overwrite),
             "--overwrite replaces one file: with --rotate-min or --rotate-mb each has a name of its own"
         );
-        Ok(Self { asked: asked.to_owned(), overwrite, limits, current: None })
+        let mut files = Self {
+            asked: asked.to_owned(),
+            overwrite,
+            limits,
+            current: None,
+            ended: Vec::new(),
+            older: Vec::new(),
+            removed: None,
+            in_vain: 0,
+            repeats: Repeats::default(),
+        };
+        files.list();
+        Ok(files)
     }
 
-    /// Begins the next file.
+    /// Whether one file follows another.
+    pub fn rotates(&self) -> bool {
+        self.limits.rotates()
+    }
+
+    /// Begins the next file, which says who writes it.
     ///
     /// # Errors
     /// If it cannot be made; the one before stays the one that is written.
-    pub fn create(&mut self) -> anyhow::Result<FileWriter> {
-        let (writer, path) = if self.limits.rotates() {
+    pub fn create(&mut self, source: &Source) -> anyhow::Result<FileWriter> {
+        let (mut writer, path) = if self.limits.rotates() {
             create_new(&self.named(OffsetDateTime::now_utc()))?
         } else {
             create(&self.asked, self.overwrite)?
         };
-        self.current = Some(Current { path, begun: Instant::now() });
+        writer.sign(source)?;
+        let lock = File::open(&path).ok().filter(|file| path.is_file() && file.try_lock().is_ok());
+        let next = Current { path, begun: Instant::now(), _lock: lock };
+        self.ended.extend(self.current.replace(next).map(|before| before.path));
+        self.list();
         Ok(writer)
     }
 
@@ -124,45 +165,72 @@ impl Files {
         self.current.as_ref().map_or(&self.asked, |current| &current.path)
     }
 
-    /// Whether it is time for the next one.
+    /// Whether it is time for the next one: also if somebody has taken this one away.
     pub fn is_full(&self) -> bool {
-        let Some(Current { path, begun }) = &self.current else { return false };
+        let Some(Current { path, begun, .. }) = &self.current else { return false };
         let Limits { rotate_mb, rotate_min, .. } = self.limits;
         let is_long = rotate_min.is_some_and(|min| begun.elapsed().as_secs_f64() >= min * 60.0);
-        is_long || rotate_mb.is_some_and(|mb| bytes(path) >= mb * MB)
+        let is_large = rotate_mb.is_some_and(|mb| bytes(path) >= mb * MB);
+        self.rotates() && (is_long || is_large || !path.exists())
     }
 
-    /// Removes old files until the quota and the disk allow for what is there; says what there is room
-    /// for.
-    pub fn make_room(&self) -> Room {
+    /// Removes the oldest file if the quota or the disk asks for it, one at a time; says what there is
+    /// room for. To be asked about once a second.
+    pub fn make_room(&mut self) -> Room {
         let left = self.limits.leave_free_gb * GB;
         let quota = self.limits.quota_gb.map_or(f64::INFINITY, |gb| gb * GB);
-        let mut older = if self.limits.rotates() { self.older() } else { Vec::new() };
-        let mut taken =
-            older.iter().chain([&self.path().to_owned()]).map(|path| bytes(path)).sum::<f64>();
-        older.reverse();
-        loop {
-            let free = self.free();
-            if taken <= quota && free >= left {
-                return Room::Pictures;
+        let free = self.free();
+        self.see_what_it_brought(free);
+        let older: f64 = self.older.iter().map(|(_, bytes)| bytes).sum();
+        let is_over = older + bytes(self.path()) > quota;
+        if is_over || (free < left && self.in_vain < MOST_IN_VAIN) {
+            self.remove_oldest(free);
+        }
+        // What goes is there again in a moment.
+        if self.removed.is_some() && self.in_vain == 0 {
+            Room::Pictures
+        } else {
+            Room::of(free, left)
+        }
+    }
+
+    /// Removes the oldest file, if there is one that nobody writes.
+    pub fn remove_oldest(&mut self, free_before: f64) {
+        while let Some((oldest, bytes)) = self.older.pop() {
+            // That of another recorder, which is being written.
+            if File::open(&oldest).is_ok_and(|file| file.try_lock().is_err()) {
+                continue;
             }
-            let Some(oldest) = older.pop() else { return Room::of(free, left) };
-            let its = bytes(&oldest);
             match std::fs::remove_file(&oldest) {
                 Ok(()) => {
                     tracing::info!("{} is removed to make room", oldest.display());
-                    taken -= its;
+                    self.removed = Some(Removed { bytes, free_before });
+                    return;
                 }
-                Err(error) => {
-                    tracing::warn!("{} cannot be removed: {error}", oldest.display());
-                }
+                Err(error) => self.repeats.warn("remove", Instant::now(), || {
+                    format!("{} cannot be removed: {error}", oldest.display())
+                }),
             }
         }
     }
 
-    /// What is free on its disk, bytes; where nobody says, enough.
-    fn free(&self) -> f64 {
-        let folder = self.path().parent().filter(|folder| !folder.as_os_str().is_empty());
+    /// Whether what was removed last has made room: where snapshots or others take what becomes free,
+    /// all recordings must not go for nothing.
+    fn see_what_it_brought(&mut self, free: f64) {
+        let Some(Removed { bytes, free_before }) = self.removed.take() else { return };
+        self.in_vain = if free > free_before + bytes / 2.0 { 0 } else { self.in_vain + 1 };
+        if self.in_vain == MOST_IN_VAIN {
+            tracing::warn!("removing old recordings makes no room: no more are removed for it");
+        }
+    }
+
+    /// What is free on its disk, bytes; where nobody says, or for a pipe, enough.
+    pub fn free(&self) -> f64 {
+        let path = self.path();
+        if path.exists() && !path.is_file() {
+            return f64::INFINITY;
+        }
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
         let disk = nix::sys::statvfs::statvfs(folder.unwrap_or(Path::new(".")));
         disk.map_or(f64::INFINITY, |disk| {
             disk.blocks_available() as f64 * disk.fragment_size() as f64
@@ -180,25 +248,32 @@ impl Files {
         ))
     }
 
-    /// The other files that are named so, the oldest first.
-    fn older(&self) -> Vec<PathBuf> {
+    /// Looks which other files are named so.
+    fn list(&mut self) {
+        self.older.clear();
+        if !self.rotates() {
+            return;
+        }
         let folder = self.asked.parent().filter(|folder| !folder.as_os_str().is_empty());
-        let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else {
-            return Vec::new();
-        };
+        let Ok(entries) = std::fs::read_dir(folder.unwrap_or(Path::new("."))) else { return };
         let (stem, extension) = parts(&self.asked);
-        let mut named: Vec<(String, PathBuf)> = entries
-            .filter_map(|entry| {
-                let name = entry.ok()?.file_name().into_string().ok()?;
-                let begins =
-                    name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&extension)?;
-                is_a_beginning(begins)
-                    .then(|| (begins.to_owned(), self.asked.with_file_name(&name)))
+        let begins_at = |name: &str| -> Option<String> {
+            let begins = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&extension)?;
+            is_a_beginning(begins).then(|| begins.to_owned())
+        };
+        let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        let mut found: Vec<(usize, String, PathBuf)> = names
+            .filter_map(|name| {
+                let path = self.asked.with_file_name(&name);
+                // Of this run, the one that ended first is the oldest, and all are younger than others.
+                let ended = self.ended.iter().position(|ended| *ended == path);
+                Some((ended.map_or(0, |place| place + 1), begins_at(&name)?, path))
             })
-            .filter(|(_, path)| path.file_name() != self.path().file_name() && path.is_file())
+            .filter(|(_, _, path)| path != self.path() && path.is_file())
             .collect();
-        named.sort();
-        named.into_iter().map(|(_, path)| path).collect()
+        found.sort();
+        self.older =
+            found.into_iter().rev().map(|(_, _, path)| (path.clone(), bytes(&path))).collect();
     }
 }
 
@@ -253,6 +328,9 @@ fn create_new(asked: &Path) -> anyhow::Result<(FileWriter, PathBuf)> {
 
 #[cfg(test)]
 mod tests {
+    use crossfix_message::{CameraName, Channel};
+
+    use super::super::recorder::room_for;
     use super::*;
 
     fn limits(quota_gb: Option<f64>) -> Limits {
@@ -284,8 +362,12 @@ mod tests {
         for path in &old {
             std::fs::write(path, vec![0; 1_000_000]).unwrap();
         }
-        drop(files.create().unwrap());
-        assert_eq!(files.make_room(), Room::Pictures);
+        drop(files.create(&Source::default()).unwrap());
+        // One at a time.
+        for left in [3, 2, 2] {
+            assert_eq!(files.make_room(), Room::Pictures);
+            assert_eq!(old.iter().filter(|path| path.exists()).count(), left);
+        }
         let stays: Vec<bool> = old.iter().map(|path| path.exists()).collect();
         assert_eq!(stays, [false, false, true, true]);
         assert!(
@@ -298,9 +380,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut files = Files::new(&folder.path().join("a.mcap"), false, limits(None)).unwrap();
         for _ in 0..3 {
-            drop(files.create().unwrap());
+            drop(files.create(&Source::default()).unwrap());
         }
-        assert_eq!(files.older().len(), 2);
+        assert_eq!(files.older.len(), 2);
         assert!(!files.is_full());
         std::fs::write(files.path(), vec![0; 1_000_000]).unwrap();
         assert!(files.is_full());
@@ -311,18 +393,69 @@ mod tests {
         for (free, room) in [(2.0, Room::Pictures), (0.9, Room::Messages), (0.05, Room::Tracks)] {
             assert_eq!(Room::of(free, 1.0), room);
         }
-        // More than any disk has.
+        assert!(room_for(&Channel::Preview("a".parse().unwrap())) == Room::Pictures);
+        for of_all in [Channel::FusionHealth, Channel::Truth, Channel::Smoothed, Channel::Cues] {
+            assert_eq!(room_for(&of_all), Room::Messages);
+        }
+        let name: CameraName = "a".parse().unwrap();
+        for last in [
+            Channel::Bearings(name.clone()),
+            Channel::Calibration(name),
+            Channel::Tracks,
+            Channel::Events,
+            Channel::RecorderHealth,
+        ] {
+            assert_eq!(room_for(&last), Room::Tracks);
+        }
+    }
+
+    /// Where nothing becomes free by it, as under snapshots, ten recordings go and no more.
+    #[test]
+    fn recordings_do_not_go_for_nothing() {
         let folder = tempfile::tempdir().unwrap();
+        // More than any disk has, and so nothing that is removed helps.
         let endless = Limits { leave_free_gb: 1e12, ..limits(None) };
+        for k in 0..30 {
+            let files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
+            // They say that they are large, and take nothing.
+            File::create(files.named(at(k))).unwrap().set_len(1 << 40).unwrap();
+        }
         let mut files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
-        drop((files.create().unwrap(), files.create().unwrap()));
-        assert_eq!(files.make_room(), Room::Tracks);
-        assert_eq!(
-            files.older().len(),
-            0,
-            "the older one is gone, and the one that is written is not"
-        );
-        assert!(files.path().exists());
+        drop(files.create(&Source::default()).unwrap());
+        let rooms: Vec<Room> = (0..40).map(|_| files.make_room()).collect();
+        assert_eq!(rooms.last(), Some(&Room::Tracks));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 31 - 10);
+    }
+
+    /// The clock was set back in the flight: what was recorded last is not the oldest.
+    #[test]
+    fn what_this_run_has_recorded_is_younger_than_what_was_there_before() {
+        let folder = tempfile::tempdir().unwrap();
+        let asked = folder.path().join("a.mcap");
+        let mut files = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        let later = files.named(OffsetDateTime::now_utc() + time::Duration::days(9000));
+        std::fs::write(&later, vec![0; 10]).unwrap();
+        drop(files.create(&Source::default()).unwrap());
+        let first = files.path().to_owned();
+        drop(files.create(&Source::default()).unwrap());
+        files.make_room();
+        assert!(!later.exists() && first.exists() && files.path().exists());
+    }
+
+    #[test]
+    fn what_another_recorder_writes_is_left_to_it_and_what_is_taken_away_is_begun_anew() {
+        let folder = tempfile::tempdir().unwrap();
+        let asked = folder.path().join("a.mcap");
+        let mut one = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        drop(one.create(&Source::default()).unwrap());
+        let mut other = Files::new(&asked, false, limits(Some(1e-9))).unwrap();
+        drop(other.create(&Source::default()).unwrap());
+        for _ in 0..3 {
+            let _ = other.make_room();
+        }
+        assert!(one.path().exists() && !one.is_full());
+        std::fs::remove_file(one.path()).unwrap();
+        assert!(one.is_full());
     }
 
     #[test]

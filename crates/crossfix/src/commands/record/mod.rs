@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_message::{Channel, Key};
-use crossfix_recording::Source;
+use crossfix_recording::{RecordingError, Source};
 use crossfix_transport::{Delivery, Role, Subscription};
 
-use self::files::{FileWriter, Files, Limits};
+use self::files::{Files, Limits, Room};
 use self::recorder::Recorder;
 use self::syncing::Syncing;
 use crate::config;
@@ -22,6 +22,10 @@ use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
+/// The disk has so long to take the end of the last file.
+const SYNCED_WITHIN: Duration = Duration::from_millis(300);
+/// So many old recordings go at most before the first file begins.
+const MOST_AT_START: u32 = 100;
 const POLL: Duration = Duration::from_millis(50);
 
 /// Record everything that a site publishes.
@@ -64,20 +68,26 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         HealthReporter::new(&args.health, &link, Channel::RecorderHealth, Delivery::Queued)?;
     let source =
         Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") };
-    let mut recorder = Recorder::new(begin(&mut files, &source)?, &network, link.run());
+    // Where it fell over the last time.
+    (0..MOST_AT_START).take_while(|_| files.make_room() < Room::Pictures).for_each(drop);
+    let mut recorder = Recorder::new(files.create(&source)?, &network, link.run());
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     let path = files.path().display().to_string();
     tracing::info!("recording `{}` to {path}, run {}", link.site(), link.run());
 
     service::ready(&format!("recording to {path}"));
-    let mut disk = Disk { files, source, syncing: Syncing::start()? };
+    let mut disk = Disk { files, source, syncing: Syncing::start()?, rescued: None };
     let mut parts = (subscription, lookout, health);
     let recorded = work(&mut recorder, &mut disk, &mut parts, &shutdown)
         .context("recording has stopped; the rest of the site goes on");
     drop((parts, alive));
     let finished = recorded.and_then(|()| Ok(recorder.finish()?));
+    let Disk { files, syncing, .. } = disk;
+    if let Err(error) = syncing.finish(files.path(), SYNCED_WITHIN) {
+        tracing::warn!("the end of {} may not be on the disk: {error}", files.path().display());
+    }
     link.close(LEAVE)?;
-    let path = disk.files.path().display();
+    let path = files.path().display();
     output::line(match finished? {
         (messages, 1) => format!("{messages} messages recorded to {path}"),
         (messages, files) => format!("{messages} messages recorded to {files} files, last {path}"),
@@ -85,35 +95,55 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Begins a file, and says in it who writes it.
-fn begin(files: &mut Files, source: &Source) -> anyhow::Result<FileWriter> {
-    let mut writer = files.create()?;
-    writer.sign(source)?;
-    Ok(writer)
-}
-
 /// Where recordings go.
 struct Disk {
     files: Files,
     source: Source,
     syncing: Syncing,
+    /// When a file could not be written last.
+    rescued: Option<Instant>,
 }
 
 impl Disk {
     /// What is to be done each second: what was flushed survives a crash of the machine's programs,
     /// and soon one of the machine; a file that is full gives way to the next.
     fn keep(&mut self, recorder: &mut Recorder) -> anyhow::Result<()> {
+        recorder.heed(self.files.make_room());
         recorder.flush()?;
-        self.syncing.ask(self.files.path());
+        if let Err(error) = self.syncing.ask(self.files.path()) {
+            let error = anyhow::Error::new(error).context("what was written is not on it");
+            recorder.note_trouble("sync", &error);
+        }
         if self.files.is_full() {
-            match begin(&mut self.files, &self.source) {
-                Ok(writer) => recorder.go_on(writer)?,
-                // Better one file that is too long.
-                Err(error) => recorder.note_trouble(&error),
+            // Better one file that is too long than none.
+            if let Err(error) = self.next(recorder) {
+                recorder.note_trouble("next file", &error);
             }
         }
-        recorder.heed(self.files.make_room());
         Ok(())
+    }
+
+    fn next(&mut self, recorder: &mut Recorder) -> anyhow::Result<()> {
+        let before = self.files.path().to_owned();
+        let writer = self.files.create(&self.source)?;
+        recorder.go_on(writer)?;
+        self.syncing.end(before);
+        Ok(())
+    }
+
+    /// A file cannot be written any more. Where files follow one another the oldest goes, and it goes
+    /// on in a new one: the disk was full before anybody looked.
+    fn rescue(&mut self, recorder: &mut Recorder, error: anyhow::Error) -> anyhow::Result<()> {
+        let lately = |at: Instant| at.elapsed() < health::PERIOD;
+        let is_of_disk = matches!(error.downcast_ref(), Some(RecordingError::Write(_)));
+        if !is_of_disk || !self.files.rotates() || self.rescued.is_some_and(lately) {
+            return Err(error);
+        }
+        self.rescued = Some(Instant::now());
+        recorder.note_trouble("write", &error);
+        let free = self.files.free();
+        self.files.remove_oldest(free);
+        self.next(recorder).context(error)
     }
 }
 
@@ -126,8 +156,10 @@ fn work(
 ) -> anyhow::Result<()> {
     let mut said_at = Instant::now();
     while !shutdown.requested() {
-        if let Some(received) = subscription.next(POLL) {
-            recorder.take(received)?;
+        if let Some(received) = subscription.next(POLL)
+            && let Err(error) = recorder.take(received)
+        {
+            disk.rescue(recorder, error.into())?;
         }
         if said_at.elapsed() >= health::PERIOD {
             said_at = Instant::now();
@@ -138,9 +170,14 @@ fn work(
                 );
             }
             lookout.look(said_at);
-            let health = recorder.health(subscription.refused(), false, reporter)?;
-            reporter.say(&health)?;
-            disk.keep(recorder)?;
+            let kept = match recorder.health(subscription.refused(), false, reporter) {
+                Ok(health) => {
+                    reporter.say(&health)?;
+                    disk.keep(recorder)
+                }
+                Err(error) => Err(error.into()),
+            };
+            kept.or_else(|error| disk.rescue(recorder, error))?;
         }
     }
     service::stopping();

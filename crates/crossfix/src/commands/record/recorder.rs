@@ -34,6 +34,8 @@ pub struct Recorder {
     /// newest word on their clocks.
     standing: BTreeMap<Key, Entry>,
     room: Room,
+    /// What was wrong with the disk since the last health.
+    trouble: Option<String>,
     /// Of the files before this one: how many, and how many messages are in them.
     before: (u64, u64),
 }
@@ -62,7 +64,7 @@ fn lacking(room: Room) -> Option<&'static str> {
 }
 
 /// What a disk must have room for if a message is to be recorded.
-fn room_for(channel: &Channel) -> Room {
+pub(super) fn room_for(channel: &Channel) -> Room {
     match channel {
         Channel::Bearings(_)
         | Channel::Calibration(_)
@@ -90,18 +92,23 @@ impl Recorder {
             counts: Counts::default(),
             standing: BTreeMap::new(),
             room: Room::default(),
+            trouble: None,
             before: (0, 0),
         }
     }
 
-    /// Goes on in another file, which begins with what holds still.
+    /// Goes on in another file, which begins with what holds still. Of the one before, what was
+    /// flushed is safe if it cannot be ended.
     ///
     /// # Errors
-    /// [`RecordingError`] if one of the files cannot be written.
+    /// [`RecordingError`] if the new file cannot be written.
     pub fn go_on(&mut self, writer: FileWriter) -> Result<(), RecordingError> {
         let full = std::mem::replace(&mut self.writer, writer);
         let (files, messages) = self.before;
-        self.before = (files + 1, messages + full.finish()?);
+        self.before = (files + 1, messages + full.messages());
+        if let Err(error) = full.finish() {
+            self.note_trouble("end", &error.into());
+        }
         let said = self.times.now();
         for entry in self.standing.clone().into_values() {
             self.write(entry, said)?;
@@ -117,9 +124,10 @@ impl Recorder {
         self.room = room;
     }
 
-    /// Something went wrong that ends nothing.
-    pub fn note_trouble(&mut self, error: &anyhow::Error) {
-        self.repeats.warn("next file", Instant::now(), || format!("no new file: {error:#}"));
+    /// Something went wrong with the disk that ends nothing: it is said in the next health, too.
+    pub fn note_trouble(&mut self, kind: &str, error: &anyhow::Error) {
+        self.trouble = Some(format!("the disk: {error:#}"));
+        self.repeats.warn(kind, Instant::now(), || format!("the disk: {error:#}"));
     }
 
     /// Records a message, if it is one of the site's.
@@ -242,6 +250,7 @@ impl Recorder {
         ];
         let mut problems = Vec::new();
         problems.extend(lacking(self.room).map(str::to_owned));
+        problems.extend(self.trouble.take());
         for (key, runs) in self.reception.rivals(now) {
             let rivalry = rivalry(key, runs);
             self.repeats.warn(&format!("rivals {key}"), now, || rivalry.clone());

@@ -75,7 +75,7 @@ fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     assert_eq!(settled, [false, false, false, false, false, false, true, true]);
     // Told to turn, it is not settled, though it stands for a while and does not say that it
     // moves.
-    pointed.order(degrees(20.0, 0.0), at(7));
+    pointed.order(degrees(20.0, 0.0));
     assert!(!hear(&mut pointed, 8, 10.0, false));
     pointed.told(degrees(20.0, 0.0), at(8));
     for (tenth, azimuth) in [(9, 10.0), (10, 10.0), (11, 12.0), (12, 16.0), (13, 20.0)] {
@@ -89,16 +89,15 @@ fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     // It never begins: told that it may go no farther, it stands where it is.
     let stands: Vec<bool> = (45..60).map(|k| hear(&mut pointed, k, 21.5, false)).collect();
     assert!(stands[8]);
-    pointed.order(degrees(90.0, 0.0), at(59));
+    pointed.order(degrees(90.0, 0.0));
     pointed.told(degrees(90.0, 0.0), at(60));
     let first = (60..90).find(|k| hear(&mut pointed, *k, 21.5, false));
     assert_eq!(first, Some(71));
-    // It refuses to turn: it sees on where it is, and is not asked again at once.
-    pointed.order(degrees(95.0, 0.0), at(72));
+    // It refuses to turn: it sees on where it is, and is not to be asked again at once.
+    pointed.order(degrees(95.0, 0.0));
     pointed.refuse(at(73));
-    assert!(hear(&mut pointed, 74, 21.5, false));
-    pointed.order(degrees(95.0, 0.0), at(75));
-    assert!(hear(&mut pointed, 76, 21.5, false));
+    assert!(hear(&mut pointed, 74, 21.5, false) && !pointed.obeys(at(75)));
+    assert!(pointed.obeys(at(124)));
     // What was said long ago says nothing.
     assert!(is_unknown(pointed.at(at(100))));
 }
@@ -189,6 +188,7 @@ fn a_mount_that_refuses_to_turn_sees_on_where_it_is() {
     mount.aim(degrees(30.0, 50.0));
     assert!(!is_settled(mount.pointed()));
     assert_eq!(settled(until(&mut mount, 6.0, is_settled)), rest);
+    assert!(!mount.obeys());
     assert_eq!(stub.state.lock().unwrap().moves, 1, "asked once");
 }
 
