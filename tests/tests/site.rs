@@ -51,6 +51,34 @@ fn live_and_offline_fusion_give_the_same_bytes() {
 }
 
 #[test]
+fn a_screen_shows_how_a_site_does() {
+    let site = Site::new(60.0);
+    let fusion = site.start_fusion();
+    let mut agents = site.start_agents(now_seconds() + 2.0, &[]);
+    std::thread::sleep(Duration::from_secs(5));
+    let network = site.path("network.toml");
+    let said = succeed(&["status", "-c", &network, "--json"]);
+    let status: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let parts = status["parts"].as_array().unwrap();
+    let named: Vec<&str> = parts.iter().map(|part| part["name"].as_str().unwrap()).collect();
+    assert_eq!(named, ["east", "north", "west", "fusion"], "{said}");
+    for part in parts {
+        assert!(part["state"] == "good" && part["rate_hz"].as_f64().unwrap() > 5.0, "{said}");
+    }
+    assert!(status["confirmed"].as_u64().unwrap() >= 1, "{said}");
+    agents.remove(0).crash();
+    let text = succeed(&["status", "-c", &network]);
+    assert!(text.contains("site `test`") && text.contains("confirmed tracks"), "{text}");
+    // The fusion centre says who is gone, and one who is gone says nothing.
+    assert!(
+        text.lines().any(|line| line.contains("silent") || line.contains("not heard")),
+        "{text}"
+    );
+    assert!(text.lines().any(|line| line.starts_with("fusion: ")), "{text}");
+    assert!(fusion.stop());
+}
+
+#[test]
 fn agents_wait_for_the_fusion_centre_and_a_new_one_picks_them_up() {
     let site = Site::new(40.0);
     let ear = site.ear();

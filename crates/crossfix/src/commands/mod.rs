@@ -10,6 +10,7 @@ pub mod numbers;
 pub mod record;
 pub mod recover;
 pub mod sources;
+pub mod status;
 pub mod track;
 
 #[cfg(feature = "centre")]
@@ -48,6 +49,7 @@ pub enum Command {
     Info(info::Args),
     Check(check::Args),
     Doctor(doctor::Args),
+    Status(status::Args),
     #[cfg(feature = "viewer")]
     View(view::Args),
     #[cfg(feature = "centre")]
@@ -100,6 +102,7 @@ impl Command {
             Self::Info(args) => info::run(&args),
             Self::Check(args) => check::run(&args),
             Self::Doctor(args) => doctor::run(&args),
+            Self::Status(args) => status::run(&args),
             #[cfg(feature = "viewer")]
             Self::View(args) => view::run(&args),
             #[cfg(feature = "centre")]

@@ -1,0 +1,309 @@
+//! What the parts of a site say of themselves, as one table.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use crossfix_message::{
+    CameraHealth, CameraName, CameraStanding, Channel, Health, TrackFrame, TrackState, decode,
+};
+use serde::Serialize;
+
+use crate::output;
+
+/// Each part says how it does every second: who has not for so long is silent.
+const SILENT: Duration = Duration::from_millis(2500);
+/// A track of which nothing was said for so long is none any more.
+const TRACK_LIVES: Duration = Duration::from_secs(2);
+/// Parts of no camera of the network's file are not shown, and tracks beyond this not counted: what
+/// comes from outside fills no memory.
+const MOST_TRACKS: usize = 10_000;
+
+/// Problems of one part that are shown, and letters of each.
+const MOST_PROBLEMS: usize = 10;
+const MOST_LETTERS: usize = 200;
+
+/// What was said elsewhere, as one line that does nothing to a terminal.
+fn printable(text: &str) -> String {
+    let shown = text.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
+    shown.take(MOST_LETTERS).collect()
+}
+
+/// What a part said last, and when it was heard.
+#[derive(Clone, Debug)]
+struct Heard {
+    health: Health,
+    at: Instant,
+}
+
+/// How a part of a site does.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Part {
+    /// The camera's name, `fusion` or `recorder`.
+    pub name: String,
+    /// In a word or two.
+    pub state: String,
+    /// Frames or messages a second.
+    pub rate_hz: f64,
+    /// From an image's last byte to its published bearings, 99 of 100, ms; of a live camera.
+    pub latency_ms: Option<f64>,
+    /// By how much its clock is ahead of the site's, as its tracks tell, ms, ...
+    pub clock_ms: Option<f64>,
+    /// ... and the standard deviation of that, ms.
+    pub clock_sd_ms: Option<f64>,
+    /// Tracks: of a camera in its image, of the fusion centre in the air.
+    pub tracks: u32,
+    /// Processor time, cores.
+    pub cores: Option<f64>,
+    /// Memory, MB.
+    pub memory_mb: Option<f64>,
+    /// Of the hottest part of its host, degrees Celsius.
+    pub temperature_c: Option<f64>,
+    /// What a person should look at.
+    pub problems: Vec<String>,
+}
+
+/// How a site does.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Status {
+    pub site: String,
+    /// The cameras of the network's file, the fusion centre, and the recorder if it is heard.
+    pub parts: Vec<Part>,
+    /// Tracks that are confirmed, or that no camera sees at present.
+    pub confirmed: usize,
+    /// Tracks that one camera alone follows.
+    pub one_camera: usize,
+}
+
+/// All that has been heard.
+#[derive(Debug)]
+pub struct Board {
+    site: String,
+    cameras: Vec<CameraName>,
+    parts: BTreeMap<String, Heard>,
+    tracks: BTreeMap<u64, (TrackState, Instant)>,
+}
+
+impl Board {
+    /// Of a site with these cameras.
+    pub fn new(site: String, cameras: Vec<CameraName>) -> Self {
+        Self { site, cameras, parts: BTreeMap::new(), tracks: BTreeMap::new() }
+    }
+
+    /// Takes a message in; what cannot be read says nothing.
+    pub fn hear(&mut self, channel: &Channel, data: &[u8], at: Instant) {
+        let name = match channel {
+            Channel::CameraHealth(camera) if self.cameras.contains(camera) => camera.to_string(),
+            Channel::FusionHealth => "fusion".to_owned(),
+            Channel::RecorderHealth => "recorder".to_owned(),
+            Channel::Tracks => return self.hear_tracks(data, at),
+            _ => return,
+        };
+        if let Ok(health) = decode(data) {
+            self.parts.insert(name, Heard { health, at });
+        }
+    }
+
+    fn hear_tracks(&mut self, data: &[u8], at: Instant) {
+        self.tracks.retain(|_, (_, said)| at.saturating_duration_since(*said) < TRACK_LIVES);
+        let frame: TrackFrame = decode(data).unwrap_or_default();
+        for track in frame.tracks {
+            if self.tracks.len() < MOST_TRACKS {
+                self.tracks.insert(track.id, (track.state(), at));
+            }
+        }
+    }
+
+    /// How the site does.
+    pub fn status(&self, now: Instant) -> Status {
+        let clocks = self.parts.get("fusion").map_or(&[][..], |heard| &heard.health.cameras);
+        let cameras = self.cameras.iter().map(|camera| {
+            let clock = clocks.iter().find(|clock| clock.camera == camera.as_str());
+            self.part(camera.as_str(), clock, now)
+        });
+        let recorder =
+            self.parts.contains_key("recorder").then(|| self.part("recorder", None, now));
+        let of = |wanted: &[TrackState]| {
+            let lives = |said: Instant| now.saturating_duration_since(said) < TRACK_LIVES;
+            let counted =
+                |(state, said): &&(TrackState, Instant)| wanted.contains(state) && lives(*said);
+            self.tracks.values().filter(counted).count()
+        };
+        Status {
+            site: self.site.clone(),
+            parts: cameras.chain([self.part("fusion", None, now)]).chain(recorder).collect(),
+            confirmed: of(&[TrackState::Confirmed, TrackState::Coasting]),
+            one_camera: of(&[TrackState::OneCamera]),
+        }
+    }
+
+    fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> Part {
+        let nobody = Health::default();
+        let heard = self.parts.get(name);
+        let health = heard.map_or(&nobody, |heard| &heard.health);
+        let load = health.load.as_ref();
+        let p99_us = health.counters.iter().find(|one| one.name == "arrival_to_bearings_p99_us");
+        Part {
+            name: name.to_owned(),
+            state: state(heard, clock, now),
+            rate_hz: health.rate_hz,
+            latency_ms: p99_us.map(|p99_us| p99_us.value as f64 * 1e-3),
+            clock_ms: clock.map(|clock| clock.clock_offset_s * 1e3),
+            clock_sd_ms: clock.map(|clock| clock.clock_relative_sd_s * 1e3),
+            tracks: health.tracks,
+            cores: load.map(|load| load.process_cores),
+            memory_mb: load.map(|load| load.process_memory as f64 * 1e-6),
+            temperature_c: load.and_then(|load| load.temperature_c),
+            problems: health
+                .problems
+                .iter()
+                .take(MOST_PROBLEMS)
+                .map(|one| printable(one))
+                .collect(),
+        }
+    }
+}
+
+/// How a part does, in a word or two.
+fn state(heard: Option<&Heard>, clock: Option<&CameraHealth>, now: Instant) -> String {
+    let Some(Heard { health, at }) = heard else { return "not heard".to_owned() };
+    let silent = now.saturating_duration_since(*at);
+    let word = match clock.map(CameraHealth::standing) {
+        _ if health.ended => "has ended",
+        _ if silent > SILENT => return format!("silent for {:.0} s", silent.as_secs_f64()),
+        Some(CameraStanding::Excluded) => "left out",
+        Some(CameraStanding::Doubted) => "doubted",
+        _ if !health.problems.is_empty() => "has trouble",
+        _ => "good",
+    };
+    word.to_owned()
+}
+
+impl Status {
+    /// As a screen of text.
+    pub fn text(&self) -> String {
+        let head = [
+            "part",
+            "state",
+            "a second",
+            "latency [ms]",
+            "clock [ms]",
+            "tracks",
+            "cores",
+            "MB",
+            "C",
+        ];
+        let mut rows = vec![head.map(str::to_owned).to_vec()];
+        rows.extend(self.parts.iter().map(Part::row));
+        let mut lines = vec![format!("site `{}`", self.site), output::table(&rows)];
+        let [confirmed, one_camera] = [self.confirmed, self.one_camera];
+        lines.push(format!(
+            "{confirmed} confirmed tracks, {one_camera} that one camera alone follows"
+        ));
+        for part in &self.parts {
+            lines.extend(part.problems.iter().map(|problem| format!("{}: {problem}", part.name)));
+        }
+        lines.join("\n")
+    }
+}
+
+impl Part {
+    fn row(&self) -> Vec<String> {
+        let number = |value: Option<f64>, digits: usize| {
+            value.map_or(String::new(), |value| format!("{value:.digits$}"))
+        };
+        let clock = match (self.clock_ms, self.clock_sd_ms) {
+            (Some(ahead), Some(sd)) => format!("{ahead:+.1} ± {sd:.1}"),
+            _ => String::new(),
+        };
+        vec![
+            self.name.clone(),
+            self.state.clone(),
+            format!("{:.1}", self.rate_hz),
+            number(self.latency_ms, 1),
+            clock,
+            self.tracks.to_string(),
+            number(self.cores, 2),
+            number(self.memory_mb, 0),
+            number(self.temperature_c, 0),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossfix_message::{Counter, HostLoad, Payload, Track};
+
+    use super::*;
+
+    fn board() -> Board {
+        let cameras = ["north", "east"].map(|name| name.parse().unwrap());
+        Board::new("field".to_owned(), cameras.into())
+    }
+
+    fn of(name: &str) -> Channel {
+        Channel::CameraHealth(name.parse().unwrap())
+    }
+
+    #[test]
+    fn each_part_is_shown_with_what_it_said_and_who_says_nothing_is_silent() {
+        let (mut board, begun) = (board(), Instant::now());
+        let north = Health {
+            rate_hz: 29.97,
+            counters: vec![Counter { name: "arrival_to_bearings_p99_us".into(), value: 12_300 }],
+            load: Some(HostLoad {
+                process_cores: 0.41,
+                process_memory: 166_000_000,
+                ..Default::default()
+            }),
+            problems: vec!["sees nothing:\x1bthe stream has ended".into()],
+            tracks: 2,
+            ..Default::default()
+        };
+        board.hear(&of("north"), &north.encode(), begun);
+        // Of no camera of the site.
+        board.hear(&of("stranger"), &north.encode(), begun);
+        let clock = CameraHealth {
+            camera: "north".into(),
+            standing: CameraStanding::Good.into(),
+            clock_offset_s: 0.005,
+            clock_relative_sd_s: 0.0007,
+            ..Default::default()
+        };
+        let fusion = Health { cameras: vec![clock], rate_hz: 80.0, ..Default::default() };
+        board.hear(&Channel::FusionHealth, &fusion.encode(), begun + Duration::from_secs(3));
+        board.hear(&Channel::FusionHealth, &[0xff; 9], begun + Duration::from_secs(3));
+        let status = board.status(begun + Duration::from_secs(1));
+        let names: Vec<&str> = status.parts.iter().map(|part| part.name.as_str()).collect();
+        assert_eq!(names, ["north", "east", "fusion"]);
+        let text = status.text();
+        let north = text.lines().find(|line| line.starts_with("north")).unwrap();
+        for shown in ["has trouble", "30.0", "12.3", "+5.0 ± 0.7", " 2 ", "0.41", "166"] {
+            assert!(north.contains(shown), "{shown} in {north}");
+        }
+        assert!(text.contains("east") && text.contains("not heard"), "{text}");
+        assert!(text.ends_with("north: sees nothing: the stream has ended"), "{text}");
+        let later = board.status(begun + Duration::from_secs(5));
+        assert_eq!(later.parts[0].state, "silent for 5 s");
+    }
+
+    #[test]
+    fn tracks_that_live_are_counted() {
+        let (mut board, begun) = (board(), Instant::now());
+        let track =
+            |id: u64, state: TrackState| Track { id, state: state.into(), ..Default::default() };
+        let tell = |board: &mut Board, tracks: Vec<Track>, at: Instant| {
+            board.hear(&Channel::Tracks, &TrackFrame { tracks, ..Default::default() }.encode(), at);
+        };
+        let both = vec![track(1, TrackState::Confirmed), track(2, TrackState::OneCamera)];
+        tell(&mut board, both, begun);
+        tell(&mut board, vec![track(3, TrackState::Coasting)], begun + Duration::from_secs(1));
+        let counted = |board: &Board, seconds: u64| {
+            let status = board.status(begun + Duration::from_secs(seconds));
+            (status.confirmed, status.one_camera)
+        };
+        assert_eq!(counted(&board, 1), (2, 1));
+        assert_eq!(counted(&board, 2), (1, 0));
+        tell(&mut board, vec![track(3, TrackState::Lost)], begun + Duration::from_secs(2));
+        assert_eq!(counted(&board, 2), (0, 0));
+    }
+}
