@@ -16,7 +16,7 @@ use crossfix_calibration::intrinsics_to_yaml;
 use crossfix_message::{CameraName, Channel};
 use crossfix_recording::{Entry, RecordingReader};
 use crossfix_simulation::{Scene, World};
-use crossfix_transport::{Link, NetworkConfig, Role};
+use crossfix_transport::{Link, Mode, NetworkConfig, Role};
 use tempfile::TempDir;
 
 /// How long a test waits for what must come.
@@ -244,6 +244,28 @@ impl Site {
         site
     }
 
+    /// Gives the site certificates, and whatever `enroll` is told beside that.
+    pub fn enroll(&mut self, options: &[&str]) -> String {
+        let file = self.path("network.toml");
+        let said = succeed(&[&["enroll", "-c", &file], options].concat());
+        self.read_network();
+        said
+    }
+
+    /// Puts a router between all parts of the site.
+    pub fn route(&mut self) {
+        self.network.mode = Mode::Client;
+        self.network.routers = vec![free_endpoints(1).remove(0)];
+        self.write("network.toml", &toml::to_string(&self.network).unwrap());
+    }
+
+    fn read_network(&mut self) {
+        self.network = toml::from_str(&self.text("network.toml")).unwrap();
+        if let Some(security) = &mut self.network.security {
+            security.certificates = self.folder.path().join(&security.certificates);
+        }
+    }
+
     /// Writes a camera's file with a source and more.
     pub fn write_camera(&self, name: &str, source: &str, more: &str) {
         let description = self.world.camera(name).unwrap().description().clone();
@@ -332,22 +354,26 @@ impl Site {
     }
 }
 
-/// A network of so many cameras at endpoints on this machine that nobody uses now.
+/// So many endpoints on this machine that nobody uses now.
+pub fn free_endpoints(count: usize) -> Vec<String> {
+    // All are held until all are known, so that none is given twice.
+    let held: Vec<_> = (0..count).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
+    held.iter()
+        .map(|listener| format!("tcp/127.0.0.1:{}", listener.local_addr().unwrap().port()))
+        .collect()
+}
+
+/// A network of some cameras at endpoints on this machine that nobody uses now.
 pub fn free_network(cameras: impl IntoIterator<Item = CameraName>) -> NetworkConfig {
-    let mut held = Vec::new();
-    let mut endpoint = || {
-        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = listener.local_addr().unwrap().port();
-        held.push(listener);
-        format!("tcp/127.0.0.1:{port}")
-    };
-    let fusion = endpoint();
-    let cameras = cameras.into_iter().map(|camera| (camera, endpoint())).collect();
+    let cameras: Vec<_> = cameras.into_iter().collect();
+    let mut endpoints = free_endpoints(cameras.len() + 1);
     NetworkConfig {
         site: "test".parse().unwrap(),
-        mode: crossfix_transport::Mode::Peer,
+        mode: Mode::Peer,
         routers: Vec::new(),
-        fusion,
-        cameras,
+        unsecured: false,
+        security: None,
+        fusion: endpoints.remove(0),
+        cameras: cameras.into_iter().zip(endpoints).collect(),
     }
 }

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{Channel, Health, Payload};
-use crossfix_transport::{Delivery, Link, LinkPublisher};
+use crossfix_transport::{Delivery, Link, LinkPublisher, OwnCertificate};
 
 use crate::host::HostWatch;
 use crate::metrics::MetricsPage;
@@ -30,7 +30,46 @@ pub struct HealthReporter {
     page: Option<MetricsPage>,
     /// When it reported last, and what had been handled then.
     before: Option<(Instant, u64)>,
+    certificate: Option<WatchedCertificate>,
 }
+
+/// A component's certificate, looked at now and then.
+#[derive(Debug)]
+struct WatchedCertificate {
+    own: OwnCertificate,
+    looked_at: Instant,
+    problem: Option<String>,
+}
+
+impl WatchedCertificate {
+    fn new(own: OwnCertificate) -> Self {
+        let mut watched = Self { own, looked_at: Instant::now(), problem: None };
+        watched.look();
+        watched
+    }
+
+    fn look(&mut self) {
+        self.looked_at = Instant::now();
+        self.problem = self.own.ending().map(|left| {
+            format!(
+                "its certificate ends in {} h: run `crossfix enroll`, copy it, and start this again",
+                left.as_secs() / HOUR_S
+            )
+        });
+    }
+
+    /// What is wrong with it.
+    fn problem(&mut self) -> Option<String> {
+        if self.looked_at.elapsed() >= CERTIFICATE_PERIOD {
+            self.look();
+        }
+        self.problem.clone()
+    }
+}
+
+/// How often a component looks whether its certificate is to be renewed.
+const CERTIFICATE_PERIOD: Duration = Duration::from_secs(60);
+const HOUR_S: u64 = 3600;
 
 impl HealthReporter {
     /// Of the component whose health goes out on a channel.
@@ -49,6 +88,7 @@ impl HealthReporter {
             host: HostWatch::start(),
             page: args.metrics.map(MetricsPage::serve).transpose()?,
             before: None,
+            certificate: link.certificate().cloned().map(WatchedCertificate::new),
         })
     }
 
@@ -61,7 +101,9 @@ impl HealthReporter {
         });
         self.before = Some((now, health.handled));
         let (run, host) = (self.run, network::host());
-        Health { run, host, rate_hz, load: self.host.look(), ..health }
+        let mut problems = health.problems;
+        problems.extend(self.certificate.as_mut().and_then(WatchedCertificate::problem));
+        Health { run, host, rate_hz, load: self.host.look(), problems, ..health }
     }
 
     /// Says it.

@@ -36,6 +36,7 @@ pub fn open(
     role: &Role,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Option<Link>> {
+    say_how_secure(network);
     let begun = Instant::now();
     let mut said: Option<Instant> = None;
     let opened = Link::open_while(network, role, |error| {
@@ -51,6 +52,18 @@ pub fn open(
         Ok(link) => Ok(Some(link)),
         Err(_) if shutdown.requested() => Ok(None),
         Err(error) => Err(error.into()),
+    }
+}
+
+/// Says at the start who may join the site's network.
+fn say_how_secure(network: &NetworkConfig) {
+    match (&network.security, network.unsecured) {
+        (Some(_), _) => {}
+        (None, true) => tracing::warn!(
+            "nothing on this network is encrypted, and whoever reaches it can add cameras and \
+             tracks: `crossfix enroll` mends it"
+        ),
+        (None, false) => tracing::info!("without [security] nothing listens beyond this host"),
     }
 }
 

@@ -79,6 +79,8 @@ fn network() -> Result<NetworkConfig, Box<dyn Error>> {
         site: "airfield".parse()?,
         mode: Mode::Peer,
         routers: Vec::new(),
+        unsecured: false,
+        security: None,
         fusion: "tcp/127.0.0.1:7450".to_owned(),
         cameras,
     })

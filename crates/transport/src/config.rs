@@ -1,8 +1,11 @@
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 
 use crossfix_message::{CameraName, SiteName};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+use crate::security::{Identity, Security};
 
 /// Who connects to whom.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,17 +30,27 @@ pub struct NetworkConfig {
     /// Endpoints of Zenoh routers, with `mode = "client"`, e.g. `tcp/10.0.0.1:7447`.
     #[serde(default)]
     pub routers: Vec<String>,
+    /// `true`: components listen beyond their own host although nothing is encrypted and anybody may
+    /// say anything. Without it and without `[security]` they listen on loopback only.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub unsecured: bool,
     /// The fusion centre's endpoint, e.g. `tcp/127.0.0.1:7450`.
     pub fusion: String,
     /// Each camera's endpoint.
     pub cameras: BTreeMap<CameraName, String>,
+    /// Certificates: with them every link is mutual TLS, also where its endpoint says `tcp/`, and
+    /// each component may say only what is its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security: Option<Security>,
 }
 
 /// What is wrong with a network's configuration.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum NetworkError {
     /// An endpoint that is none.
-    #[error("the endpoint `{endpoint}` of `{of}` is not of the form tcp/HOST:PORT")]
+    #[error(
+        "the endpoint `{endpoint}` of `{of}` is not of the form tcp/HOST:PORT, nor tls/HOST:PORT with [security]"
+    )]
     Endpoint {
         /// Whose.
         of: String,
@@ -60,6 +73,18 @@ pub enum NetworkError {
     /// A camera that the network does not know.
     #[error("camera `{0}` has no endpoint: add it to [cameras] of the network file")]
     UnknownCamera(CameraName),
+    /// Anybody could say anything.
+    #[error(
+        "{0} can be reached from other hosts, and the network has no [security]: anybody there could \
+         add cameras and tracks. Run `crossfix enroll`, or set `unsecured = true` in the network file"
+    )]
+    Unsecured(String),
+    /// A replay into a secured network.
+    #[error(
+        "a replay stands in for all cameras, which a network with [security] takes from nobody: \
+         replay into a network of its own"
+    )]
+    NobodysIdentity,
 }
 
 /// What a session is for.
@@ -69,8 +94,15 @@ pub enum Role {
     Camera(CameraName),
     /// The fusion centre.
     Fusion,
-    /// A recorder, a viewer, a check: listens to nobody, hears everybody.
+    /// A recorder: listens nowhere, hears everybody, says how it does.
+    Recorder,
+    /// A viewer, a status, an outlet: listens nowhere, hears everybody, says nothing.
     Observer,
+    /// A Zenoh router that listens at some endpoints: carries everybody's messages.
+    Router {
+        /// Where it listens.
+        listen: Vec<String>,
+    },
     /// Stands in for all cameras, and where it brings tracks too for the fusion centre: a replay.
     Cameras {
         /// Whether it stands in for the fusion centre as well.
@@ -78,15 +110,69 @@ pub enum Role {
     },
 }
 
-fn is_endpoint(text: &str) -> bool {
-    let Some((host, port)) = text.strip_prefix("tcp/").and_then(|rest| rest.rsplit_once(':'))
-    else {
-        return false;
-    };
-    !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0)
+/// The host and the port of an endpoint: what follows `tcp/` or `tls/`.
+///
+/// ```
+/// assert_eq!(crossfix_transport::address("tcp/10.0.0.1:7450"), "10.0.0.1:7450");
+/// ```
+pub fn address(endpoint: &str) -> &str {
+    endpoint.split_once('/').map_or(endpoint, |(_, address)| address)
+}
+
+/// The host of an endpoint, without the brackets of an IPv6 address.
+pub fn host_of(endpoint: &str) -> &str {
+    let address = address(endpoint);
+    address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']'])
+}
+
+/// Whether an endpoint can be reached from this host alone.
+fn is_loopback(endpoint: &str) -> bool {
+    let host = host_of(endpoint);
+    host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+}
+
+impl Role {
+    /// Whose certificate it shows; `None` of what stands in for several.
+    pub fn identity(&self) -> Option<Identity> {
+        match self {
+            Self::Camera(name) => Some(Identity::Camera(name.clone())),
+            Self::Fusion => Some(Identity::Fusion),
+            Self::Recorder => Some(Identity::Recorder),
+            Self::Observer => Some(Identity::Viewer),
+            Self::Router { .. } => Some(Identity::Router),
+            Self::Cameras { .. } => None,
+        }
+    }
 }
 
 impl NetworkConfig {
+    /// Whether an endpoint is of a form that this network can have.
+    fn is_endpoint(&self, text: &str) -> bool {
+        let known =
+            text.starts_with("tcp/") || (text.starts_with("tls/") && self.security.is_some());
+        let Some((host, port)) = address(text).rsplit_once(':').filter(|_| known) else {
+            return false;
+        };
+        !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0)
+    }
+
+    /// An endpoint as it is spoken: by TLS where there are certificates.
+    fn spoken(&self, endpoint: &str) -> String {
+        let protocol = if self.security.is_some() { "tls" } else { "tcp" };
+        format!("{protocol}/{}", address(endpoint))
+    }
+
+    /// Checks that who listens is not there for everybody.
+    fn check_reach(&self, listen: &[String]) -> Result<(), NetworkError> {
+        if self.security.is_some() || self.unsecured {
+            return Ok(());
+        }
+        match listen.iter().find(|endpoint| !is_loopback(endpoint)) {
+            Some(endpoint) => Err(NetworkError::Unsecured(endpoint.clone())),
+            None => Ok(()),
+        }
+    }
+
     /// Checks the endpoints.
     ///
     /// # Errors
@@ -95,7 +181,7 @@ impl NetworkConfig {
         if self.mode == Mode::Client && self.routers.is_empty() {
             return Err(NetworkError::NoRouter);
         }
-        if let Some(router) = self.routers.iter().find(|router| !is_endpoint(router)) {
+        if let Some(router) = self.routers.iter().find(|router| !self.is_endpoint(router)) {
             return Err(NetworkError::Endpoint {
                 of: "routers".to_owned(),
                 endpoint: router.clone(),
@@ -106,7 +192,7 @@ impl NetworkConfig {
         for (of, endpoint) in
             fusion.chain(self.cameras.iter().map(|(name, e)| (name.to_string(), e)))
         {
-            if !is_endpoint(endpoint) {
+            if !self.is_endpoint(endpoint) {
                 return Err(NetworkError::Endpoint { of, endpoint: endpoint.clone() });
             }
             if let Some(one) = seen.insert(endpoint, of.clone()) {
@@ -121,6 +207,19 @@ impl NetworkConfig {
         &self,
         role: &Role,
     ) -> Result<(Vec<String>, Vec<String>), NetworkError> {
+        let (listen, connect) = self.declared(role)?;
+        self.check_reach(&listen)?;
+        let spoken =
+            |endpoints: Vec<String>| endpoints.iter().map(|e| self.spoken(e)).collect::<Vec<_>>();
+        Ok((spoken(listen), spoken(connect)))
+    }
+
+    /// The same as the file says them.
+    fn declared(&self, role: &Role) -> Result<(Vec<String>, Vec<String>), NetworkError> {
+        if let Role::Router { listen } = role {
+            let others = self.routers.iter().filter(|router| !listen.contains(router));
+            return Ok((listen.clone(), others.cloned().collect()));
+        }
         if self.mode == Mode::Client {
             return Ok((Vec::new(), self.routers.clone()));
         }
@@ -134,7 +233,7 @@ impl NetworkConfig {
                 )
             }
             Role::Fusion => (vec![self.fusion.clone()], cameras()),
-            Role::Observer => {
+            Role::Recorder | Role::Observer | Role::Router { .. } => {
                 let mut all = cameras();
                 all.push(self.fusion.clone());
                 (Vec::new(), all)
@@ -157,6 +256,8 @@ mod tests {
             site: "field".parse().unwrap(),
             mode: Mode::Peer,
             routers: vec![],
+            unsecured: false,
+            security: None,
             fusion: "tcp/127.0.0.1:7450".into(),
             cameras: [("a", 7451), ("b", 7452)]
                 .map(|(name, port)| (name.parse().unwrap(), format!("tcp/127.0.0.1:{port}")))
@@ -173,6 +274,19 @@ mod tests {
         assert_eq!((listen.len(), connect.len()), (0, 3));
         let unknown = Role::Camera("c".parse().unwrap());
         assert!(matches!(network.endpoints(&unknown), Err(NetworkError::UnknownCamera(_))));
+    }
+
+    #[test]
+    fn who_listens_for_other_hosts_has_certificates_or_was_told_to_do_without() {
+        let there = |network: &NetworkConfig| network.endpoints(&Role::Fusion).map(|(l, _)| l);
+        let open = NetworkConfig { fusion: "tcp/10.0.0.1:7450".into(), ..network() };
+        assert_eq!(there(&open), Err(NetworkError::Unsecured("tcp/10.0.0.1:7450".into())));
+        assert!(open.endpoints(&Role::Observer).is_ok(), "who looks on listens nowhere");
+        let told = NetworkConfig { unsecured: true, ..open.clone() };
+        assert_eq!(there(&told), Ok(vec!["tcp/10.0.0.1:7450".to_owned()]));
+        let security = Security { certificates: "c".into(), revoked: BTreeMap::new() };
+        let secured = NetworkConfig { security: Some(security), ..open };
+        assert_eq!(there(&secured), Ok(vec!["tls/10.0.0.1:7450".to_owned()]));
     }
 
     #[test]

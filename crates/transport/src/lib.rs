@@ -9,6 +9,9 @@
 //! or gossip. With `mode = "client"` everybody connects to the given routers
 //! instead.
 //!
+//! With `[security]` in the [`NetworkConfig`] every link is mutual TLS by the site's own certificates,
+//! and each component may say only what is its own ([`Identity`]).
+//!
 //! # Delivery
 //!
 //! Nobody's slowness holds another up: each receiver has a queue of its own in
@@ -29,11 +32,16 @@ mod link;
 mod origin;
 mod presence;
 mod reception;
+mod security;
 mod subscription;
 
-pub use config::{Mode, NetworkConfig, NetworkError, Role};
-pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher};
+pub use config::{Mode, NetworkConfig, NetworkError, Role, address, host_of};
+pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher, OwnCertificate};
 pub use origin::{Origin, RunId};
 pub use presence::Presence;
 pub use reception::Reception;
+pub use security::{
+    AUTHORITY_FILE, Authority, AuthorityError, Credentials, CredentialsError, HandshakeError,
+    Identity, IdentityError, Issued, Security, handshake,
+};
 pub use subscription::{Received, Refused, Subscription};

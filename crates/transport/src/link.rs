@@ -3,7 +3,7 @@ use std::io;
 use std::net::TcpListener;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::channel;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use crossfix_message::{Channel, Key, MAX_MESSAGE_BYTES, SiteName};
 use thiserror::Error;
@@ -12,6 +12,8 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
 
+use crate::config::address;
+use crate::security::{Credentials, CredentialsError, Identity, Security, access_control};
 use crate::subscription::Intake;
 use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
 
@@ -42,6 +44,9 @@ pub enum LinkError {
     /// The configuration.
     #[error("the network's configuration is impossible")]
     Config(#[source] NetworkError),
+    /// This component's certificate.
+    #[error("this component cannot show who it is")]
+    Credentials(#[source] CredentialsError),
     /// Zenoh says no.
     #[error("{what}")]
     Zenoh {
@@ -113,20 +118,66 @@ pub struct Link {
     session: Session,
     site: SiteName,
     run: RunId,
+    shown: Option<OwnCertificate>,
+}
+
+/// The certificate by which a component shows who it is.
+#[derive(Clone, Debug)]
+pub struct OwnCertificate {
+    security: Security,
+    identity: Identity,
+}
+
+impl OwnCertificate {
+    /// How long it is believed yet, if it is time to renew it. Its file is read anew: what connects
+    /// shows a renewed one with its next connection, what listens from its next start on.
+    pub fn ending(&self) -> Option<Duration> {
+        let now = SystemTime::now();
+        match Credentials::load(&self.security, &self.identity, now) {
+            Ok(credentials) => credentials.ending(now),
+            Err(_) => Some(Duration::ZERO),
+        }
+    }
+}
+
+/// What it takes to show who this is, and to take from others only what is theirs to say.
+fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>, LinkError> {
+    let Some(security) = &network.security else {
+        return Ok(Vec::new());
+    };
+    let identity = role.identity().ok_or(LinkError::Config(NetworkError::NobodysIdentity))?;
+    Credentials::load(security, &identity, SystemTime::now()).map_err(LinkError::Credentials)?;
+    let (authority, own, key) = (
+        security.authority_file(),
+        security.certificate_file(&identity),
+        security.key_file(&identity),
+    );
+    let tls = serde_json::json!({
+        "root_ca_certificate": authority,
+        "listen_certificate": own, "listen_private_key": key,
+        "connect_certificate": own, "connect_private_key": key,
+        "enable_mtls": true, "verify_name_on_connect": true,
+        // Who holds on to a link does not outlive the certificate.
+        "close_link_on_expiration": true,
+        "so_sndbuf": SEND_BUFFER_BYTES,
+    });
+    let access = access_control(security, &network.site, network.cameras.keys());
+    Ok(vec![
+        ("transport/link/tls".to_owned(), tls.to_string()),
+        ("access_control".to_owned(), access.to_string()),
+    ])
 }
 
 fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
     network.validate().map_err(LinkError::Config)?;
     let (listen, connect) = network.endpoints(role).map_err(LinkError::Config)?;
-    let mode = match network.mode {
-        Mode::Peer => "peer",
-        Mode::Client => "client",
-    };
+    let is_router = matches!(role, Role::Router { .. });
     // A client is told at once that no router is there, and tries again itself: Zenoh would not
     // come back.
-    let patience = match network.mode {
-        Mode::Peer => "-1",
-        Mode::Client => "0",
+    let (mode, patience) = match network.mode {
+        _ if is_router => ("router", "-1"),
+        Mode::Peer => ("peer", "-1"),
+        Mode::Client => ("client", "0"),
     };
     let mut config = Config::default();
     let queue = |priority: &str| format!("transport/link/tx/queue/size/{priority}");
@@ -153,7 +204,7 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
         // How long opening waits for peers that are not up yet.
         ("scouting/delay".to_owned(), "200".to_owned()),
     ];
-    for (key, value) in settings {
+    for (key, value) in settings.into_iter().chain(secured(network, role)?) {
         config.insert_json5(&key, &value).map_err(zenoh(format!("cannot set Zenoh's `{key}`")))?;
     }
     Ok(config)
@@ -172,7 +223,9 @@ impl Link {
         // The first half of what Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
-        Ok(Self { session, site: network.site.clone(), run: RunId(run) })
+        let shown = network.security.clone().zip(role.identity());
+        let shown = shown.map(|(security, identity)| OwnCertificate { security, identity });
+        Ok(Self { session, site: network.site.clone(), run: RunId(run), shown })
     }
 
     /// Opens a session, and tries again where no router answers for as long as `go_on` says.
@@ -202,6 +255,11 @@ impl Link {
     /// The site's name.
     pub fn site(&self) -> &SiteName {
         &self.site
+    }
+
+    /// What it shows the others, where the network has certificates.
+    pub fn certificate(&self) -> Option<&OwnCertificate> {
+        self.shown.as_ref()
     }
 
     /// A publisher on a channel of the site.
@@ -346,12 +404,12 @@ impl Link {
 
 /// Why a session did not open.
 fn explain(network: &NetworkConfig, role: &Role, source: &zenoh::Error) -> LinkError {
-    if network.mode == Mode::Client {
+    if network.mode == Mode::Client && !matches!(role, Role::Router { .. }) {
         return LinkError::NoRouter { routers: network.routers.clone(), source: said(source) };
     }
     let listened = network.endpoints(role).map(|(listen, _)| listen).unwrap_or_default();
     for endpoint in listened {
-        if let Err(source) = TcpListener::bind(endpoint.trim_start_matches("tcp/")) {
+        if let Err(source) = TcpListener::bind(address(&endpoint)) {
             return LinkError::Listen { endpoint, source };
         }
     }

@@ -363,6 +363,8 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
         site: "demo".parse()?,
         mode: Default::default(),
         routers: Vec::new(),
+        unsecured: false,
+        security: None,
         fusion,
         cameras,
     })

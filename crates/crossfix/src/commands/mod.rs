@@ -9,6 +9,7 @@ pub mod info;
 pub mod numbers;
 pub mod record;
 pub mod recover;
+pub mod router;
 pub mod sources;
 pub mod status;
 pub mod track;
@@ -17,6 +18,8 @@ pub mod track;
 pub mod calibrate;
 #[cfg(all(feature = "centre", feature = "viewer"))]
 pub mod demo;
+#[cfg(feature = "centre")]
+pub mod enroll;
 #[cfg(feature = "centre")]
 pub mod evaluate;
 #[cfg(feature = "centre")]
@@ -50,6 +53,7 @@ pub enum Command {
     Check(check::Args),
     Doctor(doctor::Args),
     Status(status::Args),
+    Router(router::Args),
     #[cfg(feature = "viewer")]
     View(view::Args),
     #[cfg(feature = "centre")]
@@ -70,6 +74,7 @@ pub enum Centre {
     Plan(plan::Args),
     Simulate(simulate::Args),
     Validate(validate::Args),
+    Enroll(enroll::Args),
 }
 
 #[cfg(feature = "centre")]
@@ -85,6 +90,7 @@ impl Centre {
             Self::Plan(args) => plan::run(&args),
             Self::Simulate(args) => simulate::run(&args),
             Self::Validate(args) => validate::run(&args),
+            Self::Enroll(args) => enroll::run(&args),
         }
     }
 }
@@ -103,6 +109,7 @@ impl Command {
             Self::Check(args) => check::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Status(args) => status::run(&args),
+            Self::Router(args) => router::run(&args),
             #[cfg(feature = "viewer")]
             Self::View(args) => view::run(&args),
             #[cfg(feature = "centre")]

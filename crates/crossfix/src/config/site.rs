@@ -13,7 +13,11 @@ use crate::calibrated;
 
 /// Reads and checks a network file.
 pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
-    let network: NetworkConfig = super::load(path, &[], Kind::Network)?;
+    let mut network: NetworkConfig = super::load(path, &[], Kind::Network)?;
+    if let Some(security) = &mut network.security {
+        let folder = path.parent().unwrap_or(Path::new("."));
+        security.certificates = folder.join(&security.certificates);
+    }
     network
         .validate()
         .with_context(|| format!("the network file {} has an error", path.display()))?;

@@ -1,15 +1,15 @@
 //! What keeps a part of a site from working, before it has to.
 
 mod clock;
+mod security;
 
 use std::fmt;
-use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use crossfix_geometry::Camera;
-use crossfix_transport::NetworkConfig;
+use crossfix_transport::{Identity, NetworkConfig, address};
 use crossfix_video::decoding_time;
 use serde::Serialize;
 
@@ -21,8 +21,6 @@ use crate::output;
 
 /// How long a camera is watched, s: until it has said what its clock shows.
 const WATCHED_S: f64 = 8.0;
-/// How long an endpoint may take to answer.
-const ANSWER: Duration = Duration::from_secs(2);
 /// Decoding may take this share of the time between two images: the rest is for finding and following.
 const DECODING_SHARE: f64 = 0.25;
 /// Images that come so many of their intervals apart have been held up.
@@ -155,7 +153,10 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
             Finding::new("endpoint", Verdict::Fail, found).mend("give it a line in [cameras]")
         }
     });
-    findings.extend(network.routers.iter().map(|router| of_endpoint("router", router)));
+    let identity = Identity::Camera(file.name);
+    findings.extend(security::of_own(&network, &identity));
+    let others = security::Others::seen_by(&network, &identity);
+    findings.extend(network.routers.iter().map(|router| others.of("router", router)));
     Ok(findings)
 }
 
@@ -280,11 +281,6 @@ fn of_decoder(tried: &Tried) -> Finding {
     )
 }
 
-/// The host and port of an endpoint.
-fn address(endpoint: &str) -> &str {
-    endpoint.strip_prefix("tcp/").unwrap_or(endpoint)
-}
-
 /// Whether this host can listen where it is to.
 fn of_own_endpoint(endpoint: &str) -> Finding {
     match TcpListener::bind(address(endpoint)) {
@@ -298,36 +294,13 @@ fn of_own_endpoint(endpoint: &str) -> Finding {
     }
 }
 
-/// Whether somebody listens at an endpoint.
-fn of_endpoint(who: &str, endpoint: &str) -> Finding {
-    let connect = || -> std::io::Result<()> {
-        let mut last = std::io::Error::other("it has no address");
-        for address in address(endpoint).to_socket_addrs()? {
-            match TcpStream::connect_timeout(&address, ANSWER) {
-                Ok(_) => return Ok(()),
-                Err(error) => last = error,
-            }
-        }
-        Err(last)
-    };
-    match connect() {
-        Ok(()) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
-        Err(error) => Finding::new(who, Verdict::Fail, format!("{endpoint}: {error}")).mend(
-            match error.kind() {
-                std::io::ErrorKind::ConnectionRefused => "the host is there: start it on it",
-                std::io::ErrorKind::TimedOut => "is that its address, and is the port open?",
-                _ => "is that its address?",
-            },
-        ),
-    }
-}
-
 fn of_network(network: &NetworkConfig) -> Vec<Finding> {
+    let mut findings = security::of_own(network, &Identity::Viewer);
+    let others = security::Others::seen_by(network, &Identity::Viewer);
     let cameras = network.cameras.iter();
-    let mut findings: Vec<Finding> =
-        cameras.map(|(name, endpoint)| of_endpoint(name.as_str(), endpoint)).collect();
-    findings.push(of_endpoint("fusion centre", &network.fusion));
-    findings.extend(network.routers.iter().map(|router| of_endpoint("router", router)));
+    findings.extend(cameras.map(|(name, at)| others.of(name.as_str(), at)));
+    findings.push(others.of("fusion centre", &network.fusion));
+    findings.extend(network.routers.iter().map(|router| others.of("router", router)));
     findings.push(clock::host_clock());
     findings
 }

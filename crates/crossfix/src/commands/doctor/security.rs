@@ -1,0 +1,141 @@
+//! Whether the others answer, and believe who this is.
+
+use std::error::Error;
+use std::io;
+use std::net::{TcpStream, ToSocketAddrs};
+use std::time::{Duration, SystemTime};
+
+use crossfix_transport::{
+    Credentials, CredentialsError, HandshakeError, Identity, NetworkConfig, address, handshake,
+};
+
+use super::{Finding, Verdict};
+
+/// How long an endpoint may take to answer.
+const ANSWER: Duration = Duration::from_secs(2);
+const DAY_S: u64 = 24 * 3600;
+const RENEW: &str = "crossfix enroll -c network.toml, and copy what it says to this host";
+
+/// Whether a component can show who it is.
+pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
+    let Some(security) = &network.security else {
+        let found = if network.unsecured {
+            "nothing is encrypted, and whoever reaches this network can add cameras and tracks"
+        } else {
+            "no certificates: components listen on this host alone"
+        };
+        let verdict = if network.unsecured { Verdict::Warn } else { Verdict::Pass };
+        return vec![
+            Finding::new("security", verdict, found).mend("crossfix enroll -c network.toml"),
+        ];
+    };
+    let now = SystemTime::now();
+    let credentials = match Credentials::load(security, identity, now) {
+        Ok(credentials) => credentials,
+        Err(error) => {
+            let mend = match &error {
+                CredentialsError::NotYet { .. } => "set this host's clock",
+                CredentialsError::Key { .. } => "copy both files of one issue",
+                _ => RENEW,
+            };
+            return vec![Finding::new("certificate", Verdict::Fail, words(&error)).mend(mend)];
+        }
+    };
+    let left = credentials.not_after().duration_since(now).unwrap_or_default();
+    let days = left.as_secs() / DAY_S;
+    let verdict = if credentials.ending(now).is_some() { Verdict::Warn } else { Verdict::Pass };
+    let found = format!("{} for {days} more days", security.common_name(identity));
+    vec![Finding::new("certificate", verdict, found).mend(RENEW)]
+}
+
+/// The other components, as one of them sees them.
+pub struct Others<'a> {
+    network: &'a NetworkConfig,
+    /// What it shows them; `None` where nothing is shown, or nothing can be.
+    shown: Option<Credentials>,
+}
+
+impl<'a> Others<'a> {
+    pub fn seen_by(network: &'a NetworkConfig, identity: &Identity) -> Self {
+        let security = network.security.as_ref();
+        let shown = security
+            .and_then(|security| Credentials::load(security, identity, SystemTime::now()).ok());
+        Self { network, shown }
+    }
+
+    /// Whether somebody listens at an endpoint, and takes this component for what it is.
+    pub fn of(&self, who: &str, endpoint: &str) -> Finding {
+        match &self.shown {
+            Some(credentials) => self.by_handshake(credentials, who, endpoint),
+            None => match connect(endpoint) {
+                Ok(()) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
+                Err(error) => unreachable(who, endpoint, &error),
+            },
+        }
+    }
+
+    fn by_handshake(&self, credentials: &Credentials, who: &str, endpoint: &str) -> Finding {
+        match handshake(credentials, address(endpoint)) {
+            Ok(name) if self.is_believed(&name) => {
+                Finding::new(who, Verdict::Pass, format!("{endpoint} answers as {name}"))
+            }
+            Ok(name) => Finding::new(
+                who,
+                Verdict::Fail,
+                format!("{endpoint} shows `{name}`, which this network does not believe"),
+            )
+            .mend("its certificate was revoked, or the network file here is an older one"),
+            Err(HandshakeError::Connect(error)) => unreachable(who, endpoint, &error),
+            Err(error) => {
+                let mend = match &error {
+                    HandshakeError::OursRefused(_) => RENEW,
+                    HandshakeError::NoTls => "give it the network file with [security]",
+                    _ => "crossfix enroll -c network.toml, and copy what it says to that host",
+                };
+                let found = format!("{endpoint}: {}", words(&error));
+                Finding::new(who, Verdict::Fail, found).mend(mend)
+            }
+        }
+    }
+
+    /// Whether a common name is that of a component of this network.
+    fn is_believed(&self, name: &str) -> bool {
+        let Some(security) = &self.network.security else {
+            return false;
+        };
+        let cameras = self.network.cameras.keys().cloned().map(Identity::Camera);
+        let mut all = cameras.chain([Identity::Fusion, Identity::Router]);
+        all.any(|identity| security.common_name(&identity) == name)
+    }
+}
+
+/// An error and what it comes from.
+fn words(error: &dyn Error) -> String {
+    let mut words = error.to_string();
+    let mut source = error.source();
+    while let Some(inner) = source {
+        words = format!("{words}: {inner}");
+        source = inner.source();
+    }
+    words
+}
+
+fn connect(endpoint: &str) -> io::Result<()> {
+    let mut last = io::Error::other("it has no address");
+    for address in address(endpoint).to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, ANSWER) {
+            Ok(_) => return Ok(()),
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}
+
+fn unreachable(who: &str, endpoint: &str, error: &io::Error) -> Finding {
+    let mend = match error.kind() {
+        io::ErrorKind::ConnectionRefused => "the host is there: start it on it",
+        io::ErrorKind::TimedOut => "is that its address, and is the port open?",
+        _ => "is that its address?",
+    };
+    Finding::new(who, Verdict::Fail, format!("{endpoint}: {error}")).mend(mend)
+}

@@ -1,0 +1,94 @@
+use std::iter::once;
+
+use crossfix_message::{CameraName, Key, SiteName};
+use serde_json::{Value, json};
+
+use super::{Identity, Security};
+
+/// What says something.
+const SAYING: [&str; 3] = ["put", "delete", "liveliness_token"];
+/// What asks for something.
+const ASKING: [&str; 4] =
+    ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"];
+/// What answers a question.
+const ANSWERING: &str = "reply";
+
+/// What the holder of one certificate may do with whoever reads this.
+struct Rights {
+    identity: Identity,
+    /// What it may say: key expressions.
+    says: Vec<String>,
+    /// What it may hear.
+    hears: Vec<String>,
+}
+
+impl Rights {
+    fn of(identity: Identity, site: &SiteName) -> Self {
+        let of = |component: &str| format!("crossfix/{site}/{component}/**");
+        let everything = || vec![format!("crossfix/{site}/**")];
+        let (says, hears) = match &identity {
+            // It begins when those are there who must hear it.
+            Identity::Camera(camera) => {
+                (vec![of(camera.as_str())], vec![of("fusion"), Key::of_all_cameras(site, "alive")])
+            }
+            Identity::Fusion => (vec![of("fusion")], everything()),
+            Identity::Recorder => (vec![of("recorder")], everything()),
+            Identity::Viewer => (vec![], everything()),
+            Identity::Router => (everything(), everything()),
+        };
+        Self { identity, says, hears }
+    }
+
+    /// A rule of Zenoh's: messages of some kinds on some keys in one direction.
+    fn rule(&self, what: &str, flow: &str, messages: &[&str], keys: &[String]) -> Option<Value> {
+        (!keys.is_empty()).then(|| {
+            json!({
+                "id": format!("{} {what}", self.identity), "permission": "allow", "flows": [flow],
+                "messages": messages, "key_exprs": keys,
+            })
+        })
+    }
+
+    fn rules(&self, site: &SiteName) -> Vec<Value> {
+        let saying: Vec<&str> = SAYING.into_iter().chain(once(ANSWERING)).collect();
+        // Only who is told that somebody listens sends anything; what is listened to is no secret.
+        let everything = [format!("crossfix/{site}/**")];
+        [
+            self.rule("says", "ingress", &saying, &self.says),
+            self.rule("asks", "ingress", &ASKING, &self.hears),
+            self.rule("hears", "egress", &saying, &self.hears),
+            self.rule("is asked", "egress", &ASKING, &everything),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    }
+}
+
+/// Zenoh's access control: what this component takes from each other one, and gives it. The same for
+/// all, as no component is trusted with more by one than by another; what no rule allows is dropped.
+///
+/// A rule allows what its key expressions include, whole: `crossfix/site/north/**` does not let an
+/// agent subscribe to `crossfix/site/**`.
+pub(crate) fn access_control<'a>(
+    security: &Security,
+    site: &SiteName,
+    cameras: impl Iterator<Item = &'a CameraName>,
+) -> Value {
+    let others = [Identity::Fusion, Identity::Recorder, Identity::Router, Identity::Viewer];
+    let everybody = cameras.cloned().map(Identity::Camera).chain(others);
+    let (mut rules, mut subjects, mut policies) = (Vec::new(), Vec::new(), Vec::new());
+    for rights in everybody.map(|identity| Rights::of(identity, site)) {
+        let id = rights.identity.to_string();
+        let common_name = security.common_name(&rights.identity);
+        subjects.push(json!({ "id": id, "cert_common_names": [common_name] }));
+        let allowed = rights.rules(site);
+        let names: Vec<&Value> = allowed.iter().map(|rule| &rule["id"]).collect();
+        policies.push(json!({ "rules": names, "subjects": [id] }));
+        rules.extend(allowed);
+    }
+    json!({
+        "enabled": true, "default_permission": "deny",
+        "rules": rules, "subjects": subjects, "policies": policies,
+    })
+}

@@ -1,0 +1,126 @@
+use std::time::Duration;
+
+use crossfix_message::SiteName;
+use rcgen::{
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyPair, KeyUsagePurpose,
+};
+use thiserror::Error;
+use time::OffsetDateTime;
+
+/// How long the authority itself holds. Whoever has its key can join the site, so it stays where
+/// `enroll` is run; at its end every certificate is issued anew by another.
+const AUTHORITY_HOLDS: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
+/// What a host's clock may be behind the issuing one's.
+const CLOCKS: Duration = Duration::from_secs(3600);
+
+/// What went wrong with an authority.
+#[derive(Debug, Error)]
+pub enum AuthorityError {
+    /// Something could not be made or read.
+    #[error("{what}")]
+    Certificate {
+        /// What was tried.
+        what: String,
+        /// What the library says.
+        #[source]
+        source: rcgen::Error,
+    },
+}
+
+fn certificate(what: impl Into<String>) -> impl FnOnce(rcgen::Error) -> AuthorityError {
+    let what = what.into();
+    move |source| AuthorityError::Certificate { what, source }
+}
+
+/// A site's certificate authority: what it signs is believed by the whole site.
+pub struct Authority {
+    issuer: Issuer<'static, KeyPair>,
+    certificate: String,
+    key: String,
+}
+
+/// A certificate and its private key, as PEM.
+#[derive(Clone)]
+pub struct Issued {
+    /// The certificate.
+    pub certificate: String,
+    /// Its private key (PKCS #8): whoever has it is taken for the component.
+    pub key: String,
+    /// From when on it is no longer believed.
+    pub not_after: OffsetDateTime,
+}
+
+impl Authority {
+    /// A new authority of a site, from a time on.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] if no key can be made.
+    pub fn create(site: &SiteName, now: OffsetDateTime) -> Result<Self, AuthorityError> {
+        let what = || certificate("cannot make a certificate authority");
+        let mut params = CertificateParams::default();
+        params.distinguished_name = DistinguishedName::new();
+        params.distinguished_name.push(DnType::CommonName, format!("Crossfix site {site}"));
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        params.not_before = now - CLOCKS;
+        params.not_after = now + AUTHORITY_HOLDS;
+        let pair = KeyPair::generate().map_err(what())?;
+        let pem = params.self_signed(&pair).map_err(what())?.pem();
+        let key = pair.serialize_pem();
+        Ok(Self { issuer: Issuer::new(params, pair), certificate: pem, key })
+    }
+
+    /// The authority of its certificate and key, as PEM.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] if they are none.
+    pub fn load(pem: &str, key: &str) -> Result<Self, AuthorityError> {
+        let pair =
+            KeyPair::from_pem(key).map_err(certificate("the authority's key is no private key"))?;
+        let issuer = Issuer::from_ca_cert_pem(pem, pair)
+            .map_err(certificate("the authority's certificate is none"))?;
+        Ok(Self { issuer, certificate: pem.to_owned(), key: key.to_owned() })
+    }
+
+    /// Its certificate, as PEM: goes to every host.
+    pub fn certificate(&self) -> &str {
+        &self.certificate
+    }
+
+    /// Its private key, as PEM: goes nowhere.
+    pub fn key(&self) -> &str {
+        &self.key
+    }
+
+    /// Issues a certificate with a new key for a common name, for hosts (names or addresses) on
+    /// which its holder is connected to, for so long from a time on.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] if a host is no name or no key can be made.
+    pub fn issue(
+        &self,
+        common_name: &str,
+        hosts: &[String],
+        now: OffsetDateTime,
+        holds: Duration,
+    ) -> Result<Issued, AuthorityError> {
+        let what = || certificate(format!("cannot issue a certificate for `{common_name}`"));
+        let mut params = CertificateParams::new(hosts).map_err(what())?;
+        params.distinguished_name = DistinguishedName::new();
+        params.distinguished_name.push(DnType::CommonName, common_name);
+        params.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.use_authority_key_identifier_extension = true;
+        params.not_before = now - CLOCKS;
+        params.not_after = now + holds;
+        let pair = KeyPair::generate().map_err(what())?;
+        let issued = params.signed_by(&pair, &self.issuer).map_err(what())?;
+        Ok(Issued {
+            certificate: issued.pem(),
+            key: pair.serialize_pem(),
+            not_after: params.not_after,
+        })
+    }
+}

@@ -1,0 +1,158 @@
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use thiserror::Error;
+use x509_parser::parse_x509_certificate;
+use x509_parser::prelude::X509Certificate;
+
+use super::{Identity, Security};
+
+/// Why a component cannot show who it is.
+#[derive(Debug, Error)]
+pub enum CredentialsError {
+    /// A file cannot be read.
+    #[error("cannot read {}: run `crossfix enroll`, and copy what it says to this host", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+    /// A file that holds something else.
+    #[error("{} holds no {what} in PEM", path.display())]
+    Form {
+        /// The file.
+        path: PathBuf,
+        /// What should be in it.
+        what: &'static str,
+    },
+    /// Past its end.
+    #[error("the certificate {} ended {} ago: run `crossfix enroll`", path.display(), days(*ago))]
+    Expired {
+        /// The file.
+        path: PathBuf,
+        /// How long ago.
+        ago: Duration,
+    },
+    /// Before its beginning.
+    #[error("the certificate {} begins in {}: is this host's clock right?", path.display(), days(*ahead))]
+    NotYet {
+        /// The file.
+        path: PathBuf,
+        /// How far ahead.
+        ahead: Duration,
+    },
+    /// Of somebody else, or revoked.
+    #[error("the certificate {} is `{found}`'s, and the network file believes `{believed}`", path.display())]
+    Name {
+        /// The file.
+        path: PathBuf,
+        /// Its common name.
+        found: String,
+        /// The one that is believed.
+        believed: String,
+    },
+    /// Its key is another's.
+    #[error("{} is not the key of {}", key.display(), path.display())]
+    Key {
+        /// The certificate.
+        path: PathBuf,
+        /// The key.
+        key: PathBuf,
+        /// What the library says.
+        #[source]
+        source: rustls::Error,
+    },
+}
+
+fn days(time: Duration) -> String {
+    let hours = time.as_secs() / 3600;
+    if hours < 48 { format!("{hours} hours") } else { format!("{} days", hours / 24) }
+}
+
+/// What a component shows the others: a certificate that is believed now, with its key.
+pub struct Credentials {
+    pub(super) chain: Vec<CertificateDer<'static>>,
+    pub(super) key: PrivateKeyDer<'static>,
+    pub(super) authority: CertificateDer<'static>,
+    not_before: SystemTime,
+    not_after: SystemTime,
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, CredentialsError> {
+    std::fs::read(path).map_err(|source| CredentialsError::Read { path: path.to_owned(), source })
+}
+
+fn certificate(path: &Path) -> Result<CertificateDer<'static>, CredentialsError> {
+    let what = "certificate";
+    CertificateDer::from_pem_slice(&read(path)?)
+        .map_err(|_| CredentialsError::Form { path: path.to_owned(), what })
+}
+
+fn system_time(seconds: i64) -> SystemTime {
+    UNIX_EPOCH + Duration::from_secs(u64::try_from(seconds).unwrap_or(0))
+}
+
+/// The common name of a certificate.
+pub(super) fn common_name(parsed: &X509Certificate<'_>) -> Option<String> {
+    parsed.subject().iter_common_name().next()?.as_str().ok().map(str::to_owned)
+}
+
+impl Credentials {
+    /// Reads those of a component and checks that they are believed at a time, as far as can be
+    /// seen without asking anybody.
+    ///
+    /// # Errors
+    /// [`CredentialsError`] naming the file and what is wrong with it.
+    pub fn load(
+        security: &Security,
+        identity: &Identity,
+        now: SystemTime,
+    ) -> Result<Self, CredentialsError> {
+        let path = security.certificate_file(identity);
+        let key_file = security.key_file(identity);
+        let authority = certificate(&security.authority_file())?;
+        let own = certificate(&path)?;
+        let form = || CredentialsError::Form { path: path.clone(), what: "certificate" };
+        let (_, parsed) = parse_x509_certificate(&own).map_err(|_| form())?;
+        let key = PrivateKeyDer::from_pem_slice(&read(&key_file)?)
+            .map_err(|_| CredentialsError::Form { path: key_file.clone(), what: "private key" })?;
+        let believed = security.common_name(identity);
+        let found = common_name(&parsed).unwrap_or_default();
+        if found != believed {
+            return Err(CredentialsError::Name { path, found, believed });
+        }
+        let not_before = system_time(parsed.validity().not_before.timestamp());
+        let not_after = system_time(parsed.validity().not_after.timestamp());
+        if let Ok(ago) = now.duration_since(not_after) {
+            return Err(CredentialsError::Expired { path, ago });
+        }
+        if let Ok(ahead) = not_before.duration_since(now) {
+            return Err(CredentialsError::NotYet { path, ahead });
+        }
+        let credentials = Self { chain: vec![own], key, authority, not_before, not_after };
+        super::handshake::client(&credentials).map_err(|source| CredentialsError::Key {
+            path,
+            key: key_file,
+            source,
+        })?;
+        Ok(credentials)
+    }
+
+    /// How long they are believed from a time on, if that is less than a third of what they were
+    /// issued for: time to renew them.
+    pub fn ending(&self, now: SystemTime) -> Option<Duration> {
+        let left = self.not_after.duration_since(now).unwrap_or_default();
+        let issued_for = self.not_after.duration_since(self.not_before).unwrap_or_default();
+        (left < issued_for / 3).then_some(left)
+    }
+
+    /// From when on they are not believed any more.
+    pub fn not_after(&self) -> SystemTime {
+        self.not_after
+    }
+}
