@@ -1,6 +1,6 @@
 //! An agent whose camera looks for what the fusion centre tells it to look for.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::ensure;
 use crossfix_correlation::Plane;
@@ -18,6 +18,8 @@ use crate::onvif::OnvifMount;
 use crate::parts;
 use crate::seeker::{Mount, Orders, Pointed, Seeker};
 
+/// No mount turns for longer between two views.
+const LONGEST_TURN: Duration = Duration::from_secs(30);
 /// A view is the same while the angles that a mount says are within so many of their deviations.
 const SAME_SDS: f64 = 3.0;
 
@@ -27,6 +29,8 @@ pub(super) struct Seeking {
     cues: Subscription,
     mount: Option<Box<dyn Mount>>,
     angle_sd_rad: f64,
+    /// Since when it has not stood still.
+    restless: Option<Instant>,
     /// Where it pointed in the newest image, ...
     pointed: Pointed,
     /// ... and in those that the tracker knows, all of one view; `None` if there are none.
@@ -40,6 +44,8 @@ impl Seeking {
     /// the tracker knows.
     fn point(&mut self) -> bool {
         self.pointed = self.mount.as_mut().map_or(Pointed::Fixed, |mount| mount.pointed());
+        let turns = matches!(self.pointed, Pointed::Turning(_));
+        self.restless = turns.then(|| self.restless.unwrap_or_else(Instant::now));
         let before = self.view;
         self.view = match self.pointed {
             Pointed::Fixed => return false,
@@ -136,6 +142,7 @@ impl Agent {
             cues: self.link.subscribe(&[cues])?,
             mount: mount.filter(|_| file.mount.is_some()),
             angle_sd_rad,
+            restless: None,
             pointed: Pointed::Fixed,
             view: None,
             said: None,
@@ -168,8 +175,14 @@ impl Agent {
     /// What is wrong with what turns the camera.
     pub(super) fn trouble_of_mount(&self) -> Option<String> {
         let seeking = self.seeking.as_ref()?;
-        (seeking.pointed == Pointed::Unknown)
-            .then(|| "its mount does not say where it points: its images are of no use".to_owned())
+        let what = match seeking.pointed {
+            Pointed::Unknown => "does not say where it points",
+            _ if seeking.restless.is_some_and(|since| since.elapsed() > LONGEST_TURN) => {
+                "never stands still, or says angles that are noisier than `mount.angle_sd_mrad`"
+            }
+            _ => return None,
+        };
+        Some(format!("its mount {what}: its images are of no use"))
     }
 
     /// Looks at a frame by what the fusion centre has said.
