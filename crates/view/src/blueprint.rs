@@ -108,6 +108,19 @@ pub(crate) fn send_flight(
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &[])
 }
 
+/// Lays runs beside each other out: the site, how far each is from the truth below it, and the words.
+pub(crate) fn send_comparison(stream: &RecordingStream, extent: &Extent) -> Result<(), ViewError> {
+    let (site, site_path) = site_view();
+    let below: [ContainerLike; 2] = [
+        TimeSeriesView::new("error [m]").with_origin("/plots/error").into(),
+        TextDocumentView::new("legend").with_origin("/legend").into(),
+    ];
+    let below = Horizontal::new(below).with_column_shares([2.0, 1.0]);
+    let root = Vertical::new([site, below.into()]).with_row_shares([2.0, 1.0]);
+    let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &[])
+}
+
 /// Lays a volume out: the site on the left, the scale of colours and the words on the right.
 pub(crate) fn send_volume(
     stream: &RecordingStream,

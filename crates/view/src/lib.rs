@@ -30,6 +30,7 @@
 mod arrivals;
 mod blueprint;
 mod colour;
+mod comparison;
 mod draw;
 mod extent;
 mod eye;
@@ -44,6 +45,7 @@ mod sink;
 mod tracking;
 mod volume;
 
+pub use comparison::{ComparedRun, ComparisonPicture, PlaceInTime};
 pub use flight::{FlightCamera, FlightPicture, LoggedPlace, SeenTarget};
 pub use picture::Picture;
 pub use rerun::RecordingStream;

@@ -1,5 +1,6 @@
 mod data_time;
 mod files;
+mod pictures;
 mod recorder;
 mod syncing;
 
@@ -12,6 +13,7 @@ use crossfix_recording::{RecordingError, Source};
 use crossfix_transport::{Delivery, Role, Subscription};
 
 use self::files::{Files, Limits, Room};
+use self::pictures::VideoArgs;
 use self::recorder::Recorder;
 use self::syncing::Syncing;
 use crate::config;
@@ -47,6 +49,8 @@ pub struct Args {
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
+    video: VideoArgs,
+    #[command(flatten)]
     health: HealthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
@@ -58,7 +62,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let network = config::load_network(&args.config)?;
     let mut files = Files::new(&args.output, args.overwrite, args.limits)?;
     // The file comes last: what cannot record must not touch it.
-    let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
+    let Some(link) = network::open(&network, &Role::Recorder, &shutdown)? else {
         return Ok(());
     };
     let cameras: Vec<_> = network.cameras.keys().cloned().collect();
@@ -70,7 +74,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") };
     // Where it fell over the last time.
     (0..MOST_AT_START).take_while(|_| files.make_room() < Room::Pictures).for_each(drop);
-    let mut recorder = Recorder::new(files.create(&source)?, &network, link.run());
+    let mut recorder = Recorder::new(files.create(&source)?, &network, link.run(), args.video);
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     let path = files.path().display().to_string();
     tracing::info!("recording `{}` to {path}, run {}", link.site(), link.run());

@@ -2,13 +2,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use crossfix_message::{
-    CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, glance,
+    CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, decode, glance,
 };
 use crossfix_recording::{Entry, RecordingError};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
 use super::data_time::{DataTime, Said};
 use super::files::{FileWriter, Room};
+use super::pictures::{Pictures, VideoArgs};
 use crate::health::HealthReporter;
 use crate::network::rivalry;
 use crate::pace::wall_seconds;
@@ -33,6 +34,7 @@ pub struct Recorder {
     /// What each file must begin with: the cameras' newest calibrations, and the fusion centre's
     /// newest word on their clocks.
     standing: BTreeMap<Key, Entry>,
+    pictures: Pictures<(Entry, Said)>,
     room: Room,
     /// What was wrong with the disk since the last health.
     trouble: Option<String>,
@@ -78,7 +80,7 @@ pub(super) fn room_for(channel: &Channel) -> Room {
 
 impl Recorder {
     /// A recorder of a network's site.
-    pub fn new(writer: FileWriter, network: &NetworkConfig, run: RunId) -> Self {
+    pub fn new(writer: FileWriter, network: &NetworkConfig, run: RunId, video: VideoArgs) -> Self {
         Self {
             writer,
             site: network.site.clone(),
@@ -91,6 +93,7 @@ impl Recorder {
             repeats: Repeats::default(),
             counts: Counts::default(),
             standing: BTreeMap::new(),
+            pictures: Pictures::new(video),
             room: Room::default(),
             trouble: None,
             before: (0, 0),
@@ -186,7 +189,23 @@ impl Recorder {
             });
             self.times.now()
         };
-        self.write(Entry { key, data_time: seen.time, arrival, data }, said)
+        let entry = Entry { key, data_time: seen.time, arrival, data };
+        if matches!(entry.key.channel, Channel::Preview(_)) {
+            let bytes = entry.data.len();
+            let picture = self.pictures.take((entry, said), bytes, at);
+            return picture.map_or(Ok(()), |(entry, said)| self.write(entry, said));
+        }
+        if entry.key.channel == Channel::Tracks && self.pictures.wants_tracks() {
+            self.write_pictures(&entry, at)?;
+        }
+        self.write(entry, said)
+    }
+
+    /// Writes the pictures that have waited for such tracks.
+    fn write_pictures(&mut self, tracks: &Entry, at: Instant) -> Result<(), RecordingError> {
+        let Ok(tracks) = decode(&tracks.data) else { return Ok(()) };
+        let wanted: Vec<_> = self.pictures.see(&tracks, at).collect();
+        wanted.into_iter().try_for_each(|(entry, said)| self.write(entry, said))
     }
 
     fn write(&mut self, entry: Entry, said: Said) -> Result<(), RecordingError> {
@@ -240,6 +259,7 @@ impl Recorder {
         let now = Instant::now();
         self.repeats.remind(now);
         let counted = [
+            ("pictures_left_out", self.pictures.left_out()),
             ("received_dropped", refused.dropped),
             ("received_foreign_camera", self.counts.foreign),
             ("received_malformed", self.counts.malformed),

@@ -1,3 +1,5 @@
+mod comparison;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
@@ -14,13 +16,21 @@ use super::numbers;
 use crate::output;
 use crate::recorded::{self, Lacks};
 
-/// Hold the tracks of a recording against the truth in it.
+/// Hold the tracks of a recording against the truth in it, or two runs against each other.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  crossfix evaluate tracks.mcap --json\n  \
-                  crossfix evaluate tracks.mcap --min-cameras 3")]
+                  crossfix evaluate tracks.mcap --min-cameras 3\n  \
+                  crossfix evaluate before.mcap after.mcap --save both.rrd")]
 pub struct Args {
     /// The recording (MCAP) with tracks and truth.
     recording: PathBuf,
+    /// A second run over the same data: both side by side, against the truth of the first.
+    #[arg(value_name = "RECORDING")]
+    beside: Option<PathBuf>,
+    /// Draw both runs and the truth beside each other, a file for Rerun.
+    #[cfg(feature = "viewer")]
+    #[arg(long, value_name = "RRD", requires = "beside")]
+    save: Option<PathBuf>,
     #[command(flatten)]
     question: Question,
     /// Print JSON.
@@ -185,11 +195,27 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    if let Some(beside) = &args.beside {
+        return run_beside(args, beside);
+    }
     let evaluation = evaluate(&args.recording, &args.question)?;
     if args.json {
         return output::json(&evaluation);
     }
     output::line(render(&evaluation));
+    Ok(())
+}
+
+fn run_beside(args: &Args, beside: &Path) -> anyhow::Result<()> {
+    let compared = comparison::compare(&args.recording, beside, &args.question)?;
+    #[cfg(feature = "viewer")]
+    if let Some(path) = &args.save {
+        comparison::draw(&args.recording, beside, &args.question, path)?;
+    }
+    if args.json {
+        return output::json(&compared);
+    }
+    output::line(comparison::render(&compared, [&args.recording, beside]));
     Ok(())
 }
 

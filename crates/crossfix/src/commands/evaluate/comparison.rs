@@ -1,0 +1,119 @@
+//! Two runs over the same data beside each other.
+
+use std::path::Path;
+
+use anyhow::Context;
+use crossfix_evaluation::Report;
+use serde::Serialize;
+
+use super::{Evaluation, Question, Run, evaluate};
+use crate::output;
+
+/// The figures of two runs.
+#[derive(Debug, Serialize)]
+pub struct Comparison {
+    a: Evaluation,
+    b: Evaluation,
+}
+
+/// Evaluates two recordings against one truth: that of the question, else that in the first.
+pub fn compare(a: &Path, b: &Path, question: &Question) -> anyhow::Result<Comparison> {
+    let truth = question.truth.clone().unwrap_or_else(|| a.to_owned());
+    let question = Question { truth: Some(truth), ..question.clone() };
+    let evaluated =
+        |path: &Path| evaluate(path, &question).with_context(|| path.display().to_string());
+    Ok(Comparison { a: evaluated(a)?, b: evaluated(b)? })
+}
+
+/// A figure of a run, as people read it, and how it is written.
+type Figure = (&'static str, fn(&Report) -> Option<f64>, usize);
+
+/// What is compared, in the order of the table.
+const FIGURES: [Figure; 12] = [
+    ("instants", |report| Some(report.instants as f64), 0),
+    ("answers", |report| Some(report.answers as f64), 0),
+    ("targets tracked [%]", |report| Some(100.0 * report.completeness), 2),
+    ("position RMSE [m]", |report| report.position_rmse_m, 4),
+    ("velocity RMSE [m/s]", |report| report.velocity_rmse_mps, 4),
+    ("NEES (6)", |report| report.nees.mean, 2),
+    ("off by more than 1 m [%]", |report| report.share_off_by_1_m.map(percent), 3),
+    ("beyond 4 SD [%]", |report| report.share_beyond_4_sd.map(percent), 3),
+    ("false tracks", |report| Some(report.false_tracks as f64), 0),
+    ("changes of identity", |report| Some(report.id_switches as f64), 0),
+    ("OSPA [m]", |report| Some(report.ospa_m), 4),
+    ("first answer [s]", |report| report.delays.first_s, 2),
+];
+
+fn percent(share: f64) -> f64 {
+    100.0 * share
+}
+
+/// Both runs' figures and their difference.
+pub fn render(comparison: &Comparison, names: [&Path; 2]) -> String {
+    let Comparison { a, b } = comparison;
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let [first, second] = names.map(name);
+    let mut rows = vec![vec![String::new(), first, second, "difference".to_owned()]];
+    rows.extend(FIGURES.iter().map(|(what, figure, decimals)| {
+        let (a, b) = (figure(&a.report), figure(&b.report));
+        let difference = a.zip(b).map(|(a, b)| format!("{:+.decimals$}", b - a));
+        vec![
+            (*what).to_owned(),
+            output::number(a, *decimals),
+            output::number(b, *decimals),
+            difference.unwrap_or_else(|| "-".to_owned()),
+        ]
+    }));
+    output::table(&rows)
+}
+
+/// Draws both runs and the truth beside each other for Rerun.
+#[cfg(feature = "viewer")]
+pub fn draw(a: &Path, b: &Path, question: &Question, path: &Path) -> anyhow::Result<()> {
+    use crossfix_message::Timestamp;
+    use crossfix_view::{ComparedRun, ComparisonPicture, PlaceInTime};
+
+    let (mut first, mut second) = (Run::default(), Run::default());
+    first.read(a, question.smoothed)?;
+    second.read(b, question.smoothed)?;
+    let truth = match &question.truth {
+        Some(path) => {
+            let mut other = Run::default();
+            other.read(path, question.smoothed)?;
+            other.truth
+        }
+        None => first.truth.clone(),
+    };
+    let mut places: Vec<PlaceInTime> = truth
+        .iter()
+        .flat_map(|frame| {
+            let time = Timestamp::from_nanos(frame.time_ns);
+            super::targets(frame).into_iter().map(move |target| PlaceInTime {
+                time,
+                id: target.id,
+                place: target.position,
+            })
+        })
+        .collect();
+    places.sort_by_key(|at| (at.time, at.id));
+    let mut times: Vec<Timestamp> = places.iter().map(|at| at.time).collect();
+    times.dedup();
+    let compared = |run: &Run, path: &Path| {
+        let at = |&time: &Timestamp| {
+            run.estimates(time, 0.0).into_iter().map(move |estimate| PlaceInTime {
+                time,
+                id: estimate.id,
+                place: estimate.state.position(),
+            })
+        };
+        ComparedRun {
+            name: path.display().to_string(),
+            tracks: times.iter().flat_map(at).collect(),
+        }
+    };
+    let runs = vec![compared(&first, a), compared(&second, b)];
+    let picture = ComparisonPicture { truth: places, runs };
+    let draft = output::Draft::new(path, &[a, b])?;
+    picture.draw(&crossfix_view::save(draft.path())?).context("the picture is not complete")?;
+    draft.keep()
+}
