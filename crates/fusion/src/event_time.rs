@@ -47,7 +47,12 @@ struct Source {
 /// order is taken up anew from their time.
 ///
 /// A camera is live until the cameras heard since have gone on, on average, by [`PATIENCES`] times
-/// the lateness by their own clocks, jumps left out: there is no other clock here.
+/// the lateness by their own clocks, jumps left out: there is no other clock here. What a camera
+/// says all at once of a time that the others have been through, as its host stood still or its
+/// link was cut, makes nobody else look silent.
+///
+/// A camera that has been further behind than anybody waits, for as long, is not waited for: its
+/// frames come too late all the same.
 ///
 /// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
 /// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be
@@ -164,13 +169,34 @@ impl EventBuffer {
         let source = self.sources.entry(exposure.camera.clone()).or_default();
         let stream = source.stream.get_or_insert(Stream::beginning(time));
         let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
-        // A clock that races makes nobody else look silent.
-        self.run_s += time.seconds_since(stream.newest).clamp(0.0, lateness_s);
+        // A clock that races makes nobody else look silent, nor does one that makes up for lost time.
+        let reached = self.reference.map(|reference| reference.time.plus_seconds(-lateness_s));
+        let keeps_up = reached.is_none_or(|reached| time > reached);
+        if keeps_up || stream.went_back {
+            self.run_s += time.seconds_since(stream.newest).clamp(0.0, lateness_s);
+        }
         stream.hear(time, late_s, lateness_s);
+        stream.went_back &= !keeps_up;
         stream.heard_s = self.run_s;
         self.first = Some(self.first.map_or(time, |first| first.min(time)));
         self.refer();
+        self.note_who_is_behind();
         arrival
+    }
+
+    /// Takes note of the cameras that are further behind than anybody waits.
+    fn note_who_is_behind(&mut self) {
+        let Some(Reference { time, .. }) = self.reference else { return };
+        let (patience, run_s) = (time.plus_seconds(-self.config.lateness_s), self.run_s);
+        for stream in self.sources.values_mut().filter_map(|source| source.stream.as_mut()) {
+            let since_s = stream.behind_since_s.unwrap_or(run_s);
+            stream.behind_since_s = (stream.newest <= patience).then_some(since_s);
+        }
+    }
+
+    /// The time that the live cameras agree on; `None` before any was heard.
+    pub(crate) fn agreed_time(&self) -> Option<Timestamp> {
+        self.reference.map(|reference| reference.time)
     }
 
     /// Asks the live cameras for the time.
@@ -321,7 +347,15 @@ impl EventBuffer {
         if waits_for_new || is_alone {
             return Some(patience);
         }
-        let lately = self.going_on().filter(|stream| stream.newest > forgotten);
+        // Those that keep up have gone on by `run_s` together.
+        let keeping_up = self.going_on().filter(|stream| stream.behind_since_s.is_none()).count();
+        let bearable_s = PATIENCES * lateness_s * keeping_up.max(1) as f64;
+        let is_waited_for = |stream: &&Stream| {
+            let keeps_up =
+                stream.behind_since_s.is_none_or(|since_s| self.run_s - since_s <= bearable_s);
+            keeps_up && stream.newest > forgotten
+        };
+        let lately = self.going_on().filter(is_waited_for);
         let slowest = lately.map(|s| s.newest.plus_seconds(-s.disorder_s(lateness_s))).min();
         // Of the cameras that have ended, nothing more comes; of the others, nothing before
         // `slowest`.

@@ -160,7 +160,10 @@ impl Fusion {
                     arrival,
                     Err(RejectionReason::Late { .. } | RejectionReason::Future { .. })
                 );
-                self.note_time(&camera, time, in_time, outputs);
+                // By the site's time: ten seconds of frames that come all at once are not ten
+                // seconds of a clock that is wrong.
+                let now = self.buffer.agreed_time().unwrap_or(time);
+                self.note_time(&camera, now, in_time, outputs);
                 if let Some(time) = self.buffer.take_restart() {
                     self.restart(time, outputs);
                 }

@@ -9,6 +9,12 @@ const DISORDER_LASTS: f64 = 20.0;
 /// ahead, even where they come too late.
 const MOST_FAR_BEHIND: u32 = 3;
 
+/// What a camera says of a time so far back, s, it has not held back: its clock has gone back. With
+/// half of it a host that stood still for half a minute and says the newest first is taken for a
+/// clock that went back; with twice as much, a camera that is the last of its site and whose clock
+/// went back by a minute is not followed until it has made up for that.
+const LONGEST_BACKLOG_S: f64 = 30.0;
+
 /// How one camera's frames come.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stream {
@@ -19,6 +25,12 @@ pub(super) struct Stream {
     pub(super) step_s: f64,
     /// How far all cameras together had gone on when it was heard last, s.
     pub(super) heard_s: f64,
+    /// How far they had gone on when it fell behind by more than anybody waits, s; `None` while it
+    /// keeps up.
+    pub(super) behind_since_s: Option<f64>,
+    /// Its clock has gone back, by more than it can have held back, and it has not reached since
+    /// what the others say the time is.
+    pub(super) went_back: bool,
     /// Frames far behind the newest, one after the other.
     far_behind: u32,
     /// How far behind the newest others came, at most, s, and the newest when one did last; from a
@@ -33,6 +45,8 @@ impl Stream {
             trusted: Timestamp::MIN,
             step_s: 0.0,
             heard_s: 0.0,
+            behind_since_s: None,
+            went_back: false,
             far_behind: 0,
             disorder: None,
         }
@@ -54,7 +68,9 @@ impl Stream {
         } else if far_behind >= MOST_FAR_BEHIND || late_s.is_none_or(|late_s| late_s <= lateness_s)
         {
             // No network reorders so far: the clock was ahead, and now it is not.
-            *self = Self { trusted: self.trusted, ..Self::beginning(time) };
+            let trusted = self.trusted;
+            let went_back = self.went_back || behind_s > LONGEST_BACKLOG_S;
+            *self = Self { trusted, went_back, ..Self::beginning(time) };
         }
     }
 

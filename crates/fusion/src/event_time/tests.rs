@@ -306,6 +306,84 @@ fn what_a_network_held_back_is_late_and_not_a_clock_that_was_ahead() {
     assert_eq!(buffer.take_restart(), None);
 }
 
+/// Three cameras at 30 Hz until a time; the third is silent from 10 to 20 s and says it all then,
+/// maybe the newest first. What is done with each frame, by its camera.
+fn backlog(
+    buffer: &mut EventBuffer,
+    until_s: f64,
+    newest_first: bool,
+) -> Vec<(&'static str, Result<Arrival, RejectionReason>)> {
+    let mut heard = Vec::new();
+    let mut held_back = Vec::new();
+    for k in 0..(30.0 * until_s) as u32 {
+        let t = f64::from(k) / 30.0;
+        if (10.0..20.0).contains(&t) {
+            held_back.push(t + 0.02);
+        } else {
+            let now = t + 0.02;
+            let mut all: Vec<f64> = held_back.drain(..).collect();
+            all.insert(if newest_first { 0 } else { all.len() }, now);
+            heard.extend(all.into_iter().map(|time| ("c", buffer.insert(exposure("c", time)))));
+        }
+        for (camera, phase) in [("a", 0.0), ("b", 0.01)] {
+            heard.push((camera, buffer.insert(exposure(camera, t + phase))));
+        }
+        assert_eq!(buffer.take_restart(), None, "at {t} s");
+        drain(buffer);
+    }
+    heard
+}
+
+#[test]
+fn what_a_camera_says_all_at_once_of_ten_seconds_moves_nobody() {
+    for newest_first in [false, true] {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        let heard = backlog(&mut buffer, 30.0, newest_first);
+        let refused = |of: &str| heard.iter().filter(|(c, how)| *c == of && how.is_err()).count();
+        assert_eq!((refused("a"), refused("b")), (0, 0));
+        // Of the third at most what lies before the lateness, and nothing later.
+        assert!(refused("c") as f64 <= 30.0 * 10.0, "{}", refused("c"));
+        assert!(heard.iter().rev().take(800).all(|(_, how)| how.is_ok()));
+    }
+}
+
+#[test]
+fn a_camera_whose_clock_is_a_second_behind_holds_nobody_up_for_long() {
+    let mut buffer = EventBuffer::new(EventTime::default());
+    let mut waits = Vec::new();
+    for k in 0..900_u32 {
+        let t = f64::from(k) / 30.0;
+        let behind_s = if (300..600).contains(&k) { 1.0 } else { 0.0 };
+        for (camera, time_s) in [("a", t), ("b", t + 0.01), ("c", t + 0.02 - behind_s)] {
+            let _ = buffer.insert(exposure(camera, time_s));
+        }
+        let newest = drain(&mut buffer).last().copied();
+        waits.push(newest.is_none_or(|newest| newest < t - 0.1));
+    }
+    let waited = |range: std::ops::Range<usize>| waits[range].iter().filter(|wait| **wait).count();
+    assert_eq!(waited(10..300), 0);
+    // Two seconds at its first jump, and none after that; nor when it is right again.
+    assert!(waited(300..600) <= 75, "{}", waited(300..600));
+    assert_eq!((waited(400..600), waited(610..900)), (0, 0));
+}
+
+#[test]
+fn a_camera_alone_whose_clock_went_back_is_followed_after_a_while() {
+    let mut buffer = EventBuffer::new(EventTime::default());
+    let mut last = None;
+    for k in 0..900_u32 {
+        let t = f64::from(k) / 30.0;
+        // Two cameras die at 10 s; the clock of the third goes back by a minute at 11 s.
+        let of_third = if t < 11.0 { t + 0.02 } else { t - 60.0 };
+        let all = [("a", t), ("b", t + 0.01), ("c", of_third)];
+        for (camera, time_s) in all.into_iter().skip(if t < 10.0 { 0 } else { 2 }) {
+            let _ = buffer.insert(exposure(camera, time_s));
+        }
+        last = drain(&mut buffer).last().copied().or(last);
+    }
+    assert!(last.is_some_and(|last| (-32.0..-30.0).contains(&last)), "{last:?}");
+}
+
 fn crowded(camera: &str, time_s: f64, sightings: usize) -> Exposure {
     let line = crossfix_geometry::SightLine {
         origin: nalgebra::Point3::origin(),
