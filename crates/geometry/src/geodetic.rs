@@ -127,6 +127,12 @@ impl LocalFrame {
         Geodetic::from_earth_centred(self.origin + self.earth_from_local * point.coords)
     }
 
+    /// What turns a vector of this frame into the axes of another: those at a place 5 km away are
+    /// turned by 0.8 mrad.
+    pub fn axes_at(&self, other: &Self) -> Matrix3<f64> {
+        other.earth_from_local.transpose() * self.earth_from_local
+    }
+
     /// Where in the local frame (ENU, m) a place on Earth is.
     pub fn local(&self, place: Geodetic) -> Point3<f64> {
         Point3::from(self.earth_from_local.transpose() * (place.earth_centred() - self.origin))

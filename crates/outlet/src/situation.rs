@@ -1,0 +1,233 @@
+use std::collections::BTreeMap;
+
+use crossfix_geometry::{Geodetic, LocalFrame};
+use crossfix_message::{
+    CameraCalibration, Datum, SiteName, Timestamp, Track, TrackFrame, TrackState,
+};
+use nalgebra::{Matrix3, Matrix6, Point3, Vector3};
+
+use crate::Target;
+
+/// A track that nobody has said anything of for so long is gone, s: a fusion centre says each of its
+/// tracks at least every half second. With half as much a link that stutters loses tracks.
+const SILENCE_S: f64 = 2.0;
+/// Tracks that are kept count of; a fusion centre has a thousand at most.
+const MOST_TRACKS: usize = 10_000;
+
+/// Where all targets are at one instant.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot {
+    /// The site.
+    pub site: SiteName,
+    /// When, of the data.
+    pub time: Timestamp,
+    /// The targets that are sure, ordered by id: confirmed ones, those that one camera follows, those
+    /// not seen of late, and once those that were lost since the snapshot before.
+    pub targets: Vec<Target>,
+}
+
+/// A track as it was said last, in the site's axes.
+#[derive(Clone, Debug)]
+struct Known {
+    state: TrackState,
+    time: Timestamp,
+    time_sd_s: f64,
+    seen: Timestamp,
+    position: Point3<f64>,
+    velocity: Vector3<f64>,
+    covariance: Matrix6<f64>,
+}
+
+/// Hears tracks as they are said, each at its own time, and knows where all are at one.
+#[derive(Clone, Debug)]
+pub struct Situation {
+    site: SiteName,
+    frame: LocalFrame,
+    /// What the whole site may be off by.
+    datum: Option<Datum>,
+    tracks: BTreeMap<u64, Known>,
+    now: Option<Timestamp>,
+}
+
+fn is_sure(state: TrackState) -> bool {
+    matches!(state, TrackState::Confirmed | TrackState::Coasting | TrackState::OneCamera)
+}
+
+impl Known {
+    /// A track of a message; `None` if it has no place, or numbers that are none.
+    fn parse(track: &Track, frame: &TrackFrame) -> Option<Self> {
+        let covariance = <[f64; 36]>::try_from(track.covariance.as_slice()).ok()?;
+        let known = Self {
+            state: track.state(),
+            time: Timestamp::from_nanos(frame.time_ns),
+            time_sd_s: frame.time_sd_s,
+            seen: Timestamp::from_nanos(track.updated_ns),
+            position: track.position?.into(),
+            velocity: track.velocity?.into(),
+            covariance: Matrix6::from_row_slice(&covariance),
+        };
+        let mut numbers = known.position.iter().chain(&known.velocity).chain(&known.covariance);
+        (numbers.all(|number| number.is_finite()) && known.time_sd_s.is_finite()).then_some(known)
+    }
+
+    /// The same track at another time, if it flies straight on.
+    fn at(&self, time: Timestamp, frame: &LocalFrame, datum: Option<&Datum>, id: u64) -> Target {
+        let elapsed = time.seconds_since(self.time);
+        let position = self.position + self.velocity * elapsed;
+        let mut transition = Matrix6::identity();
+        transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * elapsed));
+        let mut covariance = transition * self.covariance * transition.transpose();
+        if let Some(datum) = datum {
+            covariance += datum.of_state(&position, &self.velocity, time);
+        }
+        // Along its way it may be farther or less far, by its speed times what the time is off by.
+        let mut places = covariance.fixed_view_mut::<3, 3>(0, 0);
+        places += self.velocity * self.velocity.transpose() * self.time_sd_s.powi(2);
+        let place = frame.geodetic(position);
+        let turn = frame.axes_at(&LocalFrame::at(place));
+        let mut turns = Matrix6::zeros();
+        turns.fixed_view_mut::<3, 3>(0, 0).copy_from(&turn);
+        turns.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
+        Target {
+            id,
+            state: self.state,
+            place,
+            velocity: turn * self.velocity,
+            covariance: turns * covariance * turns.transpose(),
+            seen: self.seen,
+        }
+    }
+}
+
+impl Situation {
+    /// Nothing heard yet, of a site whose origin is at an anchor.
+    pub fn new(site: SiteName, anchor: Geodetic) -> Self {
+        let frame = LocalFrame::at(anchor);
+        Self { site, frame, datum: None, tracks: BTreeMap::new(), now: None }
+    }
+
+    /// Hears a calibration: what it says of the whole site is in all tracks' covariances from then on.
+    pub fn hear_calibration(&mut self, calibration: &CameraCalibration) {
+        let datum = calibration.datum.as_ref().and_then(|datum| datum.parse());
+        self.datum = datum.or(self.datum.take());
+    }
+
+    /// Hears tracks. One without a place, or with numbers that are none, is left out.
+    pub fn hear(&mut self, frame: &TrackFrame) {
+        let time = Timestamp::from_nanos(frame.time_ns);
+        self.now = Some(self.now.map_or(time, |now| now.max(time)));
+        for track in &frame.tracks {
+            let was_sure = self.tracks.get(&track.id).is_some_and(|known| is_sure(known.state));
+            let is_news = is_sure(track.state()) || was_sure;
+            if !is_news || (!was_sure && self.tracks.len() >= MOST_TRACKS) {
+                continue;
+            }
+            match (Known::parse(track, frame), self.tracks.get_mut(&track.id)) {
+                (Some(known), _) => drop(self.tracks.insert(track.id, known)),
+                // A lost track need not say where it was.
+                (None, Some(known)) => known.state = track.state(),
+                (None, None) => {}
+            }
+        }
+    }
+
+    /// Where all targets are at the newest time that was heard; `None` if nothing was.
+    pub fn snapshot(&mut self) -> Option<Snapshot> {
+        let time = self.now?;
+        for known in self.tracks.values_mut() {
+            if !is_sure(known.state) || time.seconds_since(known.time) > SILENCE_S {
+                known.state = TrackState::Lost;
+            }
+        }
+        let (frame, datum) = (&self.frame, self.datum.as_ref());
+        let target = |(&id, known): (&u64, &Known)| {
+            // A lost one stays where it was.
+            let at = if known.state == TrackState::Lost { known.time } else { time };
+            known.at(at, frame, datum, id)
+        };
+        let targets = self.tracks.iter().map(target).collect();
+        self.tracks.retain(|_, known| known.state != TrackState::Lost);
+        Some(Snapshot { site: self.site.clone(), time, targets })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use crossfix_message::Vector3 as WireVector;
+
+    use super::*;
+
+    const START: f64 = 1.79e9;
+
+    fn situation() -> Situation {
+        let anchor = Geodetic::from_degrees(48.0, 11.0, 500.0).unwrap();
+        Situation::new("field".parse().unwrap(), anchor)
+    }
+
+    fn frame(time_s: f64, id: u64, state: TrackState, x: f64) -> TrackFrame {
+        TrackFrame {
+            time_ns: Timestamp::from_seconds(START + time_s).nanos(),
+            time_sd_s: 0.01,
+            tracks: vec![Track {
+                id,
+                state: state.into(),
+                position: Some(WireVector { x, y: 0.0, z: 0.0 }),
+                velocity: Some(WireVector { x: 10.0, y: 0.0, z: 0.0 }),
+                covariance: (0..36).map(|k| if k % 7 == 0 { 0.04 } else { 0.0 }).collect(),
+                ..Default::default()
+            }],
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn all_tracks_are_said_at_one_time_with_what_it_is_off_by() {
+        let mut situation = situation();
+        assert_eq!(situation.snapshot(), None);
+        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(&frame(0.5, 2, TrackState::Confirmed, 0.0));
+        let snapshot = situation.snapshot().unwrap();
+        assert_eq!(snapshot.time, Timestamp::from_seconds(START + 0.5));
+        let [one, two] = &snapshot.targets[..] else { panic!("{snapshot:?}") };
+        // 5 m east at 48 degrees north.
+        assert_relative_eq!(one.place.longitude_deg(), 11.0 + 5.0 / 74_625.0, epsilon = 1e-7);
+        assert_relative_eq!(two.place.longitude_deg(), 11.0, epsilon = 1e-12);
+        // 0.2 m at rest, 0.2 m/s for half a second, 10 m/s times 10 ms.
+        let east = |target: &Target| target.place_sd_m().x;
+        assert_relative_eq!(east(two), (0.04_f64 + 0.01).sqrt(), epsilon = 1e-9);
+        assert_relative_eq!(east(one), (0.04_f64 + 0.01 + 0.01).sqrt(), epsilon = 1e-9);
+    }
+
+    #[test]
+    fn a_lost_track_is_said_once_and_one_that_is_not_sure_never() {
+        let mut situation = situation();
+        situation.hear(&frame(0.0, 1, TrackState::Tentative, 0.0));
+        assert!(situation.snapshot().unwrap().targets.is_empty());
+        situation.hear(&frame(0.1, 1, TrackState::Confirmed, 0.0));
+        assert_eq!(situation.snapshot().unwrap().targets[0].state, TrackState::Confirmed);
+        situation.hear(&frame(0.2, 1, TrackState::Lost, 0.0));
+        assert_eq!(situation.snapshot().unwrap().targets[0].state, TrackState::Lost);
+        assert!(situation.snapshot().unwrap().targets.is_empty());
+    }
+
+    #[test]
+    fn tracks_of_a_fusion_centre_that_is_gone_are_lost() {
+        let mut situation = situation();
+        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(&frame(3.0, 2, TrackState::Confirmed, 0.0));
+        let states: Vec<_> =
+            situation.snapshot().unwrap().targets.iter().map(|target| target.state).collect();
+        assert_eq!(states, [TrackState::Lost, TrackState::Confirmed]);
+    }
+
+    #[test]
+    fn numbers_that_are_none_are_left_out() {
+        let mut situation = situation();
+        let mut bad = frame(0.0, 1, TrackState::Confirmed, f64::NAN);
+        situation.hear(&bad);
+        bad.tracks[0].position = None;
+        situation.hear(&bad);
+        assert!(situation.snapshot().unwrap().targets.is_empty());
+    }
+}
