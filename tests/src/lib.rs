@@ -373,6 +373,7 @@ pub fn free_network(cameras: impl IntoIterator<Item = CameraName>) -> NetworkCon
         routers: Vec::new(),
         unsecured: false,
         security: None,
+        anchor: None,
         fusion: endpoints.remove(0),
         cameras: cameras.into_iter().zip(endpoints).collect(),
     }

@@ -50,6 +50,7 @@ mod cot;
 pub mod foxglove;
 mod geojson;
 mod kml;
+#[cfg(feature = "sapient")]
 mod sapient;
 mod situation;
 mod target;
@@ -62,6 +63,7 @@ pub use asterix::Asterix;
 pub use cot::CursorOnTarget;
 pub use geojson::{GeoJsonFlights, GeoJsonLines};
 pub use kml::Kml;
+#[cfg(feature = "sapient")]
 pub use sapient::Sapient;
 pub use situation::{Situation, Snapshot};
 pub use target::Target;

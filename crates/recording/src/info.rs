@@ -5,7 +5,7 @@ use std::path::Path;
 use crossfix_message::{Channel, Health, Timestamp, decode};
 use serde::Serialize;
 
-use crate::{Damage, Entry, ReadFailure, RecordingError, RecordingReader, Source, schema};
+use crate::{Damage, Entry, ReadFailure, RecordingError, RecordingReader, Source, schema_of};
 
 /// What one channel of a recording holds.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -78,7 +78,7 @@ impl RecordingInfo {
             let topic = entry.key.to_string();
             let channel = channels.entry(topic.clone()).or_insert_with(|| ChannelInfo {
                 topic,
-                schema: schema::of(&entry.key.channel).unwrap_or_default(),
+                schema: schema_of(&entry.key.channel).unwrap_or_default(),
                 messages: 0,
                 bytes: 0,
                 first: entry.data_time,

@@ -43,6 +43,7 @@ pub use damage::Damage;
 pub use error::RecordingError;
 pub use info::{ChannelInfo, LastHealth, RecordingInfo};
 pub use reader::{ReadFailure, ReadReport, RecordingReader};
+pub use schema::schema_of;
 pub use source::Source;
 pub use writer::RecordingWriter;
 
@@ -62,4 +63,21 @@ pub struct Entry {
     pub arrival: Timestamp,
     /// The bytes of the wire.
     pub data: Vec<u8>,
+}
+
+/// A message in a schema of others, written beside ours.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Beside<'a> {
+    /// Its topic: none of ours, which begin with `crossfix/`.
+    pub topic: &'a str,
+    /// Its schema's full protobuf name.
+    pub schema: &'a str,
+    /// The schema's definitions, a `google.protobuf.FileDescriptorSet`.
+    pub definitions: &'a [u8],
+    /// The time it speaks of.
+    pub data_time: Timestamp,
+    /// When what it was made of was received.
+    pub arrival: Timestamp,
+    /// The message.
+    pub data: &'a [u8],
 }

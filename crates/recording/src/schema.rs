@@ -4,7 +4,7 @@ use crossfix_message::{
 };
 
 /// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.
-pub(crate) fn of(channel: &Channel) -> Option<&'static str> {
+pub fn schema_of(channel: &Channel) -> Option<&'static str> {
     Some(match channel {
         Channel::Bearings(_) => BearingFrame::SCHEMA,
         Channel::Calibration(_) => CameraCalibration::SCHEMA,

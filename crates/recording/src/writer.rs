@@ -7,7 +7,7 @@ use crossfix_message::{Key, MAX_MESSAGE_BYTES, file_descriptor_set};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
-use crate::{CHANNELS, Entry, RecordingError, Source, schema};
+use crate::{Beside, CHANNELS, Entry, RecordingError, Source, schema_of};
 
 /// The fastest: what fills recordings is floating-point numbers, which higher levels hardly make
 /// smaller.
@@ -19,6 +19,8 @@ const CHUNK_BYTES: u64 = 512 * 1024;
 pub struct RecordingWriter<W: Write + Seek> {
     writer: Writer<W>,
     channels: BTreeMap<Key, (u16, u32)>,
+    /// The channels of messages in others' schemas, by topic.
+    beside: BTreeMap<String, (u16, u32)>,
     /// Whether a channel has been added since they were last said outside of the chunks.
     has_new_channels: bool,
     messages: u64,
@@ -63,7 +65,13 @@ impl<W: Write + Seek> RecordingWriter<W> {
             .library(concat!("crossfix ", env!("CARGO_PKG_VERSION")))
             .create(sink)
             .map_err(RecordingError::Write)?;
-        Ok(Self { writer, channels: BTreeMap::new(), has_new_channels: false, messages: 0 })
+        Ok(Self {
+            writer,
+            channels: BTreeMap::new(),
+            beside: BTreeMap::new(),
+            has_new_channels: false,
+            messages: 0,
+        })
     }
 
     /// Says in the file who writes it.
@@ -86,7 +94,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 bytes: entry.data.len(),
             });
         }
-        let Some(name) = schema::of(&entry.key.channel) else {
+        let Some(name) = schema_of(&entry.key.channel) else {
             return Ok(());
         };
         let (channel_id, sequence) = match self.channels.get(&entry.key) {
@@ -105,6 +113,35 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.channels.insert(entry.key.clone(), (channel_id, sequence.wrapping_add(1)));
         self.messages += 1;
         Ok(())
+    }
+
+    /// Writes a message in a schema of others beside ours, for their programs. Our own readers leave
+    /// it out, and it is not counted.
+    ///
+    /// # Errors
+    /// [`RecordingError::Write`].
+    pub fn write_beside(&mut self, message: &Beside<'_>) -> Result<(), RecordingError> {
+        let known = self.beside.get(message.topic).copied();
+        let (channel_id, sequence) = match known {
+            Some(known) => known,
+            None => (self.add_beside(message).map_err(RecordingError::Write)?, 0),
+        };
+        let nanos = |time: crossfix_message::Timestamp| u64::try_from(time.nanos()).unwrap_or(0);
+        let header = MessageHeader {
+            channel_id,
+            sequence,
+            log_time: nanos(message.data_time),
+            publish_time: nanos(message.arrival),
+        };
+        let written = self.writer.write_to_known_channel(&header, message.data);
+        written.map_err(RecordingError::Write)?;
+        self.beside.insert(message.topic.to_owned(), (channel_id, sequence.wrapping_add(1)));
+        Ok(())
+    }
+
+    fn add_beside(&mut self, message: &Beside<'_>) -> McapResult<u16> {
+        let schema = self.writer.add_schema(message.schema, "protobuf", message.definitions)?;
+        self.writer.add_channel(schema, message.topic, "protobuf", &BTreeMap::new())
     }
 
     fn add_channel(&mut self, schema: &str, key: &Key) -> McapResult<u16> {

@@ -81,6 +81,7 @@ fn network() -> Result<NetworkConfig, Box<dyn Error>> {
         routers: Vec::new(),
         unsecured: false,
         security: None,
+        anchor: None,
         fusion: "tcp/127.0.0.1:7450".to_owned(),
         cameras,
     })

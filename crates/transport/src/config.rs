@@ -18,6 +18,19 @@ pub enum Mode {
     Client,
 }
 
+/// Where on the Earth the origin of a site's axes (east, north, up) is: WGS84.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Anchor {
+    /// Degrees north, -90 to 90.
+    pub latitude_deg: f64,
+    /// Degrees east, -180 to 180.
+    pub longitude_deg: f64,
+    /// Metres above the ellipsoid: what a GNSS receiver says plus its geoid height, if it says heights
+    /// above the sea.
+    pub height_m: f64,
+}
+
 /// The network of a site: a name and the endpoints of all components.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -38,6 +51,9 @@ pub struct NetworkConfig {
     pub fusion: String,
     /// Each camera's endpoint.
     pub cameras: BTreeMap<CameraName, String>,
+    /// Where on the Earth the site is: what tells others where its targets are needs it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub anchor: Option<Anchor>,
     /// Certificates: with them every link is mutual TLS, also where its endpoint says `tcp/`, and
     /// each component may say only what is its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -258,6 +274,7 @@ mod tests {
             routers: vec![],
             unsecured: false,
             security: None,
+            anchor: None,
             fusion: "tcp/127.0.0.1:7450".into(),
             cameras: [("a", 7451), ("b", 7452)]
                 .map(|(name, port)| (name.parse().unwrap(), format!("tcp/127.0.0.1:{port}")))

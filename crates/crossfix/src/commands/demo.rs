@@ -365,6 +365,7 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
         routers: Vec::new(),
         unsecured: false,
         security: None,
+        anchor: None,
         fusion,
         cameras,
     })

@@ -29,6 +29,8 @@ pub mod fuse;
 #[cfg(feature = "centre")]
 pub mod import;
 #[cfg(feature = "centre")]
+pub mod outlet;
+#[cfg(feature = "centre")]
 pub mod plan;
 #[cfg(feature = "centre")]
 pub mod replay;
@@ -75,6 +77,7 @@ pub enum Centre {
     Simulate(simulate::Args),
     Validate(validate::Args),
     Enroll(enroll::Args),
+    Outlet(outlet::Args),
 }
 
 #[cfg(feature = "centre")]
@@ -91,6 +94,7 @@ impl Centre {
             Self::Simulate(args) => simulate::run(&args),
             Self::Validate(args) => validate::run(&args),
             Self::Enroll(args) => enroll::run(&args),
+            Self::Outlet(args) => outlet::run(&args),
         }
     }
 }

@@ -47,7 +47,7 @@ impl Kind {
             Some(Self::Camera)
         } else if has(&["targets"]) {
             Some(Self::Scene)
-        } else if has(&["site", "routers", "security", "unsecured"])
+        } else if has(&["site", "routers", "security", "unsecured", "anchor"])
             || keys.get("cameras").is_some_and(toml::Value::is_table)
         {
             Some(Self::Network)

@@ -14,6 +14,6 @@ pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use mount::{MountConfig, OnvifConfig};
-pub use site::{Site, load_cameras, load_network};
+pub use site::{Site, anchor_of, load_cameras, load_network};
 pub use source::SourceConfig;
 pub use stream::{GstreamerConfig, StreamConfig, login};

@@ -2,9 +2,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use crossfix_geometry::Camera;
+use crossfix_geometry::{Camera, Geodetic};
 use crossfix_message::CameraName;
-use crossfix_transport::NetworkConfig;
+use crossfix_transport::{Anchor, NetworkConfig};
 
 #[cfg(feature = "centre")]
 use super::FusionFile;
@@ -18,10 +18,18 @@ pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
         let folder = path.parent().unwrap_or(Path::new("."));
         security.certificates = folder.join(&security.certificates);
     }
-    network
-        .validate()
-        .with_context(|| format!("the network file {} has an error", path.display()))?;
+    let has_error = || format!("the network file {} has an error", path.display());
+    network.validate().with_context(has_error)?;
+    anchor_of(&network).with_context(has_error)?;
     Ok(network)
+}
+
+/// Where on the Earth a network's site is, if it says.
+pub fn anchor_of(network: &NetworkConfig) -> anyhow::Result<Option<Geodetic>> {
+    let place = |anchor: Anchor| {
+        Geodetic::from_degrees(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m)
+    };
+    network.anchor.map(place).transpose().context("section [anchor]")
 }
 
 /// The TOML files of a folder by name, with their keys.

@@ -1,5 +1,6 @@
 mod data_time;
 mod files;
+pub mod foxglove;
 mod pictures;
 mod recorder;
 mod syncing;
@@ -13,6 +14,7 @@ use crossfix_recording::{RecordingError, Source};
 use crossfix_transport::{Delivery, Role, Subscription};
 
 use self::files::{Files, Limits, Room};
+use self::foxglove::WithFoxglove;
 use self::pictures::VideoArgs;
 use self::recorder::Recorder;
 use self::syncing::Syncing;
@@ -50,6 +52,11 @@ pub struct Args {
     limits: Limits,
     #[command(flatten)]
     video: VideoArgs,
+    /// What is written a second time in Foxglove's schemas, so that the files open in Foxglove and
+    /// Rerun without Crossfix: all of cameras, pictures and tracks; the site without pictures, which
+    /// are most of a recording; or none.
+    #[arg(long, value_enum, default_value_t)]
+    foxglove: WithFoxglove,
     #[command(flatten)]
     health: HealthArgs,
     /// Stop when stdin ends.
@@ -74,7 +81,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") };
     // Where it fell over the last time.
     (0..MOST_AT_START).take_while(|_| files.make_room() < Room::Pictures).for_each(drop);
-    let mut recorder = Recorder::new(files.create(&source)?, &network, link.run(), args.video);
+    let foxglove = args.foxglove.view(&network.site, config::anchor_of(&network)?);
+    let mut recorder =
+        Recorder::new(files.create(&source)?, &network, link.run(), args.video, foxglove);
     let alive = link.declare_alive(Channel::RecorderAlive)?;
     let path = files.path().display().to_string();
     tracing::info!("recording `{}` to {path}, run {}", link.site(), link.run());

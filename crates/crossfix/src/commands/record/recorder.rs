@@ -4,11 +4,13 @@ use std::time::Instant;
 use crossfix_message::{
     CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, decode, glance,
 };
+use crossfix_outlet::foxglove::FoxgloveView;
 use crossfix_recording::{Entry, RecordingError};
 use crossfix_transport::{NetworkConfig, Received, Reception, Refused, RunId};
 
 use super::data_time::{DataTime, Said};
 use super::files::{FileWriter, Room};
+use super::foxglove;
 use super::pictures::{Pictures, VideoArgs};
 use crate::health::HealthReporter;
 use crate::network::rivalry;
@@ -35,6 +37,7 @@ pub struct Recorder {
     /// newest word on their clocks.
     standing: BTreeMap<Key, Entry>,
     pictures: Pictures<(Entry, Said)>,
+    foxglove: Option<FoxgloveView>,
     room: Room,
     /// What was wrong with the disk since the last health.
     trouble: Option<String>,
@@ -80,7 +83,13 @@ pub(super) fn room_for(channel: &Channel) -> Room {
 
 impl Recorder {
     /// A recorder of a network's site.
-    pub fn new(writer: FileWriter, network: &NetworkConfig, run: RunId, video: VideoArgs) -> Self {
+    pub fn new(
+        writer: FileWriter,
+        network: &NetworkConfig,
+        run: RunId,
+        video: VideoArgs,
+        foxglove: Option<FoxgloveView>,
+    ) -> Self {
         Self {
             writer,
             site: network.site.clone(),
@@ -94,6 +103,7 @@ impl Recorder {
             counts: Counts::default(),
             standing: BTreeMap::new(),
             pictures: Pictures::new(video),
+            foxglove,
             room: Room::default(),
             trouble: None,
             before: (0, 0),
@@ -242,7 +252,11 @@ impl Recorder {
                 self.repeats.warn("too long", Instant::now(), || error.to_string());
                 Ok(())
             }
-            written => written,
+            Err(error) => Err(error),
+            Ok(()) => match &mut self.foxglove {
+                Some(view) => foxglove::write(&mut self.writer, view, entry),
+                None => Ok(()),
+            },
         }
     }
 

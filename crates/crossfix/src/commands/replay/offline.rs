@@ -46,7 +46,7 @@ pub fn fuse(
     let is_smoothed = config.tracking.smoothing_s > 0.0;
     let draft = Draft::new(output, &[&args.recording])?;
     let mut run = OfflineFusion {
-        centre: Centre::new(config, None)?,
+        centre: Centre::new(config, file.cameras)?,
         is_smoothed,
         writer: RecordingWriter::create(draft.path())?,
         frames: 0,

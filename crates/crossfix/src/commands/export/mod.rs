@@ -1,14 +1,17 @@
+mod others;
+
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_evaluation::{Estimate, TrackHistory};
 use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
 
+use self::others::Others;
 use crate::output::{self, Draft};
 use crate::recorded::{self, Lacks};
 
-/// Write the confirmed tracks of a recording as a table.
+/// Write the confirmed tracks of a recording as a table, or in the formats of others.
 ///
 /// Columns t,track_id,x,y,z,vx,vy,vz,state,cameras,sd_m,time_sd_s: seconds since the Unix epoch,
 /// metres, metres per second, what the track is (confirmed or coasting; with --all also tentative
@@ -18,14 +21,14 @@ use crate::recorded::{self, Lacks};
 /// times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Example:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv"
+    after_help = "Examples:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  crossfix export site.mcap --foxglove shown.mcap"
 )]
 pub struct Args {
     /// The recording (MCAP) with tracks.
     recording: PathBuf,
     /// The table to write (CSV).
     #[arg(long, value_name = "FILE")]
-    csv: PathBuf,
+    csv: Option<PathBuf>,
     /// A table (CSV) with a column `t`: the times to answer, seconds since the Unix epoch.
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
@@ -36,6 +39,8 @@ pub struct Args {
     /// The smoothed tracks (of `fuse --lag`) in the place of those that went out at once.
     #[arg(long)]
     smoothed: bool,
+    #[command(flatten)]
+    others: Others,
 }
 
 /// What a track is, in a word.
@@ -55,6 +60,18 @@ struct TimeRow {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
+    ensure!(
+        args.csv.is_some() || args.others.are_asked_for(),
+        "what is to be written? Give --csv FILE, or a format of others (--help)"
+    );
+    if let Some(csv) = &args.csv {
+        write_table(args, csv)?;
+    }
+    let channel = if args.smoothed { Channel::Smoothed } else { Channel::Tracks };
+    args.others.write(&args.recording, &channel)
+}
+
+fn write_table(args: &Args, csv: &Path) -> anyhow::Result<()> {
     let mut history = TrackHistory::default();
     let mut lacks = Lacks::default();
     let mut frames = 0_u64;
@@ -73,9 +90,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     lacks.ensure_found(frames > 0, what, &args.recording)?;
     let inputs: Vec<&Path> =
         std::iter::once(&args.recording).chain(&args.times).map(PathBuf::as_path).collect();
-    let draft = Draft::new(&args.csv, &inputs)?;
-    let mut writer = csv::Writer::from_path(draft.path())
-        .with_context(|| format!("cannot write {}", args.csv.display()))?;
+    let draft = Draft::new(csv, &inputs)?;
+    let mut writer = ::csv::Writer::from_path(draft.path())
+        .with_context(|| format!("cannot write {}", csv.display()))?;
     writer.write_record([
         "t",
         "track_id",
@@ -107,7 +124,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let at = |time| if args.all { history.all_at(time) } else { history.at(time) };
     match &args.times {
         Some(path) => {
-            let mut reader = csv::Reader::from_path(path)
+            let mut reader = ::csv::Reader::from_path(path)
                 .with_context(|| format!("cannot read {}", path.display()))?;
             for row in reader.deserialize() {
                 let TimeRow { t } =
@@ -121,9 +138,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             }
         }
     }
-    writer.flush().with_context(|| format!("cannot write {}", args.csv.display()))?;
+    writer.flush().with_context(|| format!("cannot write {}", csv.display()))?;
     drop(writer);
     draft.keep()?;
-    output::line(format!("{rows} rows written to {}", args.csv.display()));
+    output::line(format!("{rows} rows written to {}", csv.display()));
     Ok(())
 }

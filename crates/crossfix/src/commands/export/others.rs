@@ -1,0 +1,208 @@
+//! A recording's tracks in the formats of others, as an outlet would have told them live.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use crossfix_geometry::Geodetic;
+use crossfix_message::{CameraCalibration, Channel, SiteName, Timestamp, TrackEvent, TrackFrame};
+use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
+use crossfix_outlet::{GeoJsonFlights, Kml, Outlet, Sapient, Situation};
+use crossfix_recording::{Entry, RecordingWriter, Source};
+
+use crate::commands::numbers;
+use crate::commands::outlet::FormatArgs;
+use crate::commands::record::foxglove;
+use crate::output::{self, Draft};
+use crate::recorded::{self, Lacks};
+
+/// Files in the formats of others.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Others {
+    /// Write each track's flight as GeoJSON (WGS84); needs --anchor, as do all but --foxglove.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    geojson: Option<PathBuf>,
+    /// Write each track's flight as KML, for Google Earth.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    kml: Option<PathBuf>,
+    /// With --kml: how high the geoid (mean sea level) is above the ellipsoid there, metres.
+    #[arg(long, value_name = "METRES", default_value_t = 0.0, value_parser = numbers::number, allow_hyphen_values = true)]
+    geoid: f64,
+    /// Write events of Cursor on Target, one after the other.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    cot: Option<PathBuf>,
+    /// Write messages of SAPIENT, each after its length.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    sapient: Option<PathBuf>,
+    /// Write blocks of ASTERIX category 062.
+    #[arg(long, value_name = "FILE", requires = "anchor")]
+    asterix: Option<PathBuf>,
+    /// Write the recording again with Foxglove's schemas beside ours (MCAP): it opens in Foxglove and
+    /// Rerun without Crossfix.
+    #[arg(long, value_name = "FILE")]
+    foxglove: Option<PathBuf>,
+    /// How often the targets' places are said in the formats of others, a second.
+    #[arg(long, value_name = "HERTZ", default_value_t = 10.0, value_parser = numbers::positive)]
+    rate_hz: f64,
+    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
+    /// ellipsoid.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    formats: FormatArgs,
+}
+
+impl Others {
+    /// Whether anything is asked for.
+    pub fn are_asked_for(&self) -> bool {
+        let files =
+            [&self.geojson, &self.kml, &self.cot, &self.sapient, &self.asterix, &self.foxglove];
+        files.into_iter().any(Option::is_some)
+    }
+
+    /// Writes what is asked for.
+    pub fn write(&self, recording: &Path, channel: &Channel) -> anyhow::Result<()> {
+        let site = site_of(recording)?;
+        if let Some(anchor) = self.anchor {
+            let told = Told { recording, channel, site: &site, anchor, rate_hz: self.rate_hz };
+            let formats = &self.formats;
+            told.write(self.geojson.as_deref(), || Ok(Box::<GeoJsonFlights>::default()))?;
+            told.write(self.kml.as_deref(), || Ok(Box::new(Kml::above_geoid(self.geoid))))?;
+            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cursor_on_target()?)))?;
+            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix()?)))?;
+            let sapient = || Ok(Box::new(Sapient::of_site(site.clone())) as Box<dyn Outlet>);
+            told.write(self.sapient.as_deref(), sapient)?;
+        }
+        match &self.foxglove {
+            Some(path) => write_foxglove(recording, path, &site, self.anchor),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The site that a recording is of: that of its first message.
+fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
+    let mut site = None;
+    let mut lacks = Lacks::default();
+    recorded::for_each(recording, &mut lacks, |_, entry| {
+        site.get_or_insert_with(|| entry.key.site.clone());
+        Ok(())
+    })?;
+    site.with_context(|| format!("{} holds no message of a site", recording.display()))
+}
+
+/// Writes messages.
+type Put<'a> = dyn FnMut(Vec<Vec<u8>>) -> anyhow::Result<()> + 'a;
+
+/// A recording's tracks, told to an outlet.
+struct Told<'a> {
+    recording: &'a Path,
+    channel: &'a Channel,
+    site: &'a SiteName,
+    anchor: Geodetic,
+    rate_hz: f64,
+}
+
+impl Told<'_> {
+    fn write(
+        &self,
+        path: Option<&Path>,
+        outlet: impl FnOnce() -> anyhow::Result<Box<dyn Outlet>>,
+    ) -> anyhow::Result<()> {
+        let Some(path) = path else { return Ok(()) };
+        let cannot_write = || format!("cannot write {}", path.display());
+        let draft = Draft::new(path, &[self.recording])?;
+        let mut file = BufWriter::new(File::create(draft.path()).with_context(cannot_write)?);
+        let mut messages = 0_u64;
+        let mut put = |said: Vec<Vec<u8>>| -> anyhow::Result<()> {
+            for message in said {
+                messages += 1;
+                file.write_all(&message).with_context(cannot_write)?;
+            }
+            Ok(())
+        };
+        self.tell(&mut *outlet()?, &mut put)?;
+        file.flush().with_context(cannot_write)?;
+        drop(file);
+        draft.keep()?;
+        output::line(format!("{messages} messages written to {}", path.display()));
+        Ok(())
+    }
+
+    /// Tells the tracks at even times of the data.
+    fn tell(&self, outlet: &mut dyn Outlet, put: &mut Put<'_>) -> anyhow::Result<()> {
+        let mut situation = Situation::new(self.site.clone(), self.anchor);
+        let mut next: Option<Timestamp> = None;
+        let mut last = Timestamp::EPOCH;
+        let mut lacks = Lacks::default();
+        let mut frames = 0_u64;
+        let mut is_greeted = false;
+        let mut greet = |outlet: &mut dyn Outlet, now: Timestamp, put: &mut Put<'_>| {
+            if std::mem::replace(&mut is_greeted, true) {
+                return Ok(());
+            }
+            put(outlet.greeting(now))
+        };
+        recorded::for_each(self.recording, &mut lacks, |lacks, entry| {
+            match &entry.key.channel {
+                Channel::Calibration(_) => {
+                    if let Some(message) = lacks.read::<CameraCalibration>(&entry.data) {
+                        situation.hear_calibration(&message);
+                    }
+                }
+                Channel::Events => {
+                    if let Some(event) = lacks.read::<TrackEvent>(&entry.data) {
+                        greet(outlet, Timestamp::from_nanos(event.time_ns), put)?;
+                        put(outlet.event(&event))?;
+                    }
+                }
+                channel if channel == self.channel => {
+                    let Some(frame) = lacks.read::<TrackFrame>(&entry.data) else { return Ok(()) };
+                    frames += 1;
+                    situation.hear(&frame);
+                    last = last.max(Timestamp::from_nanos(frame.time_ns));
+                    let due = *next.get_or_insert(last);
+                    if last >= due {
+                        // A recording may have gaps: no time is made up for.
+                        next = Some(last.max(due).plus_seconds(self.rate_hz.recip()));
+                        greet(outlet, last, put)?;
+                        let snapshot = situation.snapshot();
+                        put(snapshot.iter().flat_map(|s| outlet.tracks(s)).collect())?;
+                    }
+                }
+                _ => {}
+            }
+            Ok(())
+        })?;
+        lacks.say(self.recording);
+        lacks.ensure_found(frames > 0, "tracks", self.recording)?;
+        put(outlet.farewell(last))
+    }
+}
+
+/// Writes a recording again with Foxglove's schemas beside ours.
+fn write_foxglove(
+    recording: &Path,
+    path: &Path,
+    site: &SiteName,
+    anchor: Option<Geodetic>,
+) -> anyhow::Result<()> {
+    let draft = Draft::new(path, &[recording])?;
+    let mut writer = RecordingWriter::create(draft.path())?;
+    writer.sign(&Source::of("export --foxglove"))?;
+    let mut view = FoxgloveView::new(site, anchor, Pictures::Said);
+    let mut lacks = Lacks::default();
+    recorded::for_each(recording, &mut lacks, |_, entry: Entry| {
+        writer.write(&entry)?;
+        Ok(foxglove::write(&mut writer, &mut view, &entry)?)
+    })?;
+    lacks.say(recording);
+    let messages = writer.finish()?;
+    draft.keep()?;
+    output::line(format!(
+        "{messages} messages and what Foxglove reads of them written to {}",
+        path.display()
+    ));
+    Ok(())
+}

@@ -1,0 +1,197 @@
+//! A site's tracks for programs of others, live.
+
+mod carrier;
+mod foxglove;
+mod tls;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use crossfix_geometry::Geodetic;
+use crossfix_message::{CameraCalibration, Channel, Key, TrackEvent, TrackFrame, decode};
+use crossfix_outlet::{Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation};
+use crossfix_transport::{Received, Role};
+
+use self::carrier::{Carrier, Destination};
+use self::tls::TlsFiles;
+use crate::commands::numbers;
+use crate::config;
+use crate::network;
+use crate::shutdown::{LEAVE, Shutdown};
+
+const POLL: Duration = Duration::from_millis(20);
+/// Events that wait for the other side to be there; more are old news.
+const MOST_EVENTS: usize = 1000;
+
+/// Tell programs of others where the targets are, live.
+///
+/// cot: Cursor on Target, for TAK. sapient: BSI Flex 335 v2.0. asterix: category 062. geojson: a
+/// collection a line. foxglove: a server that Foxglove connects to. What each says of its uncertainty
+/// is in docs/outlets.md.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  crossfix outlet cot -c my-site/network.toml --to udp://239.2.3.1:6969\n  crossfix outlet sapient -c my-site/network.toml --to tcp://10.0.0.9:5020\n  crossfix outlet geojson -c my-site/network.toml\n  crossfix outlet foxglove -c my-site/network.toml --listen 127.0.0.1:8765"
+)]
+pub struct Args {
+    /// The format.
+    format: Format,
+    /// The network's file (TOML).
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Where to: udp://HOST:PORT (multicast too), tcp://HOST:PORT, tls://HOST:PORT, a file, or - for
+    /// stdout.
+    #[arg(long, value_name = "DESTINATION", default_value = "-")]
+    to: Destination,
+    /// How often, a second; by default once, SAPIENT twice, ASTERIX every four seconds.
+    #[arg(long, value_name = "HERTZ", value_parser = numbers::positive)]
+    rate_hz: Option<f64>,
+    /// Where on Earth the site's origin is, in the place of the network file's [anchor]: degrees north,
+    /// degrees east, metres above the WGS84 ellipsoid.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    #[command(flatten)]
+    formats: FormatArgs,
+    #[command(flatten)]
+    tls: TlsFiles,
+    /// Where Foxglove connects to.
+    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8765")]
+    listen: SocketAddr,
+    /// Stop when stdin ends.
+    #[arg(long, hide = true)]
+    stop_with_stdin: bool,
+}
+
+/// What formats must be told.
+#[derive(Clone, Debug, clap::Args)]
+pub struct FormatArgs {
+    /// What targets are in Cursor on Target: a-u-A (unknown, in the air) claims nothing more;
+    /// a-u-A-M-H-Q is a rotary drone.
+    #[arg(long, value_name = "TYPE", default_value = "a-u-A")]
+    pub cot_type: String,
+    /// The data source in ASTERIX: system area code and system identification code.
+    #[arg(long, value_name = "SAC,SIC", default_value = "0,0")]
+    pub asterix_source: String,
+}
+
+impl FormatArgs {
+    pub fn cursor_on_target(&self) -> anyhow::Result<CursorOnTarget> {
+        CursorOnTarget::of_type(&self.cot_type).with_context(|| {
+            format!("--cot-type {}: no type of Cursor on Target, e.g. a-u-A", self.cot_type)
+        })
+    }
+
+    pub fn asterix(&self) -> anyhow::Result<Asterix> {
+        let codes = self.asterix_source.split_once(',').and_then(|(area, identification)| {
+            Some((area.trim().parse().ok()?, identification.trim().parse().ok()?))
+        });
+        let (area, identification) = codes.with_context(|| {
+            format!("--asterix-source {}: two numbers from 0 to 255", self.asterix_source)
+        })?;
+        Ok(Asterix::of_source(area, identification))
+    }
+}
+
+/// The formats that go out live.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Format {
+    Cot,
+    Sapient,
+    Asterix,
+    Geojson,
+    Foxglove,
+}
+
+impl Format {
+    /// How often it is said unless somebody asks for more, s.
+    fn period_s(self) -> f64 {
+        match self {
+            Self::Cot | Self::Geojson | Self::Foxglove => 1.0,
+            Self::Sapient => 0.5,
+            // As radars turn.
+            Self::Asterix => 4.0,
+        }
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
+    let network = config::load_network(&args.config)?;
+    let anchor = args.anchor.or(config::anchor_of(&network)?);
+    let site = network.site.clone();
+    if args.format == Format::Foxglove {
+        return foxglove::serve(&network, anchor, args.listen, &shutdown);
+    }
+    let anchor = anchor.with_context(|| {
+        format!(
+            "where on Earth is the site? Give {} a section [anchor] with latitude_deg, longitude_deg \
+             and height_m, or --anchor",
+            args.config.display()
+        )
+    })?;
+    let mut outlet: Box<dyn Outlet> = match args.format {
+        Format::Cot => Box::new(args.formats.cursor_on_target()?),
+        Format::Sapient => Box::new(Sapient::of_site(site.clone())),
+        Format::Asterix => Box::new(args.formats.asterix()?),
+        Format::Geojson => Box::new(GeoJsonLines),
+        Format::Foxglove => bail!("Foxglove is served"),
+    };
+    let mut carrier = Carrier::new(args.to.clone(), args.tls.client(&args.to)?);
+    let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
+        return Ok(());
+    };
+    let channels = [Channel::Tracks, Channel::Events]
+        .map(|channel| Key::new(site.clone(), channel).to_string());
+    let calibrations = Key::of_all_cameras(&site, "calibration");
+    let subscription = link.subscribe(&[channels.as_slice(), &[calibrations]].concat())?;
+    tracing::info!("telling {} where the targets of `{site}` are", args.to);
+
+    let mut heard = Heard { situation: Situation::new(site, anchor), events: Vec::new() };
+    let period = Duration::from_secs_f64(
+        args.rate_hz.map_or(args.format.period_s(), |rate_hz| rate_hz.recip()),
+    );
+    let mut said_at = Instant::now();
+    while !shutdown.requested() {
+        if let Some(received) = subscription.next(POLL) {
+            heard.hear(&received);
+        }
+        if said_at.elapsed() >= period {
+            said_at = Instant::now();
+            carrier.say(&mut *outlet, &mut heard);
+        }
+    }
+    carrier.finish(&mut *outlet);
+    drop(subscription);
+    link.close(LEAVE)?;
+    crate::output::line(format!("outlet: {} messages", carrier.messages()));
+    Ok(())
+}
+
+/// What has been heard of the site since something was said.
+struct Heard {
+    situation: Situation,
+    events: Vec<TrackEvent>,
+}
+
+impl Heard {
+    /// What is no message of this version is the viewer's and the recorder's to report.
+    fn hear(&mut self, received: &Received) {
+        match received.key.channel {
+            Channel::Tracks => {
+                if let Ok(frame) = decode::<TrackFrame>(&received.data) {
+                    self.situation.hear(&frame);
+                }
+            }
+            Channel::Calibration(_) => {
+                if let Ok(calibration) = decode::<CameraCalibration>(&received.data) {
+                    self.situation.hear_calibration(&calibration);
+                }
+            }
+            Channel::Events if self.events.len() < MOST_EVENTS => {
+                self.events.extend(decode::<TrackEvent>(&received.data).ok());
+            }
+            _ => {}
+        }
+    }
+}
