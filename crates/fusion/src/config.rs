@@ -147,11 +147,11 @@ pub struct Initiation {
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
     /// How long the bearings of two cameras must agree to start a track that no third camera sees,
-    /// s, for `hypotheses`. 0.001 to 3600. Default 1.
+    /// s, for `hypotheses`. 0.001 to 3600. Default 0.3.
     pub pair_s: f64,
-    /// Standard deviation of the velocity's prior, m/s per axis. 0.001 to 10000. Default 15.
+    /// Standard deviation of the velocity's prior, m/s per axis. 0.001 to 10000. Default 50.
     pub velocity_prior_sd_mps: f64,
-    /// Fixes farther than this from a camera are ghosts, m. 0.01 to 1000000. Default 2000.
+    /// Fixes farther than this from a camera are ghosts, m. 0.01 to 1000000. Default 20000.
     pub max_range_m: f64,
     /// Probability with which a true combination passes the gates of `hypotheses` and of `map`.
     /// Default 0.999.
