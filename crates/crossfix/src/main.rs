@@ -16,6 +16,7 @@ mod config;
 mod eye;
 mod health;
 mod host;
+mod http;
 #[cfg(feature = "centre")]
 mod import;
 mod logging;

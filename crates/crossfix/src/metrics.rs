@@ -1,33 +1,23 @@
 //! A component's health for Prometheus: `GET /metrics` on an address of its own.
 
-use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
 use crossfix_message::{CameraStanding, Health};
 use http_body_util::Full;
 use hyper::body::Bytes;
 use hyper::header::{CONTENT_TYPE, HeaderValue};
-use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
-use hyper_util::rt::TokioIo;
 use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
-use tokio::time::{sleep, timeout};
+
+use crate::http::{self, Answers};
 
 /// How long somebody who asks may take, from the first byte to the last: who asks slower, or nothing, must
 /// not keep a connection.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
-/// Who may ask at the same time; the next wait. Each takes a file descriptor, of which the camera and
-/// the network need some, too.
-const ASKING: usize = 16;
 /// A page that is older is of a component that does not say any more how it does.
 const STALE: Duration = Duration::from_secs(5);
-/// The pause after a connection could not be taken, as descriptors are short.
-const PAUSE: Duration = Duration::from_millis(100);
 
 /// The page; it is gone when the process ends.
 #[derive(Debug)]
@@ -48,23 +38,10 @@ impl MetricsPage {
     /// # Errors
     /// If the address cannot be listened on.
     pub fn serve(address: SocketAddr) -> anyhow::Result<Self> {
-        let listener = std::net::TcpListener::bind(address)
-            .and_then(|listener| listener.set_nonblocking(true).map(|()| listener))
-            .with_context(|| format!("cannot serve metrics on {address}"))?;
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()
-            .context("cannot serve metrics")?;
-        let shown = Shown { text: String::new(), at: Instant::now() };
-        let page = Self { shown: Arc::new(RwLock::new(shown)) };
-        let shown = Arc::clone(&page.shown);
-        std::thread::Builder::new().name("metrics".into()).spawn(move || {
-            runtime.block_on(async {
-                match TcpListener::from_std(listener) {
-                    Ok(listener) => answer(&listener, &shown).await,
-                    Err(error) => tracing::warn!("metrics are not served: {error}"),
-                }
-            });
+        let shown = Arc::new(RwLock::new(Shown { text: String::new(), at: Instant::now() }));
+        let page = Self { shown: Arc::clone(&shown) };
+        http::serve("metrics", address, Answers::Within(ANSWERED_WITHIN), move |request| {
+            answer(request, &shown)
         })?;
         tracing::info!("metrics at http://{address}/metrics");
         Ok(page)
@@ -82,34 +59,7 @@ impl MetricsPage {
     }
 }
 
-/// Answers everybody who asks.
-async fn answer(listener: &TcpListener, shown: &Arc<RwLock<Shown>>) {
-    let room = Arc::new(Semaphore::new(ASKING));
-    loop {
-        let Ok(place) = Arc::clone(&room).acquire_owned().await else { return };
-        match listener.accept().await {
-            Ok((stream, _)) => {
-                let shown = Arc::clone(shown);
-                tokio::spawn(async move {
-                    // What goes wrong with one who asks is theirs.
-                    let _ = timeout(ANSWERED_WITHIN, answer_one(stream, &shown)).await;
-                    drop(place);
-                });
-            }
-            Err(_) => sleep(PAUSE).await,
-        }
-    }
-}
-
-async fn answer_one(stream: TcpStream, shown: &RwLock<Shown>) -> hyper::Result<()> {
-    let page = service_fn(|request| async move { Ok::<_, Infallible>(page(&request, shown)) });
-    hyper::server::conn::http1::Builder::new()
-        .keep_alive(false)
-        .serve_connection(TokioIo::new(stream), page)
-        .await
-}
-
-fn page<B>(request: &Request<B>, shown: &RwLock<Shown>) -> Response<Full<Bytes>> {
+fn answer<B>(request: &Request<B>, shown: &RwLock<Shown>) -> Response<Full<Bytes>> {
     let is_there = request.uri().path() == "/metrics" && request.method() == Method::GET;
     let shown = shown.read().unwrap_or_else(PoisonError::into_inner);
     let (status, text) = if !is_there {
@@ -240,6 +190,7 @@ mod tests {
     use crossfix_message::Counter;
 
     use super::*;
+    use crate::http::ASKING;
 
     fn ask(address: SocketAddr, request: &str) -> String {
         let mut stream = std::net::TcpStream::connect(address).unwrap();

@@ -1,6 +1,9 @@
 mod board;
+mod page;
+mod plan;
 
 use std::io::{IsTerminal, stdout};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -8,6 +11,8 @@ use crossfix_message::{Channel, Key};
 use crossfix_transport::{Link, NetworkConfig, Role};
 
 use self::board::Board;
+use self::page::{Page, Shown};
+use self::plan::PlanBoard;
 use crate::config;
 use crate::network;
 use crate::output;
@@ -25,7 +30,9 @@ const CLEARED: &str = "\x1b[H\x1b[2J";
 ///
 /// On a terminal until Ctrl-C; else, or with --once or --json, what is heard in three seconds.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  crossfix status -c configs/site/network.toml")]
+#[command(
+    after_help = "Examples:\n  crossfix status -c configs/site/network.toml\n  crossfix status -c configs/site/network.toml --page 127.0.0.1:8080"
+)]
 pub struct Args {
     /// The network's file (TOML).
     #[arg(short, long, value_name = "FILE")]
@@ -36,14 +43,25 @@ pub struct Args {
     /// Print JSON, once.
     #[arg(long)]
     json: bool,
+    /// Serve a page instead, with a plan of the site, its tracks and what has happened, e.g.
+    /// 127.0.0.1:8080. Whoever reaches the address can look.
+    #[arg(long, value_name = "ADDRESS", conflicts_with_all = ["once", "json"])]
+    page: Option<SocketAddr>,
+    /// Stop when stdin ends.
+    #[arg(long, hide = true)]
+    stop_with_stdin: bool,
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let shutdown = Shutdown::listen();
+    let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
+    if let Some(address) = args.page {
+        serve(&link, &network, address, &shutdown)?;
+        return Ok(link.close(LEAVE)?);
+    }
     let is_screen = stdout().is_terminal() && !args.once && !args.json;
     let board = watch(&link, &network, &shutdown, |board| {
         if is_screen {
@@ -90,4 +108,38 @@ fn watch(
         }
     }
     Ok(board)
+}
+
+/// Serves a page until it is asked to stop.
+fn serve(
+    link: &Link,
+    network: &NetworkConfig,
+    address: SocketAddr,
+    shutdown: &Shutdown,
+) -> anyhow::Result<()> {
+    let page = Page::serve(address)?;
+    if !address.ip().is_loopback() {
+        tracing::warn!("whoever reaches {address} can look on: the page has no certificates");
+    }
+    let site = link.site();
+    let kinds = ["health", "calibration"].map(|kind| Key::of_all_cameras(site, kind));
+    let channels = [Channel::Tracks, Channel::Events]
+        .map(|channel| Key::new(site.clone(), channel).to_string());
+    let subscription = link.subscribe(&[kinds, channels].concat())?;
+    output::line(format!("site `{site}`: http://{address}/"));
+    let cameras: Vec<_> = network.cameras.keys().cloned().collect();
+    let mut board = Board::new(site.to_string(), cameras.clone());
+    let mut plan = PlanBoard::new(cameras);
+    let mut shown_at = Instant::now();
+    while !shutdown.requested() {
+        if let Some(received) = subscription.next(POLL) {
+            board.hear(&received.key.channel, &received.data, received.at);
+            plan.hear(&received.key.channel, &received.data, received.at);
+        }
+        if shown_at.elapsed() >= page::PERIOD {
+            shown_at = Instant::now();
+            page.show(&Shown { status: board.status(shown_at), plan: plan.plan(shown_at) })?;
+        }
+    }
+    Ok(())
 }

@@ -1,0 +1,168 @@
+//! A site seen from above: cameras, tracks, and what has happened.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use crossfix_geometry::{Camera, Pixel};
+use crossfix_message::{
+    Calibration, CameraCalibration, CameraName, Channel, Timestamp, Track, TrackEvent, TrackFrame,
+    TrackNumber, TrackState, decode,
+};
+use nalgebra::Vector3;
+use serde::Serialize;
+
+/// A track of which nothing was said for so long is none any more.
+const TRACK_LIVES: Duration = Duration::from_secs(2);
+/// What is drawn at most: more is no plan.
+const MOST_TRACKS: usize = 1000;
+/// Events that are shown.
+const MOST_EVENTS: usize = 100;
+
+/// A camera on the plan.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PlannedCamera {
+    pub name: String,
+    /// East and north, m.
+    pub at: [f64; 2],
+    /// From where to where it looks, degrees from north, clockwise; absent of one that turns.
+    pub view_deg: Option<[f64; 2]>,
+}
+
+/// A track on the plan.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PlannedTrack {
+    /// Its identity, as a text: JavaScript's numbers are too short.
+    pub id: String,
+    pub number: String,
+    /// `confirmed`, `coasting` or `one camera`.
+    pub state: &'static str,
+    /// East, north and up, m.
+    pub at: [f64; 3],
+    /// The same, m/s.
+    pub velocity: [f64; 3],
+    /// Covariance of east and north: east, both, north, m^2.
+    pub covariance: [f64; 3],
+}
+
+/// What happened.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Event {
+    /// Seconds since the Unix epoch, of the data.
+    pub time_s: f64,
+    pub what: String,
+}
+
+/// A site from above, as it is now.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Plan {
+    /// The time of the newest tracks, seconds since the Unix epoch.
+    pub time_s: Option<f64>,
+    pub cameras: Vec<PlannedCamera>,
+    pub tracks: Vec<PlannedTrack>,
+    /// The newest first.
+    pub events: Vec<Event>,
+}
+
+/// All that has been heard.
+#[derive(Debug, Default)]
+pub struct PlanBoard {
+    known: Vec<CameraName>,
+    cameras: BTreeMap<CameraName, PlannedCamera>,
+    tracks: BTreeMap<u64, (Track, Instant)>,
+    events: VecDeque<Event>,
+    time: Option<Timestamp>,
+}
+
+impl PlanBoard {
+    /// Of a site with these cameras.
+    pub fn new(known: Vec<CameraName>) -> Self {
+        Self { known, ..Self::default() }
+    }
+
+    /// Takes a message in; what cannot be read says nothing.
+    pub fn hear(&mut self, channel: &Channel, data: &[u8], at: Instant) {
+        match channel {
+            Channel::Calibration(name) if self.known.contains(name) => {
+                let message = decode::<CameraCalibration>(data).ok();
+                let calibration = message.and_then(|message| message.parse().ok());
+                if let Some(calibration) = calibration {
+                    self.cameras.insert(name.clone(), planned(name, &calibration));
+                }
+            }
+            Channel::Tracks => {
+                let frame: TrackFrame = decode(data).unwrap_or_default();
+                self.time = Some(Timestamp::from_nanos(frame.time_ns)).max(self.time);
+                self.tracks
+                    .retain(|_, (_, said)| at.saturating_duration_since(*said) < TRACK_LIVES);
+                for track in frame.tracks {
+                    if self.tracks.len() < MOST_TRACKS {
+                        self.tracks.insert(track.id, (track, at));
+                    }
+                }
+            }
+            Channel::Events => {
+                if let Ok(event) = decode::<TrackEvent>(data) {
+                    self.note(&event);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn note(&mut self, event: &TrackEvent) {
+        let word = event.kind().as_str_name().trim_start_matches("TRACK_EVENT_KIND_");
+        let what = format!("track {} {}", TrackNumber(event.track_id), word.to_lowercase());
+        let time_s = Timestamp::from_nanos(event.time_ns).seconds();
+        self.events.push_front(Event { time_s, what });
+        self.events.truncate(MOST_EVENTS);
+    }
+
+    /// The site as it is now.
+    pub fn plan(&self, now: Instant) -> Plan {
+        let lives = |said: &Instant| now.saturating_duration_since(*said) < TRACK_LIVES;
+        let tracks = self.tracks.values().filter(|(_, said)| lives(said));
+        Plan {
+            time_s: self.time.map(Timestamp::seconds),
+            cameras: self.cameras.values().cloned().collect(),
+            tracks: tracks.filter_map(|(track, _)| planned_track(track)).collect(),
+            events: self.events.iter().cloned().collect(),
+        }
+    }
+}
+
+fn planned(name: &CameraName, calibration: &Calibration) -> PlannedCamera {
+    let place = calibration.camera.pose().position();
+    let view_deg = calibration.mount.is_none().then(|| view(&calibration.camera)).flatten();
+    PlannedCamera { name: name.to_string(), at: [place.x, place.y], view_deg }
+}
+
+/// From where to where a camera looks: through the middles of its image's left and right edges.
+fn view(camera: &Camera) -> Option<[f64; 2]> {
+    let size = camera.model().intrinsics().size;
+    let middle = f64::from(size.height) / 2.0;
+    let azimuth = |x: f64| -> Option<f64> {
+        let direction = camera.model().direction(Pixel::new(x, middle)).ok()?;
+        let line: Vector3<f64> = camera.pose().rotation() * direction.into_inner();
+        Some(line.x.atan2(line.y).to_degrees())
+    };
+    Some([azimuth(0.0)?, azimuth(f64::from(size.width))?])
+}
+
+fn planned_track(track: &Track) -> Option<PlannedTrack> {
+    let state = match track.state() {
+        TrackState::Confirmed => "confirmed",
+        TrackState::Coasting => "coasting",
+        TrackState::OneCamera => "one camera",
+        TrackState::Tentative | TrackState::Lost | TrackState::Unspecified => return None,
+    };
+    let (at, velocity) = (track.position?, track.velocity?);
+    let covariance = |index: usize| track.covariance.get(index).copied().unwrap_or(0.0);
+    Some(PlannedTrack {
+        id: track.id.to_string(),
+        number: TrackNumber(track.id).to_string(),
+        state,
+        at: [at.x, at.y, at.z],
+        velocity: [velocity.x, velocity.y, velocity.z],
+        covariance: [covariance(0), covariance(1), covariance(7)],
+    })
+}

@@ -1,0 +1,107 @@
+//! Pages that this program serves itself: requests answered on a thread of their own.
+
+use std::convert::Infallible;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use hyper::body::{Body, Bytes, Incoming};
+use hyper::service::service_fn;
+use hyper::{Request, Response};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::time::{sleep, timeout};
+
+/// Who may ask at the same time; the next wait. Each takes a file descriptor, of which the camera and
+/// the network need some, too.
+pub const ASKING: usize = 16;
+/// How long a question may take to come.
+const ASKED_WITHIN: Duration = Duration::from_secs(1);
+/// The pause after a connection could not be taken, as descriptors are short.
+const PAUSE: Duration = Duration::from_millis(100);
+/// An answer without end is for those who are there: a day.
+const LONGEST_ANSWER: Duration = Duration::from_secs(24 * 3600);
+
+/// How long an answer takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answers {
+    /// From the first byte to the last so long: who takes it slower must not keep a connection.
+    Within(Duration),
+    /// As long as who asked is there.
+    GoOn,
+}
+
+/// Answers everybody who asks at an address, until the process ends.
+///
+/// # Errors
+/// If the address cannot be listened on.
+pub fn serve<B, F>(
+    what: &'static str,
+    address: SocketAddr,
+    answers: Answers,
+    answer: F,
+) -> anyhow::Result<()>
+where
+    F: Fn(&Request<Incoming>) -> Response<B> + Send + Sync + 'static,
+    B: Body<Data = Bytes, Error = Infallible> + Send + 'static,
+{
+    let listener = std::net::TcpListener::bind(address)
+        .and_then(|listener| listener.set_nonblocking(true).map(|()| listener))
+        .with_context(|| format!("cannot serve {what} on {address}"))?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .with_context(|| format!("cannot serve {what}"))?;
+    let answer = Arc::new(answer);
+    std::thread::Builder::new().name(what.into()).spawn(move || {
+        runtime.block_on(async {
+            match TcpListener::from_std(listener) {
+                Ok(listener) => accept(&listener, answers, &answer).await,
+                Err(error) => tracing::warn!("no {what}: {error}"),
+            }
+        });
+    })?;
+    Ok(())
+}
+
+async fn accept<B, F>(listener: &TcpListener, answers: Answers, answer: &Arc<F>)
+where
+    F: Fn(&Request<Incoming>) -> Response<B> + Send + Sync + 'static,
+    B: Body<Data = Bytes, Error = Infallible> + Send + 'static,
+{
+    let within = match answers {
+        Answers::Within(time) => time,
+        Answers::GoOn => LONGEST_ANSWER,
+    };
+    let room = Arc::new(Semaphore::new(ASKING));
+    loop {
+        let Ok(place) = Arc::clone(&room).acquire_owned().await else { return };
+        match listener.accept().await {
+            Ok((stream, _)) => {
+                let answer = Arc::clone(answer);
+                tokio::spawn(async move {
+                    // What goes wrong with one who asks is theirs.
+                    let _ = timeout(within, answer_one(stream, &*answer)).await;
+                    drop(place);
+                });
+            }
+            Err(_) => sleep(PAUSE).await,
+        }
+    }
+}
+
+async fn answer_one<B, F>(stream: TcpStream, answer: &F) -> hyper::Result<()>
+where
+    F: Fn(&Request<Incoming>) -> Response<B>,
+    B: Body<Data = Bytes, Error = Infallible> + Send + 'static,
+{
+    let page = service_fn(|request| async move { Ok::<_, Infallible>(answer(&request)) });
+    hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(ASKED_WITHIN)
+        .keep_alive(false)
+        .serve_connection(TokioIo::new(stream), page)
+        .await
+}
