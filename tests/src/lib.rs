@@ -176,6 +176,17 @@ impl Process {
         line.split_whitespace().next()?.parse::<u64>().ok().map(|kilobytes| kilobytes << 10)
     }
 
+    /// The processor time that it has had, s; `None` where the system does not say.
+    pub fn processor_s(&self) -> Option<f64> {
+        /// Of Linux, in what `/proc` counts.
+        const TICKS_A_SECOND: f64 = 100.0;
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.0.id())).ok()?;
+        // The name, in brackets, may hold spaces; user and system time are the 12th and 13th after it.
+        let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+        let ticks = |index: usize| fields.get(index)?.parse::<f64>().ok();
+        Some((ticks(11)? + ticks(12)?) / TICKS_A_SECOND)
+    }
+
     /// Sends it SIGTERM, as systemd does, and says how long it took to end, and its exit code.
     pub fn terminate(mut self) -> (Duration, Option<i32>) {
         let begun = Instant::now();
