@@ -19,6 +19,11 @@ const MAX_TAKEN: usize = 20_000;
 /// A camera that has been silent for so many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
 
+/// Of what one camera's clock alone says has gone by, this share is believed. With all of it a clock
+/// that races makes all others look silent between two of their frames; with half of it the last
+/// camera of a site is not followed for ten seconds.
+const ALONE: f64 = 0.4;
+
 /// How an exposure arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Arrival {
@@ -46,10 +51,11 @@ struct Source {
 /// If most of them have been behind what was released for a while, that was the mistake, and the
 /// order is taken up anew from their time.
 ///
-/// A camera is live until the cameras heard since have gone on, on average, by [`PATIENCES`] times
-/// the lateness by their own clocks, jumps left out: there is no other clock here. What a camera
-/// says all at once of a time that the others have been through, as its host stood still or its
-/// link was cut, makes nobody else look silent.
+/// A camera is live until time has gone on by [`PATIENCES`] times the lateness since it was heard.
+/// There is no other clock here than the cameras': time goes on as the second quickest of them does,
+/// jumps left out, and by a share of what the quickest alone is ahead ([`ALONE`]). What a camera says
+/// all at once of a time that the others have been through, as its host stood still or its link was
+/// cut, is no progress.
 ///
 /// A camera that has been further behind than anybody waits, for as long, is not waited for: its
 /// frames come too late all the same.
@@ -68,7 +74,7 @@ pub(crate) struct EventBuffer {
     /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
     taken: BTreeSet<(Timestamp, CameraName)>,
     sources: BTreeMap<CameraName, Source>,
-    /// How far all cameras together have gone on, each by its own clock and without jumps, s.
+    /// How far time has gone on, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
     reference: Option<Reference>,
@@ -172,16 +178,30 @@ impl EventBuffer {
         // A clock that races makes nobody else look silent, nor does one that makes up for lost time.
         let reached = self.reference.map(|reference| reference.time.plus_seconds(-lateness_s));
         let keeps_up = reached.is_none_or(|reached| time > reached);
-        if keeps_up || stream.went_back {
-            self.run_s += time.seconds_since(stream.newest).clamp(0.0, lateness_s);
-        }
+        let step_s = time.seconds_since(stream.newest).clamp(0.0, lateness_s);
+        stream.gone_s += stream.progress(keeps_up, step_s);
         stream.hear(time, late_s, lateness_s);
-        stream.went_back &= !keeps_up;
-        stream.heard_s = self.run_s;
+        self.go_on();
+        let run_s = self.run_s;
+        if let Some(stream) = self.stream_mut(&exposure.camera) {
+            stream.heard_s = run_s;
+        }
         self.first = Some(self.first.map_or(time, |first| first.min(time)));
         self.refer();
         self.note_who_is_behind();
         arrival
+    }
+
+    /// Time goes on as the cameras do.
+    fn go_on(&mut self) {
+        let (mut first_s, mut second_s) = (0.0_f64, 0.0_f64);
+        for (stream, _) in self.streams() {
+            second_s = second_s.max(stream.gone_s.min(first_s));
+            first_s = first_s.max(stream.gone_s);
+        }
+        // Where there is one camera, nobody else can look silent.
+        let share = if self.streams().count() > 1 { ALONE } else { 1.0 };
+        self.run_s = self.run_s.max(second_s + share * (first_s - second_s));
     }
 
     /// Takes note of the cameras that are further behind than anybody waits.
@@ -202,13 +222,8 @@ impl EventBuffer {
     /// Asks the live cameras for the time.
     fn refer(&mut self) {
         let patience_s = PATIENCES * self.config.lateness_s;
-        let mut heard: Vec<&Stream> = self.going_on().collect();
-        heard.sort_by(|one, other| other.heard_s.total_cmp(&one.heard_s));
-        let is_live = |(since, stream): &(usize, &Stream)| {
-            self.run_s - stream.heard_s <= patience_s * (*since).max(1) as f64
-        };
-        let live: Vec<&Stream> =
-            heard.into_iter().enumerate().take_while(is_live).map(|(_, s)| s).collect();
+        let is_live = |stream: &&Stream| self.run_s - stream.heard_s <= patience_s;
+        let live: Vec<&Stream> = self.going_on().filter(is_live).collect();
         let newest_first = |mut times: Vec<Timestamp>| {
             times.sort_by(|one, other| other.cmp(one));
             times
@@ -230,7 +245,7 @@ impl EventBuffer {
             return;
         }
         let since_s = *self.behind_since_s.get_or_insert(self.run_s);
-        if let Some(time) = time.filter(|_| self.run_s - since_s > patience_s * behind as f64) {
+        if let Some(time) = time.filter(|_| self.run_s - since_s > patience_s) {
             self.restart(time);
         }
     }
@@ -347,9 +362,7 @@ impl EventBuffer {
         if waits_for_new || is_alone {
             return Some(patience);
         }
-        // Those that keep up have gone on by `run_s` together.
-        let keeping_up = self.going_on().filter(|stream| stream.behind_since_s.is_none()).count();
-        let bearable_s = PATIENCES * lateness_s * keeping_up.max(1) as f64;
+        let bearable_s = PATIENCES * lateness_s;
         let is_waited_for = |stream: &&Stream| {
             let keeps_up =
                 stream.behind_since_s.is_none_or(|since_s| self.run_s - since_s <= bearable_s);

@@ -140,6 +140,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
     }
 
     fn add_beside(&mut self, message: &Beside<'_>) -> McapResult<u16> {
+        self.has_new_channels = true;
         let schema = self.writer.add_schema(message.schema, "protobuf", message.definitions)?;
         self.writer.add_channel(schema, message.topic, "protobuf", &BTreeMap::new())
     }
@@ -156,7 +157,9 @@ impl<W: Write + Seek> RecordingWriter<W> {
         if !std::mem::take(&mut self.has_new_channels) {
             return Ok(());
         }
-        let said = self.channels.iter().map(|(key, (id, _))| (id.to_string(), key.to_string()));
+        let ours = self.channels.iter().map(|(key, (id, _))| (id.to_string(), key.to_string()));
+        let beside = self.beside.iter().map(|(topic, (id, _))| (id.to_string(), topic.clone()));
+        let said = ours.chain(beside);
         self.writer
             .write_metadata(&Metadata { name: CHANNELS.to_owned(), metadata: said.collect() })
     }

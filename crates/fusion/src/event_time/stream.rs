@@ -11,8 +11,8 @@ const MOST_FAR_BEHIND: u32 = 3;
 
 /// What a camera says of a time so far back, s, it has not held back: its clock has gone back. With
 /// half of it a host that stood still for half a minute and says the newest first is taken for a
-/// clock that went back; with twice as much, a camera that is the last of its site and whose clock
-/// went back by a minute is not followed until it has made up for that.
+/// clock that went back; with twice as much, cameras that outlive others whose clocks were ahead are
+/// followed after a minute.
 const LONGEST_BACKLOG_S: f64 = 30.0;
 
 /// How one camera's frames come.
@@ -23,11 +23,16 @@ pub(super) struct Stream {
     pub(super) trusted: Timestamp,
     /// From the last but one to the newest, s, as far as that is no jump.
     pub(super) step_s: f64,
-    /// How far all cameras together had gone on when it was heard last, s.
+    /// How far it has gone on, by its own clock and without jumps, s.
+    pub(super) gone_s: f64,
+    /// How far time had gone on when it was heard last, s.
     pub(super) heard_s: f64,
-    /// How far they had gone on when it fell behind by more than anybody waits, s; `None` while it
+    /// How far time had gone on when it fell behind by more than anybody waits, s; `None` while it
     /// keeps up.
     pub(super) behind_since_s: Option<f64>,
+    /// How far it has gone on since it fell behind what the others say the time is, s: what it may
+    /// have held back.
+    pub(super) made_up_s: f64,
     /// Its clock has gone back, by more than it can have held back, and it has not reached since
     /// what the others say the time is.
     pub(super) went_back: bool,
@@ -44,8 +49,10 @@ impl Stream {
             newest,
             trusted: Timestamp::MIN,
             step_s: 0.0,
+            gone_s: 0.0,
             heard_s: 0.0,
             behind_since_s: None,
+            made_up_s: 0.0,
             went_back: false,
             far_behind: 0,
             disorder: None,
@@ -70,8 +77,22 @@ impl Stream {
             // No network reorders so far: the clock was ahead, and now it is not.
             let trusted = self.trusted;
             let went_back = self.went_back || behind_s > LONGEST_BACKLOG_S;
-            *self = Self { trusted, went_back, ..Self::beginning(time) };
+            let (gone_s, made_up_s) = (self.gone_s, self.made_up_s);
+            *self = Self { trusted, went_back, gone_s, made_up_s, ..Self::beginning(time) };
         }
+    }
+
+    /// Takes note of whether it keeps up with what the others say the time is, `step_s` further on than
+    /// before; returns how much of that is progress.
+    pub(super) fn progress(&mut self, keeps_up: bool, step_s: f64) -> f64 {
+        if keeps_up {
+            (self.made_up_s, self.went_back) = (0.0, false);
+            return step_s;
+        }
+        self.made_up_s += step_s;
+        // Nobody holds back so much: it is behind for good, and may be the one that is right.
+        let is_slow = self.went_back || self.made_up_s > LONGEST_BACKLOG_S;
+        if is_slow { step_s } else { 0.0 }
     }
 
     /// How far behind the newest another frame may still come, s: 0 for a camera that keeps the

@@ -450,3 +450,52 @@ proptest! {
         prop_assert!(released.is_sorted());
     }
 }
+
+#[test]
+fn a_clock_that_races_costs_nobody_else_a_frame() {
+    let mut buffer = EventBuffer::new(EventTime::default());
+    let (mut refused, mut raced) = (Vec::new(), 0.0);
+    for tick in 0..6000_u32 {
+        // Two hundred ticks a second; the third camera races from 10 to 20 s, a second each tick.
+        let t = f64::from(tick) / 200.0;
+        let races = (10.0..20.0).contains(&t);
+        raced += f64::from(u8::from(races));
+        let mut all = Vec::new();
+        if tick % 8 == 0 {
+            all.push(("a", t));
+        }
+        if tick % 10 == 3 {
+            all.push(("b", t));
+        }
+        if races {
+            all.push(("c", t + raced));
+        } else if tick % 7 == 0 {
+            all.push(("c", t));
+        }
+        for (camera, time_s) in all {
+            if buffer.insert(exposure(camera, time_s)).is_err() && camera != "c" {
+                refused.push(t);
+            }
+        }
+        assert_eq!(buffer.take_restart(), None, "at {t} s");
+        drain(&mut buffer);
+    }
+    assert!(refused.is_empty(), "{refused:?}");
+}
+
+#[test]
+fn those_that_outlive_cameras_whose_clocks_were_ahead_are_followed() {
+    // Five cameras; three, or two with two that are right, are an hour ahead and die at 20 s.
+    for ahead in [3, 2] {
+        let mut buffer = EventBuffer::new(EventTime::default());
+        let cameras = 2 + ahead;
+        let change = |camera: usize, t: f64| match camera {
+            0 | 1 => Some(t),
+            _ => (t < 20.0).then_some(t + 3600.0),
+        };
+        run(&mut buffer, cameras, 0..120, change);
+        let refused = run(&mut buffer, cameras, 120..130, change);
+        assert_eq!(refused, 0, "{ahead} ahead");
+        assert!(buffer.released > Timestamp::from_seconds(129.0), "{:?}", buffer.released);
+    }
+}
