@@ -22,6 +22,8 @@ use crossfix_transport::{Delivery, Link, Mode, NetworkConfig, Role};
 const RATE_HZ: u32 = 30;
 const TRACKS: u64 = 20;
 const SECONDS: u32 = 10;
+/// What 99 of 100 messages may take from agent to ear, ms.
+const MOST_MS: f64 = 5.0;
 /// What has begun together is not measured, s.
 const SETTLING: Duration = Duration::from_secs(2);
 
@@ -130,6 +132,10 @@ fn nothing_is_lost_of_many_agents_through_a_router() {
         quantile(1.0),
         busy_s / f64::from(SECONDS),
     );
+    // A debug build beside other tests has no figure; whoever asks for the load asks for this, too.
+    if std::env::var_os("CROSSFIX_AGENTS").is_some() {
+        assert!(quantile(0.99) <= MOST_MS, "{} ms", quantile(0.99));
+    }
     assert_eq!(heard, sent, "nothing is lost");
     assert_eq!(subscription.refused().dropped, 0);
     assert!(router.stop());

@@ -8,7 +8,7 @@
 )]
 
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::net::{TcpListener, UdpSocket};
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -355,6 +355,75 @@ fn live_tracks_go_out_over_a_connection_that_is_made_again() {
         assert!(events(&heard) >= 4);
     }
     assert!(told.outlet.stop());
+}
+
+#[test]
+fn tracks_of_a_fusion_centre_that_has_died_are_said_no_more() {
+    let site = Site::new(20.0);
+    let anchor = "[anchor]\nlatitude_deg = 48.3538\nlongitude_deg = 11.7861\nheight_m = 490.0\n";
+    site.write("network.toml", &format!("{}{anchor}", site.text("network.toml")));
+    let (network, file) = (site.path("network.toml"), site.path("live.jsonl"));
+    let fusion = site.start_fusion();
+    let outlet =
+        site.start(&["outlet", "geojson", "-c", &network, "--rate-hz", "5", "--to", &file]);
+    let _agents = site.start_agents(now_seconds() + 1.0, &[]);
+    let features = || -> Vec<usize> {
+        let text = std::fs::read_to_string(&file).unwrap_or_default();
+        let lines = text.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        lines.map(|line| line["features"].as_array().unwrap().len()).collect()
+    };
+    let deadline = Instant::now() + PATIENCE;
+    while features().last() != Some(&2) && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    fusion.crash();
+    std::thread::sleep(Duration::from_secs(4));
+    assert_eq!(features().last(), Some(&0), "nothing is left");
+    assert!(features().iter().filter(|count| **count == 2).count() < 40);
+    assert!(outlet.stop());
+}
+
+#[test]
+fn sapient_waits_until_its_registration_is_taken_and_then_tells() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("tcp://{}", listener.local_addr().unwrap());
+    let told = Told::start("sapient", &["--to", &address]);
+    let (mut stream, _) = listener.accept().unwrap();
+    stream.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+    let frames = |heard: &[u8]| {
+        let (mut count, mut rest) = (0, heard);
+        while let Some((head, more)) = rest.split_first_chunk::<4>()
+            && let Some(next) = more.get(u32::from_le_bytes(*head) as usize..)
+        {
+            (count, rest) = (count + 1, next);
+        }
+        count
+    };
+    let registration = hear(&mut stream, |heard| frames(heard) >= 1);
+    std::thread::sleep(Duration::from_secs(3));
+    assert_eq!(frames(&registration), 1, "nothing before the answer");
+    // An acknowledgement: SapientMessage.registration_ack (field 5) with acceptance (field 1).
+    stream.write_all(&[4, 0, 0, 0, 0x2a, 2, 0x08, 1]).unwrap();
+    let heard = hear(&mut stream, |heard| frames(heard) >= 6);
+    assert!(frames(&heard) >= 6, "{}", frames(&heard));
+    assert!(told.outlet.stop());
+}
+
+#[test]
+fn what_takes_no_more_ends_the_command_and_a_receiver_that_refuses_does_not() {
+    let told = Told::start("geojson", &["--to", "/dev/full"]);
+    let mut outlet = told.outlet;
+    assert_eq!(outlet.exit_code(), Some(1));
+    let refused = crossfix_tests::crossfix(&[
+        "outlet",
+        "sapient",
+        "-c",
+        &told.site.path("network.toml"),
+        "--to",
+        "udp://127.0.0.1:9",
+    ]);
+    let said = String::from_utf8(refused.stderr).unwrap();
+    assert!(said.contains("SAPIENT waits for an answer"), "{said}");
 }
 
 #[test]

@@ -122,6 +122,9 @@ impl Guarded {
     /// Sends as somebody on a key, and says how much of it got in.
     fn got_in_of(&mut self, tls: bool, shown: Option<&Shown>, key: &str) -> u64 {
         let session = intruder(&self.endpoint, tls, shown, &self.site);
+        // Who has a certificate of the site gets a link, and is held to what it may say.
+        let is_of_site = shown.is_some_and(|shown| shown.folder == certificates(&self.site));
+        assert!(session.is_some() || !is_of_site, "a certified one has no link");
         // Zenoh tells a publisher of subscribers in a moment.
         std::thread::sleep(Duration::from_millis(500));
         send(session.as_ref(), key);
@@ -180,6 +183,13 @@ fn only_its_own_agent_gets_anything_in(routed: bool) {
     }
     let agent = guarded.own("camera-east");
     assert_eq!(guarded.got_in_of(true, Some(&agent), east), SENT, "its own agent");
+    // Neither may another agent move its camera, nor end it.
+    for kind in ["calibration", "health"] {
+        let key = format!("crossfix/test/east/{kind}");
+        let north = guarded.own("camera-north");
+        assert_eq!(guarded.got_in_of(true, Some(&north), &key), 0, "{kind} by another");
+        assert_eq!(guarded.got_in_of(true, Some(&agent), &key), SENT, "{kind} by its own");
+    }
 }
 
 #[test]
@@ -308,7 +318,20 @@ fn the_doctor_says_whose_certificate_is_wrong_and_why() {
     }
     let foreign = Authority::create(&"test".parse().unwrap(), OffsetDateTime::now_utc()).unwrap();
     {
-        let _fusion = fusion_with(&site, &foreign, &["127.0.0.1"], 0);
+        // A fusion centre of another site, where ours should be.
+        let theirs = PathBuf::from(site.path("theirs"));
+        fs::create_dir(&theirs).unwrap();
+        fs::write(theirs.join("authority.pem"), foreign.certificate()).unwrap();
+        let hosts = ["127.0.0.1".to_owned()];
+        let now = OffsetDateTime::now_utc();
+        let issued = foreign.issue("fusion", &hosts, now, Duration::from_secs(3600)).unwrap();
+        fs::write(theirs.join("fusion.pem"), issued.certificate).unwrap();
+        fs::write(theirs.join("fusion.key"), issued.key).unwrap();
+        let network = site.text("network.toml").replace("\"certificates\"", "\"theirs\"");
+        site.write("theirs.toml", &network);
+        site.write("fusion.toml", "network = \"theirs.toml\"\n");
+        let _fusion = site.start_fusion();
+        std::thread::sleep(Duration::from_millis(1500));
         let said = doctor(&site);
         assert!(said.contains("by another authority than this site's"), "{said}");
     }
@@ -321,11 +344,14 @@ fn the_doctor_says_whose_certificate_is_wrong_and_why() {
         doctor(&site)
     );
     issue(&own, &certificates(&site), "viewer", "fusion", 0, Duration::from_secs(3600));
-    assert!(doctor(&site).contains("is `fusion`'s, and the network file believes `viewer`"));
+    assert!(doctor(&site).contains("is of `fusion`, and the network file believes `viewer` alone"));
     fs::copy(certificates(&site).join("camera-east.key"), file("key")).unwrap();
     issue(&own, &certificates(&site), "other", "viewer", 0, Duration::from_secs(3600));
     fs::copy(certificates(&site).join("other.pem"), file("pem")).unwrap();
     assert!(doctor(&site).contains("viewer.key is not the key of"), "{}", doctor(&site));
+    // A certificate by another authority than the one beside it.
+    issue(&foreign, &certificates(&site), "viewer", "viewer", 0, Duration::from_secs(3600));
+    assert!(doctor(&site).contains("is not by the authority of"), "{}", doctor(&site));
     fs::remove_file(file("pem")).unwrap();
     assert!(doctor(&site).contains("run `crossfix enroll`, and copy"), "{}", doctor(&site));
 }
@@ -339,7 +365,7 @@ fn a_component_without_its_certificate_says_so_and_does_not_start() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1));
     assert!(said.contains("this component cannot show who it is"), "{said}");
-    assert!(said.contains("fusion.key: run `crossfix enroll`"), "{said}");
+    assert!(said.contains("fusion.key is not there: run `crossfix enroll`"), "{said}");
 }
 
 #[test]
@@ -376,4 +402,44 @@ fn keys_are_their_owners_alone_and_the_file_stays_as_it_was_written() {
     succeed(&["enroll", "-c", &site.path("network.toml"), "--only", "viewer"]);
     let after = [read("authority.pem"), read("viewer.pem"), read("fusion.pem")];
     assert_eq!([0, 1, 2].map(|k| before[k] == after[k]), [true, false, true]);
+}
+
+#[test]
+fn enroll_leaves_everything_as_it_was_where_it_cannot_issue() {
+    let mut site = Site::new(1.0);
+    site.enroll(&[]);
+    let (network, key) = (site.text("network.toml"), site.path("authority/authority.key"));
+    let kept = fs::read_to_string(certificates(&site).join("camera-east.pem")).unwrap();
+    let other = Authority::create(&"other".parse().unwrap(), OffsetDateTime::now_utc()).unwrap();
+    fs::write(&key, other.key()).unwrap();
+    let file = site.path("network.toml");
+    let output = crossfix(&["enroll", "-c", &file, "--revoke", "camera-east"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(said.contains("the authority's key is not that of its certificate"), "{said}");
+    assert_eq!(site.text("network.toml"), network);
+    let now = fs::read_to_string(certificates(&site).join("camera-east.pem")).unwrap();
+    assert_eq!(now, kept);
+}
+
+#[test]
+fn the_doctor_asks_the_router_where_there_is_one_and_notices_whose_endpoint_it_is() {
+    let mut site = Site::new(1.0);
+    site.route();
+    site.enroll(&[]);
+    let network = site.path("network.toml");
+    let router = site.start(&["router", "-c", &network]);
+    let fusion = site.start_fusion();
+    std::thread::sleep(Duration::from_secs(2));
+    let output = crossfix(&["doctor", "-c", &network]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success() && said.contains("answers as router"), "{said}");
+    assert!(fusion.stop() && router.stop());
+    // Somebody else's certificate where the router should be.
+    for end in ["pem", "key"] {
+        let of = |name: &str| certificates(&site).join(format!("{name}.{end}"));
+        fs::copy(of("fusion"), of("router")).unwrap();
+    }
+    let output = crossfix(&["router", "-c", &network]);
+    assert_eq!(output.status.code(), Some(1), "it does not pass for the router");
 }

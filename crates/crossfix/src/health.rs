@@ -1,7 +1,7 @@
 //! How a component says, every second, how it does: to the site, to Prometheus, and to systemd.
 
 use std::net::SocketAddr;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use crossfix_message::{Channel, Health, Payload};
 use crossfix_transport::{Delivery, Link, LinkPublisher, OwnCertificate};
@@ -50,12 +50,11 @@ impl WatchedCertificate {
 
     fn look(&mut self) {
         self.looked_at = Instant::now();
-        self.problem = self.own.ending().map(|left| {
-            format!(
-                "its certificate ends in {} h: run `crossfix enroll`, copy it, and start this again",
-                left.as_secs() / HOUR_S
-            )
-        });
+        let problem = self.own.problem(SystemTime::now());
+        if let Some(problem) = problem.as_ref().filter(|_| self.problem.is_none()) {
+            tracing::warn!("{problem}");
+        }
+        self.problem = problem;
     }
 
     /// What is wrong with it.
@@ -69,7 +68,6 @@ impl WatchedCertificate {
 
 /// How often a component looks whether its certificate is to be renewed.
 const CERTIFICATE_PERIOD: Duration = Duration::from_secs(60);
-const HOUR_S: u64 = 3600;
 
 impl HealthReporter {
     /// Of the component whose health goes out on a channel.

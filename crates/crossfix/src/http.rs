@@ -21,26 +21,16 @@ pub const ASKING: usize = 16;
 const ASKED_WITHIN: Duration = Duration::from_secs(1);
 /// The pause after a connection could not be taken, as descriptors are short.
 const PAUSE: Duration = Duration::from_millis(100);
-/// An answer without end is for those who are there: a day.
-const LONGEST_ANSWER: Duration = Duration::from_secs(24 * 3600);
 
-/// How long an answer takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Answers {
-    /// From the first byte to the last so long: who takes it slower must not keep a connection.
-    Within(Duration),
-    /// As long as who asked is there.
-    GoOn,
-}
-
-/// Answers everybody who asks at an address, until the process ends.
+/// Answers everybody who asks at an address, until the process ends. From the first byte of a question to
+/// the last of its answer it may take `within`: who takes it slower must not keep a connection.
 ///
 /// # Errors
 /// If the address cannot be listened on.
 pub fn serve<B, F>(
     what: &'static str,
     address: SocketAddr,
-    answers: Answers,
+    within: Duration,
     answer: F,
 ) -> anyhow::Result<()>
 where
@@ -58,7 +48,7 @@ where
     std::thread::Builder::new().name(what.into()).spawn(move || {
         runtime.block_on(async {
             match TcpListener::from_std(listener) {
-                Ok(listener) => accept(&listener, answers, &answer).await,
+                Ok(listener) => accept(&listener, within, &answer).await,
                 Err(error) => tracing::warn!("no {what}: {error}"),
             }
         });
@@ -66,15 +56,11 @@ where
     Ok(())
 }
 
-async fn accept<B, F>(listener: &TcpListener, answers: Answers, answer: &Arc<F>)
+async fn accept<B, F>(listener: &TcpListener, within: Duration, answer: &Arc<F>)
 where
     F: Fn(&Request<Incoming>) -> Response<B> + Send + Sync + 'static,
     B: Body<Data = Bytes, Error = Infallible> + Send + 'static,
 {
-    let within = match answers {
-        Answers::Within(time) => time,
-        Answers::GoOn => LONGEST_ANSWER,
-    };
     let room = Arc::new(Semaphore::new(ASKING));
     loop {
         let Ok(place) = Arc::clone(&room).acquire_owned().await else { return };

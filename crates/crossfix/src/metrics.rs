@@ -11,7 +11,7 @@ use hyper::header::{CONTENT_TYPE, HeaderValue};
 use hyper::{Method, Request, Response, StatusCode};
 use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
 
-use crate::http::{self, Answers};
+use crate::http;
 
 /// How long somebody who asks may take, from the first byte to the last: who asks slower, or nothing, must
 /// not keep a connection.
@@ -40,9 +40,7 @@ impl MetricsPage {
     pub fn serve(address: SocketAddr) -> anyhow::Result<Self> {
         let shown = Arc::new(RwLock::new(Shown { text: String::new(), at: Instant::now() }));
         let page = Self { shown: Arc::clone(&shown) };
-        http::serve("metrics", address, Answers::Within(ANSWERED_WITHIN), move |request| {
-            answer(request, &shown)
-        })?;
+        http::serve("metrics", address, ANSWERED_WITHIN, move |request| answer(request, &shown))?;
         tracing::info!("metrics at http://{address}/metrics");
         Ok(page)
     }

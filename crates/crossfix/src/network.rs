@@ -36,7 +36,7 @@ pub fn open(
     role: &Role,
     shutdown: &Shutdown,
 ) -> anyhow::Result<Option<Link>> {
-    say_how_secure(network);
+    say_how_secure(network, role);
     let begun = Instant::now();
     let mut said: Option<Instant> = None;
     let opened = Link::open_while(network, role, |error| {
@@ -56,14 +56,20 @@ pub fn open(
 }
 
 /// Says at the start who may join the site's network.
-fn say_how_secure(network: &NetworkConfig) {
-    match (&network.security, network.unsecured) {
-        (Some(_), _) => {}
-        (None, true) => tracing::warn!(
+fn say_how_secure(network: &NetworkConfig, role: &Role) {
+    if network.security.is_some() {
+        return;
+    }
+    match network.unencrypted(role) {
+        _ if network.unsecured => tracing::warn!(
             "nothing on this network is encrypted, and whoever reaches it can add cameras and \
              tracks: `crossfix enroll` mends it"
         ),
-        (None, false) => tracing::info!("without [security] nothing listens beyond this host"),
+        Some(endpoint) => tracing::warn!(
+            "what goes to {endpoint} is not encrypted, and who answers there may be anybody: \
+             `crossfix enroll` mends it"
+        ),
+        None => tracing::info!("without [security] nothing listens beyond this host"),
     }
 }
 

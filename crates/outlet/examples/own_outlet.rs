@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             }],
             ..Default::default()
         });
-        let snapshot = situation.snapshot().ok_or("nothing was heard")?;
+        let snapshot = situation.snapshot(0.0).ok_or("nothing was heard")?;
         for message in outlet.tracks(&snapshot) {
             print!("{}", String::from_utf8_lossy(&message));
         }

@@ -25,6 +25,9 @@ pub fn file_descriptor_set() -> &'static [u8] {
 
 /// The frame of the site: local east, north, up.
 const SITE_FRAME: &str = "site";
+/// A track's topic has its number's last two digits: a recorder that writes for years has no more than
+/// a hundred of them.
+const TOPICS_OF_TRACKS: u64 = 100;
 /// A track's place is said so often at most, s.
 const PLACE_PERIOD_S: f64 = 0.1;
 
@@ -73,12 +76,17 @@ impl FoxgloveView {
     /// nothing.
     pub fn of(&mut self, channel: &Channel, data: &[u8], time: Timestamp) -> Vec<FoxgloveMessage> {
         match channel {
-            Channel::Calibration(_) => decode::<CameraCalibration>(data)
+            // Whose it is the channel says: a message that says otherwise is nobody's.
+            Channel::Calibration(camera) => decode::<CameraCalibration>(data)
+                .ok()
+                .filter(|message| message.camera == camera.as_str())
                 .map(|message| self.of_calibration(&message, time))
                 .unwrap_or_default(),
-            Channel::Preview(_) if self.pictures == Pictures::Said => {
-                decode::<Preview>(data).map(|message| vec![of_preview(message)]).unwrap_or_default()
-            }
+            Channel::Preview(camera) if self.pictures == Pictures::Said => decode::<Preview>(data)
+                .ok()
+                .filter(|message| message.camera == camera.as_str())
+                .map(|message| vec![of_preview(message)])
+                .unwrap_or_default(),
             Channel::Tracks => decode::<TrackFrame>(data)
                 .map(|message| self.of_tracks(&message))
                 .unwrap_or_default(),
@@ -113,7 +121,7 @@ impl FoxgloveView {
         self.said_at = Some(time);
         let mut messages: Vec<FoxgloveMessage> =
             frame.tracks.iter().filter_map(|track| pose_of(track, time)).collect();
-        let snapshot = self.situation.as_mut().and_then(Situation::snapshot);
+        let snapshot = self.situation.as_mut().and_then(|situation| situation.snapshot(0.0));
         messages.extend(snapshot.iter().flat_map(fixes_of));
         messages
     }
@@ -196,6 +204,12 @@ fn of_preview(message: Preview) -> FoxgloveMessage {
     said(topic, time, &image)
 }
 
+/// The topic of a track's place.
+fn topic_of(track_id: u64, what: &str) -> String {
+    // A run's numbers are what is left of 2^20.
+    format!("/track/{:02}/{what}", track_id % (1 << 20) % TOPICS_OF_TRACKS)
+}
+
 /// A sure track's place in the site.
 fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
     let is_sure = matches!(track.state(), TrackState::Confirmed | TrackState::Coasting);
@@ -208,7 +222,7 @@ fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
             orientation: Some(wire::Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }),
         }),
     };
-    Some(said(format!("/track/{}/pose", crossfix_message::TrackNumber(track.id)), time, &pose))
+    Some(said(topic_of(track.id, "pose"), time, &pose))
 }
 
 /// The targets on the Earth.
@@ -217,7 +231,7 @@ fn fixes_of(snapshot: &crate::Snapshot) -> Vec<FoxgloveMessage> {
         matches!(target.state, TrackState::Confirmed | TrackState::Coasting)
     };
     let fix = |target: &crate::Target| {
-        let topic = format!("/track/{}/location", target.number());
+        let topic = topic_of(target.id, "location");
         let covariance = target.covariance.fixed_view::<3, 3>(0, 0).into_owned();
         let fix = wire::LocationFix {
             timestamp: stamp(snapshot.time),

@@ -37,7 +37,7 @@
 //!     }],
 //!     ..Default::default()
 //! });
-//! let snapshot = situation.snapshot().ok_or("nothing was heard")?;
+//! let snapshot = situation.snapshot(0.0).ok_or("nothing was heard")?;
 //! let said = GeoJsonLines.tracks(&snapshot);
 //! assert!(String::from_utf8_lossy(&said[0]).contains("\"id\":\"7\""));
 //! # Ok::<(), Box<dyn std::error::Error>>(())

@@ -291,7 +291,10 @@ impl Outlet for Sapient {
 
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
         let time = snapshot.time;
-        let since = |at: Option<Timestamp>| at.map_or(f64::INFINITY, |at| time.seconds_since(at));
+        // Where time has gone back, all is due.
+        let since = |at: Option<Timestamp>| {
+            at.map(|at| time.seconds_since(at)).filter(|s| *s >= 0.0).unwrap_or(f64::INFINITY)
+        };
         let mut said = Vec::new();
         if since(self.status_at) >= STATUS_PERIOD_S {
             said.push(self.status(time, sapient::status_report::System::Ok));

@@ -115,6 +115,12 @@ impl Situation {
     /// Hears tracks. One without a place, or with numbers that are none, is left out.
     pub fn hear(&mut self, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
+        if self.now.is_some_and(|now| now.seconds_since(time) > SILENCE_S) {
+            // Time has gone back: a fusion centre that was started again, or another replay. What was
+            // known is of a time that is not.
+            self.tracks.clear();
+            self.now = None;
+        }
         self.now = Some(self.now.map_or(time, |now| now.max(time)));
         for track in &frame.tracks {
             let was_sure = self.tracks.get(&track.id).is_some_and(|known| is_sure(known.state));
@@ -131,11 +137,14 @@ impl Situation {
         }
     }
 
-    /// Where all targets are at the newest time that was heard; `None` if nothing was.
-    pub fn snapshot(&mut self) -> Option<Snapshot> {
+    /// Where all targets are at the newest time that was heard, where the fusion centre has been silent
+    /// for so long since, s; `None` if it never was heard. One that is silent for two seconds has no
+    /// tracks any more.
+    pub fn snapshot(&mut self, silent_s: f64) -> Option<Snapshot> {
         let time = self.now?;
         for known in self.tracks.values_mut() {
-            if !is_sure(known.state) || time.seconds_since(known.time) > SILENCE_S {
+            let unsaid_s = silent_s.max(time.seconds_since(known.time));
+            if !is_sure(known.state) || unsaid_s > SILENCE_S {
                 known.state = TrackState::Lost;
             }
         }
@@ -184,10 +193,10 @@ mod tests {
     #[test]
     fn all_tracks_are_said_at_one_time_with_what_it_is_off_by() {
         let mut situation = situation();
-        assert_eq!(situation.snapshot(), None);
+        assert_eq!(situation.snapshot(0.0), None);
         situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
         situation.hear(&frame(0.5, 2, TrackState::Confirmed, 0.0));
-        let snapshot = situation.snapshot().unwrap();
+        let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START + 0.5));
         let [one, two] = &snapshot.targets[..] else { panic!("{snapshot:?}") };
         // 5 m east at 48 degrees north.
@@ -203,12 +212,12 @@ mod tests {
     fn a_lost_track_is_said_once_and_one_that_is_not_sure_never() {
         let mut situation = situation();
         situation.hear(&frame(0.0, 1, TrackState::Tentative, 0.0));
-        assert!(situation.snapshot().unwrap().targets.is_empty());
+        assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
         situation.hear(&frame(0.1, 1, TrackState::Confirmed, 0.0));
-        assert_eq!(situation.snapshot().unwrap().targets[0].state, TrackState::Confirmed);
+        assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Confirmed);
         situation.hear(&frame(0.2, 1, TrackState::Lost, 0.0));
-        assert_eq!(situation.snapshot().unwrap().targets[0].state, TrackState::Lost);
-        assert!(situation.snapshot().unwrap().targets.is_empty());
+        assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Lost);
+        assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
 
     #[test]
@@ -217,8 +226,27 @@ mod tests {
         situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
         situation.hear(&frame(3.0, 2, TrackState::Confirmed, 0.0));
         let states: Vec<_> =
-            situation.snapshot().unwrap().targets.iter().map(|target| target.state).collect();
+            situation.snapshot(0.0).unwrap().targets.iter().map(|target| target.state).collect();
         assert_eq!(states, [TrackState::Lost, TrackState::Confirmed]);
+    }
+
+    #[test]
+    fn tracks_of_a_fusion_centre_that_says_nothing_any_more_are_lost_once() {
+        let mut situation = situation();
+        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
+        assert_eq!(situation.snapshot(1.0).unwrap().targets[0].state, TrackState::Confirmed);
+        assert_eq!(situation.snapshot(2.5).unwrap().targets[0].state, TrackState::Lost);
+        assert!(situation.snapshot(3.5).unwrap().targets.is_empty());
+    }
+
+    #[test]
+    fn where_time_goes_back_what_is_heard_then_counts() {
+        let mut situation = situation();
+        situation.hear(&frame(100.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(&frame(0.0, 2, TrackState::Confirmed, 0.0));
+        let snapshot = situation.snapshot(0.0).unwrap();
+        assert_eq!(snapshot.time, Timestamp::from_seconds(START));
+        assert_eq!(snapshot.targets.iter().map(|target| target.id).collect::<Vec<_>>(), [2]);
     }
 
     #[test]
@@ -228,6 +256,6 @@ mod tests {
         situation.hear(&bad);
         bad.tracks[0].position = None;
         situation.hear(&bad);
-        assert!(situation.snapshot().unwrap().targets.is_empty());
+        assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
 }

@@ -62,3 +62,10 @@ pub enum RecordingError {
         source: std::io::Error,
     },
 }
+
+impl RecordingError {
+    /// Whether what it is written to does not take it: a full disk, and not a file that holds no more.
+    pub fn is_of_disk(&self) -> bool {
+        matches!(self, Self::Write(mcap::McapError::Io(_)))
+    }
+}

@@ -169,7 +169,10 @@ impl NetworkConfig {
         let Some((host, port)) = address(text).rsplit_once(':').filter(|_| known) else {
             return false;
         };
-        !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok_and(|port| port > 0)
+        // Behind a `#` or `?` Zenoh would take settings, such as to do without certificates.
+        let is_host = |c: char| c.is_ascii_alphanumeric() || "-._:[]%".contains(c);
+        let is_named = !host.is_empty() && host.chars().all(is_host);
+        is_named && port.parse::<u16>().is_ok_and(|port| port > 0)
     }
 
     /// An endpoint as it is spoken: by TLS where there are certificates.
@@ -216,6 +219,13 @@ impl NetworkConfig {
             }
         }
         Ok(())
+    }
+
+    /// The first endpoint beyond this host that a session connects to with nothing encrypted; `None`
+    /// where there is none.
+    pub fn unencrypted(&self, role: &Role) -> Option<String> {
+        let (_, connect) = self.declared(role).ok().filter(|_| self.security.is_none())?;
+        connect.into_iter().find(|endpoint| !is_loopback(endpoint))
     }
 
     /// Where a session listens and whom it connects to.
@@ -311,7 +321,13 @@ mod tests {
         let mut bad = network();
         bad.fusion = "127.0.0.1:7450".into();
         assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { of, .. }) if of == "fusion"));
-        for endpoint in ["tcp/:7451", "tcp/a/b:7451", "udp/127.0.0.1:7451", "tcp/127.0.0.1:99999"] {
+        for endpoint in [
+            "tcp/:7451",
+            "tcp/a/b:7451",
+            "tcp/a:1#iface=x;x=:2",
+            "udp/127.0.0.1:7451",
+            "tcp/127.0.0.1:99999",
+        ] {
             let bad = NetworkConfig { fusion: endpoint.into(), ..network() };
             assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { .. })), "{endpoint}");
             let bad = NetworkConfig { routers: vec![endpoint.into()], ..network() };

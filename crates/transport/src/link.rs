@@ -13,7 +13,9 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
 
 use crate::config::address;
-use crate::security::{Credentials, CredentialsError, Identity, Security, access_control};
+use crate::security::{
+    Credentials, CredentialsError, Identity, Security, Validity, access_control, days,
+};
 use crate::subscription::Intake;
 use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
 
@@ -126,17 +128,27 @@ pub struct Link {
 pub struct OwnCertificate {
     security: Security,
     identity: Identity,
+    /// Of the one that was there at the start, which is what a component that listens goes on showing.
+    at_start: Validity,
+    listens: bool,
 }
 
 impl OwnCertificate {
-    /// How long it is believed yet, if it is time to renew it. Its file is read anew: what connects
-    /// shows a renewed one with its next connection, what listens from its next start on.
-    pub fn ending(&self) -> Option<Duration> {
-        let now = SystemTime::now();
-        match Credentials::load(&self.security, &self.identity, now) {
-            Ok(credentials) => credentials.ending(now),
-            Err(_) => Some(Duration::ZERO),
-        }
+    /// What is wrong with it at a time, in words: it is to be renewed, or cannot be read.
+    ///
+    /// What connects reads its file for each connection, what listens at its start alone.
+    pub fn problem(&self, now: SystemTime) -> Option<String> {
+        let mend = "run `crossfix enroll`, copy it here, and start this again";
+        let shown = match Credentials::load(&self.security, &self.identity, now) {
+            Ok(credentials) => credentials.validity(),
+            Err(error) => return Some(format!("{error}")),
+        };
+        let shown = if self.listens { self.at_start } else { shown };
+        let left = shown.ending(now)?;
+        Some(match left {
+            Duration::ZERO => format!("the certificate that it shows has ended: {mend}"),
+            _ => format!("the certificate that it shows ends in {}: {mend}", days(left)),
+        })
     }
 }
 
@@ -146,7 +158,6 @@ fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>
         return Ok(Vec::new());
     };
     let identity = role.identity().ok_or(LinkError::Config(NetworkError::NobodysIdentity))?;
-    Credentials::load(security, &identity, SystemTime::now()).map_err(LinkError::Credentials)?;
     let (authority, own, key) = (
         security.authority_file(),
         security.certificate_file(&identity),
@@ -166,6 +177,21 @@ fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>
         ("transport/link/tls".to_owned(), tls.to_string()),
         ("access_control".to_owned(), access.to_string()),
     ])
+}
+
+/// The certificate that a session shows, checked; `None` where the network has none.
+fn own_certificate(
+    network: &NetworkConfig,
+    role: &Role,
+) -> Result<Option<OwnCertificate>, LinkError> {
+    let Some((security, identity)) = network.security.clone().zip(role.identity()) else {
+        return Ok(None);
+    };
+    let credentials = Credentials::load(&security, &identity, SystemTime::now())
+        .map_err(LinkError::Credentials)?;
+    let (listen, _) = network.endpoints(role).map_err(LinkError::Config)?;
+    let (at_start, listens) = (credentials.validity(), !listen.is_empty());
+    Ok(Some(OwnCertificate { security, identity, at_start, listens }))
 }
 
 fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
@@ -218,13 +244,12 @@ impl Link {
     /// router answers.
     pub fn open(network: &NetworkConfig, role: &Role) -> Result<Self, LinkError> {
         let config = config(network, role)?;
+        let shown = own_certificate(network, role)?;
         let session =
             zenoh::open(config).wait().map_err(|source| explain(network, role, &source))?;
         // The first half of what Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
-        let shown = network.security.clone().zip(role.identity());
-        let shown = shown.map(|(security, identity)| OwnCertificate { security, identity });
         Ok(Self { session, site: network.site.clone(), run: RunId(run), shown })
     }
 

@@ -44,7 +44,7 @@ pub struct Args {
     #[arg(long, value_name = "DAYS", default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..=3650))]
     days: u32,
     /// Only these: camera-NAME, fusion, recorder, router, viewer.
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", conflicts_with = "revoke")]
     only: Vec<Identity>,
     /// Believe none of the certificates issued for it so far, and issue another.
     #[arg(long, value_name = "NAME")]
@@ -60,11 +60,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         ensure!(hosts.contains_key(identity), "the network has no `{identity}`");
     }
     let believed_until = args.revoke.as_ref().and_then(|revoked| end_of(&before, revoked));
-    secure(&args.config, args.revoke.as_ref())?;
-    let network = load_network(&args.config)?;
-    let security = network.security.context("the network file has no [security]")?;
+    let secured = secured(&args.config, args.revoke.as_ref())?;
+    let security = security_of(&secured, folder)?;
     let authority_folder = args.authority.clone().unwrap_or_else(|| folder.join(AUTHORITY));
-    let authority = authority(&authority_folder, &security, &network.site)?;
+    let authority = authority(&authority_folder, &security, &before.site)?;
 
     let is_meant = |identity: &&Identity| match &args.revoke {
         Some(revoked) => *identity == revoked,
@@ -78,6 +77,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         write(&security, identity, &issued)?;
         rows.push(row(identity, hosts, &issued));
     }
+    // Last: the network file believes nobody who has not been issued a certificate.
+    if secured != read(&args.config)? {
+        output::write_file(&args.config, &[], secured.as_bytes())?;
+    }
     output::line(output::table(&rows));
     output::line(format!(
         "\nTo each host: {}, {} and the two files of what runs there, the key readable by it alone. \
@@ -88,7 +91,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     ));
     if let Some(revoked) = &args.revoke {
         let until = believed_until.map_or_else(String::new, |end| {
-            format!(", and of one that is not at most until {}", OffsetDateTime::from(end).date())
+            format!(
+                "; one that is not started again believes them until {}",
+                OffsetDateTime::from(end).date()
+            )
         });
         output::line(format!(
             "Earlier certificates of {revoked} are believed by each component until it is started \
@@ -124,13 +130,15 @@ fn end_of(network: &NetworkConfig, identity: &Identity) -> Option<SystemTime> {
     Some(credentials.not_after())
 }
 
-/// Adds [security] to a network file that has none, and counts a revocation there. All else in the
-/// file stays as it was written.
-fn secure(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<()> {
-    let text =
-        fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+fn read(path: &Path) -> anyhow::Result<String> {
+    fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+}
+
+/// A network file with [security], if it has none, and with a revocation counted. All else in it stays
+/// as it was written.
+fn secured(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<String> {
     let mut file: DocumentMut =
-        text.parse().with_context(|| format!("{} is no TOML", path.display()))?;
+        read(path)?.parse().with_context(|| format!("{} is no TOML", path.display()))?;
     let security = file.entry("security").or_insert_with(|| Item::Table(Table::new()));
     let security = security.as_table_like_mut().context("`security` is no section")?;
     security.entry("certificates").or_insert(value(CERTIFICATES));
@@ -141,11 +149,14 @@ fn secure(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<()> {
         let times = counts.get(&name).and_then(Item::as_integer).unwrap_or(0);
         counts.insert(&name, value(times + 1));
     }
-    let secured = file.to_string();
-    if secured == text {
-        return Ok(());
-    }
-    output::write_file(path, &[], secured.as_bytes())
+    Ok(file.to_string())
+}
+
+/// What a network file, in a folder, says of certificates.
+fn security_of(text: &str, folder: &Path) -> anyhow::Result<Security> {
+    let network: NetworkConfig = crate::config::parse(text, &[])?;
+    let security = network.security.context("the network file has no [security]")?;
+    Ok(Security { certificates: folder.join(&security.certificates), ..security })
 }
 
 /// The site's authority: the one that there is, or a new one.
@@ -156,10 +167,16 @@ fn authority(
 ) -> anyhow::Result<Authority> {
     let (key, public) = (folder.join(AUTHORITY_KEY), security.authority_file());
     if key.exists() {
-        let read = |path: &Path| {
-            fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
-        };
-        return Ok(Authority::load(&read(&public)?, &read(&key)?)?);
+        let authority = Authority::load(&read(&public)?, &read(&key)?)?;
+        if let Some(other) = authority.site().filter(|other| *other != site.as_str()) {
+            tracing::warn!(
+                "the authority was made for site `{other}`: whoever has a certificate of that site is \
+                 believed here, too. An authority of its own: remove {} and {}",
+                public.display(),
+                folder.display()
+            );
+        }
+        return Ok(authority);
     }
     ensure!(
         !public.exists(),

@@ -43,7 +43,7 @@ fn print(info: &RecordingInfo) {
     }));
     output::line(output::table(&rows));
     if info.foreign > 0 {
-        output::line(format!("{} messages on topics that are not Crossfix's", info.foreign));
+        output::line(format!("{} messages in other schemas, such as Foxglove's", info.foreign));
     }
     if let Some(source) = &info.source {
         let Source { command, version, run, host } = source;

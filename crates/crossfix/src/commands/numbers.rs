@@ -39,6 +39,17 @@ pub fn wall_time(text: &str) -> Result<f64, String> {
     within(text, 0.0, LAST_WALL_TIME, " s since the Unix epoch")
 }
 
+/// How often something is said to others, a second.
+#[cfg(feature = "centre")]
+pub fn outlet_rate(text: &str) -> Result<f64, String> {
+    within(text, 0.001, 100.0, " a second")
+}
+
+/// Seconds, an hour at most.
+pub fn seconds_of_an_hour(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 3600.0, " s")
+}
+
 /// Frames a second.
 pub fn rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 10_000.0, " frames a second")

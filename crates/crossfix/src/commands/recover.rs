@@ -3,10 +3,12 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
+use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
 use crossfix_recording::{
     Entry, ReadReport, RecordingInfo, RecordingReader, RecordingWriter, Source,
 };
 
+use super::record::foxglove;
 use crate::output::{self, Draft};
 use crate::recorded::Lacks;
 
@@ -69,7 +71,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let mut lost =
         lacks.damage.map_or("it was whole".to_owned(), |damage| format!("damaged {damage}"));
     if read.foreign > 0 {
-        lost = format!("{lost}; {} messages that are not Crossfix's were left out", read.foreign);
+        lost = format!(
+            "{lost}; {} messages in other schemas were left out, and Foxglove's made anew (with places \
+             on Earth by `export --foxglove --anchor`)",
+            read.foreign
+        );
     }
     output::line(format!(
         "{} messages recovered to {}, and read back; {lost}",
@@ -81,15 +87,24 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// Writes what can be read of a recording, and whose it is.
 fn rewrite(from: &Path, to: &Path) -> anyhow::Result<(Tally, ReadReport)> {
-    let Source { command, run, host, .. } = RecordingInfo::of(from)?.source.unwrap_or_default();
+    let info = RecordingInfo::of(from)?;
+    let has_beside = info.foreign > 0;
+    let Source { command, run, host, .. } = info.source.unwrap_or_default();
     let own = Source::of("recover");
     let command = format!("{} of {command}", own.command);
     let mut writer = RecordingWriter::create(to)?;
     writer.sign(&Source { command, run, host, ..own })?;
     let mut tally = Tally::default();
+    let mut view: Option<FoxgloveView> = None;
     let report = RecordingReader::open(from)?.for_each(|entry| {
         tally.see(&entry);
-        writer.write(&entry)
+        writer.write(&entry)?;
+        if !has_beside {
+            return Ok(());
+        }
+        let site = &entry.key.site;
+        let view = view.get_or_insert_with(|| FoxgloveView::new(site, None, Pictures::Said));
+        foxglove::write(&mut writer, view, &entry)
     })?;
     writer.finish()?;
     Ok((tally, report))

@@ -59,7 +59,7 @@ pub fn drive(data: &[u8]) {
         Box::new(Kml::above_geoid(0.0)),
     ];
     let event = decode::<TrackEvent>(data).ok();
-    while let Some(snapshot) = situation.snapshot() {
+    while let Some(snapshot) = situation.snapshot(0.0) {
         for outlet in &mut outlets {
             outlet.greeting(snapshot.time);
             let said = outlet.tracks(&snapshot);

@@ -3,20 +3,30 @@ use std::time::Duration;
 use crossfix_message::SiteName;
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
-    Issuer, KeyPair, KeyUsagePurpose,
+    Issuer, KeyPair, KeyUsagePurpose, PublicKeyData,
 };
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject;
 use thiserror::Error;
 use time::OffsetDateTime;
+use x509_parser::parse_x509_certificate;
+
+use super::credentials::common_name;
 
 /// How long the authority itself holds. Whoever has its key can join the site, so it stays where
 /// `enroll` is run; at its end every certificate is issued anew by another.
 const AUTHORITY_HOLDS: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
+/// What precedes the site's name in the authority's own.
+const OF_SITE: &str = "Crossfix site ";
 /// What a host's clock may be behind the issuing one's.
 const CLOCKS: Duration = Duration::from_secs(3600);
 
 /// What went wrong with an authority.
 #[derive(Debug, Error)]
 pub enum AuthorityError {
+    /// What it would sign nobody would believe.
+    #[error("the authority's key is not that of its certificate: they are of two authorities")]
+    OtherKey,
     /// Something could not be made or read.
     #[error("{what}")]
     Certificate {
@@ -51,6 +61,13 @@ pub struct Issued {
     pub not_after: OffsetDateTime,
 }
 
+/// Whether a key is that of a certificate (PEM).
+fn is_key_of(pair: &KeyPair, pem: &str) -> bool {
+    let Ok(der) = CertificateDer::from_pem_slice(pem.as_bytes()) else { return false };
+    let parsed = parse_x509_certificate(&der);
+    parsed.is_ok_and(|(_, parsed)| parsed.public_key().raw == pair.subject_public_key_info())
+}
+
 impl Authority {
     /// A new authority of a site, from a time on.
     ///
@@ -60,7 +77,7 @@ impl Authority {
         let what = || certificate("cannot make a certificate authority");
         let mut params = CertificateParams::default();
         params.distinguished_name = DistinguishedName::new();
-        params.distinguished_name.push(DnType::CommonName, format!("Crossfix site {site}"));
+        params.distinguished_name.push(DnType::CommonName, format!("{OF_SITE}{site}"));
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
         params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
         params.not_before = now - CLOCKS;
@@ -78,9 +95,19 @@ impl Authority {
     pub fn load(pem: &str, key: &str) -> Result<Self, AuthorityError> {
         let pair =
             KeyPair::from_pem(key).map_err(certificate("the authority's key is no private key"))?;
+        if !is_key_of(&pair, pem) {
+            return Err(AuthorityError::OtherKey);
+        }
         let issuer = Issuer::from_ca_cert_pem(pem, pair)
             .map_err(certificate("the authority's certificate is none"))?;
         Ok(Self { issuer, certificate: pem.to_owned(), key: key.to_owned() })
+    }
+
+    /// The site that it was made for, if its certificate says.
+    pub fn site(&self) -> Option<String> {
+        let der = CertificateDer::from_pem_slice(self.certificate.as_bytes()).ok()?;
+        let (_, parsed) = parse_x509_certificate(&der).ok()?;
+        common_name(&parsed)?.strip_prefix(OF_SITE).map(str::to_owned)
     }
 
     /// Its certificate, as PEM: goes to every host.

@@ -13,8 +13,14 @@ use super::{Identity, Security};
 /// Why a component cannot show who it is.
 #[derive(Debug, Error)]
 pub enum CredentialsError {
+    /// A file that is not there.
+    #[error("{} is not there: run `crossfix enroll`, and copy what it says to this host", path.display())]
+    Missing {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file cannot be read.
-    #[error("cannot read {}: run `crossfix enroll`, and copy what it says to this host", path.display())]
+    #[error("cannot read {}: it must be readable to whoever runs this (chown root:crossfix, chmod 640)", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -46,8 +52,12 @@ pub enum CredentialsError {
         /// How far ahead.
         ahead: Duration,
     },
-    /// Of somebody else, or revoked.
-    #[error("the certificate {} is `{found}`'s, and the network file believes `{believed}`", path.display())]
+    /// Of somebody else, or revoked: a number behind the name counts the revocations.
+    #[error(
+        "the certificate {} is of `{found}`, and the network file believes `{believed}` alone: it was \
+         revoked, or is another component's; copy the new one here",
+        path.display()
+    )]
     Name {
         /// The file.
         path: PathBuf,
@@ -55,6 +65,17 @@ pub enum CredentialsError {
         found: String,
         /// The one that is believed.
         believed: String,
+    },
+    /// By another authority.
+    #[error(
+        "the certificate {} is not by the authority of {}: copy both of one site",
+        path.display(), authority.display()
+    )]
+    Foreign {
+        /// The certificate.
+        path: PathBuf,
+        /// The authority's.
+        authority: PathBuf,
     },
     /// Its key is another's.
     #[error("{} is not the key of {}", key.display(), path.display())]
@@ -69,9 +90,14 @@ pub enum CredentialsError {
     },
 }
 
-fn days(time: Duration) -> String {
-    let hours = time.as_secs() / 3600;
-    if hours < 48 { format!("{hours} hours") } else { format!("{} days", hours / 24) }
+/// A time as people say it.
+pub(crate) fn days(time: Duration) -> String {
+    let (minutes, hours) = (time.as_secs() / 60, time.as_secs() / 3600);
+    match hours {
+        0 => format!("{minutes} minutes"),
+        1..48 => format!("{hours} hours"),
+        _ => format!("{} days", hours / 24),
+    }
 }
 
 /// What a component shows the others: a certificate that is believed now, with its key.
@@ -84,7 +110,10 @@ pub struct Credentials {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, CredentialsError> {
-    std::fs::read(path).map_err(|source| CredentialsError::Read { path: path.to_owned(), source })
+    std::fs::read(path).map_err(|source| match source.kind() {
+        io::ErrorKind::NotFound => CredentialsError::Missing { path: path.to_owned() },
+        _ => CredentialsError::Read { path: path.to_owned(), source },
+    })
 }
 
 fn certificate(path: &Path) -> Result<CertificateDer<'static>, CredentialsError> {
@@ -126,6 +155,14 @@ impl Credentials {
         if found != believed {
             return Err(CredentialsError::Name { path, found, believed });
         }
+        let authority_file = security.authority_file();
+        let (_, by) = parse_x509_certificate(&authority).map_err(|_| CredentialsError::Form {
+            path: authority_file.clone(),
+            what: "certificate",
+        })?;
+        if parsed.verify_signature(Some(by.public_key())).is_err() {
+            return Err(CredentialsError::Foreign { path, authority: authority_file });
+        }
         let not_before = system_time(parsed.validity().not_before.timestamp());
         let not_after = system_time(parsed.validity().not_after.timestamp());
         if let Ok(ago) = now.duration_since(not_after) {
@@ -146,13 +183,32 @@ impl Credentials {
     /// How long they are believed from a time on, if that is less than a third of what they were
     /// issued for: time to renew them.
     pub fn ending(&self, now: SystemTime) -> Option<Duration> {
-        let left = self.not_after.duration_since(now).unwrap_or_default();
-        let issued_for = self.not_after.duration_since(self.not_before).unwrap_or_default();
-        (left < issued_for / 3).then_some(left)
+        self.validity().ending(now)
+    }
+
+    /// From when to when they are believed.
+    pub fn validity(&self) -> Validity {
+        Validity { not_before: self.not_before, not_after: self.not_after }
     }
 
     /// From when on they are not believed any more.
     pub fn not_after(&self) -> SystemTime {
         self.not_after
+    }
+}
+
+/// From when to when a certificate is believed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Validity {
+    not_before: SystemTime,
+    not_after: SystemTime,
+}
+
+impl Validity {
+    /// How long it holds from a time on, if that is less than a third of the whole.
+    pub fn ending(&self, now: SystemTime) -> Option<Duration> {
+        let left = self.not_after.duration_since(now).unwrap_or_default();
+        let whole = self.not_after.duration_since(self.not_before).unwrap_or_default();
+        (left < whole / 3).then_some(left)
     }
 }

@@ -21,7 +21,8 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) use access::access_control;
 pub use authority::{Authority, AuthorityError, Issued};
-pub use credentials::{Credentials, CredentialsError};
+pub(crate) use credentials::days;
+pub use credentials::{Credentials, CredentialsError, Validity};
 pub use handshake::{HandshakeError, handshake};
 pub use identity::{Identity, IdentityError};
 

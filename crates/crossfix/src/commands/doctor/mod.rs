@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use crossfix_geometry::Camera;
-use crossfix_transport::{Identity, NetworkConfig, address};
+use crossfix_message::CameraName;
+use crossfix_transport::{Identity, Mode, NetworkConfig, address};
 use crossfix_video::decoding_time;
 use serde::Serialize;
 
@@ -92,13 +93,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let keys: toml::Table = config::load(&args.config, &[], Kind::Camera)?;
     let findings = match Kind::of(&keys) {
         Some(Kind::Camera) => of_camera(&args.config)?,
-        Some(Kind::Network) => of_network(&load_network(&args.config)?),
+        Some(Kind::Network) => of_network(&load_network(&args.config)?, &Identity::Viewer),
         Some(Kind::Fusion) => {
             let network = keys.get("network").and_then(toml::Value::as_str);
             let network = network
                 .with_context(|| format!("{}: key `network` is missing", args.config.display()))?;
             let folder = args.config.parent().unwrap_or(Path::new("."));
-            of_network(&load_network(&folder.join(network))?)
+            of_network(&load_network(&folder.join(network))?, &Identity::Fusion)
         }
         _ => anyhow::bail!(
             "{} is no file of a camera, a fusion centre or a network",
@@ -147,6 +148,9 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     findings.push(clock::host_clock());
     let network = load_network(&file.network)?;
     findings.push(match network.cameras.get(&file.name) {
+        Some(_) if network.mode == Mode::Client => {
+            Finding::new("endpoint", Verdict::Pass, "none: it connects to a router")
+        }
         Some(endpoint) => of_own_endpoint(endpoint),
         None => {
             let found = format!("camera `{}` has no endpoint in the network's file", file.name);
@@ -156,7 +160,7 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     let identity = Identity::Camera(file.name);
     findings.extend(security::of_own(&network, &identity));
     let others = security::Others::seen_by(&network, &identity);
-    findings.extend(network.routers.iter().map(|router| others.of("router", router)));
+    findings.extend(routers(&network, &others));
     Ok(findings)
 }
 
@@ -294,13 +298,28 @@ fn of_own_endpoint(endpoint: &str) -> Finding {
     }
 }
 
-fn of_network(network: &NetworkConfig) -> Vec<Finding> {
-    let mut findings = security::of_own(network, &Identity::Viewer);
-    let others = security::Others::seen_by(network, &Identity::Viewer);
-    let cameras = network.cameras.iter();
-    findings.extend(cameras.map(|(name, at)| others.of(name.as_str(), at)));
-    findings.push(others.of("fusion centre", &network.fusion));
-    findings.extend(network.routers.iter().map(|router| others.of("router", router)));
+/// Who can be reached by a component of the network.
+fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
+    let mut findings = security::of_own(network, identity);
+    let others = security::Others::seen_by(network, identity);
+    // Through a router nobody listens but the router.
+    if network.mode == Mode::Peer {
+        let cameras = network.cameras.iter();
+        let camera = |(name, at): (&CameraName, &String)| {
+            others.of(name.as_str(), at, &Identity::Camera(name.clone()))
+        };
+        findings.extend(cameras.map(camera));
+        if *identity != Identity::Fusion {
+            findings.push(others.of("fusion centre", &network.fusion, &Identity::Fusion));
+        }
+    }
+    findings.extend(routers(network, &others));
     findings.push(clock::host_clock());
     findings
+}
+
+/// Which of the network's routers can be reached.
+fn routers(network: &NetworkConfig, others: &security::Others<'_>) -> Vec<Finding> {
+    let routers = network.routers.iter();
+    routers.map(|router| others.of("router", router, &Identity::Router)).collect()
 }

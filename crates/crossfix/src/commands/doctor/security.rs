@@ -3,10 +3,13 @@
 use std::error::Error;
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use crossfix_transport::{
-    Credentials, CredentialsError, HandshakeError, Identity, NetworkConfig, address, handshake,
+    Credentials, CredentialsError, HandshakeError, Identity, Mode, NetworkConfig, address,
+    handshake,
 };
 
 use super::{Finding, Verdict};
@@ -14,17 +17,20 @@ use super::{Finding, Verdict};
 /// How long an endpoint may take to answer.
 const ANSWER: Duration = Duration::from_secs(2);
 const DAY_S: u64 = 24 * 3600;
+/// The bit of a file's mode by which everybody may read it.
+const OTHERS_READ: u32 = 0o004;
 const RENEW: &str = "crossfix enroll -c network.toml, and copy what it says to this host";
 
 /// Whether a component can show who it is.
 pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let Some(security) = &network.security else {
-        let found = if network.unsecured {
+        let found = if network.unsecured || network.mode == Mode::Client {
             "nothing is encrypted, and whoever reaches this network can add cameras and tracks"
         } else {
             "no certificates: components listen on this host alone"
         };
-        let verdict = if network.unsecured { Verdict::Warn } else { Verdict::Pass };
+        let is_open = network.unsecured || network.mode == Mode::Client;
+        let verdict = if is_open { Verdict::Warn } else { Verdict::Pass };
         return vec![
             Finding::new("security", verdict, found).mend("crossfix enroll -c network.toml"),
         ];
@@ -36,6 +42,7 @@ pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
             let mend = match &error {
                 CredentialsError::NotYet { .. } => "set this host's clock",
                 CredentialsError::Key { .. } => "copy both files of one issue",
+                CredentialsError::Read { .. } => "chown root:crossfix, chmod 640",
                 _ => RENEW,
             };
             return vec![Finding::new("certificate", Verdict::Fail, words(&error)).mend(mend)];
@@ -45,7 +52,18 @@ pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let days = left.as_secs() / DAY_S;
     let verdict = if credentials.ending(now).is_some() { Verdict::Warn } else { Verdict::Pass };
     let found = format!("{} for {days} more days", security.common_name(identity));
-    vec![Finding::new("certificate", verdict, found).mend(RENEW)]
+    let mut findings = vec![Finding::new("certificate", verdict, found).mend(RENEW)];
+    findings.extend(of_key(&security.key_file(identity)));
+    findings
+}
+
+/// Whether everybody on this host can read a private key.
+fn of_key(path: &Path) -> Option<Finding> {
+    let mode = std::fs::metadata(path).ok()?.permissions().mode();
+    (mode & OTHERS_READ != 0).then(|| {
+        let found = format!("everybody on this host can read {}", path.display());
+        Finding::new("key", Verdict::Warn, found).mend("chmod 640, or 600")
+    })
 }
 
 /// The other components, as one of them sees them.
@@ -63,10 +81,10 @@ impl<'a> Others<'a> {
         Self { network, shown }
     }
 
-    /// Whether somebody listens at an endpoint, and takes this component for what it is.
-    pub fn of(&self, who: &str, endpoint: &str) -> Finding {
+    /// Whether the one who is wanted listens at an endpoint, and takes this component for what it is.
+    pub fn of(&self, who: &str, endpoint: &str, wanted: &Identity) -> Finding {
         match &self.shown {
-            Some(credentials) => self.by_handshake(credentials, who, endpoint),
+            Some(credentials) => self.by_handshake(credentials, who, endpoint, wanted),
             None => match connect(endpoint) {
                 Ok(()) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
                 Err(error) => unreachable(who, endpoint, &error),
@@ -74,38 +92,39 @@ impl<'a> Others<'a> {
         }
     }
 
-    fn by_handshake(&self, credentials: &Credentials, who: &str, endpoint: &str) -> Finding {
+    fn by_handshake(
+        &self,
+        credentials: &Credentials,
+        who: &str,
+        endpoint: &str,
+        wanted: &Identity,
+    ) -> Finding {
+        let believed = self.network.security.as_ref().map(|it| it.common_name(wanted));
         match handshake(credentials, address(endpoint)) {
-            Ok(name) if self.is_believed(&name) => {
+            Ok(name) if believed.as_ref() == Some(&name) => {
                 Finding::new(who, Verdict::Pass, format!("{endpoint} answers as {name}"))
             }
             Ok(name) => Finding::new(
                 who,
                 Verdict::Fail,
-                format!("{endpoint} shows `{name}`, which this network does not believe"),
+                format!("{endpoint} shows `{name}`, and `{wanted}` is wanted there"),
             )
-            .mend("its certificate was revoked, or the network file here is an older one"),
+            .mend(
+                "another's endpoint, a revoked certificate, or an older network file here or there",
+            ),
             Err(HandshakeError::Connect(error)) => unreachable(who, endpoint, &error),
             Err(error) => {
                 let mend = match &error {
                     HandshakeError::OursRefused(_) => RENEW,
                     HandshakeError::NoTls => "give it the network file with [security]",
-                    _ => "crossfix enroll -c network.toml, and copy what it says to that host",
+                    _ => {
+                        "crossfix enroll, copy what it says to that host, and start it again there"
+                    }
                 };
                 let found = format!("{endpoint}: {}", words(&error));
                 Finding::new(who, Verdict::Fail, found).mend(mend)
             }
         }
-    }
-
-    /// Whether a common name is that of a component of this network.
-    fn is_believed(&self, name: &str) -> bool {
-        let Some(security) = &self.network.security else {
-            return false;
-        };
-        let cameras = self.network.cameras.keys().cloned().map(Identity::Camera);
-        let mut all = cameras.chain([Identity::Fusion, Identity::Router]);
-        all.any(|identity| security.common_name(&identity) == name)
     }
 }
 

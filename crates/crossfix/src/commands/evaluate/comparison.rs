@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use crossfix_evaluation::Report;
 use serde::Serialize;
 
@@ -22,7 +22,15 @@ pub fn compare(a: &Path, b: &Path, question: &Question) -> anyhow::Result<Compar
     let question = Question { truth: Some(truth), ..question.clone() };
     let evaluated =
         |path: &Path| evaluate(path, &question).with_context(|| path.display().to_string());
-    Ok(Comparison { a: evaluated(a)?, b: evaluated(b)? })
+    let compared = Comparison { a: evaluated(a)?, b: evaluated(b)? };
+    for (run, path) in [(&compared.a, a), (&compared.b, b)] {
+        ensure!(
+            run.report.completeness > 0.0 || run.report.answers == 0,
+            "{} has no track near any target: are both recordings of the same time and place?",
+            path.display()
+        );
+    }
+    Ok(compared)
 }
 
 /// A figure of a run, as people read it, and how it is written.

@@ -43,7 +43,7 @@ pub struct Others {
     #[arg(long, value_name = "FILE")]
     foxglove: Option<PathBuf>,
     /// How often the targets' places are said in the formats of others, a second.
-    #[arg(long, value_name = "HERTZ", default_value_t = 10.0, value_parser = numbers::positive)]
+    #[arg(long, value_name = "HERTZ", default_value_t = 10.0, value_parser = numbers::outlet_rate)]
     rate_hz: f64,
     /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84
     /// ellipsoid.
@@ -167,7 +167,7 @@ impl Told<'_> {
                         // A recording may have gaps: no time is made up for.
                         next = Some(last.max(due).plus_seconds(self.rate_hz.recip()));
                         greet(outlet, last, put)?;
-                        let snapshot = situation.snapshot();
+                        let snapshot = situation.snapshot(0.0);
                         put(snapshot.iter().flat_map(|s| outlet.tracks(s)).collect())?;
                     }
                 }

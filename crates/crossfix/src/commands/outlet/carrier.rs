@@ -1,13 +1,14 @@
 //! What carries an outlet's bytes: datagrams, streams, files.
 
 use std::fmt;
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs, UdpSocket};
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use crossfix_message::Timestamp;
 use crossfix_outlet::Outlet;
 
@@ -24,8 +25,12 @@ const RETRY: Duration = Duration::from_secs(1);
 const REMINDER: Duration = Duration::from_secs(60);
 /// Looking whether the other side has said something takes so long.
 const GLANCE: Duration = Duration::from_millis(1);
-/// What it says at once, bytes; the rest is read the next time.
-const HEARD_AT_ONCE: usize = 64 << 10;
+/// What it says is read in pieces of so many bytes, and so many of them at once: a TAK server relays
+/// what everybody says, and drops who does not take it.
+const PIECE: usize = 64 << 10;
+const MOST_PIECES: usize = 64;
+/// A parent that has not taken the registration after so long will not.
+const WELCOME: Duration = Duration::from_secs(10);
 
 /// Where an outlet's bytes go.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,6 +63,13 @@ impl FromStr for Destination {
             "tls" => Ok(Self::Tls(address.to_owned())),
             _ => Err(format!("`{protocol}` is none of udp, tcp, tls")),
         }
+    }
+}
+
+impl Destination {
+    /// Whether the other side can answer.
+    pub fn answers(&self) -> bool {
+        matches!(self, Self::Tcp(_) | Self::Tls(_))
     }
 }
 
@@ -97,7 +109,9 @@ impl Way {
                 let tls = tls.ok_or_else(|| io::Error::other("there is no --tls-ca"))?;
                 Self::Encrypted(Box::new(tls.connect(connect(address)?, address)?))
             }
-            Destination::File(path) => Self::File(File::create(path)?),
+            Destination::File(path) => {
+                Self::File(OpenOptions::new().append(true).create(true).open(path)?)
+            }
             Destination::Stdout => Self::Stdout,
         })
     }
@@ -125,21 +139,23 @@ impl Way {
             }
             Self::Datagrams(_) | Self::File(_) | Self::Stdout => return Ok(Vec::new()),
         };
-        let mut heard = vec![0; HEARD_AT_ONCE];
-        match stream.read(&mut heard) {
-            Ok(0) => Err(io::ErrorKind::UnexpectedEof.into()),
-            Ok(length) => {
-                heard.truncate(length);
-                Ok(heard)
+        let mut heard = Vec::new();
+        let mut piece = vec![0; PIECE];
+        for _ in 0..MOST_PIECES {
+            match stream.read(&mut piece) {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(length) => heard.extend(&piece[..length]),
+                Err(error) if is_silence(&error) => break,
+                Err(error) => return Err(error),
             }
-            Err(error)
-                if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) =>
-            {
-                Ok(Vec::new())
-            }
-            Err(error) => Err(error),
         }
+        Ok(heard)
     }
+}
+
+/// Whether nothing was said in time.
+fn is_silence(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
 }
 
 fn resolve(address: &str) -> io::Result<SocketAddr> {
@@ -158,15 +174,25 @@ pub struct Carrier {
     destination: Destination,
     tls: Option<TlsClient>,
     way: Option<Way>,
+    /// When the way was opened, or it was tried to.
     tried_at: Option<Instant>,
     complained_at: Option<Instant>,
+    /// What was written last went through.
+    goes_through: bool,
     messages: u64,
 }
 
 impl Carrier {
     pub fn new(destination: Destination, tls: Option<TlsClient>) -> Self {
-        let (way, tried_at, complained_at) = (None, None, None);
-        Self { destination, tls, way, tried_at, complained_at, messages: 0 }
+        Self {
+            destination,
+            tls,
+            way: None,
+            tried_at: None,
+            complained_at: None,
+            goes_through: false,
+            messages: 0,
+        }
     }
 
     /// Messages that have gone out.
@@ -174,12 +200,27 @@ impl Carrier {
         self.messages
     }
 
+    /// Hears what the other side says; who does not listen is not told anything for long.
+    ///
+    /// # Errors
+    /// As [`Self::say`].
+    pub fn listen(&mut self, outlet: &mut dyn Outlet) -> anyhow::Result<()> {
+        let Some(way) = &mut self.way else { return Ok(()) };
+        let heard = way.read().and_then(|said| outlet.heard(&said).map_err(io::Error::other));
+        let is_late = !outlet.is_ready() && self.tried_at.is_some_and(|at| at.elapsed() > WELCOME);
+        self.mind(heard.and_then(|()| match is_late {
+            true => Err(io::Error::other("it has not accepted the registration")),
+            false => Ok(()),
+        }))
+    }
+
     /// Says what has been heard since the last time, if the other side is there and takes it.
-    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) {
-        if let Err(error) = self.try_to_say(outlet, heard) {
-            self.way = None;
-            self.complain(&error);
-        }
+    ///
+    /// # Errors
+    /// Where there is nobody to try again for: a file or a pipe that takes no more.
+    pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) -> anyhow::Result<()> {
+        let said = self.try_to_say(outlet, heard);
+        self.mind(said)
     }
 
     fn try_to_say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) -> io::Result<()> {
@@ -190,20 +231,13 @@ impl Carrier {
             self.tried_at = Some(Instant::now());
             self.way = Some(Way::open(&self.destination, self.tls.as_ref())?);
             self.put(outlet.greeting(Timestamp::from_seconds(wall_seconds())))?;
-            if self.complained_at.take().is_some() {
-                tracing::info!("{} is there again", self.destination);
-            }
-        }
-        if let Some(way) = &mut self.way {
-            let said = way.read()?;
-            outlet.heard(&said).map_err(io::Error::other)?;
         }
         if !outlet.is_ready() {
             return Ok(());
         }
-        let events = std::mem::take(&mut heard.events);
-        self.put(events.iter().flat_map(|event| outlet.event(event)).collect())?;
-        match heard.situation.snapshot() {
+        self.put(heard.events.iter().flat_map(|event| outlet.event(event)).collect())?;
+        heard.events.clear();
+        match heard.snapshot() {
             Some(snapshot) => self.put(outlet.tracks(&snapshot)),
             None => Ok(()),
         }
@@ -214,23 +248,31 @@ impl Carrier {
         for message in messages {
             way.write(&message)?;
             self.messages += 1;
+            if !std::mem::replace(&mut self.goes_through, true) && self.complained_at.is_some() {
+                tracing::info!("{} takes what is said again", self.destination);
+            }
         }
         Ok(())
     }
 
-    fn complain(&mut self, error: &io::Error) {
+    /// What becomes of an error: another try, with a word now and then, where somebody may come back.
+    fn mind(&mut self, done: io::Result<()>) -> anyhow::Result<()> {
+        let Err(error) = done else { return Ok(()) };
+        (self.way, self.goes_through) = (None, false);
+        if matches!(self.destination, Destination::File(_) | Destination::Stdout) {
+            return Err(error).with_context(|| format!("cannot write to {}", self.destination));
+        }
         if self.complained_at.is_none_or(|at| at.elapsed() >= REMINDER) {
             self.complained_at = Some(Instant::now());
             tracing::warn!("{}: {error}; trying again", self.destination);
         }
+        Ok(())
     }
 
     /// Says goodbye.
-    pub fn finish(&mut self, outlet: &mut dyn Outlet) {
-        let last = outlet.farewell(Timestamp::from_seconds(wall_seconds()));
-        if let Err(error) = self.put(last) {
-            self.complain(&error);
-        }
+    pub fn finish(&mut self, outlet: &mut dyn Outlet) -> anyhow::Result<()> {
+        let last = self.put(outlet.farewell(Timestamp::from_seconds(wall_seconds())));
+        self.mind(last)
     }
 }
 

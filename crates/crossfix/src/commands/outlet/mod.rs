@@ -8,10 +8,12 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use crossfix_geometry::Geodetic;
 use crossfix_message::{CameraCalibration, Channel, Key, TrackEvent, TrackFrame, decode};
-use crossfix_outlet::{Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation};
+use crossfix_outlet::{
+    Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation, Snapshot,
+};
 use crossfix_transport::{Received, Role};
 
 use self::carrier::{Carrier, Destination};
@@ -45,7 +47,7 @@ pub struct Args {
     #[arg(long, value_name = "DESTINATION", default_value = "-")]
     to: Destination,
     /// How often, a second; by default once, SAPIENT twice, ASTERIX every four seconds.
-    #[arg(long, value_name = "HERTZ", value_parser = numbers::positive)]
+    #[arg(long, value_name = "HERTZ", value_parser = numbers::outlet_rate)]
     rate_hz: Option<f64>,
     /// Where on Earth the site's origin is, in the place of the network file's [anchor]: degrees north,
     /// degrees east, metres above the WGS84 ellipsoid.
@@ -130,6 +132,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             args.config.display()
         )
     })?;
+    ensure!(
+        args.format != Format::Sapient || args.to.answers(),
+        "SAPIENT waits for an answer: --to tcp://HOST:PORT or tls://HOST:PORT"
+    );
     let mut outlet: Box<dyn Outlet> = match args.format {
         Format::Cot => Box::new(args.formats.cursor_on_target()?),
         Format::Sapient => Box::new(Sapient::of_site(site.clone())),
@@ -147,7 +153,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let subscription = link.subscribe(&[channels.as_slice(), &[calibrations]].concat())?;
     tracing::info!("telling {} where the targets of `{site}` are", args.to);
 
-    let mut heard = Heard { situation: Situation::new(site, anchor), events: Vec::new() };
+    let mut heard = Heard {
+        situation: Situation::new(site, anchor),
+        tracks_at: Instant::now(),
+        events: Vec::new(),
+    };
     let period = Duration::from_secs_f64(
         args.rate_hz.map_or(args.format.period_s(), |rate_hz| rate_hz.recip()),
     );
@@ -156,12 +166,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         if let Some(received) = subscription.next(POLL) {
             heard.hear(&received);
         }
+        carrier.listen(&mut *outlet)?;
         if said_at.elapsed() >= period {
             said_at = Instant::now();
-            carrier.say(&mut *outlet, &mut heard);
+            carrier.say(&mut *outlet, &mut heard)?;
         }
     }
-    carrier.finish(&mut *outlet);
+    carrier.finish(&mut *outlet)?;
     drop(subscription);
     link.close(LEAVE)?;
     crate::output::line(format!("outlet: {} messages", carrier.messages()));
@@ -171,15 +182,23 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 /// What has been heard of the site since something was said.
 struct Heard {
     situation: Situation,
+    /// When the fusion centre said something of its tracks last.
+    tracks_at: Instant,
     events: Vec<TrackEvent>,
 }
 
 impl Heard {
+    /// Where all targets are now.
+    fn snapshot(&mut self) -> Option<Snapshot> {
+        self.situation.snapshot(self.tracks_at.elapsed().as_secs_f64())
+    }
+
     /// What is no message of this version is the viewer's and the recorder's to report.
     fn hear(&mut self, received: &Received) {
         match received.key.channel {
             Channel::Tracks => {
                 if let Ok(frame) = decode::<TrackFrame>(&received.data) {
+                    self.tracks_at = received.at;
                     self.situation.hear(&frame);
                 }
             }

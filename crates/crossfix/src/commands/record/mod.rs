@@ -148,7 +148,7 @@ impl Disk {
     /// on in a new one: the disk was full before anybody looked.
     fn rescue(&mut self, recorder: &mut Recorder, error: anyhow::Error) -> anyhow::Result<()> {
         let lately = |at: Instant| at.elapsed() < health::PERIOD;
-        let is_of_disk = matches!(error.downcast_ref(), Some(RecordingError::Write(_)));
+        let is_of_disk = error.downcast_ref().is_some_and(RecordingError::is_of_disk);
         if !is_of_disk || !self.files.rotates() || self.rescued.is_some_and(lately) {
             return Err(error);
         }

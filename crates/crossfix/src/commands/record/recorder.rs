@@ -215,6 +215,10 @@ impl Recorder {
     fn write_pictures(&mut self, tracks: &Entry, at: Instant) -> Result<(), RecordingError> {
         let Ok(tracks) = decode(&tracks.data) else { return Ok(()) };
         let wanted: Vec<_> = self.pictures.see(&tracks, at).collect();
+        if self.room < Room::Pictures {
+            self.counts.no_room += wanted.len() as u64;
+            return Ok(());
+        }
         wanted.into_iter().try_for_each(|(entry, said)| self.write(entry, said))
     }
 

@@ -95,7 +95,7 @@ impl PlanBoard {
                 self.tracks
                     .retain(|_, (_, said)| at.saturating_duration_since(*said) < TRACK_LIVES);
                 for track in frame.tracks {
-                    if self.tracks.len() < MOST_TRACKS {
+                    if self.tracks.len() < MOST_TRACKS || self.tracks.contains_key(&track.id) {
                         self.tracks.insert(track.id, (track, at));
                     }
                 }
@@ -157,12 +157,15 @@ fn planned_track(track: &Track) -> Option<PlannedTrack> {
     };
     let (at, velocity) = (track.position?, track.velocity?);
     let covariance = |index: usize| track.covariance.get(index).copied().unwrap_or(0.0);
-    Some(PlannedTrack {
+    let covariance = [covariance(0), covariance(1), covariance(7)];
+    let numbers = [at.x, at.y, at.z, velocity.x, velocity.y, velocity.z];
+    let is_drawable = numbers.iter().chain(&covariance).all(|number| number.is_finite());
+    is_drawable.then(|| PlannedTrack {
         id: track.id.to_string(),
         number: TrackNumber(track.id).to_string(),
         state,
         at: [at.x, at.y, at.z],
         velocity: [velocity.x, velocity.y, velocity.z],
-        covariance: [covariance(0), covariance(1), covariance(7)],
+        covariance,
     })
 }
