@@ -443,3 +443,22 @@ fn the_doctor_asks_the_router_where_there_is_one_and_notices_whose_endpoint_it_i
     let output = crossfix(&["router", "-c", &network]);
     assert_eq!(output.status.code(), Some(1), "it does not pass for the router");
 }
+
+#[test]
+fn the_log_of_who_waits_for_another_says_what_is_wrong_with_the_certificate() {
+    let mut site = Site::new(1.0);
+    site.enroll(&[]);
+    let own = own_authority(&site);
+    // `east` says that it is another host.
+    let hosts = ["10.9.8.7".to_owned()];
+    let issued = own
+        .issue("camera-east", &hosts, OffsetDateTime::now_utc(), Duration::from_secs(600))
+        .unwrap();
+    fs::write(certificates(&site).join("camera-east.pem"), issued.certificate).unwrap();
+    fs::write(certificates(&site).join("camera-east.key"), issued.key).unwrap();
+    let _agent = site.start(&["agent", "-c", &site.path("east.toml")]);
+    let fusion = site.start_logged(&["fuse", "-c", &site.path("fusion.toml")], "fuse.log");
+    let words = "its certificate is not for this address";
+    assert!(site.wait_for_line("fuse.log", words, PATIENCE), "{}", site.text("fuse.log"));
+    assert!(fusion.stop());
+}

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crossfix_message::{CameraName, Channel};
-use crossfix_transport::{Link, NetworkConfig, Presence};
+use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
 /// How long somebody may be missing before that is said, and how often it is said again that nobody
 /// is there.
@@ -19,6 +19,8 @@ pub struct Lookout {
     site: String,
     others: Vec<Other>,
     absence: Absence,
+    /// What is shown those who are missing, where there are certificates.
+    certificate: Option<OwnCertificate>,
 }
 
 /// When it is time to say who is missing.
@@ -94,7 +96,8 @@ impl Lookout {
 
     fn new(link: &Link, others: Vec<Other>) -> anyhow::Result<Self> {
         let (presence, site) = (link.presence()?, link.site().to_string());
-        Ok(Self { presence, site, others, absence: Absence::default() })
+        let certificate = link.certificate().cloned();
+        Ok(Self { presence, site, others, absence: Absence::default(), certificate })
     }
 
     /// Looks again; to be called about once a second.
@@ -114,7 +117,28 @@ impl Lookout {
         let here = self.others.iter().filter(|other| other.is_here).count();
         if self.absence.is_due(here, self.others.len(), changed, now) {
             tracing::warn!("{}", self.missing());
+            self.ask_why();
         }
+    }
+
+    /// Says of those that are missing whether it is for a certificate, which Zenoh does not: on a thread
+    /// of its own, as they may be slow to answer.
+    fn ask_why(&self) {
+        let Some(certificate) = self.certificate.clone() else { return };
+        let missing: Vec<(String, String)> = self
+            .others
+            .iter()
+            .filter(|other| !other.is_here)
+            .take(NAMED)
+            .map(|other| (other.name.clone(), other.endpoint.clone()))
+            .collect();
+        std::thread::spawn(move || {
+            for (name, endpoint) in missing {
+                if let Some(why) = certificate.why_no_link(&endpoint) {
+                    tracing::warn!("{name} at {endpoint}: {why}");
+                }
+            }
+        });
     }
 
     /// Whether one of them is there.

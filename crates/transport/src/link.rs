@@ -14,7 +14,8 @@ use zenoh::{Config, Session, Wait};
 
 use crate::config::address;
 use crate::security::{
-    Credentials, CredentialsError, Identity, Security, Validity, access_control, days,
+    Credentials, CredentialsError, HandshakeError, Identity, Security, Validity, access_control,
+    days, handshake,
 };
 use crate::subscription::Intake;
 use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
@@ -149,6 +150,22 @@ impl OwnCertificate {
             Duration::ZERO => format!("the certificate that it shows has ended: {mend}"),
             _ => format!("the certificate that it shows ends in {}: {mend}", days(left)),
         })
+    }
+}
+
+impl OwnCertificate {
+    /// Why there is no link with whoever answers at an endpoint, in words; `None` where nobody answers,
+    /// or nothing is wrong with either certificate. Takes two seconds at most: not for a main loop.
+    pub fn why_no_link(&self, endpoint: &str) -> Option<String> {
+        let credentials = match Credentials::load(&self.security, &self.identity, SystemTime::now())
+        {
+            Ok(credentials) => credentials,
+            Err(error) => return Some(error.to_string()),
+        };
+        match handshake(&credentials, address(endpoint)) {
+            Ok(_) | Err(HandshakeError::Connect(_) | HandshakeError::Other(_)) => None,
+            Err(error) => Some(error.to_string()),
+        }
     }
 }
 

@@ -53,9 +53,11 @@ impl Y4mSource {
         if !text.starts_with("YUV4MPEG2") {
             return Err(damaged("it does not begin with YUV4MPEG2".to_owned()));
         }
+        // The library takes the last of several, whatever it is: there must be one.
         let side = |letter: char| {
-            let token = text.split_whitespace().find_map(|token| token.strip_prefix(letter));
-            token.and_then(|digits| digits.parse::<u64>().ok()).unwrap_or(0)
+            let mut tokens = text.split_whitespace().filter_map(|token| token.strip_prefix(letter));
+            let only = tokens.next().filter(|_| tokens.next().is_none());
+            only.and_then(|digits| digits.parse::<u64>().ok()).unwrap_or(0)
         };
         let (width, height) = (side('W'), side('H'));
         if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {

@@ -99,6 +99,16 @@ fn a_y4m_file_has_its_own_rate_and_may_be_torn() {
 }
 
 #[test]
+fn a_y4m_file_with_two_heights_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.y4m");
+    // The library takes the second one, and multiplies beyond all numbers.
+    fs::write(&path, "YUV4MPEG2 W4 H4 F30:1 W4 H4888888888888888888\nFRAME\n").unwrap();
+    let error = open(&path, FrameClock::default()).err().unwrap();
+    assert!(error.to_string().contains("a.y4m"), "{error}");
+}
+
+#[test]
 fn a_y4m_file_of_sixteen_bits_is_read() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.y4m");

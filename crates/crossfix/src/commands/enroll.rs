@@ -25,7 +25,7 @@ const DAY: Duration = Duration::from_secs(24 * 3600);
 
 /// Make or renew a site's certificates, and secure its network by them.
 ///
-/// The first time it makes the site's certificate authority and adds [security] to the network file:
+/// The first time it makes the site's certificate authority and adds `[security]` to the network file:
 /// from then on every link is encrypted, and each component may say only what is its own.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -134,7 +134,7 @@ fn read(path: &Path) -> anyhow::Result<String> {
     fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
-/// A network file with [security], if it has none, and with a revocation counted. All else in it stays
+/// A network file with `[security]`, if it has none, and with a revocation counted. All else in it stays
 /// as it was written.
 fn secured(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<String> {
     let mut file: DocumentMut =

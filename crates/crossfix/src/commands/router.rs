@@ -14,7 +14,7 @@ const POLL: Duration = Duration::from_millis(200);
 
 /// Run the Zenoh router of a site whose network has mode = "client".
 ///
-/// It carries everybody's messages; with [security] it holds each component to what it may say.
+/// It carries everybody's messages; with `[security]` it holds each component to what it may say.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Example:\n  crossfix router -c configs/site/network.toml --listen tcp/127.0.0.1:7447"

@@ -321,7 +321,7 @@ fn backlog(
             held_back.push(t + 0.02);
         } else {
             let now = t + 0.02;
-            let mut all: Vec<f64> = held_back.drain(..).collect();
+            let mut all: Vec<f64> = std::mem::take(&mut held_back);
             all.insert(if newest_first { 0 } else { all.len() }, now);
             heard.extend(all.into_iter().map(|time| ("c", buffer.insert(exposure("c", time)))));
         }

@@ -49,7 +49,7 @@ pub struct Args {
     /// How often, a second; by default once, SAPIENT twice, ASTERIX every four seconds.
     #[arg(long, value_name = "HERTZ", value_parser = numbers::outlet_rate)]
     rate_hz: Option<f64>,
-    /// Where on Earth the site's origin is, in the place of the network file's [anchor]: degrees north,
+    /// Where on Earth the site's origin is, in the place of the network file's `[anchor]`: degrees north,
     /// degrees east, metres above the WGS84 ellipsoid.
     #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
     anchor: Option<Geodetic>,
