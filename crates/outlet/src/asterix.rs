@@ -1,3 +1,5 @@
+//! ASTERIX category 062, byte by byte (EUROCONTROL-SPEC-0149-9).
+
 use std::collections::BTreeMap;
 
 use crossfix_message::{Timestamp, TrackState};

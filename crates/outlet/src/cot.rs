@@ -1,3 +1,5 @@
+//! Cursor on Target, as MITRE's schema has it.
+
 use crossfix_message::{Timestamp, TrackState};
 
 use crate::target::{Motion, Target};

@@ -1,3 +1,5 @@
+//! GeoJSON (RFC 7946): points of now, lines of whole flights.
+
 use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;

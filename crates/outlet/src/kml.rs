@@ -1,3 +1,5 @@
+//! KML, for Google Earth.
+
 use std::fmt::Write;
 
 use crossfix_message::{Timestamp, TrackNumber};

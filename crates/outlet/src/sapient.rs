@@ -1,3 +1,5 @@
+//! SAPIENT, as dstl's middleware takes it.
+
 use crossfix_message::{SiteName, Timestamp, TrackEvent, TrackEventKind, TrackState};
 use prost::Message;
 use sapient::sapient_message::Content;

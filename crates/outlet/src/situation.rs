@@ -1,3 +1,5 @@
+//! All tracks at one time: a fusion centre says each at its own, and only those that have changed.
+
 use std::collections::BTreeMap;
 
 use crossfix_geometry::{Geodetic, LocalFrame};

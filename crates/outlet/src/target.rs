@@ -1,3 +1,5 @@
+//! A track as others want it: on the Earth, with course, speed, and one standard deviation of each.
+
 use crossfix_geometry::Geodetic;
 use crossfix_message::{Timestamp, TrackNumber, TrackState};
 use nalgebra::{Matrix2, Matrix3, Matrix6, Vector3};

@@ -3,7 +3,7 @@ use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Seek, Write};
 use std::path::Path;
 
-use crossfix_message::{Key, MAX_MESSAGE_BYTES, file_descriptor_set};
+use crossfix_message::{Key, MAX_MESSAGE_BYTES, Timestamp, file_descriptor_set};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
@@ -14,6 +14,16 @@ use crate::{Beside, CHANNELS, Entry, RecordingError, Source, schema_of};
 const COMPRESSION_LEVEL: u32 = 1;
 /// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
 const CHUNK_BYTES: u64 = 512 * 1024;
+
+/// What precedes the so many-th message of a channel. MCAP has no time before the epoch.
+fn header(
+    (channel_id, sequence): (u16, u32),
+    data_time: Timestamp,
+    arrival: Timestamp,
+) -> MessageHeader {
+    let nanos = |time: Timestamp| u64::try_from(time.nanos()).unwrap_or(0);
+    MessageHeader { channel_id, sequence, log_time: nanos(data_time), publish_time: nanos(arrival) }
+}
 
 /// Writes a recording. Call [`Self::flush`] about once a second: what was flushed survives a crash.
 pub struct RecordingWriter<W: Write + Seek> {
@@ -101,14 +111,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
             Some(&known) => known,
             None => (self.add_channel(name, &entry.key).map_err(RecordingError::Write)?, 0),
         };
-        // MCAP has no time before the epoch.
-        let nanos = |time: crossfix_message::Timestamp| u64::try_from(time.nanos()).unwrap_or(0);
-        let header = MessageHeader {
-            channel_id,
-            sequence,
-            log_time: nanos(entry.data_time),
-            publish_time: nanos(entry.arrival),
-        };
+        let header = header((channel_id, sequence), entry.data_time, entry.arrival);
         self.writer.write_to_known_channel(&header, &entry.data).map_err(RecordingError::Write)?;
         self.channels.insert(entry.key.clone(), (channel_id, sequence.wrapping_add(1)));
         self.messages += 1;
@@ -126,13 +129,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
             Some(known) => known,
             None => (self.add_beside(message).map_err(RecordingError::Write)?, 0),
         };
-        let nanos = |time: crossfix_message::Timestamp| u64::try_from(time.nanos()).unwrap_or(0);
-        let header = MessageHeader {
-            channel_id,
-            sequence,
-            log_time: nanos(message.data_time),
-            publish_time: nanos(message.arrival),
-        };
+        let header = header((channel_id, sequence), message.data_time, message.arrival);
         let written = self.writer.write_to_known_channel(&header, message.data);
         written.map_err(RecordingError::Write)?;
         self.beside.insert(message.topic.to_owned(), (channel_id, sequence.wrapping_add(1)));

@@ -1,3 +1,5 @@
+//! Who may say what: one table for all, in the words of Zenoh's access control.
+
 use std::iter::once;
 
 use crossfix_message::{CameraName, Key, SiteName};

@@ -1,3 +1,5 @@
+//! What signs the certificates of a site.
+
 use std::time::Duration;
 
 use crossfix_message::SiteName;

@@ -1,9 +1,13 @@
+//! What a component shows the others, read from its files and held against all that can be wrong with them.
+
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::{ClientConfig, RootCertStore};
 use thiserror::Error;
 use x509_parser::parse_x509_certificate;
 use x509_parser::prelude::X509Certificate;
@@ -102,9 +106,9 @@ pub(crate) fn days(time: Duration) -> String {
 
 /// What a component shows the others: a certificate that is believed now, with its key.
 pub struct Credentials {
-    pub(super) chain: Vec<CertificateDer<'static>>,
-    pub(super) key: PrivateKeyDer<'static>,
-    pub(super) authority: CertificateDer<'static>,
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+    authority: CertificateDer<'static>,
     not_before: SystemTime,
     not_after: SystemTime,
 }
@@ -172,12 +176,24 @@ impl Credentials {
             return Err(CredentialsError::NotYet { path, ahead });
         }
         let credentials = Self { chain: vec![own], key, authority, not_before, not_after };
-        super::handshake::client(&credentials).map_err(|source| CredentialsError::Key {
+        credentials.client().map_err(|source| CredentialsError::Key {
             path,
             key: key_file,
             source,
         })?;
         Ok(credentials)
+    }
+
+    /// The client's side of a handshake that shows them; it believes what this site's authority has signed
+    /// and nobody else.
+    pub(super) fn client(&self) -> Result<ClientConfig, rustls::Error> {
+        let mut roots = RootCertStore::empty();
+        roots.add(self.authority.clone())?;
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        ClientConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&rustls::version::TLS13])?
+            .with_root_certificates(roots)
+            .with_client_auth_cert(self.chain.clone(), self.key.clone_key())
     }
 
     /// How long they are believed from a time on, if that is less than a third of what they were

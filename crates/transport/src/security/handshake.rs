@@ -6,9 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rustls::pki_types::ServerName;
-use rustls::{
-    AlertDescription, CertificateError, ClientConfig, ClientConnection, RootCertStore, StreamOwned,
-};
+use rustls::{AlertDescription, CertificateError, ClientConnection, StreamOwned};
 use thiserror::Error;
 use x509_parser::parse_x509_certificate;
 
@@ -45,17 +43,6 @@ pub enum HandshakeError {
     /// Something else.
     #[error("the handshake failed")]
     Other(#[source] io::Error),
-}
-
-/// The client's side of a handshake with such credentials.
-pub(super) fn client(credentials: &Credentials) -> Result<ClientConfig, rustls::Error> {
-    let mut roots = RootCertStore::empty();
-    roots.add(credentials.authority.clone())?;
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    ClientConfig::builder_with_provider(provider)
-        .with_protocol_versions(&[&rustls::version::TLS13])?
-        .with_root_certificates(roots)
-        .with_client_auth_cert(credentials.chain.clone(), credentials.key.clone_key())
 }
 
 fn connect(address: &str) -> io::Result<TcpStream> {
@@ -113,7 +100,7 @@ fn explain(error: io::Error) -> HandshakeError {
 /// [`HandshakeError`] saying whose certificate is refused, and why.
 pub fn handshake(credentials: &Credentials, address: &str) -> Result<String, HandshakeError> {
     let other = |source| HandshakeError::Other(io::Error::other(source));
-    let config = client(credentials).map_err(|source| other(Box::new(source)))?;
+    let config = credentials.client().map_err(|source| other(Box::new(source)))?;
     let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
     let host = host.trim_matches(['[', ']']).to_owned();
     let name = ServerName::try_from(host)

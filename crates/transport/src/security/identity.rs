@@ -1,3 +1,5 @@
+//! Which component of a site a certificate is of.
+
 use std::fmt;
 use std::str::FromStr;
 

@@ -143,7 +143,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Format::Geojson => Box::new(GeoJsonLines),
         Format::Foxglove => bail!("Foxglove is served"),
     };
-    let mut carrier = Carrier::new(args.to.clone(), args.tls.client(&args.to)?);
+    let tls = matches!(args.to, Destination::Tls(_)).then(|| args.tls.client()).transpose()?;
+    let mut carrier = Carrier::new(args.to.clone(), tls);
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };

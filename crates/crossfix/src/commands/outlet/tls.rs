@@ -10,8 +10,6 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 
-use super::carrier::Destination;
-
 /// An encrypted stream.
 pub type TlsStream = StreamOwned<ClientConnection, TcpStream>;
 
@@ -43,11 +41,8 @@ fn certificates(path: &Path) -> anyhow::Result<Vec<CertificateDer<'static>>> {
 }
 
 impl TlsFiles {
-    /// What connects to a destination that wants TLS; `None` where it does not.
-    pub fn client(&self, destination: &Destination) -> anyhow::Result<Option<TlsClient>> {
-        if !matches!(destination, Destination::Tls(_)) {
-            return Ok(None);
-        }
+    /// What connects by them.
+    pub fn client(&self) -> anyhow::Result<TlsClient> {
         let authorities = self.tls_ca.as_deref().context("tls:// needs --tls-ca FILE")?;
         let mut roots = RootCertStore::empty();
         for certificate in certificates(authorities)? {
@@ -69,7 +64,7 @@ impl TlsFiles {
             }
             _ => builder.with_no_client_auth(),
         };
-        Ok(Some(TlsClient { config: Arc::new(config) }))
+        Ok(TlsClient { config: Arc::new(config) })
     }
 }
 
