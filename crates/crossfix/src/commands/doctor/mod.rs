@@ -309,9 +309,7 @@ fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
             others.of(name.as_str(), at, &Identity::Camera(name.clone()))
         };
         findings.extend(cameras.map(camera));
-        if *identity != Identity::Fusion {
-            findings.push(others.of("fusion centre", &network.fusion, &Identity::Fusion));
-        }
+        findings.push(others.of("fusion centre", &network.fusion, &Identity::Fusion));
     }
     findings.extend(routers(network, &others));
     findings.push(clock::host_clock());
