@@ -33,16 +33,16 @@ pub struct HealthReporter {
     certificate: Option<WatchedCertificate>,
 }
 
-/// A component's certificate, looked at now and then.
+/// A component's certificate, looked at now and then; what is wrong with it is said when it begins.
 #[derive(Debug)]
-struct WatchedCertificate {
+pub struct WatchedCertificate {
     own: OwnCertificate,
     looked_at: Instant,
     problem: Option<String>,
 }
 
 impl WatchedCertificate {
-    fn new(own: OwnCertificate) -> Self {
+    pub fn new(own: OwnCertificate) -> Self {
         let mut watched = Self { own, looked_at: Instant::now(), problem: None };
         watched.look();
         watched
@@ -58,7 +58,7 @@ impl WatchedCertificate {
     }
 
     /// What is wrong with it.
-    fn problem(&mut self) -> Option<String> {
+    pub fn problem(&mut self) -> Option<String> {
         if self.looked_at.elapsed() >= CERTIFICATE_PERIOD {
             self.look();
         }

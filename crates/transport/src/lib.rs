@@ -42,6 +42,6 @@ pub use presence::Presence;
 pub use reception::Reception;
 pub use security::{
     AUTHORITY_FILE, Authority, AuthorityError, Credentials, CredentialsError, HandshakeError,
-    Identity, IdentityError, Issued, Security, Validity, handshake,
+    Identity, IdentityError, Issued, Security, Validity, connect, handshake,
 };
 pub use subscription::{Received, Refused, Subscription};

@@ -5,6 +5,7 @@ use anyhow::{Context, ensure};
 use crossfix_transport::{NetworkConfig, Role};
 
 use crate::config;
+use crate::health::WatchedCertificate;
 use crate::network;
 use crate::output;
 use crate::service;
@@ -56,8 +57,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     tracing::info!("the router of `{}` is up at {endpoint}, run {}", link.site(), link.run());
     service::ready(&format!("routing at {endpoint}"));
+    // It has no health of its own: its log says when its certificate is to be renewed.
+    let mut certificate = link.certificate().cloned().map(WatchedCertificate::new);
     while !shutdown.requested() {
         std::thread::sleep(POLL);
+        certificate.as_mut().and_then(WatchedCertificate::problem);
         service::alive();
     }
     service::stopping();

@@ -45,7 +45,12 @@ pub enum HandshakeError {
     Other(#[source] io::Error),
 }
 
-fn connect(address: &str) -> io::Result<TcpStream> {
+/// A connection with whoever listens at `HOST:PORT`, by each of its addresses; nobody waits for it for
+/// longer than two seconds.
+///
+/// # Errors
+/// What the system says of the last address.
+pub fn connect(address: &str) -> io::Result<TcpStream> {
     let mut last = io::Error::other("it has no address");
     for address in address.to_socket_addrs()? {
         match TcpStream::connect_timeout(&address, ANSWER) {

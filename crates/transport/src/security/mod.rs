@@ -23,7 +23,7 @@ pub(crate) use access::access_control;
 pub use authority::{Authority, AuthorityError, Issued};
 pub(crate) use credentials::days;
 pub use credentials::{Credentials, CredentialsError, Validity};
-pub use handshake::{HandshakeError, handshake};
+pub use handshake::{HandshakeError, connect, handshake};
 pub use identity::{Identity, IdentityError};
 
 /// `[security]` of a network file: the site's links are encrypted, and both ends of each show who

@@ -2,20 +2,17 @@
 
 use std::error::Error;
 use std::io;
-use std::net::{TcpStream, ToSocketAddrs};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use crossfix_transport::{
-    Credentials, CredentialsError, HandshakeError, Identity, Mode, NetworkConfig, address,
+    Credentials, CredentialsError, HandshakeError, Identity, NetworkConfig, Role, address, connect,
     handshake,
 };
 
 use super::{Finding, Verdict};
 
-/// How long an endpoint may take to answer.
-const ANSWER: Duration = Duration::from_secs(2);
 const DAY_S: u64 = 24 * 3600;
 /// The bit of a file's mode by which everybody may read it.
 const OTHERS_READ: u32 = 0o004;
@@ -24,12 +21,12 @@ const RENEW: &str = "crossfix enroll -c network.toml, and copy what it says to t
 /// Whether a component can show who it is.
 pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let Some(security) = &network.security else {
-        let found = if network.unsecured || network.mode == Mode::Client {
+        let is_open = network.unsecured || network.unencrypted(&Role::Observer).is_some();
+        let found = if is_open {
             "nothing is encrypted, and whoever reaches this network can add cameras and tracks"
         } else {
             "no certificates: components listen on this host alone"
         };
-        let is_open = network.unsecured || network.mode == Mode::Client;
         let verdict = if is_open { Verdict::Warn } else { Verdict::Pass };
         return vec![
             Finding::new("security", verdict, found).mend("crossfix enroll -c network.toml"),
@@ -85,8 +82,8 @@ impl<'a> Others<'a> {
     pub fn of(&self, who: &str, endpoint: &str, wanted: &Identity) -> Finding {
         match &self.shown {
             Some(credentials) => self.by_handshake(credentials, who, endpoint, wanted),
-            None => match connect(endpoint) {
-                Ok(()) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
+            None => match connect(address(endpoint)) {
+                Ok(_) => Finding::new(who, Verdict::Pass, format!("{endpoint} answers")),
                 Err(error) => unreachable(who, endpoint, &error),
             },
         }
@@ -137,17 +134,6 @@ fn words(error: &dyn Error) -> String {
         source = inner.source();
     }
     words
-}
-
-fn connect(endpoint: &str) -> io::Result<()> {
-    let mut last = io::Error::other("it has no address");
-    for address in address(endpoint).to_socket_addrs()? {
-        match TcpStream::connect_timeout(&address, ANSWER) {
-            Ok(_) => return Ok(()),
-            Err(error) => last = error,
-        }
-    }
-    Err(last)
 }
 
 fn unreachable(who: &str, endpoint: &str, error: &io::Error) -> Finding {
