@@ -452,3 +452,45 @@ fn an_outlet_without_a_place_on_earth_says_what_it_needs() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("section [anchor] with latitude_deg"), "{said}");
 }
+
+#[test]
+fn a_recording_of_two_runs_is_told_whole_though_the_second_is_of_an_earlier_time() {
+    use crossfix_message::{
+        Channel, Key, Payload, Timestamp, Track, TrackFrame, TrackState, Vector3,
+    };
+    use crossfix_recording::{Entry, RecordingWriter};
+
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let mut writer = RecordingWriter::create(path("runs.mcap").as_ref()).unwrap();
+    for (id, begin_s) in [(1, 1000.0), (2, 0.0)] {
+        for tenth in 0..50 {
+            let time = Timestamp::from_seconds(begin_s + 0.1 * f64::from(tenth));
+            let track = Track {
+                id,
+                state: TrackState::Confirmed.into(),
+                position: Some(Vector3 { x: f64::from(tenth), y: 0.0, z: 30.0 }),
+                velocity: Some(Vector3 { x: 10.0, y: 0.0, z: 0.0 }),
+                covariance: (0..36).map(|k| if k % 7 == 0 { 0.01 } else { 0.0 }).collect(),
+                ..Default::default()
+            };
+            let frame =
+                TrackFrame { time_ns: time.nanos(), tracks: vec![track], ..Default::default() };
+            let key = Key::new("test".parse().unwrap(), Channel::Tracks);
+            let entry = Entry { key, data_time: time, arrival: time, data: frame.encode() };
+            writer.write(&entry).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+    let (runs, file) = (path("runs.mcap"), path("flights.geojson"));
+    succeed(&["export", &runs, "--anchor", ANCHOR, "--rate-hz", "10", "--geojson", &file]);
+    let told: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    let lengths: Vec<usize> = told["features"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|feature| feature["geometry"]["coordinates"].as_array().unwrap().len())
+        .collect();
+    assert_eq!(lengths.len(), 2, "{told}");
+    assert!(lengths.iter().all(|length| *length >= 45), "{lengths:?}");
+}

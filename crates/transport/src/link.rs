@@ -151,9 +151,7 @@ impl OwnCertificate {
             _ => format!("the certificate that it shows ends in {}: {mend}", days(left)),
         })
     }
-}
 
-impl OwnCertificate {
     /// Why there is no link with whoever answers at an endpoint, in words; `None` where nobody answers,
     /// or nothing is wrong with either certificate. Takes two seconds at most: not for a main loop.
     pub fn why_no_link(&self, endpoint: &str) -> Option<String> {

@@ -92,6 +92,9 @@ fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
     site.with_context(|| format!("{} holds no message of a site", recording.display()))
 }
 
+/// Tracks of an earlier time than this, s, are of another run and not out of order.
+const OUT_OF_ORDER_S: f64 = 2.0;
+
 /// Writes messages.
 type Put<'a> = dyn FnMut(Vec<Vec<u8>>) -> anyhow::Result<()> + 'a;
 
@@ -126,13 +129,15 @@ impl Told<'_> {
         file.flush().with_context(cannot_write)?;
         drop(file);
         draft.keep()?;
-        output::line(format!("{messages} messages written to {}", path.display()));
+        let count = if messages == 1 { String::new() } else { format!(": {messages} messages") };
+        output::line(format!("{} written{count}", path.display()));
         Ok(())
     }
 
     /// Tells the tracks at even times of the data.
     fn tell(&self, outlet: &mut dyn Outlet, put: &mut Put<'_>) -> anyhow::Result<()> {
         let mut situation = Situation::new(self.site.clone(), self.anchor);
+        let period_s = self.rate_hz.recip();
         let mut next: Option<Timestamp> = None;
         let mut last = Timestamp::EPOCH;
         let mut lacks = Lacks::default();
@@ -161,11 +166,13 @@ impl Told<'_> {
                     let Some(frame) = lacks.read::<TrackFrame>(&entry.data) else { return Ok(()) };
                     frames += 1;
                     situation.hear(&frame);
-                    last = last.max(Timestamp::from_nanos(frame.time_ns));
-                    let due = *next.get_or_insert(last);
-                    if last >= due {
-                        // A recording may have gaps: no time is made up for.
-                        next = Some(last.max(due).plus_seconds(self.rate_hz.recip()));
+                    last = Timestamp::from_nanos(frame.time_ns);
+                    // A recording may have gaps, and runs of earlier times: nothing is made up for.
+                    let is_due = next.is_none_or(|next| {
+                        last >= next || next.seconds_since(last) > period_s + OUT_OF_ORDER_S
+                    });
+                    if is_due {
+                        next = Some(last.plus_seconds(period_s));
                         greet(outlet, last, put)?;
                         let snapshot = situation.snapshot(0.0);
                         put(snapshot.iter().flat_map(|s| outlet.tracks(s)).collect())?;
