@@ -10,6 +10,7 @@ use std::path::Path;
 
 use crossfix_message::{BearingFrame, Channel, ClockSource, ImageTrackState, decode};
 use crossfix_tests::{Site, alone, messages, program};
+use nalgebra::Vector2;
 
 const CAMERAS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/peers/gige_cameras.py");
 /// A lens for the camera's image.
@@ -52,21 +53,28 @@ kill $camera",
     assert!(frames.len() > 200, "{}", frames.len());
     assert!(frames.iter().all(|frame| frame.clock_source() == ClockSource::Host));
     // The dot is drawn at whole pixels below its place, so it is half a pixel beside it in the mean.
-    let mut off: [Vec<f64>; 2] = Default::default();
+    let mut off = Vec::new();
     for frame in &frames {
         for track in frame.tracks.iter().filter(|t| t.state() == ImageTrackState::Tracking) {
-            let seconds = frame.capture_time_ns as f64 * 1e-9;
-            let place = [256.0 + 200.0 * seconds.cos(), 256.0 + 100.0 * seconds.sin()];
-            off[0].push(track.pixel_x - place[0] + 0.5);
-            off[1].push(track.pixel_y - place[1] + 0.5);
+            let (sin, cos) = (frame.capture_time_ns as f64 * 1e-9).sin_cos();
+            let place = Vector2::new(256.0 + 200.0 * cos, 256.0 + 100.0 * sin);
+            let speed = Vector2::new(-200.0 * sin, 100.0 * cos);
+            off.push((Vector2::new(track.pixel_x + 0.5, track.pixel_y + 0.5) - place, speed));
         }
     }
-    for off in &mut off {
-        off.sort_unstable_by(f64::total_cmp);
-        let at = |share: f64| off[(share * (off.len() - 1) as f64) as usize];
-        println!("{} places, {:.2} {:.2} {:.2} px", off.len(), at(0.05), at(0.5), at(0.95));
-        assert!(off.len() > 100, "{}", off.len());
-        // A millisecond is a fifth of a pixel.
-        assert!(at(0.5).abs() < 0.2 && at(0.05) > -0.8 && at(0.95) < 0.8, "{off:?}");
+    assert!(off.len() > 100, "{}", off.len());
+    let count = off.len() as f64;
+    let beside = off.iter().map(|(off, _)| off).sum::<Vector2<f64>>() / count;
+    let mean_speed = off.iter().map(|(_, speed)| speed).sum::<Vector2<f64>>() / count;
+    let (mut along, mut squares) = (0.0, 0.0);
+    for (off, speed) in &off {
+        along += (off - beside).dot(&(speed - mean_speed));
+        squares += (speed - mean_speed).norm_squared();
     }
+    let late_s = along / squares;
+    println!("{count} places, {:.2} ms late, {:.2?} px beside", late_s * 1e3, beside.as_slice());
+    // Whole pixels leave 0.1 ms of standard deviation. The target's template may hold it half a pixel
+    // beside its middle, more so on a busy machine, whose agent leaves out frames.
+    assert!(late_s.abs() < 1e-3, "{late_s}");
+    assert!(beside.amax() < 0.5, "{beside}");
 }
