@@ -7,6 +7,7 @@
     reason = "a test that cannot set itself up has failed, and one that is skipped says so"
 )]
 
+use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -16,7 +17,7 @@ use crossfix_calibration::intrinsics_to_yaml;
 use crossfix_message::{CameraName, Channel};
 use crossfix_recording::{Entry, RecordingReader};
 use crossfix_simulation::{Scene, World};
-use crossfix_transport::{Link, Mode, NetworkConfig, Role};
+use crossfix_transport::{Area, Link, Mode, NetworkConfig, Role};
 use tempfile::TempDir;
 
 /// How long a test waits for what must come.
@@ -234,12 +235,17 @@ impl Site {
         let mut scene: Scene =
             toml::from_str(include_str!("../../configs/demo/scene.toml")).unwrap();
         scene.duration_s = duration_s;
+        Self::of(&scene)
+    }
+
+    /// A scene, each camera's agent playing its bearings twice as fast as life.
+    pub fn of(scene: &Scene) -> Self {
         let world = scene.build().unwrap();
         let folder = tempfile::tempdir().unwrap();
         let network = free_network(world.cameras().iter().map(|camera| camera.name().clone()));
         let site = Self { folder, network, world };
         site.write("network.toml", &toml::to_string(&site.network).unwrap());
-        site.write("scene.toml", &toml::to_string(&scene).unwrap());
+        site.write("scene.toml", &toml::to_string(scene).unwrap());
         site.write("fusion.toml", "network = \"network.toml\"\n[event_time]\nlateness_s = 3.0\n");
         succeed(&["simulate", &site.path("scene.toml"), "-o", &site.path("source.mcap")]);
         for camera in site.world.cameras() {
@@ -267,6 +273,19 @@ impl Site {
     pub fn route(&mut self) {
         self.network.mode = Mode::Client;
         self.network.routers = vec![free_endpoints(1).remove(0)];
+        self.write("network.toml", &toml::to_string(&self.network).unwrap());
+    }
+
+    /// Gives the site several fusion centres, each with its own file: `fusion-west.toml` of area
+    /// `west`. What follows is in each of these files.
+    pub fn divide(&mut self, areas: &[(&str, &[&str])], settings: &str) {
+        self.network.fusion = None;
+        for ((area, cameras), fusion) in areas.iter().zip(free_endpoints(areas.len())) {
+            let cameras = cameras.iter().map(|name| name.parse().unwrap()).collect();
+            self.network.areas.insert(area.parse().unwrap(), Area { fusion, cameras });
+            let file = format!("network = \"network.toml\"\narea = \"{area}\"\n{settings}");
+            self.write(&format!("fusion-{area}.toml"), &file);
+        }
         self.write("network.toml", &toml::to_string(&self.network).unwrap());
     }
 
@@ -385,7 +404,8 @@ pub fn free_network(cameras: impl IntoIterator<Item = CameraName>) -> NetworkCon
         unsecured: false,
         security: None,
         anchor: None,
-        fusion: endpoints.remove(0),
+        fusion: Some(endpoints.remove(0)),
+        areas: BTreeMap::new(),
         cameras: cameras.into_iter().zip(endpoints).collect(),
     }
 }

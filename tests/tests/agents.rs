@@ -163,7 +163,7 @@ fn a_second_program_under_a_cameras_name_is_named_in_health() {
     let recorder = site.start_recorder("live.mcap");
     // The recorder hears two programs: one in the cameras' place, one in the fusion centre's.
     let one = Link::open(site.network(), &Role::Cameras { and_fusion: false }).unwrap();
-    let two = Link::open(site.network(), &Role::Fusion).unwrap();
+    let two = Link::open(site.network(), &Role::Fusion(None)).unwrap();
     for link in [&one, &two] {
         link.wait_for(&[Channel::RecorderAlive], PATIENCE, || true).unwrap();
     }

@@ -137,6 +137,7 @@ macro_rules! pages {
 
 pages! {
     readme: "README.md",
+    areas: "docs/areas.md",
     calibration: "docs/calibration.md",
     cameras: "docs/cameras.md",
     formats: "docs/formats.md",

@@ -170,7 +170,7 @@ fn site(play_s: f64, has_cable: bool) -> (Site, NetworkConfig) {
     let mut network = site.network().clone();
     if has_cable {
         network.unsecured = true;
-        network.fusion = network.fusion.replace("127.0.0.1", NEAR);
+        network.fusion = network.fusion.map(|fusion| fusion.replace("127.0.0.1", NEAR));
         for (name, endpoint) in &mut network.cameras {
             let address = if name.as_str() == "north" { FAR } else { NEAR };
             *endpoint = endpoint.replace("127.0.0.1", address);

@@ -110,7 +110,7 @@ impl Guarded {
         let health = ear.subscribe(&[key]).unwrap();
         ear.wait_for(&[Channel::FusionAlive], PATIENCE, || true).unwrap();
         let network = site.network();
-        let endpoint = network.routers.first().unwrap_or(&network.fusion).clone();
+        let endpoint = network.routers.first().or(network.fusion.as_ref()).unwrap().clone();
         Self { site, endpoint, _processes: processes, health, before: 0, _ear: ear }
     }
 

@@ -160,7 +160,7 @@ fn site(played_s: f64) -> Option<(Namespaces, Site)> {
     let site = Site::new(played_s);
     let mut network = site.network().clone();
     network.unsecured = true;
-    for endpoint in network.cameras.values_mut().chain([&mut network.fusion]) {
+    for endpoint in network.cameras.values_mut().chain(&mut network.fusion) {
         *endpoint = endpoint.replace("127.0.0.1", ADDRESS);
     }
     site.write("network.toml", &toml::to_string(&network).unwrap());

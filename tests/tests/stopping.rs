@@ -123,7 +123,7 @@ fn a_fusion_centre_whose_router_is_not_there_says_so_and_ends_when_asked() {
     let site = Site::new(2.0);
     let mut network = site.network().clone();
     network.mode = crossfix_transport::Mode::Client;
-    network.routers = vec![network.fusion.clone()];
+    network.routers = network.fusion.clone().into_iter().collect();
     site.write("network.toml", &toml::to_string(&network).unwrap());
     let fusion = site.start_logged(&["fuse", "-c", &site.path("fusion.toml")], "fuse.log");
     let router = network.routers[0].as_str();

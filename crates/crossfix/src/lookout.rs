@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crossfix_message::{CameraName, Channel};
+use crossfix_message::{AreaName, CameraName, Channel, Key};
 use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
 /// How long somebody may be missing before that is said, and how often it is said again that nobody
@@ -55,12 +55,18 @@ impl Absence {
 struct Other {
     name: String,
     endpoint: String,
-    channel: Channel,
+    key: Key,
     is_here: bool,
     /// Whether it was there at the look before, too.
     was_here: bool,
     /// Whether it ever was.
     has_been_here: bool,
+}
+
+impl Other {
+    fn new(name: String, endpoint: String, key: Key) -> Self {
+        Self { name, endpoint, key, is_here: false, was_here: false, has_been_here: false }
+    }
 }
 
 impl Lookout {
@@ -70,28 +76,31 @@ impl Lookout {
         network: &NetworkConfig,
         cameras: &[CameraName],
     ) -> anyhow::Result<Self> {
-        let others = cameras.iter().map(|camera| Other {
-            name: format!("camera `{camera}`"),
-            endpoint: network.cameras.get(camera).cloned().unwrap_or_default(),
-            channel: Channel::Alive(camera.clone()),
-            is_here: false,
-            was_here: false,
-            has_been_here: false,
+        let others = cameras.iter().map(|camera| {
+            let endpoint = network.cameras.get(camera).cloned().unwrap_or_default();
+            let key = Key::new(link.site().clone(), Channel::Alive(camera.clone()));
+            Other::new(format!("camera `{camera}`"), endpoint, key)
         });
         Self::new(link, others.collect())
     }
 
-    /// For those who need the fusion centre.
-    pub fn for_fusion(link: &Link, network: &NetworkConfig) -> anyhow::Result<Self> {
-        let fusion = Other {
-            name: "the fusion centre".to_owned(),
-            endpoint: network.fusion.clone(),
-            channel: Channel::FusionAlive,
-            is_here: false,
-            was_here: false,
-            has_been_here: false,
-        };
-        Self::new(link, vec![fusion])
+    /// For those who need the fusion centres of a camera.
+    pub fn for_centres_of(
+        link: &Link,
+        network: &NetworkConfig,
+        camera: &CameraName,
+    ) -> anyhow::Result<Self> {
+        let heard_by = network.heard_by(camera);
+        let hears = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| heard_by.contains(a));
+        let centres = network.centres().filter(|(area, _)| hears(area)).map(|(area, endpoint)| {
+            let name = area.as_ref().map_or_else(
+                || "the fusion centre".to_owned(),
+                |area| format!("the fusion centre of area `{area}`"),
+            );
+            let key = Key::of_centre(link.site().clone(), area, Channel::FusionAlive);
+            Other::new(name, endpoint.to_owned(), key)
+        });
+        Self::new(link, centres.collect())
     }
 
     fn new(link: &Link, others: Vec<Other>) -> anyhow::Result<Self> {
@@ -104,7 +113,7 @@ impl Lookout {
     pub fn look(&mut self, now: Instant) {
         let mut changed = false;
         for other in &mut self.others {
-            let is_here = self.presence.is_alive(&other.channel);
+            let is_here = self.presence.is_alive(&other.key);
             if is_here != other.is_here {
                 let what = if is_here { "is there" } else { "is gone" };
                 tracing::info!("{} {what}", other.name);
@@ -141,22 +150,27 @@ impl Lookout {
         });
     }
 
-    /// Whether one of them is there.
-    pub fn is_here(&self, channel: &Channel) -> bool {
-        self.presence.is_alive(channel)
+    /// Whether all of them are there.
+    pub fn all_are_here(&self) -> bool {
+        self.others.iter().all(|other| self.presence.is_alive(&other.key))
+    }
+
+    /// Whether a component is there, whoever is looked out for.
+    pub fn is_here(&self, key: &Key) -> bool {
+        self.presence.is_alive(key)
     }
 
     /// The cameras of them that were there at the last two looks, by name: by the second, they hear
     /// what is said of them.
     pub fn cameras_here(&self) -> Vec<String> {
         let here = self.others.iter().filter(|other| other.is_here && other.was_here);
-        here.filter_map(|other| other.channel.camera()).map(ToString::to_string).collect()
+        here.filter_map(|other| other.key.channel.camera()).map(ToString::to_string).collect()
     }
 
     /// The cameras of them that were there and are not now.
     pub fn cameras_gone(&self) -> impl Iterator<Item = &CameraName> {
         let gone = self.others.iter().filter(|other| other.has_been_here && !other.is_here);
-        gone.filter_map(|other| other.channel.camera())
+        gone.filter_map(|other| other.key.channel.camera())
     }
 
     fn missing(&self) -> String {

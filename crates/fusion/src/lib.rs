@@ -63,6 +63,7 @@ mod ingress;
 mod initiation;
 mod messages;
 mod motion;
+mod neighbours;
 pub mod papers;
 mod prediction;
 mod range_chart;
@@ -86,6 +87,7 @@ pub use config::{
 pub use counters::Counters;
 pub use fusion::{CameraReport, Fusion, Output};
 pub use ingress::{Exposure, Rejection, RejectionReason, Sighting};
+pub use neighbours::{Neighbours, Share};
 pub use track::{MeasurementResidual, Track, TrackId, TrackStatus};
 pub use uncertainty::pose_covariance_of_careful_survey;
 pub use unmet::{UnmetLines, WhyNothing};

@@ -48,6 +48,7 @@ pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix
         rank: track.observability.rank as u32,
         condition_number: track.observability.condition_number,
         updated_ns: track.updated.nanos(),
+        born_ns: track.born.nanos(),
         weak_position_axis: weak(Quantity::Position),
         weak_velocity_axis: weak(Quantity::Velocity),
         ..Default::default()

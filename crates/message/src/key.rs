@@ -4,7 +4,7 @@ use std::str::FromStr;
 use thiserror::Error;
 
 use crate::name::{FUSION, RECORDER, TRUTH};
-use crate::{CameraName, NameError, SiteName};
+use crate::{AreaName, CameraName, NameError, SiteName};
 
 /// What goes over a key, and so its message type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -40,19 +40,25 @@ pub enum Channel {
     RecorderAlive,
 }
 
-/// A key expression of Crossfix: `crossfix/<site>/<component>/<kind>`.
+/// A key expression of Crossfix: `crossfix/<site>/<component>/<kind>`, and where a site has several
+/// fusion centres `crossfix/<site>/fusion/<area>/<kind>` of each.
 ///
 /// ```
 /// use crossfix_message::{Channel, Key};
 /// let key: Key = "crossfix/airfield/north/bearings".parse()?;
 /// assert_eq!(key.channel, Channel::Bearings("north".parse()?));
 /// assert_eq!(key.to_string(), "crossfix/airfield/north/bearings");
+/// let of_an_area: Key = "crossfix/airfield/fusion/west/tracks".parse()?;
+/// assert_eq!((of_an_area.area, of_an_area.channel), (Some("west".parse()?), Channel::Tracks));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Key {
     /// The site.
     pub site: SiteName,
+    /// Of which of several fusion centres it is; `None` of one that is the only one, and of all
+    /// that is no fusion centre's.
+    pub area: Option<AreaName>,
     /// The rest.
     pub channel: Channel,
 }
@@ -91,7 +97,12 @@ impl Channel {
 impl Key {
     /// The key of a channel of a site.
     pub fn new(site: SiteName, channel: Channel) -> Self {
-        Self { site, channel }
+        Self { site, area: None, channel }
+    }
+
+    /// The key of a channel of a fusion centre: of an area's, or of a site's only one.
+    pub fn of_centre(site: SiteName, area: Option<AreaName>, channel: Channel) -> Self {
+        Self { site, area, channel }
     }
 
     /// The key expression that holds everything of a site.
@@ -105,23 +116,40 @@ impl Key {
     pub fn of_all_cameras(site: &SiteName, kind: &str) -> String {
         format!("crossfix/{site}/*/{kind}")
     }
+
+    /// The key expression that holds one kind of channel of the fusion centres of a site's areas; the
+    /// one of a site without areas is among [`Self::of_all_cameras`].
+    pub fn of_all_areas(site: &SiteName, kind: &str) -> String {
+        format!("crossfix/{site}/{FUSION}/*/{kind}")
+    }
+
+    /// The key expression that holds one kind of channel of all fusion centres of a site.
+    ///
+    /// `kind` is the last part of a key: `tracks`, `smoothed`, `events`, `cues`, `health`, `alive`.
+    pub fn of_all_centres(site: &SiteName, kind: &str) -> String {
+        format!("crossfix/{site}/{FUSION}/**/{kind}")
+    }
 }
 
 impl fmt::Display for Key {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "crossfix/{}/", self.site)?;
+        let centre = |f: &mut fmt::Formatter<'_>, kind: &str| match &self.area {
+            None => write!(f, "{FUSION}/{kind}"),
+            Some(area) => write!(f, "{FUSION}/{area}/{kind}"),
+        };
         match &self.channel {
             Channel::Bearings(camera) => write!(f, "{camera}/bearings"),
             Channel::Calibration(camera) => write!(f, "{camera}/calibration"),
             Channel::Preview(camera) => write!(f, "{camera}/preview"),
             Channel::CameraHealth(camera) => write!(f, "{camera}/health"),
             Channel::Alive(camera) => write!(f, "{camera}/alive"),
-            Channel::Tracks => write!(f, "{FUSION}/tracks"),
-            Channel::Smoothed => write!(f, "{FUSION}/smoothed"),
-            Channel::Events => write!(f, "{FUSION}/events"),
-            Channel::Cues => write!(f, "{FUSION}/cues"),
-            Channel::FusionHealth => write!(f, "{FUSION}/health"),
-            Channel::FusionAlive => write!(f, "{FUSION}/alive"),
+            Channel::Tracks => centre(f, "tracks"),
+            Channel::Smoothed => centre(f, "smoothed"),
+            Channel::Events => centre(f, "events"),
+            Channel::Cues => centre(f, "cues"),
+            Channel::FusionHealth => centre(f, "health"),
+            Channel::FusionAlive => centre(f, "alive"),
             Channel::Truth => write!(f, "{TRUTH}/states"),
             Channel::RecorderHealth => write!(f, "{RECORDER}/health"),
             Channel::RecorderAlive => write!(f, "{RECORDER}/alive"),
@@ -136,8 +164,10 @@ impl FromStr for Key {
         let form = || KeyError::Form(text.to_owned());
         let name = |source| KeyError::Name { key: text.to_owned(), source };
         let parts: Vec<&str> = text.split('/').collect();
-        let ["crossfix", site, component, kind] = parts[..] else {
-            return Err(form());
+        let (site, component, area, kind) = match parts[..] {
+            ["crossfix", site, component, kind] => (site, component, None, kind),
+            ["crossfix", site, FUSION, area, kind] => (site, FUSION, Some(area), kind),
+            _ => return Err(form()),
         };
         let camera = || component.parse::<CameraName>().map_err(name);
         let channel = match (component, kind) {
@@ -150,6 +180,7 @@ impl FromStr for Key {
             (TRUTH, "states") => Channel::Truth,
             (RECORDER, "health") => Channel::RecorderHealth,
             (RECORDER, "alive") => Channel::RecorderAlive,
+            (FUSION, _) => return Err(form()),
             (_, "bearings") => Channel::Bearings(camera()?),
             (_, "calibration") => Channel::Calibration(camera()?),
             (_, "preview") => Channel::Preview(camera()?),
@@ -157,7 +188,8 @@ impl FromStr for Key {
             (_, "alive") => Channel::Alive(camera()?),
             _ => return Err(form()),
         };
-        Ok(Self { site: site.parse().map_err(name)?, channel })
+        let area = area.map(str::parse).transpose().map_err(name)?;
+        Ok(Self { site: site.parse().map_err(name)?, area, channel })
     }
 }
 
@@ -190,10 +222,20 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_key_survives_its_text(channel in channels(), site in "[a-z0-9]{1,10}") {
+        fn a_key_survives_its_text(
+            channel in channels(),
+            site in "[a-z0-9]{1,10}",
+            area in proptest::option::of("[a-z]{1,10}"),
+        ) {
             let site: SiteName = site.parse()?;
-            let key = Key::new(site, channel);
-            prop_assert_eq!(key.to_string().parse::<Key>()?, key);
+            let key = Key::new(site.clone(), channel.clone());
+            let text = key.to_string();
+            prop_assert_eq!(text.parse::<Key>()?, key);
+            let area: Option<AreaName> = area.map(|area| area.parse()).transpose()?;
+            if text.contains("/fusion/") {
+                let key = Key::of_centre(site, area, channel);
+                prop_assert_eq!(key.to_string().parse::<Key>()?, key);
+            }
         }
 
         #[test]

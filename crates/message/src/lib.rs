@@ -29,11 +29,11 @@ pub use camera::{Calibration, CalibrationError, LastingNoise};
 pub use datum::Datum;
 pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};
-pub use name::{CameraName, NameError, SiteName};
+pub use name::{AreaName, CameraName, NameError, SiteName};
 pub use payload::{DecodeError, Payload, decode, file_descriptor_set};
 pub use size::{MAX_DECODED_BYTES, MAX_MESSAGE_BYTES, Repeated};
 pub use time::Timestamp;
-pub use track::{TrackNumber, track_id};
+pub use track::{TrackNumber, renumbered, track_id};
 pub use wire::*;
 
 /// The types that `tests/generated.rs` makes of `messages.proto`; their documentation is the
@@ -44,4 +44,4 @@ mod wire {
 }
 
 /// The version of the message definitions that this build speaks.
-pub const VERSION: Version = Version { major: 1, minor: 6 };
+pub const VERSION: Version = Version { major: 1, minor: 7 };

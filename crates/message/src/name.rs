@@ -104,7 +104,12 @@ name_type!(
     [FUSION, RECORDER, TRUTH]
 );
 name_type!(
-    /// The name of a site: one fusion centre and its cameras.
+    /// The name of a site: its cameras and what is made of what they see.
     SiteName,
+    []
+);
+name_type!(
+    /// The name of an area: a part of a site that has a fusion centre of its own.
+    AreaName,
     []
 );

@@ -18,6 +18,11 @@ pub fn track_id(run_began: Timestamp, number: u64) -> u64 {
     seconds * TRACKS_A_RUN + number
 }
 
+/// The identity of another number in the same run.
+pub fn renumbered(id: u64, number: u64) -> u64 {
+    id - id % TRACKS_A_RUN + number
+}
+
 /// A track's number in its run: what people call it.
 ///
 /// ```

@@ -82,7 +82,8 @@ fn network() -> Result<NetworkConfig, Box<dyn Error>> {
         unsecured: false,
         security: None,
         anchor: None,
-        fusion: "tcp/127.0.0.1:7450".to_owned(),
+        fusion: Some("tcp/127.0.0.1:7450".to_owned()),
+        areas: BTreeMap::new(),
         cameras,
     })
 }

@@ -1,7 +1,10 @@
+#[cfg(test)]
+mod tests;
+
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 
-use crossfix_message::{CameraName, SiteName};
+use crossfix_message::{AreaName, CameraName, SiteName};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -31,6 +34,17 @@ pub struct Anchor {
     pub height_m: f64,
 }
 
+/// A part of a site that has a fusion centre of its own.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Area {
+    /// The fusion centre's endpoint.
+    pub fusion: String,
+    /// The cameras that it hears. Those that see into two areas belong to both: where they see a
+    /// target it passes from the one to the other.
+    pub cameras: Vec<CameraName>,
+}
+
 /// The network of a site: a name and the endpoints of all components.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -47,10 +61,14 @@ pub struct NetworkConfig {
     /// say anything. Without it and without `[security]` they listen on loopback only.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unsecured: bool,
-    /// The fusion centre's endpoint, e.g. `tcp/127.0.0.1:7450`.
-    pub fusion: String,
+    /// The fusion centre's endpoint, e.g. `tcp/127.0.0.1:7450`; absent where there are `areas`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fusion: Option<String>,
     /// Each camera's endpoint.
     pub cameras: BTreeMap<CameraName, String>,
+    /// The areas of a site that is too large for one fusion centre.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub areas: BTreeMap<AreaName, Area>,
     /// Where on the Earth the site is: what tells others where its targets are needs it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub anchor: Option<Anchor>,
@@ -89,6 +107,26 @@ pub enum NetworkError {
     /// A camera that the network does not know.
     #[error("camera `{0}` has no endpoint: add it to [cameras] of the network file")]
     UnknownCamera(CameraName),
+    /// Nobody fuses, or too many.
+    #[error("name the fusion centre's endpoint as `fusion`, or each area's in [areas], not both")]
+    Centres,
+    /// An area that the network does not know.
+    #[error("the network has no area `{0}`: add it as [areas.{0}]")]
+    UnknownArea(AreaName),
+    /// Which of several areas is not said.
+    #[error("the network has areas: say by `area` of the fusion centre's file which is its own")]
+    WhichArea,
+    /// An area's camera that the network does not know.
+    #[error("camera `{camera}` of area `{area}` has no endpoint: add it to [cameras]")]
+    CameraOfArea {
+        /// The area.
+        area: AreaName,
+        /// The camera.
+        camera: CameraName,
+    },
+    /// A camera that no fusion centre hears.
+    #[error("camera `{0}` is in no area: nobody would hear it")]
+    CameraOfNoArea(CameraName),
     /// Anybody could say anything.
     #[error(
         "{0} can be reached from other hosts, and the network has no [security]: anybody there could \
@@ -108,8 +146,8 @@ pub enum NetworkError {
 pub enum Role {
     /// A camera's agent.
     Camera(CameraName),
-    /// The fusion centre.
-    Fusion,
+    /// The fusion centre: an area's, or the only one.
+    Fusion(Option<AreaName>),
     /// A recorder: listens nowhere, hears everybody, says how it does.
     Recorder,
     /// A viewer, a status, an outlet: listens nowhere, hears everybody, says nothing.
@@ -152,7 +190,7 @@ impl Role {
     pub fn identity(&self) -> Option<Identity> {
         match self {
             Self::Camera(name) => Some(Identity::Camera(name.clone())),
-            Self::Fusion => Some(Identity::Fusion),
+            Self::Fusion(area) => Some(Identity::Fusion(area.clone())),
             Self::Recorder => Some(Identity::Recorder),
             Self::Observer => Some(Identity::Viewer),
             Self::Router { .. } => Some(Identity::Router),
@@ -206,19 +244,75 @@ impl NetworkConfig {
                 endpoint: router.clone(),
             });
         }
+        self.validate_areas()?;
         let mut seen: BTreeMap<&str, String> = BTreeMap::new();
-        let fusion = std::iter::once(("fusion".to_owned(), &self.fusion));
+        let centres = self.centres().map(|(area, e)| (Identity::Fusion(area).to_string(), e));
         for (of, endpoint) in
-            fusion.chain(self.cameras.iter().map(|(name, e)| (name.to_string(), e)))
+            centres.chain(self.cameras.iter().map(|(name, e)| (name.to_string(), e.as_str())))
         {
             if !self.is_endpoint(endpoint) {
-                return Err(NetworkError::Endpoint { of, endpoint: endpoint.clone() });
+                return Err(NetworkError::Endpoint { of, endpoint: endpoint.to_owned() });
             }
             if let Some(one) = seen.insert(endpoint, of.clone()) {
-                return Err(NetworkError::Shared { one, other: of, endpoint: endpoint.clone() });
+                let endpoint = endpoint.to_owned();
+                return Err(NetworkError::Shared { one, other: of, endpoint });
             }
         }
         Ok(())
+    }
+
+    fn validate_areas(&self) -> Result<(), NetworkError> {
+        if self.fusion.is_some() != self.areas.is_empty() {
+            return Err(NetworkError::Centres);
+        }
+        let unknown = self.areas.iter().find_map(|(area, of)| {
+            let camera = of.cameras.iter().find(|camera| !self.cameras.contains_key(camera))?;
+            Some(NetworkError::CameraOfArea { area: area.clone(), camera: camera.clone() })
+        });
+        let unheard =
+            |camera: &&CameraName| !self.areas.is_empty() && self.heard_by(camera).is_empty();
+        let unheard = self.cameras.keys().find(unheard);
+        unknown
+            .or_else(|| unheard.map(|camera| NetworkError::CameraOfNoArea(camera.clone())))
+            .map_or(Ok(()), Err)
+    }
+
+    /// The fusion centres, each with its area where there are several, and their endpoints.
+    pub fn centres(&self) -> impl Iterator<Item = (Option<AreaName>, &str)> {
+        let only = self.fusion.iter().map(|endpoint| (None, endpoint.as_str()));
+        let of_areas = self.areas.iter();
+        only.chain(of_areas.map(|(area, of)| (Some(area.clone()), of.fusion.as_str())))
+    }
+
+    /// The areas that hear a camera, by name; none where there is one fusion centre for all. The
+    /// first is the one that tells it what to look for.
+    pub fn heard_by(&self, camera: &CameraName) -> Vec<AreaName> {
+        let hear = |(_, of): &(&AreaName, &Area)| of.cameras.contains(camera);
+        self.areas.iter().filter(hear).map(|(area, _)| area.clone()).collect()
+    }
+
+    /// The cameras that a fusion centre hears.
+    ///
+    /// # Errors
+    /// [`NetworkError::UnknownArea`], or [`NetworkError::WhichArea`] where there are several.
+    pub fn cameras_of(&self, area: Option<&AreaName>) -> Result<Vec<CameraName>, NetworkError> {
+        match area {
+            None if self.areas.is_empty() => Ok(self.cameras.keys().cloned().collect()),
+            None => Err(NetworkError::WhichArea),
+            Some(area) => {
+                let of = self.areas.get(area);
+                Ok(of.ok_or_else(|| NetworkError::UnknownArea(area.clone()))?.cameras.clone())
+            }
+        }
+    }
+
+    /// The areas that share a camera with one: targets pass from it to them.
+    pub fn neighbours(&self, area: &AreaName) -> Vec<AreaName> {
+        let Some(own) = self.areas.get(area) else { return Vec::new() };
+        let is_beside = |(name, of): &(&AreaName, &Area)| {
+            *name != area && of.cameras.iter().any(|camera| own.cameras.contains(camera))
+        };
+        self.areas.iter().filter(is_beside).map(|(name, _)| name.clone()).collect()
     }
 
     /// The first endpoint beyond this host that a session connects to with nothing encrypted; `None`
@@ -250,6 +344,7 @@ impl NetworkConfig {
             return Ok((Vec::new(), self.routers.clone()));
         }
         let cameras = || self.cameras.values().cloned().collect::<Vec<_>>();
+        let centres = || self.centres().map(|(_, endpoint)| endpoint.to_owned());
         Ok(match role {
             Role::Camera(name) => {
                 let own = self.cameras.get(name);
@@ -258,83 +353,31 @@ impl NetworkConfig {
                     Vec::new(),
                 )
             }
-            Role::Fusion => (vec![self.fusion.clone()], cameras()),
+            Role::Fusion(area) => self.declared_of_centre(area.as_ref())?,
             Role::Recorder | Role::Observer | Role::Router { .. } => {
-                let mut all = cameras();
-                all.push(self.fusion.clone());
-                (Vec::new(), all)
+                (Vec::new(), cameras().into_iter().chain(centres()).collect())
             }
             Role::Cameras { and_fusion } => {
-                let mut all = cameras();
-                all.extend(and_fusion.then(|| self.fusion.clone()));
-                (all, Vec::new())
+                let fusion = and_fusion.then(centres).into_iter().flatten();
+                (cameras().into_iter().chain(fusion).collect(), Vec::new())
             }
         })
     }
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn network() -> NetworkConfig {
-        NetworkConfig {
-            site: "field".parse().unwrap(),
-            mode: Mode::Peer,
-            routers: vec![],
-            unsecured: false,
-            security: None,
-            anchor: None,
-            fusion: "tcp/127.0.0.1:7450".into(),
-            cameras: [("a", 7451), ("b", 7452)]
-                .map(|(name, port)| (name.parse().unwrap(), format!("tcp/127.0.0.1:{port}")))
-                .into(),
-        }
-    }
-
-    #[test]
-    fn every_pair_has_exactly_one_side_that_connects() {
-        let network = network();
-        let (listen, connect) = network.endpoints(&Role::Fusion).unwrap();
-        assert_eq!((listen.len(), connect.len()), (1, 2));
-        let (listen, connect) = network.endpoints(&Role::Observer).unwrap();
-        assert_eq!((listen.len(), connect.len()), (0, 3));
-        let unknown = Role::Camera("c".parse().unwrap());
-        assert!(matches!(network.endpoints(&unknown), Err(NetworkError::UnknownCamera(_))));
-    }
-
-    #[test]
-    fn who_listens_for_other_hosts_has_certificates_or_was_told_to_do_without() {
-        let there = |network: &NetworkConfig| network.endpoints(&Role::Fusion).map(|(l, _)| l);
-        let open = NetworkConfig { fusion: "tcp/10.0.0.1:7450".into(), ..network() };
-        assert_eq!(there(&open), Err(NetworkError::Unsecured("tcp/10.0.0.1:7450".into())));
-        assert!(open.endpoints(&Role::Observer).is_ok(), "who looks on listens nowhere");
-        let told = NetworkConfig { unsecured: true, ..open.clone() };
-        assert_eq!(there(&told), Ok(vec!["tcp/10.0.0.1:7450".to_owned()]));
-        let security = Security { certificates: "c".into(), revoked: BTreeMap::new() };
-        let secured = NetworkConfig { security: Some(security), ..open };
-        assert_eq!(there(&secured), Ok(vec!["tls/10.0.0.1:7450".to_owned()]));
-    }
-
-    #[test]
-    fn impossible_endpoints_are_named() {
-        let mut bad = network();
-        bad.fusion = "127.0.0.1:7450".into();
-        assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { of, .. }) if of == "fusion"));
-        for endpoint in [
-            "tcp/:7451",
-            "tcp/a/b:7451",
-            "tcp/a:1#iface=x;x=:2",
-            "udp/127.0.0.1:7451",
-            "tcp/127.0.0.1:99999",
-        ] {
-            let bad = NetworkConfig { fusion: endpoint.into(), ..network() };
-            assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { .. })), "{endpoint}");
-            let bad = NetworkConfig { routers: vec![endpoint.into()], ..network() };
-            assert!(matches!(bad.validate(), Err(NetworkError::Endpoint { .. })), "{endpoint}");
-        }
-        let mut shared = network();
-        shared.fusion = "tcp/127.0.0.1:7451".into();
-        assert!(matches!(shared.validate(), Err(NetworkError::Shared { .. })));
+    /// A fusion centre connects to its cameras, and to those of the areas beside that come before it
+    /// by name: one link is enough for both.
+    fn declared_of_centre(
+        &self,
+        area: Option<&AreaName>,
+    ) -> Result<(Vec<String>, Vec<String>), NetworkError> {
+        let cameras = self.cameras_of(area)?;
+        let cameras = cameras.iter().filter_map(|camera| self.cameras.get(camera)).cloned();
+        let Some(area) = area else {
+            return Ok((self.fusion.iter().cloned().collect(), cameras.collect()));
+        };
+        let earlier = self.neighbours(area).into_iter().filter(|beside| beside < area);
+        let endpoint = |area: &AreaName| self.areas.get(area).map(|of| of.fusion.clone());
+        let connect = cameras.chain(earlier.filter_map(|beside| endpoint(&beside)));
+        Ok((endpoint(area).into_iter().collect(), connect.collect()))
     }
 }

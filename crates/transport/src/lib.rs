@@ -35,7 +35,7 @@ mod reception;
 mod security;
 mod subscription;
 
-pub use config::{Anchor, Mode, NetworkConfig, NetworkError, Role, address, host_of};
+pub use config::{Anchor, Area, Mode, NetworkConfig, NetworkError, Role, address, host_of};
 pub use link::{AliveToken, Delivery, Link, LinkError, LinkPublisher, OwnCertificate};
 pub use origin::{Origin, RunId};
 pub use presence::Presence;

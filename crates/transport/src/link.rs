@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant, SystemTime};
 
-use crossfix_message::{Channel, Key, MAX_MESSAGE_BYTES, SiteName};
+use crossfix_message::{AreaName, Channel, Key, MAX_MESSAGE_BYTES, SiteName};
 use thiserror::Error;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
@@ -120,6 +120,8 @@ pub enum Delivery {
 pub struct Link {
     session: Session,
     site: SiteName,
+    /// Of a fusion centre that is one of several.
+    area: Option<AreaName>,
     run: RunId,
     shown: Option<OwnCertificate>,
 }
@@ -187,7 +189,7 @@ fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>
         "close_link_on_expiration": true,
         "so_sndbuf": SEND_BUFFER_BYTES,
     });
-    let access = access_control(security, &network.site, network.cameras.keys());
+    let access = access_control(security, network);
     Ok(vec![
         ("transport/link/tls".to_owned(), tls.to_string()),
         ("access_control".to_owned(), access.to_string()),
@@ -265,7 +267,11 @@ impl Link {
         // The first half of what Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
-        Ok(Self { session, site: network.site.clone(), run: RunId(run), shown })
+        let area = match role {
+            Role::Fusion(area) => area.clone(),
+            _ => None,
+        };
+        Ok(Self { session, site: network.site.clone(), area, run: RunId(run), shown })
     }
 
     /// Opens a session, and tries again where no router answers for as long as `go_on` says.
@@ -302,6 +308,12 @@ impl Link {
         self.shown.as_ref()
     }
 
+    /// The key of a channel of the site, as this component says it: a fusion centre that is one of
+    /// several, as its area's.
+    pub fn key(&self, channel: Channel) -> Key {
+        Key::of_centre(self.site.clone(), self.area.clone(), channel)
+    }
+
     /// A publisher on a channel of the site.
     ///
     /// # Errors
@@ -311,7 +323,7 @@ impl Link {
         channel: Channel,
         delivery: Delivery,
     ) -> Result<LinkPublisher, LinkError> {
-        let key = Key::new(self.site.clone(), channel).to_string();
+        let key = self.key(channel).to_string();
         let (control, priority) = match delivery {
             Delivery::Queued => (CongestionControl::Drop, Priority::Data),
             Delivery::Every => (CongestionControl::Block, Priority::Data),
@@ -365,9 +377,11 @@ impl Link {
     /// # Errors
     /// [`LinkError::Zenoh`].
     pub fn presence(&self) -> Result<Presence, LinkError> {
-        let expression = Key::of_all_cameras(&self.site, "alive");
-        Presence::watch(&self.session, &expression)
-            .map_err(zenoh(format!("cannot watch who is there on `{expression}`")))
+        // The only fusion centre and the recorder are beside the cameras.
+        let expressions =
+            [Key::of_all_cameras, Key::of_all_areas].map(|of_all| of_all(&self.site, "alive"));
+        Presence::watch(&self.session, &expressions)
+            .map_err(zenoh(format!("cannot watch who is there on `{}`", expressions.join("`, `"))))
     }
 
     /// Says that this component is alive for as long as the token lives.
@@ -375,7 +389,7 @@ impl Link {
     /// # Errors
     /// [`LinkError::Zenoh`].
     pub fn declare_alive(&self, channel: Channel) -> Result<AliveToken, LinkError> {
-        let key = Key::new(self.site.clone(), channel).to_string();
+        let key = self.key(channel).to_string();
         let token = self
             .session
             .liveliness()
@@ -390,7 +404,7 @@ impl Link {
     /// # Errors
     /// [`LinkError::Zenoh`].
     fn is_alive(&self, channel: &Channel) -> Result<bool, LinkError> {
-        let key = Key::new(self.site.clone(), channel.clone()).to_string();
+        let key = self.key(channel.clone()).to_string();
         let replies = self
             .session
             .liveliness()
@@ -415,7 +429,7 @@ impl Link {
         for channel in channels {
             while !self.is_alive(channel)? {
                 if Instant::now() > deadline || !go_on() {
-                    let key = Key::new(self.site.clone(), channel.clone());
+                    let key = self.key(channel.clone());
                     return Err(LinkError::NotAlive(key.to_string()));
                 }
                 std::thread::sleep(ALIVE_PERIOD / 4);

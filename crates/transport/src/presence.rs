@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crossfix_message::{Channel, Key};
+use crossfix_message::Key;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::SampleKind;
 
@@ -13,36 +13,38 @@ const MAX_COMPONENTS: usize = 10_000;
 #[derive(Clone, Debug)]
 pub struct Presence {
     alive: Alive,
-    _subscriber: Arc<Subscriber<()>>,
+    _subscribers: Arc<Vec<Subscriber<()>>>,
 }
 
-type Alive = Arc<Mutex<BTreeSet<Channel>>>;
+type Alive = Arc<Mutex<BTreeSet<Key>>>;
 
 impl Presence {
-    pub(crate) fn watch(session: &zenoh::Session, expression: &str) -> zenoh::Result<Self> {
+    pub(crate) fn watch(session: &zenoh::Session, expressions: &[String]) -> zenoh::Result<Self> {
         use zenoh::Wait;
         let alive = Alive::default();
-        let heard = Arc::clone(&alive);
-        // Runs on Zenoh's receiving thread.
-        let note = move |sample: zenoh::sample::Sample| {
-            let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-                return;
+        let watch = |expression: &String| {
+            let heard = Arc::clone(&alive);
+            // Runs on Zenoh's receiving thread.
+            let note = move |sample: zenoh::sample::Sample| {
+                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                    return;
+                };
+                let mut alive = heard.lock().unwrap_or_else(PoisonError::into_inner);
+                match sample.kind() {
+                    SampleKind::Put if alive.len() < MAX_COMPONENTS => alive.insert(key),
+                    SampleKind::Put => false,
+                    SampleKind::Delete => alive.remove(&key),
+                };
             };
-            let mut alive = heard.lock().unwrap_or_else(PoisonError::into_inner);
-            match sample.kind() {
-                SampleKind::Put if alive.len() < MAX_COMPONENTS => alive.insert(key.channel),
-                SampleKind::Put => false,
-                SampleKind::Delete => alive.remove(&key.channel),
-            };
+            let liveliness = session.liveliness();
+            liveliness.declare_subscriber(expression).history(true).callback(note).wait()
         };
-        let liveliness = session.liveliness();
-        let subscriber =
-            liveliness.declare_subscriber(expression).history(true).callback(note).wait()?;
-        Ok(Self { alive, _subscriber: Arc::new(subscriber) })
+        let subscribers = expressions.iter().map(watch).collect::<zenoh::Result<Vec<_>>>()?;
+        Ok(Self { alive, _subscribers: Arc::new(subscribers) })
     }
 
-    /// Whether a component is there: its channel is one of the `..Alive`.
-    pub fn is_alive(&self, channel: &Channel) -> bool {
-        self.alive.lock().unwrap_or_else(PoisonError::into_inner).contains(channel)
+    /// Whether a component is there: its key's channel is one of the `..Alive`.
+    pub fn is_alive(&self, key: &Key) -> bool {
+        self.alive.lock().unwrap_or_else(PoisonError::into_inner).contains(key)
     }
 }

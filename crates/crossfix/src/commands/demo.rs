@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use crossfix_calibration::intrinsics_to_yaml;
-use crossfix_message::{CameraName, Channel, Key, TrackFrame, TrackNumber, TrackState, decode};
+use crossfix_message::{CameraName, Channel, TrackFrame, TrackNumber, TrackState, decode};
 use crossfix_simulation::{Scene, SimulatedCamera, World};
 use crossfix_transport::{Link, NetworkConfig, Role};
 use crossfix_vision::{DetectorConfig, TrackerConfig};
@@ -234,8 +234,7 @@ fn play(
     };
 
     let link = Link::open(network, &Role::Observer)?;
-    let subscription =
-        link.subscribe(&[Key::new(network.site.clone(), Channel::Tracks).to_string()])?;
+    let subscription = link.subscribe(&[link.key(Channel::Tracks).to_string()])?;
     let go_on = || !shutdown.requested();
     link.wait_for(&[Channel::FusionAlive], PATIENCE, go_on)
         .context("the fusion centre did not come up")?;
@@ -366,7 +365,8 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
         unsecured: false,
         security: None,
         anchor: None,
-        fusion,
+        fusion: Some(fusion),
+        areas: BTreeMap::new(),
         cameras,
     })
 }

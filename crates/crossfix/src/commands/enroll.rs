@@ -106,16 +106,17 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 
 /// The components of a network, with the hosts at which others connect to each.
 fn hosts_of(network: &NetworkConfig) -> BTreeMap<Identity, Vec<String>> {
-    let host = |endpoint: &String| host_of(endpoint).to_owned();
+    let host = |endpoint: &str| host_of(endpoint).to_owned();
     let cameras = network.cameras.iter();
     let mut hosts: BTreeMap<Identity, Vec<String>> = cameras
         .map(|(name, endpoint)| (Identity::Camera(name.clone()), vec![host(endpoint)]))
         .collect();
-    hosts.insert(Identity::Fusion, vec![host(&network.fusion)]);
+    let centres = network.centres();
+    hosts.extend(centres.map(|(area, endpoint)| (Identity::Fusion(area), vec![host(endpoint)])));
     hosts.insert(Identity::Recorder, Vec::new());
     hosts.insert(Identity::Viewer, Vec::new());
     if !network.routers.is_empty() {
-        let mut routers: Vec<String> = network.routers.iter().map(host).collect();
+        let mut routers: Vec<String> = network.routers.iter().map(|router| host(router)).collect();
         routers.sort();
         routers.dedup();
         hosts.insert(Identity::Router, routers);

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use crossfix_fusion::{Bearings, Clocks, EventTime, FusionConfig, Initiation, Tracking};
-use crossfix_message::CameraName;
+use crossfix_message::{AreaName, CameraName};
 use serde::{Deserialize, Serialize};
 
 /// The fusion centre's file: its network, whom it listens to, and how it fuses.
@@ -11,7 +11,9 @@ use serde::{Deserialize, Serialize};
 pub struct FusionFile {
     /// The network's file (TOML), relative to this one. Needed by `fuse`, not by `replay --fuse`.
     pub network: Option<PathBuf>,
-    /// The cameras that are listened to. Absent: all of the network's.
+    /// Which of the network's areas it is the fusion centre of. Absent where the network has none.
+    pub area: Option<AreaName>,
+    /// The cameras that are listened to. Absent: all of the network's, or of its area's.
     pub cameras: Option<Vec<CameraName>>,
     /// See the fusion's documentation; every key has a default.
     pub event_time: EventTime,

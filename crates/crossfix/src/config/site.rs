@@ -165,6 +165,9 @@ fn check_fusion(path: &Path) -> anyhow::Result<()> {
     };
     let network =
         load_network(network).with_context(|| format!("key `network` of {}", path.display()))?;
+    network
+        .cameras_of(file.area.as_ref())
+        .with_context(|| format!("key `area` of {}", path.display()))?;
     for camera in file.cameras.iter().flatten() {
         ensure!(
             network.cameras.contains_key(camera),

@@ -281,6 +281,7 @@ pub struct CameraResidual {
 pub struct Track {
     /// Number of the track: the data time at which the fusion centre's run began in whole seconds, times 2^20, and the
     /// track's number in that run, from 1. Live it is unique over restarts; the same data replayed give the same numbers.
+    /// A fusion centre that takes a track over from the one of the area beside says it under that one's number.
     #[prost(uint64, tag = "1")]
     pub id: u64,
     #[prost(enumeration = "TrackState", tag = "2")]
@@ -315,6 +316,9 @@ pub struct Track {
     pub weak_position_axis: ::core::option::Option<Vector3>,
     #[prost(message, optional, tag = "12")]
     pub weak_velocity_axis: ::core::option::Option<Vector3>,
+    /// When it began; of one that another fusion centre has found first, there. 0: not said.
+    #[prost(sfixed64, tag = "13")]
+    pub born_ns: i64,
 }
 /// The 3D tracks that one exposure has changed: those that it updated or whose life has changed; each track is in a
 /// frame at least every half second. What is not in a frame goes on as it was said last.

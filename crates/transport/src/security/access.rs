@@ -2,10 +2,11 @@
 
 use std::iter::once;
 
-use crossfix_message::{CameraName, Key, SiteName};
+use crossfix_message::{Key, SiteName};
 use serde_json::{Value, json};
 
 use super::{Identity, Security};
+use crate::NetworkConfig;
 
 /// What says something.
 const SAYING: [&str; 3] = ["put", "delete", "liveliness_token"];
@@ -33,7 +34,8 @@ impl Rights {
             Identity::Camera(camera) => {
                 (vec![of(camera.as_str())], vec![of("fusion"), Key::of_all_cameras(site, "alive")])
             }
-            Identity::Fusion => (vec![of("fusion")], everything()),
+            Identity::Fusion(None) => (vec![of("fusion")], everything()),
+            Identity::Fusion(Some(area)) => (vec![of(&format!("fusion/{area}"))], everything()),
             Identity::Recorder => (vec![of("recorder")], everything()),
             Identity::Viewer => (vec![], everything()),
             Identity::Router => (everything(), everything()),
@@ -72,13 +74,12 @@ impl Rights {
 ///
 /// A rule allows what its key expressions include, whole: `crossfix/site/north/**` does not let an
 /// agent subscribe to `crossfix/site/**`.
-pub(crate) fn access_control<'a>(
-    security: &Security,
-    site: &SiteName,
-    cameras: impl Iterator<Item = &'a CameraName>,
-) -> Value {
-    let others = [Identity::Fusion, Identity::Recorder, Identity::Router, Identity::Viewer];
-    let everybody = cameras.cloned().map(Identity::Camera).chain(others);
+pub(crate) fn access_control(security: &Security, network: &NetworkConfig) -> Value {
+    let site = &network.site;
+    let cameras = network.cameras.keys().cloned().map(Identity::Camera);
+    let centres = network.centres().map(|(area, _)| Identity::Fusion(area));
+    let others = [Identity::Recorder, Identity::Router, Identity::Viewer];
+    let everybody = cameras.chain(centres).chain(others);
     let (mut rules, mut subjects, mut policies) = (Vec::new(), Vec::new(), Vec::new());
     for rights in everybody.map(|identity| Rights::of(identity, site)) {
         let id = rights.identity.to_string();

@@ -3,12 +3,12 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crossfix_message::{CameraName, NameError};
+use crossfix_message::{AreaName, CameraName, NameError};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Which component of a site a certificate is of. Its text is the certificate's common name and the
-/// name of its files: `camera-north`, `fusion`, `recorder`, `router`, `viewer`.
+/// name of its files: `camera-north`, `fusion` or `fusion-west`, `recorder`, `router`, `viewer`.
 ///
 /// ```
 /// use crossfix_transport::Identity;
@@ -23,8 +23,8 @@ use thiserror::Error;
 pub enum Identity {
     /// A camera's agent: says what its camera sees, and hears the fusion centre.
     Camera(CameraName),
-    /// The fusion centre: hears all, says the tracks.
-    Fusion,
+    /// The fusion centre, an area's or the only one: hears all, says the tracks.
+    Fusion(Option<AreaName>),
     /// The recorder: hears all, says how it does.
     Recorder,
     /// A Zenoh router: carries everything, and holds the others to what each may say.
@@ -37,14 +37,14 @@ pub enum Identity {
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum IdentityError {
     /// None of the components.
-    #[error("`{0}` is none of camera-NAME, fusion, recorder, router, viewer")]
+    #[error("`{0}` is none of camera-NAME, fusion, fusion-AREA, recorder, router, viewer")]
     Unknown(String),
-    /// An impossible camera.
-    #[error("`{text}` names an impossible camera")]
-    Camera {
+    /// An impossible camera, or area.
+    #[error("`{text}` names an impossible component")]
+    Name {
         /// The text.
         text: String,
-        /// What is wrong with the name.
+        /// What is wrong with the camera's or the area's name.
         #[source]
         source: NameError,
     },
@@ -52,12 +52,15 @@ pub enum IdentityError {
 
 /// What precedes a camera's name, so that a camera may be called `viewer`.
 const CAMERA: &str = "camera-";
+/// What precedes an area's.
+const CENTRE: &str = "fusion-";
 
 impl fmt::Display for Identity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Camera(name) => write!(f, "{CAMERA}{name}"),
-            Self::Fusion => f.write_str("fusion"),
+            Self::Fusion(None) => f.write_str("fusion"),
+            Self::Fusion(Some(area)) => write!(f, "{CENTRE}{area}"),
             Self::Recorder => f.write_str("recorder"),
             Self::Router => f.write_str("router"),
             Self::Viewer => f.write_str("viewer"),
@@ -69,14 +72,15 @@ impl FromStr for Identity {
     type Err = IdentityError;
 
     fn from_str(text: &str) -> Result<Self, IdentityError> {
+        let impossible = |source| IdentityError::Name { text: text.to_owned(), source };
         if let Some(name) = text.strip_prefix(CAMERA) {
-            let camera = name.parse();
-            return camera
-                .map(Self::Camera)
-                .map_err(|source| IdentityError::Camera { text: text.to_owned(), source });
+            return name.parse().map(Self::Camera).map_err(impossible);
+        }
+        if let Some(area) = text.strip_prefix(CENTRE) {
+            return area.parse().map(|area| Self::Fusion(Some(area))).map_err(impossible);
         }
         match text {
-            "fusion" => Ok(Self::Fusion),
+            "fusion" => Ok(Self::Fusion(None)),
             "recorder" => Ok(Self::Recorder),
             "router" => Ok(Self::Router),
             "viewer" => Ok(Self::Viewer),

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::ensure;
 use crossfix_correlation::Plane;
 use crossfix_geometry::ScanAngles;
-use crossfix_message::{BearingFrame, Channel, CueFrame, Key, Pointing, Timestamp, decode};
+use crossfix_message::{BearingFrame, CueFrame, Key, Pointing, Timestamp, decode};
 use crossfix_transport::Subscription;
 use crossfix_video::CaptureTime;
 use crossfix_vision::ImageTracker;
@@ -136,7 +136,8 @@ impl Agent {
         );
         let camera = &self.identity.camera;
         let angle_sd_rad = file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3);
-        let cues = Key::new(self.link.site().clone(), Channel::Cues).to_string();
+        // One of the fusion centres that hear it tells it what to look for.
+        let cues = Key::of_all_centres(self.link.site(), "cues");
         self.seeking = Some(Seeking {
             seeker: Seeker::new(camera.model(), file.pan_tilt(camera.pose())?, angle_sd_rad),
             cues: self.link.subscribe(&[cues])?,

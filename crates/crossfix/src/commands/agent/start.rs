@@ -100,15 +100,15 @@ impl Agent {
         begins: Timestamp,
         has_start: bool,
     ) -> anyhow::Result<Option<Start>> {
-        let mut lookout = Lookout::for_fusion(&self.link, network)?;
+        let mut lookout = Lookout::for_centres_of(&self.link, network, &self.identity.name)?;
+        let recorder_alive = self.link.key(Channel::RecorderAlive);
         let begun = Instant::now();
         // A token comes with its peer's other declarations, but the subscription may come after it.
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
             lookout.look(Instant::now());
             service::alive();
-            let [fusion, recording] = [Channel::FusionAlive, Channel::RecorderAlive]
-                .map(|channel| lookout.is_here(&channel));
+            let [fusion, recording] = [lookout.all_are_here(), lookout.is_here(&recorder_alive)];
             if fusion && (recording || !recorder) && has_ears(self)? {
                 break;
             }
@@ -138,8 +138,10 @@ impl Agent {
         network: &NetworkConfig,
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
-        let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
-        let key = Key::new(self.link.site().clone(), Channel::FusionHealth);
+        // Of the first of its areas: that one must be complete.
+        let area = network.heard_by(&self.identity.name).into_iter().next();
+        let cameras = network.cameras_of(area.as_ref())?;
+        let key = Key::of_centre(self.link.site().clone(), area, Channel::FusionHealth);
         let reports = self.link.subscribe(&[key.to_string()])?;
         self.appear()?;
         let begun = Instant::now();

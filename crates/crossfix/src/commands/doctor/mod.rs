@@ -99,7 +99,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
             let network = network
                 .with_context(|| format!("{}: key `network` is missing", args.config.display()))?;
             let folder = args.config.parent().unwrap_or(Path::new("."));
-            of_network(&load_network(&folder.join(network))?, &Identity::Fusion)
+            let area = keys.get("area").and_then(toml::Value::as_str);
+            let area = area.map(str::parse).transpose().context("key `area`")?;
+            of_network(&load_network(&folder.join(network))?, &Identity::Fusion(area))
         }
         _ => anyhow::bail!(
             "{} is no file of a camera, a fusion centre or a network",
@@ -304,12 +306,22 @@ fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let others = security::Others::seen_by(network, identity);
     // Through a router nobody listens but the router.
     if network.mode == Mode::Peer {
-        let cameras = network.cameras.iter();
+        // An area's fusion centre has to do with its own cameras alone.
+        let own_cameras = match identity {
+            Identity::Fusion(area) => network.cameras_of(area.as_ref()).ok(),
+            _ => None,
+        };
+        let concerns =
+            |name: &CameraName| own_cameras.as_ref().is_none_or(|own| own.contains(name));
+        let cameras = network.cameras.iter().filter(|(name, _)| concerns(name));
         let camera = |(name, at): (&CameraName, &String)| {
             others.of(name.as_str(), at, &Identity::Camera(name.clone()))
         };
         findings.extend(cameras.map(camera));
-        findings.push(others.of("fusion centre", &network.fusion, &Identity::Fusion));
+        findings.extend(network.centres().map(|(area, endpoint)| {
+            let who = area.as_ref().map_or("fusion centre".to_owned(), |a| format!("fusion {a}"));
+            others.of(&who, endpoint, &Identity::Fusion(area))
+        }));
     }
     findings.extend(routers(network, &others));
     findings.push(clock::host_clock());

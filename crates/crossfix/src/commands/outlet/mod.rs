@@ -148,8 +148,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
-    let channels = [Channel::Tracks, Channel::Events]
-        .map(|channel| Key::new(site.clone(), channel).to_string());
+    let channels = ["tracks", "events"].map(|kind| Key::of_all_centres(&site, kind));
     let calibrations = Key::of_all_cameras(&site, "calibration");
     let subscription = link.subscribe(&[channels.as_slice(), &[calibrations]].concat())?;
     tracing::info!("telling {} where the targets of `{site}` are", args.to);

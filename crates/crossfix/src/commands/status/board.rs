@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use crossfix_message::{
-    CameraHealth, CameraName, CameraStanding, Channel, Health, TrackFrame, TrackState, decode,
+    CameraHealth, CameraName, CameraStanding, Channel, Health, Key, TrackFrame, TrackState, decode,
 };
+use crossfix_transport::{Identity, NetworkConfig};
 use serde::Serialize;
 
 use crate::output;
@@ -38,7 +39,7 @@ struct Heard {
 /// How a part of a site does.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Part {
-    /// The camera's name, `fusion` or `recorder`.
+    /// The camera's name, `fusion` (`fusion-west` of an area) or `recorder`.
     pub name: String,
     /// In a word or two.
     pub state: String,
@@ -79,21 +80,36 @@ pub struct Status {
 pub struct Board {
     site: String,
     cameras: Vec<CameraName>,
+    /// The names of the fusion centres: `fusion`, or `fusion-west` and so on.
+    centres: Vec<String>,
     parts: BTreeMap<String, Heard>,
     tracks: BTreeMap<u64, (TrackState, Instant)>,
 }
 
 impl Board {
-    /// Of a site with these cameras.
-    pub fn new(site: String, cameras: Vec<CameraName>) -> Self {
-        Self { site, cameras, parts: BTreeMap::new(), tracks: BTreeMap::new() }
+    /// Of a site.
+    pub fn new(network: &NetworkConfig) -> Self {
+        let centres = network.centres().map(|(area, _)| Identity::Fusion(area).to_string());
+        Self {
+            site: network.site.to_string(),
+            cameras: network.cameras.keys().cloned().collect(),
+            centres: centres.collect(),
+            parts: BTreeMap::new(),
+            tracks: BTreeMap::new(),
+        }
     }
 
     /// Takes a message in; what cannot be read says nothing.
-    pub fn hear(&mut self, channel: &Channel, data: &[u8], at: Instant) {
-        let name = match channel {
+    pub fn hear(&mut self, key: &Key, data: &[u8], at: Instant) {
+        let name = match &key.channel {
             Channel::CameraHealth(camera) if self.cameras.contains(camera) => camera.to_string(),
-            Channel::FusionHealth => "fusion".to_owned(),
+            Channel::FusionHealth => {
+                let name = Identity::Fusion(key.area.clone()).to_string();
+                if !self.centres.contains(&name) {
+                    return;
+                }
+                name
+            }
             Channel::RecorderHealth => "recorder".to_owned(),
             Channel::Tracks => return self.hear_tracks(data, at),
             _ => return,
@@ -115,11 +131,13 @@ impl Board {
 
     /// How the site does.
     pub fn status(&self, now: Instant) -> Status {
-        let clocks = self.parts.get("fusion").map_or(&[][..], |heard| &heard.health.cameras);
+        let heard = self.centres.iter().filter_map(|centre| self.parts.get(centre));
+        let clocks: Vec<&CameraHealth> = heard.flat_map(|heard| &heard.health.cameras).collect();
         let cameras = self.cameras.iter().map(|camera| {
             let clock = clocks.iter().find(|clock| clock.camera == camera.as_str());
-            self.part(camera.as_str(), clock, now)
+            self.part(camera.as_str(), clock.copied(), now)
         });
+        let centres = self.centres.iter().map(|centre| self.part(centre, None, now));
         let recorder =
             self.parts.contains_key("recorder").then(|| self.part("recorder", None, now));
         let of = |wanted: &[TrackState]| {
@@ -130,7 +148,7 @@ impl Board {
         };
         Status {
             site: self.site.clone(),
-            parts: cameras.chain([self.part("fusion", None, now)]).chain(recorder).collect(),
+            parts: cameras.chain(centres).chain(recorder).collect(),
             confirmed: of(&[TrackState::Confirmed, TrackState::Coasting]),
             one_camera: of(&[TrackState::OneCamera]),
         }
@@ -236,12 +254,17 @@ mod tests {
     use super::*;
 
     fn board() -> Board {
-        let cameras = ["north", "east"].map(|name| name.parse().unwrap());
-        Board::new("field".to_owned(), cameras.into())
+        let network = "site = \"field\"\nfusion = \"tcp/127.0.0.1:7450\"\n[cameras]\n\
+                       north = \"tcp/127.0.0.1:7451\"\neast = \"tcp/127.0.0.1:7452\"\n";
+        Board::new(&toml::from_str(network).unwrap())
     }
 
-    fn of(name: &str) -> Channel {
-        Channel::CameraHealth(name.parse().unwrap())
+    fn key(channel: Channel) -> Key {
+        Key::new("field".parse().unwrap(), channel)
+    }
+
+    fn of(name: &str) -> Key {
+        key(Channel::CameraHealth(name.parse().unwrap()))
     }
 
     #[test]
@@ -270,11 +293,11 @@ mod tests {
             ..Default::default()
         };
         let fusion = Health { cameras: vec![clock], rate_hz: 80.0, ..Default::default() };
-        board.hear(&Channel::FusionHealth, &fusion.encode(), begun + Duration::from_secs(3));
-        board.hear(&Channel::FusionHealth, &[0xff; 9], begun + Duration::from_secs(3));
+        board.hear(&key(Channel::FusionHealth), &fusion.encode(), begun + Duration::from_secs(3));
+        board.hear(&key(Channel::FusionHealth), &[0xff; 9], begun + Duration::from_secs(3));
         let status = board.status(begun + Duration::from_secs(1));
         let names: Vec<&str> = status.parts.iter().map(|part| part.name.as_str()).collect();
-        assert_eq!(names, ["north", "east", "fusion"]);
+        assert_eq!(names, ["east", "north", "fusion"]);
         let text = status.text();
         let north = text.lines().find(|line| line.starts_with("north")).unwrap();
         for shown in ["has trouble", "30.0", "12.3", "+5.0 ± 0.7", " 2 ", "0.41", "166"] {
@@ -292,7 +315,11 @@ mod tests {
         let track =
             |id: u64, state: TrackState| Track { id, state: state.into(), ..Default::default() };
         let tell = |board: &mut Board, tracks: Vec<Track>, at: Instant| {
-            board.hear(&Channel::Tracks, &TrackFrame { tracks, ..Default::default() }.encode(), at);
+            board.hear(
+                &key(Channel::Tracks),
+                &TrackFrame { tracks, ..Default::default() }.encode(),
+                at,
+            );
         };
         let both = vec![track(1, TrackState::Confirmed), track(2, TrackState::OneCamera)];
         tell(&mut board, both, begun);

@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crossfix_message::{Channel, Key};
+use crossfix_message::{Key, SiteName};
 use crossfix_transport::{Link, NetworkConfig, Role};
 
 use self::board::Board;
@@ -81,6 +81,12 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
+/// The key expressions of what all parts of a site say of themselves.
+fn health_of_all(site: &SiteName) -> [String; 2] {
+    // That of a single fusion centre and the recorder are beside the cameras'.
+    [Key::of_all_cameras, Key::of_all_areas].map(|of_all| of_all(site, "health"))
+}
+
 /// Hears a site until it is asked to stop, or has heard enough; `draw` says each second whether it
 /// wants more than that.
 fn watch(
@@ -89,16 +95,15 @@ fn watch(
     shutdown: &Shutdown,
     mut draw: impl FnMut(&Board) -> bool,
 ) -> anyhow::Result<Board> {
-    // That of the fusion centre and the recorder, too.
-    let health = Key::of_all_cameras(link.site(), "health");
-    let tracks = Key::new(link.site().clone(), Channel::Tracks).to_string();
-    let subscription = link.subscribe(&[health, tracks])?;
-    let mut board = Board::new(link.site().to_string(), network.cameras.keys().cloned().collect());
+    let tracks = Key::of_all_centres(link.site(), "tracks");
+    let health = health_of_all(link.site());
+    let subscription = link.subscribe(&[health.as_slice(), &[tracks]].concat())?;
+    let mut board = Board::new(network);
     let begun = Instant::now();
     let mut drawn = begun;
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
-            board.hear(&received.key.channel, &received.data, received.at);
+            board.hear(&received.key, &received.data, received.at);
         }
         if drawn.elapsed() >= PERIOD {
             drawn = Instant::now();
@@ -122,18 +127,18 @@ fn serve(
         tracing::warn!("whoever reaches {address} can look on: the page has no certificates");
     }
     let site = link.site();
-    let kinds = ["health", "calibration"].map(|kind| Key::of_all_cameras(site, kind));
-    let channels = [Channel::Tracks, Channel::Events]
-        .map(|channel| Key::new(site.clone(), channel).to_string());
-    let subscription = link.subscribe(&[kinds, channels].concat())?;
+    let calibrations = Key::of_all_cameras(site, "calibration");
+    let of_centres = ["tracks", "events"].map(|kind| Key::of_all_centres(site, kind));
+    let expressions = [health_of_all(site).as_slice(), &of_centres, &[calibrations]].concat();
+    let subscription = link.subscribe(&expressions)?;
     output::line(format!("site `{site}`: http://{address}/"));
     let cameras: Vec<_> = network.cameras.keys().cloned().collect();
-    let mut board = Board::new(site.to_string(), cameras.clone());
+    let mut board = Board::new(network);
     let mut plan = PlanBoard::new(cameras);
     let mut shown_at = Instant::now();
     while !shutdown.requested() {
         if let Some(received) = subscription.next(POLL) {
-            board.hear(&received.key.channel, &received.data, received.at);
+            board.hear(&received.key, &received.data, received.at);
             plan.hear(&received.key.channel, &received.data, received.at);
         }
         if shown_at.elapsed() >= page::PERIOD {

@@ -1,11 +1,14 @@
+mod border;
+
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use crossfix_fusion::Output;
-use crossfix_message::{Channel, Key, Payload, Timestamp};
+use crossfix_message::{CameraName, Channel, Key, Payload, SiteName, Timestamp};
 use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Role, Subscription};
 
+use self::border::Border;
 use crate::centre::Centre;
 use crate::commands::numbers;
 use crate::config::{self, FusionFile};
@@ -42,6 +45,8 @@ pub struct Args {
 /// The fusion centre on its network.
 struct Station {
     centre: Centre,
+    /// Towards the areas beside, where there are any.
+    border: Option<Border>,
     link: Link,
     tracks: LinkPublisher,
     smoothed: LinkPublisher,
@@ -61,14 +66,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         format!("{}: key `network` is missing: name the network file", args.config.display())
     })?;
     let network = config::load_network(network)?;
-    let cameras = file.cameras.clone().unwrap_or_else(|| network.cameras.keys().cloned().collect());
-    let Some(link) = network::open(&network, &Role::Fusion, &shutdown)? else {
+    let everybody = network
+        .cameras_of(file.area.as_ref())
+        .with_context(|| format!("key `area` of {}", args.config.display()))?;
+    let cameras = file.cameras.clone().unwrap_or_else(|| everybody.clone());
+    let Some(link) = network::open(&network, &Role::Fusion(file.area.clone()), &shutdown)? else {
         return Ok(());
     };
-    let everybody: Vec<_> = network.cameras.keys().cloned().collect();
     let lookout = Lookout::for_cameras(&link, &network, &everybody)?;
+    let config = file.fusion().smoothed(args.lag);
+    let border = file.area.as_ref().map(|area| Border::new(&network, area, &config));
     let mut station = Station {
-        centre: Centre::new(file.fusion().smoothed(args.lag), Some(cameras))?,
+        centre: Centre::new(config, Some(cameras))?,
+        border,
         tracks: link.publisher(Channel::Tracks, Delivery::Queued)?,
         smoothed: link.publisher(Channel::Smoothed, Delivery::Queued)?,
         events: link.publisher(Channel::Events, Delivery::Queued)?,
@@ -79,10 +89,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         said_at: Timestamp::EPOCH,
         link,
     };
-    let kinds = ["bearings", "calibration", "health"];
     let site = station.link.site().clone();
-    let mut subscription =
-        station.link.subscribe(&kinds.map(|kind| Key::of_all_cameras(&site, kind)))?;
+    let mut subscription = station.link.subscribe(&station.heard(&everybody))?;
     let alive = station.link.declare_alive(Channel::FusionAlive)?;
     tracing::info!("the fusion centre of `{site}` is up, run {}", station.link.run());
 
@@ -98,7 +106,28 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What is said of a camera that the fusion needs.
+fn of_camera(site: &SiteName, camera: &CameraName) -> [String; 3] {
+    [Channel::Bearings, Channel::Calibration, Channel::CameraHealth]
+        .map(|channel| Key::new(site.clone(), channel(camera.clone())).to_string())
+}
+
 impl Station {
+    /// The key expressions that it listens to. In an area, of its own cameras and the areas beside
+    /// alone: what nobody there listens to does not go over the way there.
+    fn heard(&self, cameras: &[CameraName]) -> Vec<String> {
+        let site = self.link.site();
+        match &self.border {
+            None => ["bearings", "calibration", "health"]
+                .map(|kind| Key::of_all_cameras(site, kind))
+                .to_vec(),
+            Some(border) => {
+                let of_cameras = cameras.iter().flat_map(|camera| of_camera(site, camera));
+                of_cameras.chain(border.tracks_beside(site)).collect()
+            }
+        }
+    }
+
     fn work(&mut self, subscription: &Subscription, shutdown: &Shutdown) -> anyhow::Result<()> {
         let mut healthy_at = Instant::now();
         while !shutdown.requested() {
@@ -147,7 +176,10 @@ impl Station {
     fn take(&mut self, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
         // Names come from outside: those that are not configured are not kept count of.
-        let is_ours = key.channel.camera().is_some_and(|camera| self.centre.listens_to(camera));
+        let is_ours = match key.channel.camera() {
+            Some(camera) => self.centre.listens_to(camera),
+            None => key.area.is_some(),
+        };
         if let Some(origin) = origin.filter(|_| is_ours) {
             let missing = self.reception.see(key, origin, *at);
             if missing > 0 {
@@ -163,11 +195,23 @@ impl Station {
             || " from an unknown program".to_owned(),
             |o| format!(" from run {}", o.run),
         );
+        if let (Some(border), Some(area)) = (&mut self.border, &key.area) {
+            if let Err(error) = border.hear(area, data) {
+                self.centre.warn(&format!("beside {area}"), || {
+                    format!("what area `{area}` says of its tracks{sender} is not used: {error}")
+                });
+            }
+            return Ok(());
+        }
         let outputs = self.centre.take(&key.channel, data, &sender);
         self.publish(outputs)
     }
 
-    fn publish(&self, outputs: Vec<Output>) -> anyhow::Result<()> {
+    fn publish(&mut self, outputs: Vec<Output>) -> anyhow::Result<()> {
+        let outputs = match &mut self.border {
+            Some(border) => border.pass(outputs),
+            None => outputs,
+        };
         for output in outputs {
             match output {
                 Output::Tracks(frame) => self.tracks.put(frame.encode())?,

@@ -1,0 +1,61 @@
+//! What the fusion centre of an area has to do with those of the areas beside.
+
+use std::collections::BTreeMap;
+
+use crossfix_fusion::{FusionConfig, Neighbours, Output, Share};
+use crossfix_message::{
+    AreaName, CameraName, Channel, DecodeError, Key, SiteName, TrackFrame, decode,
+};
+use crossfix_transport::NetworkConfig;
+
+/// The areas beside one, and what it says for them.
+pub struct Border {
+    neighbours: Neighbours,
+    /// The areas beside with their places among all areas.
+    beside: BTreeMap<AreaName, usize>,
+    /// Cameras of this area that another one tells what to look for: two would turn them to and fro.
+    told_by_others: Vec<CameraName>,
+}
+
+impl Border {
+    /// Of an area of the network.
+    pub fn new(network: &NetworkConfig, area: &AreaName, config: &FusionConfig) -> Self {
+        let place = |area: &AreaName| network.areas.keys().take_while(|one| *one < area).count();
+        let beside = network.neighbours(area).into_iter().map(|one| (one.clone(), place(&one)));
+        let told_by_others = |camera: &&CameraName| network.heard_by(camera).first() != Some(area);
+        Self {
+            neighbours: Neighbours::new(
+                Share { index: place(area), of: network.areas.len() },
+                config,
+            ),
+            beside: beside.collect(),
+            told_by_others: network.cameras.keys().filter(told_by_others).cloned().collect(),
+        }
+    }
+
+    /// The keys of what the areas beside say of their tracks.
+    pub fn tracks_beside(&self, site: &SiteName) -> impl Iterator<Item = String> {
+        self.beside.keys().map(|area| {
+            Key::of_centre(site.clone(), Some(area.clone()), Channel::Tracks).to_string()
+        })
+    }
+
+    /// Takes in what another area says of its tracks.
+    pub fn hear(&mut self, area: &AreaName, data: &[u8]) -> Result<(), DecodeError> {
+        if let Some(place) = self.beside.get(area) {
+            self.neighbours.hear(*place, &decode::<TrackFrame>(data)?);
+        }
+        Ok(())
+    }
+
+    /// What of the fusion's outputs is said, and how.
+    pub fn pass(&mut self, outputs: Vec<Output>) -> Vec<Output> {
+        let mut outputs = self.neighbours.pass(outputs);
+        let is_told_here = |camera: &str| self.told_by_others.iter().all(|c| c.as_str() != camera);
+        outputs.retain(|output| match output {
+            Output::Cues(cues) => is_told_here(&cues.camera),
+            _ => true,
+        });
+        outputs
+    }
+}
