@@ -15,7 +15,7 @@ use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
-use crate::site_time::{SiteTime, Turn};
+use crate::site_time::{SiteTime, Turn, moved};
 use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::{TrackChange, Tracker};
 use smoothing::Smoothing;
@@ -140,12 +140,17 @@ impl Fusion {
             Turn::Now => self.take(frame, &mut outputs),
             Turn::Waits => {}
             Turn::Together(frames, step_s) => self.take_after(&frames, step_s, &mut outputs),
+            Turn::Apart(frames, apart) => self.take_apart(&frames, &apart, &mut outputs),
         }
         self.drain(&mut outputs);
         outputs
     }
 
     fn take(&mut self, frame: &BearingFrame, outputs: &mut Vec<Output>) {
+        let name = frame.camera.parse::<CameraName>().ok();
+        let ahead_s = name.map_or(0.0, |name| self.site_time.ahead_s(&name));
+        let settled = (ahead_s != 0.0).then(|| moved(frame, -ahead_s));
+        let frame = settled.as_ref().unwrap_or(frame);
         match self.read(frame) {
             Ok((mut exposure, left_out)) => {
                 for reason in left_out {
@@ -202,7 +207,10 @@ impl Fusion {
             camera: name.clone(),
             standing: camera.standing(),
             noise_factor: camera.noise_factor(),
-            clock: self.clocks.estimate(name),
+            clock: self.clocks.estimate(name).map(|clock| ClockEstimate {
+                offset_s: clock.offset_s + self.site_time.ahead_s(name),
+                ..clock
+            }),
         })
     }
 
@@ -422,6 +430,9 @@ impl Fusion {
     ) {
         let changed = self.cameras.get_mut(camera).and_then(|known| known.note_time(time, in_time));
         if let Some(standing) = changed {
+            if standing == CameraStanding::Excluded {
+                self.site_time.doubt(camera);
+            }
             self.counters.count(match standing {
                 CameraStanding::Excluded => "cameras_out_of_time",
                 _ => "cameras_in_time_again",
@@ -487,7 +498,7 @@ impl Fusion {
 
     /// Tells the cameras that look where they are told what they should look for.
     fn cue(&mut self, now: Timestamp, outputs: &mut Vec<Output>) {
-        let Self { cameras, tracker, initiator, cueing, clocks, config, .. } = self;
+        let Self { cameras, tracker, initiator, cueing, clocks, config, site_time, .. } = self;
         let due: Vec<(&CameraName, &KnownCamera)> = cameras
             .iter()
             .filter(|(_, camera)| !camera.is_excluded() && camera.at_rest().takes_cues)
@@ -503,7 +514,7 @@ impl Fusion {
             let [ahead_s, sd_s] = clocks
                 .estimate(name)
                 .map_or([0.0; 2], |clock| [clock.offset_s, clock.relative_sd_s]);
-            let clock = OwnClock { ahead_s, sd_s };
+            let clock = OwnClock { ahead_s: ahead_s + site_time.ahead_s(name), sd_s };
             let max_range_m = config.initiation.max_range_m;
             let cues = cueing::cues(name, known, (now, clock), &targets, max_range_m);
             outputs.push(Output::Cues(cues));

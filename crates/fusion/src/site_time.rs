@@ -1,12 +1,16 @@
-//! A step of all clocks at once: the source of time that the cameras share was off and has been set
-//! right.
+//! Steps of the cameras' clocks.
 //!
 //! A camera's frames are numbered and come in a rhythm. Where the numbers go on and the time does
 //! not go on with them, its clock has stepped, or it has stood still. Where all cameras that are
 //! heard do so by as much, within the time for which late frames are waited for anyway, it is the
 //! site's time: agents of one host, or hosts that follow one source. Until that is clear the frames
 //! of those that have stepped wait; where it does not become clear each clock has stepped for
-//! itself.
+//! itself: its step is taken off its times from then on, so that it goes on as if nothing had been.
+//! The site's time is what most clocks say: once most have made the same step, it has, and those
+//! that have not are held to be off.
+//!
+//! A clock that goes back while the frames go on has stepped. One that goes forward may have stood
+//! still: then the other cameras have gone on meanwhile.
 
 use std::collections::BTreeMap;
 
@@ -31,6 +35,9 @@ const LIVE_S: f64 = 2.0;
 /// of it hosts whose frames are a tenth of a second apart on their way do not step together; with
 /// all of it what waits is late.
 const SHARE_OF_LATENESS: f64 = 0.5;
+/// A camera whose clock has gone forward stood still where the others have gone on by this share of it.
+/// Anything between none of it and all of it serves.
+const SHARE_OF_STEP: f64 = 0.5;
 /// No more frames than this wait, of no more bearings: memory is bounded.
 const MOST_WAITING: usize = 200;
 const MOST_BEARINGS_WAITING: usize = 20_000;
@@ -52,11 +59,32 @@ struct Rhythm {
     gone_s: f64,
     /// ... and all cameras together, when it was heard last.
     heard_s: f64,
+    /// What its clock has stepped by for itself, s.
+    ahead_s: f64,
+    /// Whether the newest frame was off the rhythm.
+    has_stepped: bool,
+    /// The newest time of another camera when it was heard last.
+    others: Option<Timestamp>,
 }
 
 impl Rhythm {
     fn beginning(sequence: u64, time: Timestamp) -> Self {
-        Self { sequence, time, period_s: 0.0, frames: 0, gone_s: 0.0, heard_s: 0.0 }
+        Self {
+            sequence,
+            time,
+            period_s: 0.0,
+            frames: 0,
+            gone_s: 0.0,
+            heard_s: 0.0,
+            ahead_s: 0.0,
+            has_stepped: false,
+            others: None,
+        }
+    }
+
+    /// Its newest time without the steps of its own.
+    fn settled(&self) -> Timestamp {
+        self.time.plus_seconds(-self.ahead_s)
     }
 
     /// By how much the next frame's time is off the rhythm, s, where that is no matter of frames
@@ -78,11 +106,13 @@ impl Rhythm {
     fn go_on(&mut self, sequence: u64, time: Timestamp, step: Option<f64>) -> f64 {
         let numbers = sequence.saturating_sub(self.sequence);
         let since_s = time.seconds_since(self.time) - step.unwrap_or(0.0);
-        if numbers == 0 || step.is_some() || since_s <= 0.0 {
+        let is_another_rate = step.is_some() && self.has_stepped;
+        self.has_stepped = step.is_some();
+        if numbers == 0 || is_another_rate || since_s <= 0.0 && step.is_none() {
             // Numbered anew, out of order, or at another rate from now on: the rhythm has to show
             // again.
             (self.period_s, self.frames) = (0.0, 0);
-        } else {
+        } else if step.is_none() {
             let share = PERIOD_SHARE.max(f64::from(self.frames + 1).recip());
             self.period_s += (since_s / numbers as f64 - self.period_s) * share;
             self.frames = self.frames.saturating_add(1);
@@ -94,11 +124,33 @@ impl Rhythm {
     }
 }
 
+/// A clock that has stepped.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    step_s: f64,
+    /// Its camera before.
+    before: Rhythm,
+    /// How far the others have gone on meanwhile, s.
+    others_s: f64,
+}
+
+impl Step {
+    /// Whether a clock has stepped that by now is like this, and not a camera that stood still, nor a
+    /// single frame with a wrong time.
+    fn is_of_clock(&self, now: &Rhythm) -> bool {
+        let numbers = now.sequence.saturating_sub(self.before.sequence);
+        let off_s =
+            now.time.seconds_since(self.before.time) - numbers as f64 * self.before.period_s;
+        let stood_still = self.step_s > 0.0 && self.others_s > SHARE_OF_STEP * self.step_s;
+        numbers >= 2 && (off_s - self.step_s).abs() < LEAST_STEP_S && !stood_still
+    }
+}
+
 /// Cameras that have stepped, until it is clear whether all have.
 #[derive(Debug, Default)]
 struct Pending {
     frames: Vec<BearingFrame>,
-    steps: BTreeMap<CameraName, f64>,
+    steps: BTreeMap<CameraName, Step>,
     /// How far the cameras had gone on then, s.
     gone_s: BTreeMap<CameraName, f64>,
 }
@@ -110,9 +162,19 @@ pub(crate) enum Turn {
     Now,
     /// It waits.
     Waits,
-    /// What waited is taken, and it after that: all clocks have stepped by so much, s, or each for
-    /// itself.
-    Together(Vec<BearingFrame>, Option<f64>),
+    /// What waited is taken, and it after that: all clocks have stepped by so much, s.
+    Together(Vec<BearingFrame>, f64),
+    /// The same, where each has stepped for itself.
+    Apart(Vec<BearingFrame>, Apart),
+}
+
+/// Clocks that have stepped for themselves.
+#[derive(Debug, Default, PartialEq)]
+pub(crate) struct Apart {
+    /// Whose steps are taken off.
+    pub(crate) cameras: Vec<CameraName>,
+    /// By how much most clocks have stepped by now, s: so has the site's time.
+    pub(crate) site_s: Option<f64>,
 }
 
 /// Watches the cameras' times for steps that all make.
@@ -135,20 +197,35 @@ impl SiteTime {
     /// Takes a known camera's frame.
     pub(crate) fn see(&mut self, camera: &CameraName, frame: &BearingFrame) -> Turn {
         let (sequence, time) = (frame.sequence, Timestamp::from_nanos(frame.capture_time_ns));
+        let others = self.newest_of_others(camera);
         let rhythm =
             self.rhythms.entry(camera.clone()).or_insert(Rhythm::beginning(sequence, time));
+        if sequence < rhythm.sequence
+            && let Some(others) = others
+        {
+            // Its agent has been started again, perhaps by another clock.
+            let off_s = |ahead_s: f64| time.plus_seconds(-ahead_s).seconds_since(others).abs();
+            if off_s(0.0) < off_s(rhythm.ahead_s) {
+                rhythm.ahead_s = 0.0;
+            }
+        }
         let (before, step) = (*rhythm, rhythm.step(sequence, time));
+        rhythm.others = others;
+        let others_s = match (before.others, others) {
+            (Some(before), Some(now)) => now.seconds_since(before),
+            _ => 0.0,
+        };
         self.gone_s += rhythm.go_on(sequence, time, step);
         rhythm.heard_s = self.gone_s;
         // A clock that was none of the site's steps for itself.
-        if let Some(step) = step.filter(|_| self.is_of_site(camera, before.time)) {
+        if let Some(step_s) = step.filter(|_| self.is_of_site(camera, before.settled())) {
             let gone_s = || {
                 self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect()
             };
             let pending = self
                 .pending
                 .get_or_insert_with(|| Pending { gone_s: gone_s(), ..Pending::default() });
-            pending.steps.insert(camera.clone(), step);
+            pending.steps.entry(camera.clone()).or_insert(Step { step_s, before, others_s });
         }
         let Some(pending) = &mut self.pending else {
             return Turn::Now;
@@ -157,17 +234,56 @@ impl SiteTime {
         if waits {
             pending.frames.push(frame.clone());
         }
-        match self.decide() {
-            Some(step) => {
-                let mut frames = self.end();
-                if !waits {
-                    frames.push(frame.clone());
-                }
-                Turn::Together(frames, step)
-            }
-            None if waits => Turn::Waits,
-            None => Turn::Now,
+        let Some(step) = self.decide() else {
+            return if waits { Turn::Waits } else { Turn::Now };
+        };
+        let apart = step.is_none().then(|| self.part());
+        let mut frames = self.end();
+        if !waits {
+            frames.push(frame.clone());
         }
+        match (step, apart) {
+            (Some(step_s), _) => Turn::Together(frames, step_s),
+            (None, apart) => Turn::Apart(frames, apart.unwrap_or_default()),
+        }
+    }
+
+    /// What a camera's clock has stepped by for itself, s.
+    pub(crate) fn ahead_s(&self, camera: &CameraName) -> f64 {
+        self.rhythms.get(camera).map_or(0.0, |rhythm| rhythm.ahead_s)
+    }
+
+    /// A camera does not keep the site's time with the steps of its clock taken off: they were none.
+    pub(crate) fn doubt(&mut self, camera: &CameraName) {
+        if let Some(rhythm) = self.rhythms.get_mut(camera) {
+            rhythm.ahead_s = 0.0;
+        }
+    }
+
+    /// Takes each clock's own step off its times from now on.
+    fn part(&mut self) -> Apart {
+        let steps = self.pending.as_ref().map(|pending| pending.steps.clone()).unwrap_or_default();
+        let mut apart = Apart::default();
+        if self.live().count() < 2 {
+            return apart;
+        }
+        for (camera, step) in steps {
+            let Some(rhythm) = self.rhythms.get_mut(&camera) else { continue };
+            if step.is_of_clock(rhythm) {
+                rhythm.ahead_s += step.step_s;
+                apart.cameras.push(camera);
+            }
+        }
+        let mut ahead: Vec<f64> = self.live().map(|(_, rhythm)| rhythm.ahead_s).collect();
+        ahead.sort_unstable_by(f64::total_cmp);
+        // Where as many have as have not, those that have not.
+        let middle = [ahead[(ahead.len() - 1) / 2], ahead[ahead.len() / 2]];
+        let of_most = if middle[0].abs() < middle[1].abs() { middle[0] } else { middle[1] };
+        if of_most.abs() > LEAST_STEP_S {
+            self.rhythms.values_mut().for_each(|rhythm| rhythm.ahead_s -= of_most);
+            apart.site_s = Some(of_most);
+        }
+        apart
     }
 
     /// Says that a camera has come to its end: nobody asks it any more.
@@ -190,15 +306,21 @@ impl SiteTime {
         let has_stepped =
             |name| self.pending.as_ref().is_some_and(|pending| pending.steps.contains_key(name));
         let others = self.live().filter(|(name, _)| *name != camera && !has_stepped(name));
-        let mut times: Vec<Timestamp> = others.map(|(_, rhythm)| rhythm.time).collect();
+        let mut times: Vec<Timestamp> = others.map(|(_, rhythm)| rhythm.settled()).collect();
         times.sort_unstable();
         times.get(times.len() / 2).is_none_or(|others| time.seconds_since(*others).abs() < LIVE_S)
+    }
+
+    /// The newest time of the other cameras: one of them that goes on is enough to show that time has.
+    fn newest_of_others(&self, camera: &CameraName) -> Option<Timestamp> {
+        let others = self.live().filter(|(name, _)| *name != camera);
+        others.map(|(_, rhythm)| rhythm.settled()).max()
     }
 
     /// By how much all clocks have stepped, s, or that each has for itself, if either is clear.
     fn decide(&self) -> Option<Option<f64>> {
         let pending = self.pending.as_ref()?;
-        let mut steps: Vec<f64> = pending.steps.values().copied().collect();
+        let mut steps: Vec<f64> = pending.steps.values().map(|step| step.step_s).collect();
         steps.sort_unstable_by(f64::total_cmp);
         let step = steps[steps.len() / 2];
         let is_alike = steps.iter().all(|other| (other - step).abs() < LEAST_STEP_S);

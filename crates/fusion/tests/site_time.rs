@@ -73,13 +73,80 @@ fn a_track_outlives_a_step_of_all_clocks_either_way() {
     }
 }
 
+/// How far a camera's clock is said to be ahead, s.
+fn ahead_s(fusion: &Fusion, camera: &str) -> f64 {
+    let report = fusion.cameras().find(|report| report.camera.as_str() == camera).unwrap();
+    report.clock.unwrap().offset_s
+}
+
 #[test]
-fn one_clock_that_steps_alone_moves_nobody_else() {
-    let (scene, frames) = stepped(1.0, 0.0, &["b"]);
+fn one_clock_that_steps_alone_costs_its_camera_half_a_second_and_moves_nobody_else() {
+    let steps = [-3600.0, -5.0, -1.0, -0.6, 0.6, 1.0, 5.0, 3600.0];
+    for (step_s, sd_s) in steps.into_iter().flat_map(|step_s| [(step_s, 0.0), (step_s, 0.02)]) {
+        for camera in ["a", "b", "c"] {
+            let (scene, frames) = stepped(step_s, sd_s, &[camera]);
+            let (fusion, numbers) = run(&scene, &frames);
+            assert_eq!(numbers.len(), 1, "{camera} by {step_s}");
+            assert!(error_m(&fusion, 0.0) < 0.3, "{}", error_m(&fusion, 0.0));
+            let count = |name| fusion.counters().get(name);
+            assert_eq!(
+                (count("site_time_steps"), count("clock_steps")),
+                (0, 1),
+                "{camera} by {step_s}, {sd_s}"
+            );
+            assert!((ahead_s(&fusion, camera) - step_s).abs() < 0.02, "{camera} by {step_s}");
+            // All that it saw since is used.
+            let lost = frames.len() as u64 - count("exposures");
+            assert!(lost <= 5, "{camera} by {step_s}: {lost} frames lost");
+        }
+    }
+}
+
+#[test]
+fn a_clock_that_steps_and_is_set_back_is_followed_both_ways() {
+    let (scene, mut frames) = stepped(-1.0, 0.0, &["b"]);
+    for frame in frames.iter_mut().filter(|frame| frame.camera == "b") {
+        // It has been a second behind since 15 s, and is right again from 18 s on.
+        let seconds = frame.capture_time_ns as f64 / 1e9;
+        frame.capture_time_ns += if seconds + 1.0 >= AT_S + 3.0 { 1_000_000_000 } else { 0 };
+    }
+    let (fusion, numbers) = run(&scene, &frames);
+    assert_eq!((numbers.len(), fusion.counters().get("clock_steps")), (1, 2));
+    assert!(ahead_s(&fusion, "b").abs() < 0.02, "{}", ahead_s(&fusion, "b"));
+    assert!(error_m(&fusion, 0.0) < 0.3, "{}", error_m(&fusion, 0.0));
+}
+
+#[test]
+fn clocks_that_are_set_right_one_after_the_other_take_the_sites_time_along() {
+    // By NTP, seconds apart: first `a`, then `b`, then `c`.
+    let scene = Scene::new(vec![path()], UNTIL_S + 6.0);
+    let mut frames = scene.frames(3);
+    for frame in &mut frames {
+        let seconds = frame.capture_time_ns as f64 / 1e9;
+        let at_s = AT_S + f64::from(frame.camera.as_bytes()[0] - b'a') * 3.0;
+        frame.capture_time_ns -= if seconds >= at_s { 1_000_000_000 } else { 0 };
+    }
     let (fusion, numbers) = run(&scene, &frames);
     assert_eq!(numbers.len(), 1);
-    assert!(error_m(&fusion, 0.0) < 0.3, "{}", error_m(&fusion, 0.0));
-    assert_eq!(fusion.counters().get("site_time_steps"), 0);
+    assert!(error_m(&fusion, -1.0) < 0.3, "{}", error_m(&fusion, -1.0));
+    for camera in ["a", "b", "c"] {
+        assert!(ahead_s(&fusion, camera).abs() < 0.02, "{camera}");
+    }
+}
+
+#[test]
+fn a_frame_with_a_wrong_time_is_no_step() {
+    for off_s in [-1.0, 1.0, 3600.0] {
+        let (scene, mut frames) = stepped(0.0, 0.0, &[]);
+        let wrong = frames
+            .iter()
+            .position(|frame| frame.camera == "b" && frame.capture_time_ns as f64 / 1e9 > AT_S);
+        frames[wrong.unwrap()].capture_time_ns += (off_s * 1e9) as i64;
+        let (fusion, numbers) = run(&scene, &frames);
+        let count = |name| fusion.counters().get(name);
+        assert_eq!((numbers.len(), count("clock_steps"), count("site_time_steps")), (1, 0, 0));
+        assert!(frames.len() as u64 - count("exposures") <= 5, "{off_s}");
+    }
 }
 
 #[test]

@@ -7,7 +7,7 @@ use crate::Counters;
 use crate::clocks::ClockEstimator;
 use crate::ingress::{self, RejectionReason};
 use crate::initiation::Initiator;
-use crate::site_time::moved;
+use crate::site_time::{Apart, moved};
 use crate::unmet::Unmet;
 
 /// All clocks have stepped forward, and the cameras have not stood still, where that is so much
@@ -49,10 +49,28 @@ impl Fusion {
     pub(super) fn take_after(
         &mut self,
         frames: &[BearingFrame],
-        step_s: Option<f64>,
+        step_s: f64,
         outputs: &mut Vec<Output>,
     ) {
-        if let Some(step_s) = step_s.filter(|step_s| self.has_stepped(frames, *step_s)) {
+        if self.has_stepped(frames, step_s) {
+            self.step_time(step_s, outputs);
+        }
+        frames.iter().for_each(|frame| self.take(frame, outputs));
+    }
+
+    /// Takes frames in that have waited until it was clear that some clocks have stepped for
+    /// themselves: by how much exactly, tracks have to show.
+    pub(super) fn take_apart(
+        &mut self,
+        frames: &[BearingFrame],
+        apart: &Apart,
+        outputs: &mut Vec<Output>,
+    ) {
+        for camera in &apart.cameras {
+            self.counters.count("clock_steps");
+            self.clocks.suspect(camera);
+        }
+        if let Some(step_s) = apart.site_s {
             self.step_time(step_s, outputs);
         }
         frames.iter().for_each(|frame| self.take(frame, outputs));
