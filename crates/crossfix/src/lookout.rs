@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crossfix_message::{AreaName, CameraName, Channel, Key};
+use crossfix_message::{CameraName, Channel, Key};
 use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
 /// How long somebody may be missing before that is said, and how often it is said again that nobody
@@ -90,9 +90,9 @@ impl Lookout {
         network: &NetworkConfig,
         camera: &CameraName,
     ) -> anyhow::Result<Self> {
-        let heard_by = network.heard_by(camera);
-        let hears = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| heard_by.contains(a));
-        let centres = network.centres().filter(|(area, _)| hears(area)).map(|(area, endpoint)| {
+        let hear = network.centres_of(camera);
+        let centres = network.centres().filter(|(area, _)| hear.contains(area));
+        let centres = centres.map(|(area, endpoint)| {
             let name = area.as_ref().map_or_else(
                 || "the fusion centre".to_owned(),
                 |area| format!("the fusion centre of area `{area}`"),
@@ -153,6 +153,11 @@ impl Lookout {
     /// Whether all of them are there.
     pub fn all_are_here(&self) -> bool {
         self.others.iter().all(|other| self.presence.is_alive(&other.key))
+    }
+
+    /// Whether one of them is there.
+    pub fn any_is_here(&self) -> bool {
+        self.others.iter().any(|other| self.presence.is_alive(&other.key))
     }
 
     /// Whether a component is there, whoever is looked out for.

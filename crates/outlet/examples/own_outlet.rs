@@ -39,18 +39,21 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut situation = Situation::new("airfield".parse()?, anchor);
     let mut outlet = Lines;
     for second in 0..3 {
-        situation.hear(&TrackFrame {
-            time_ns: Timestamp::from_seconds(f64::from(second)).nanos(),
-            tracks: vec![Track {
-                id: 1,
-                state: TrackState::Confirmed.into(),
-                position: Some(Vector3 { x: 12.0 * f64::from(second), y: 0.0, z: 50.0 }),
-                velocity: Some(Vector3 { x: 12.0, y: 0.0, z: 0.0 }),
-                covariance: (0..36).map(|k| if k % 7 == 0 { 0.01 } else { 0.0 }).collect(),
+        situation.hear(
+            None,
+            &TrackFrame {
+                time_ns: Timestamp::from_seconds(f64::from(second)).nanos(),
+                tracks: vec![Track {
+                    id: 1,
+                    state: TrackState::Confirmed.into(),
+                    position: Some(Vector3 { x: 12.0 * f64::from(second), y: 0.0, z: 50.0 }),
+                    velocity: Some(Vector3 { x: 12.0, y: 0.0, z: 0.0 }),
+                    covariance: (0..36).map(|k| if k % 7 == 0 { 0.01 } else { 0.0 }).collect(),
+                    ..Default::default()
+                }],
                 ..Default::default()
-            }],
-            ..Default::default()
-        });
+            },
+        );
         let snapshot = situation.snapshot(0.0).ok_or("nothing was heard")?;
         for message in outlet.tracks(&snapshot) {
             print!("{}", String::from_utf8_lossy(&message));

@@ -4,8 +4,8 @@
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
-    CameraCalibration, Channel, DistortionModel, Preview, Timestamp, Track, TrackFrame, TrackState,
-    Vector3, decode,
+    AreaName, CameraCalibration, Channel, DistortionModel, Key, Preview, Timestamp, Track,
+    TrackFrame, TrackState, Vector3, decode,
 };
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use prost::Message;
@@ -74,8 +74,8 @@ impl FoxgloveView {
 
     /// What a message on a channel says in Foxglove's schemas. Bytes that are no such message say
     /// nothing.
-    pub fn of(&mut self, channel: &Channel, data: &[u8], time: Timestamp) -> Vec<FoxgloveMessage> {
-        match channel {
+    pub fn of(&mut self, key: &Key, data: &[u8], time: Timestamp) -> Vec<FoxgloveMessage> {
+        match &key.channel {
             // Whose it is the channel says: a message that says otherwise is nobody's.
             Channel::Calibration(camera) => decode::<CameraCalibration>(data)
                 .ok()
@@ -88,7 +88,7 @@ impl FoxgloveView {
                 .map(|message| vec![of_preview(message)])
                 .unwrap_or_default(),
             Channel::Tracks => decode::<TrackFrame>(data)
-                .map(|message| self.of_tracks(&message))
+                .map(|message| self.of_tracks(key.area.as_ref(), &message))
                 .unwrap_or_default(),
             _ => Vec::new(),
         }
@@ -110,9 +110,9 @@ impl FoxgloveView {
         messages
     }
 
-    fn of_tracks(&mut self, frame: &TrackFrame) -> Vec<FoxgloveMessage> {
+    fn of_tracks(&mut self, area: Option<&AreaName>, frame: &TrackFrame) -> Vec<FoxgloveMessage> {
         if let Some(situation) = &mut self.situation {
-            situation.hear(frame);
+            situation.hear(area, frame);
         }
         let time = Timestamp::from_nanos(frame.time_ns);
         if self.said_at.is_some_and(|at| (0.0..PLACE_PERIOD_S).contains(&time.seconds_since(at))) {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crossfix_geometry::{Geodetic, LocalFrame};
 use crossfix_message::{
-    CameraCalibration, Datum, SiteName, Timestamp, Track, TrackFrame, TrackState,
+    AreaName, CameraCalibration, Datum, SiteName, Timestamp, Track, TrackFrame, TrackState,
 };
 use nalgebra::{Matrix3, Matrix6, Point3, Vector3};
 
@@ -15,6 +15,8 @@ use crate::Target;
 const SILENCE_S: f64 = 2.0;
 /// Tracks that are kept count of; a fusion centre has a thousand at most.
 const MOST_TRACKS: usize = 10_000;
+/// Fusion centres that are kept count of.
+const MOST_CENTRES: usize = 1000;
 
 /// Where all targets are at one instant.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,6 +50,8 @@ pub struct Situation {
     /// What the whole site may be off by.
     datum: Option<Datum>,
     tracks: BTreeMap<u64, Known>,
+    /// The newest time that each fusion centre has said, by its area.
+    newest: BTreeMap<Option<AreaName>, Timestamp>,
     now: Option<Timestamp>,
 }
 
@@ -105,7 +109,14 @@ impl Situation {
     /// Nothing heard yet, of a site whose origin is at an anchor.
     pub fn new(site: SiteName, anchor: Geodetic) -> Self {
         let frame = LocalFrame::at(anchor);
-        Self { site, frame, datum: None, tracks: BTreeMap::new(), now: None }
+        Self {
+            site,
+            frame,
+            datum: None,
+            tracks: BTreeMap::new(),
+            newest: BTreeMap::new(),
+            now: None,
+        }
     }
 
     /// Hears a calibration: what it says of the whole site is in all tracks' covariances from then on.
@@ -114,14 +125,21 @@ impl Situation {
         self.datum = datum.or(self.datum.take());
     }
 
-    /// Hears tracks. One without a place, or with numbers that are none, is left out.
-    pub fn hear(&mut self, frame: &TrackFrame) {
+    /// Hears tracks of a fusion centre: of its area, where there are several. One without a place, or
+    /// with numbers that are none, is left out.
+    pub fn hear(&mut self, area: Option<&AreaName>, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
-        if self.now.is_some_and(|now| now.seconds_since(time) > SILENCE_S) {
+        let area = area.cloned();
+        if self.newest.get(&area).is_some_and(|newest| newest.seconds_since(time) > SILENCE_S) {
             // Time has gone back: a fusion centre that was started again, or another replay. What was
             // known is of a time that is not.
             self.tracks.clear();
+            self.newest.clear();
             self.now = None;
+        }
+        if self.newest.len() < MOST_CENTRES || self.newest.contains_key(&area) {
+            let newest = self.newest.entry(area).or_insert(time);
+            *newest = time.max(*newest);
         }
         self.now = Some(self.now.map_or(time, |now| now.max(time)));
         for track in &frame.tracks {
@@ -196,8 +214,8 @@ mod tests {
     fn all_tracks_are_said_at_one_time_with_what_it_is_off_by() {
         let mut situation = situation();
         assert_eq!(situation.snapshot(0.0), None);
-        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(&frame(0.5, 2, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.5, 2, TrackState::Confirmed, 0.0));
         let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START + 0.5));
         let [one, two] = &snapshot.targets[..] else { panic!("{snapshot:?}") };
@@ -213,11 +231,11 @@ mod tests {
     #[test]
     fn a_lost_track_is_said_once_and_one_that_is_not_sure_never() {
         let mut situation = situation();
-        situation.hear(&frame(0.0, 1, TrackState::Tentative, 0.0));
+        situation.hear(None, &frame(0.0, 1, TrackState::Tentative, 0.0));
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
-        situation.hear(&frame(0.1, 1, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.1, 1, TrackState::Confirmed, 0.0));
         assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Confirmed);
-        situation.hear(&frame(0.2, 1, TrackState::Lost, 0.0));
+        situation.hear(None, &frame(0.2, 1, TrackState::Lost, 0.0));
         assert_eq!(situation.snapshot(0.0).unwrap().targets[0].state, TrackState::Lost);
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
@@ -225,8 +243,8 @@ mod tests {
     #[test]
     fn tracks_of_a_fusion_centre_that_is_gone_are_lost() {
         let mut situation = situation();
-        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(&frame(3.0, 2, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(3.0, 2, TrackState::Confirmed, 0.0));
         let states: Vec<_> =
             situation.snapshot(0.0).unwrap().targets.iter().map(|target| target.state).collect();
         assert_eq!(states, [TrackState::Lost, TrackState::Confirmed]);
@@ -235,7 +253,7 @@ mod tests {
     #[test]
     fn tracks_of_a_fusion_centre_that_says_nothing_any_more_are_lost_once() {
         let mut situation = situation();
-        situation.hear(&frame(0.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.0, 1, TrackState::Confirmed, 0.0));
         assert_eq!(situation.snapshot(1.0).unwrap().targets[0].state, TrackState::Confirmed);
         assert_eq!(situation.snapshot(2.5).unwrap().targets[0].state, TrackState::Lost);
         assert!(situation.snapshot(3.5).unwrap().targets.is_empty());
@@ -244,8 +262,8 @@ mod tests {
     #[test]
     fn where_time_goes_back_what_is_heard_then_counts() {
         let mut situation = situation();
-        situation.hear(&frame(100.0, 1, TrackState::Confirmed, 0.0));
-        situation.hear(&frame(0.0, 2, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(100.0, 1, TrackState::Confirmed, 0.0));
+        situation.hear(None, &frame(0.0, 2, TrackState::Confirmed, 0.0));
         let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START));
         assert_eq!(snapshot.targets.iter().map(|target| target.id).collect::<Vec<_>>(), [2]);
@@ -255,9 +273,9 @@ mod tests {
     fn numbers_that_are_none_are_left_out() {
         let mut situation = situation();
         let mut bad = frame(0.0, 1, TrackState::Confirmed, f64::NAN);
-        situation.hear(&bad);
+        situation.hear(None, &bad);
         bad.tracks[0].position = None;
-        situation.hear(&bad);
+        situation.hear(None, &bad);
         assert!(situation.snapshot(0.0).unwrap().targets.is_empty());
     }
 }

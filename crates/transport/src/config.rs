@@ -4,7 +4,7 @@ mod tests;
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 
-use crossfix_message::{AreaName, CameraName, SiteName};
+use crossfix_message::{AreaName, CameraName, Channel, Key, SiteName};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -284,11 +284,29 @@ impl NetworkConfig {
         only.chain(of_areas.map(|(area, of)| (Some(area.clone()), of.fusion.as_str())))
     }
 
+    /// Whether a key is of a camera or of a fusion centre of this network, or of neither kind.
+    pub fn names(&self, key: &Key) -> bool {
+        match &key.channel {
+            channel if channel.camera().is_some() => {
+                channel.camera().is_some_and(|camera| self.cameras.contains_key(camera))
+            }
+            Channel::Truth | Channel::RecorderHealth | Channel::RecorderAlive => true,
+            _ => self.centres().any(|(area, _)| area == key.area),
+        }
+    }
+
     /// The areas that hear a camera, by name; none where there is one fusion centre for all. The
     /// first is the one that tells it what to look for.
     pub fn heard_by(&self, camera: &CameraName) -> Vec<AreaName> {
         let hear = |(_, of): &(&AreaName, &Area)| of.cameras.contains(camera);
         self.areas.iter().filter(hear).map(|(area, _)| area.clone()).collect()
+    }
+
+    /// The fusion centres that hear a camera, by their areas.
+    pub fn centres_of(&self, camera: &CameraName) -> Vec<Option<AreaName>> {
+        let heard_by = self.heard_by(camera);
+        let hears = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| heard_by.contains(a));
+        self.centres().map(|(area, _)| area).filter(hears).collect()
     }
 
     /// The cameras that a fusion centre hears.

@@ -323,7 +323,20 @@ impl Link {
         channel: Channel,
         delivery: Delivery,
     ) -> Result<LinkPublisher, LinkError> {
-        let key = self.key(channel).to_string();
+        self.publisher_of(self.area.clone(), channel, delivery)
+    }
+
+    /// The same in the place of an area's fusion centre.
+    ///
+    /// # Errors
+    /// [`LinkError::Zenoh`].
+    pub fn publisher_of(
+        &self,
+        area: Option<AreaName>,
+        channel: Channel,
+        delivery: Delivery,
+    ) -> Result<LinkPublisher, LinkError> {
+        let key = Key::of_centre(self.site.clone(), area, channel).to_string();
         let (control, priority) = match delivery {
             Delivery::Queued => (CongestionControl::Drop, Priority::Data),
             Delivery::Every => (CongestionControl::Block, Priority::Data),
@@ -389,7 +402,19 @@ impl Link {
     /// # Errors
     /// [`LinkError::Zenoh`].
     pub fn declare_alive(&self, channel: Channel) -> Result<AliveToken, LinkError> {
-        let key = self.key(channel).to_string();
+        self.declare_alive_of(self.area.clone(), channel)
+    }
+
+    /// The same in the place of an area's fusion centre.
+    ///
+    /// # Errors
+    /// [`LinkError::Zenoh`].
+    pub fn declare_alive_of(
+        &self,
+        area: Option<AreaName>,
+        channel: Channel,
+    ) -> Result<AliveToken, LinkError> {
+        let key = Key::of_centre(self.site.clone(), area, channel).to_string();
         let token = self
             .session
             .liveliness()

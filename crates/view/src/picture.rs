@@ -24,6 +24,8 @@ const LINE_RATE_HZ: f64 = 10.0;
 const TRACK_RATE_HZ: f64 = 15.0;
 /// Points of a trail, at the rate of the tracks: ten seconds.
 const TRAIL_POINTS: usize = 150;
+/// Fusion centres whose problems are kept in mind.
+const MOST_CENTRES: usize = 1000;
 /// Sight lines reach this far where no track says how far, m.
 const DEFAULT_REACH_M: f64 = 150.0;
 /// Targets fly about so high above the cameras, m, as long as no track says where.
@@ -93,7 +95,7 @@ pub struct Picture {
     /// Where confirmed tracks have been.
     flown: Extent,
     /// What the fusion centre has said last that a person should look at.
-    problems: Vec<String>,
+    problems: BTreeMap<String, Vec<String>>,
 }
 
 impl Picture {
@@ -114,7 +116,7 @@ impl Picture {
             arrivals: Arrivals::default(),
             viewer: ViewerWatch::default(),
             flown: Extent::default(),
-            problems: Vec::new(),
+            problems: BTreeMap::new(),
         })
     }
 
@@ -411,11 +413,15 @@ impl Picture {
             return Ok(());
         }
         self.at(health.time_ns);
-        for problem in health.problems.iter().filter(|problem| !self.problems.contains(problem)) {
+        let known = self.problems.get(&health.component);
+        let is_new = |problem: &&String| known.is_none_or(|known| !known.contains(problem));
+        for problem in health.problems.iter().filter(is_new) {
             self.stream
                 .log("events", &TextLog::new(problem.as_str()).with_level(TextLogLevel::WARN))?;
         }
-        self.problems.clone_from(&health.problems);
+        if known.is_some() || self.problems.len() < MOST_CENTRES {
+            self.problems.insert(health.component.clone(), health.problems.clone());
+        }
         Ok(())
     }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use crossfix_message::{CameraName, Key, Timestamp};
-use crossfix_transport::{Received, Reception, Role, Subscription};
+use crossfix_transport::{NetworkConfig, Received, Reception, Role, Subscription};
 use crossfix_view::{Picture, RecordingStream};
 
 use crate::config;
@@ -120,7 +120,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
     tracing::info!("showing `{}` until Ctrl-C", link.site());
-    let mut watch = Watch { cameras, reception: Reception::default(), repeats: Repeats::default() };
+    let mut watch = Watch { network, reception: Reception::default(), repeats: Repeats::default() };
     let mut looked_at = Instant::now();
     let mut is_watched = true;
     while is_watched && !shutdown.requested() {
@@ -148,7 +148,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
 
 /// What a viewer is shown of what comes, and what it misses.
 struct Watch {
-    cameras: Vec<CameraName>,
+    network: NetworkConfig,
     reception: Reception,
     repeats: Repeats,
 }
@@ -156,9 +156,9 @@ struct Watch {
 impl Watch {
     fn show(&mut self, picture: &mut Picture, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
-        if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
+        if !self.network.names(key) {
             self.repeats.warn("foreign", *at, || {
-                format!("`{key}` is of no camera of the network's file: not shown")
+                format!("`{key}` is of nobody in the network's file: not shown")
             });
             return Ok(());
         }

@@ -5,56 +5,68 @@ use std::collections::BTreeMap;
 use crossfix_filter::KinematicState;
 use crossfix_message::Timestamp;
 
+use super::{Number, Own};
+
 /// Two tracks are held against each other for so long before anything follows, s. Half of it and two
 /// targets that cross are taken for one; with twice as much a fast one has left where both see it.
 const LONG_ENOUGH_S: f64 = 1.0;
 /// Places that are farther apart, as a squared Mahalanobis distance of three degrees of freedom, are
-/// of two targets: of one they are once in a thousand times. A mean over a second is no better than
-/// one of them, as what both tracks are off by lasts.
+/// hardly of one target: of one they are once in a thousand times. A mean over a second is no better
+/// than one of them, as what both tracks are off by lasts.
 const UNLIKE: f64 = 16.3;
+/// Who has been taken for one is two beyond this: seven standard deviations. With half of it poses that
+/// disagree by more than they say take a target to and fro.
+const PARTED: f64 = 3.0 * UNLIKE;
 /// A squared distance counts no more than this, so that one bad update is outweighed in a second.
-const MOST: f64 = 3.0 * UNLIKE;
-/// Another reading must be so much worse, in squared distance: a hundred times less likely.
-const CLEARLY: f64 = 9.2;
+const MOST: f64 = 3.0 * PARTED;
+/// Targets are taken to be this thick, 1/m^3: one in a cube of 100 m. Ten times as thick asks for half
+/// the error before two tracks are one.
+const DENSITY: f64 = 1e-6;
+/// That two tracks are one target must be so many times likelier than each other reading.
+const CLEARLY: f64 = 100.0;
 
-/// A track of the fusion here and one of a neighbour.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Pair {
-    /// The number that the fusion here has given.
-    pub(super) own: u64,
-    /// The number that the neighbour says.
-    pub(super) number: u64,
-}
+/// A track of a neighbour: which neighbour, and under which number it says it.
+pub(super) type Said = (usize, Number);
 
-/// How well the places of two tracks have agreed of late.
+/// How well the places of two tracks have agreed of late, as means over about [`LONG_ENOUGH_S`].
 #[derive(Clone, Copy, Debug)]
 struct Likeness {
     since: Timestamp,
     seen: Timestamp,
-    /// Squared Mahalanobis distance, mean over about [`LONG_ENOUGH_S`].
-    mean: f64,
+    /// Squared Mahalanobis distance.
+    distance: f64,
+    /// That, and the logarithm of the determinant of what both may be off by: -2 times the
+    /// logarithm of the likelihood of one target, less a constant. A track that may be anywhere
+    /// explains nothing.
+    cost: f64,
 }
 
 impl Likeness {
-    fn is_old_enough(&self) -> bool {
+    fn is_of_late(&self, now: Timestamp) -> bool {
+        (0.0..LONG_ENOUGH_S).contains(&now.seconds_since(self.seen))
+    }
+
+    fn has_lasted(&self) -> bool {
         self.seen.seconds_since(self.since) >= LONG_ENOUGH_S
     }
 
-    fn is_of_late(&self, now: Timestamp) -> bool {
-        now.seconds_since(self.seen).abs() < LONG_ENOUGH_S
+    /// Whether one target is clearly likelier than two that are there by chance.
+    fn is_likely(&self) -> bool {
+        let by_chance = CLEARLY * DENSITY * (2.0 * std::f64::consts::PI).powf(1.5);
+        self.distance < UNLIKE && self.cost < -2.0 * by_chance.ln()
     }
 }
 
-/// All pairs that may be of one target.
+/// All pairs of tracks that may be of one target.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Likenesses(BTreeMap<Pair, Likeness>);
+pub(super) struct Likenesses(BTreeMap<(Own, Said), Likeness>);
 
 impl Likenesses {
     /// Holds two states of one time against each other; `is_one` of tracks that are said under one
     /// number, whose pair is kept whatever comes out.
     pub(super) fn see(
         &mut self,
-        pair: Pair,
+        pair: (Own, Said),
         is_one: bool,
         [here, there]: [&KinematicState; 2],
         now: Timestamp,
@@ -62,55 +74,64 @@ impl Likenesses {
         let apart = here.position() - there.position();
         let spread = here.position_covariance() + there.position_covariance();
         // No direction's variance is greater than the sum of all.
-        let is_far = apart.norm_squared() > MOST * spread.trace();
+        let is_far = apart.norm_squared() > UNLIKE * spread.trace();
         if is_far && !is_one && !self.0.contains_key(&pair) {
             return;
         }
         let Some(factor) = spread.cholesky() else { return };
         let distance = apart.dot(&factor.solve(&apart)).min(MOST);
-        let mean = match self.0.get_mut(&pair) {
-            Some(known) => {
-                let share = (now.seconds_since(known.seen) / LONG_ENOUGH_S).clamp(0.0, 1.0);
-                known.mean += share * (distance - known.mean);
-                known.seen = now;
-                known.mean
-            }
-            None => {
-                self.0.insert(pair, Likeness { since: now, seen: now, mean: distance });
-                distance
-            }
-        };
-        if mean > UNLIKE && !is_one {
+        let cost = distance + 2.0 * factor.l().diagonal().map(f64::ln).sum();
+        let new = Likeness { since: now, seen: now, distance, cost };
+        let known = self.0.entry(pair).or_insert(new);
+        if !known.is_of_late(now) {
+            *known = new;
+        }
+        let share = now.seconds_since(known.seen) / LONG_ENOUGH_S;
+        known.distance += share * (distance - known.distance);
+        known.cost += share * (cost - known.cost);
+        known.seen = now;
+        if known.distance > UNLIKE && !is_one {
             self.0.remove(&pair);
         }
     }
 
-    /// The number of a neighbour's track that is of the same target as one here, beyond doubt.
-    pub(super) fn same_as(&self, own: u64, now: Timestamp) -> Option<u64> {
-        let late = || self.0.iter().filter(|(_, likeness)| likeness.is_of_late(now));
-        let of_own = late().filter(|(pair, _)| pair.own == own);
-        let (best, likeness) = of_own.min_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
-        let is_rival = |(pair, other): &(&Pair, &Likeness)| {
-            *pair != best
-                && (pair.own == own || pair.number == best.number)
-                && other.mean < likeness.mean + CLEARLY
+    fn of_own(&self, own: Own) -> impl Iterator<Item = (Said, &Likeness)> {
+        let all = (own, (0, Number(0)))..=(own, (usize::MAX, Number(u64::MAX)));
+        self.0.range(all).map(|((_, said), likeness)| (*said, likeness))
+    }
+
+    /// The neighbours' tracks that are of the same target as one here, beyond doubt: one of a neighbour at
+    /// most, as each has one track of a target.
+    pub(super) fn same_as(&self, own: Own, now: Timestamp) -> impl Iterator<Item = Said> + '_ {
+        let is_sure = move |(said, likeness): &(Said, &Likeness)| {
+            let is_rival = |other: &Likeness| {
+                other.is_of_late(now) && other.cost < likeness.cost + 2.0 * CLEARLY.ln()
+            };
+            let mut of_neighbour = self.of_own(own).filter(|(other, _)| other.0 == said.0);
+            let mut of_said = self.0.iter().filter(|((_, other), _)| other == said);
+            likeness.is_of_late(now)
+                && likeness.has_lasted()
+                && likeness.is_likely()
+                && !of_neighbour.any(|(other, likeness)| other != *said && is_rival(likeness))
+                && !of_said.any(|((other, _), likeness)| *other != own && is_rival(likeness))
         };
-        let is_sure = likeness.is_old_enough()
-            && likeness.mean < UNLIKE
-            && !late().any(|other| is_rival(&other));
-        is_sure.then_some(best.number)
+        self.of_own(own).filter(is_sure).map(|(said, _)| said)
     }
 
     /// Whether a track here may be one of the neighbours'.
-    pub(super) fn may_be_theirs(&self, own: u64, now: Timestamp) -> bool {
-        let of_own = self.0.iter().filter(|(pair, _)| pair.own == own);
-        of_own.into_iter().any(|(_, likeness)| likeness.is_of_late(now) && likeness.mean < UNLIKE)
+    pub(super) fn may_be_theirs(&self, own: Own, now: Timestamp) -> bool {
+        self.of_own(own).any(|(_, likeness)| likeness.is_of_late(now) && likeness.is_likely())
+    }
+
+    /// Whether two tracks that are said under one number are where one target may be.
+    pub(super) fn may_be_one(&self, own: Own, said: Said) -> bool {
+        self.0.get(&(own, said)).is_some_and(|likeness| likeness.distance < PARTED)
     }
 
     /// Whether two tracks that are said under one number are of two targets, beyond doubt.
-    pub(super) fn is_unlike(&self, pair: Pair) -> bool {
-        let likeness = self.0.get(&pair);
-        likeness.is_some_and(|likeness| likeness.is_old_enough() && likeness.mean > UNLIKE)
+    pub(super) fn have_parted(&self, own: Own, said: Said) -> bool {
+        let likeness = self.0.get(&(own, said));
+        likeness.is_some_and(|likeness| likeness.has_lasted() && likeness.distance > PARTED)
     }
 
     /// Forgets pairs of which one has not been seen of late.

@@ -3,12 +3,16 @@
 //! track in each. What is here makes it one target for everybody else: both tracks have the number
 //! of the elder, and one of the two centres says it.
 //!
-//! - *Whether two tracks are one target* is a test of hypotheses ([`likeness`]): their places agree
-//!   within what both say of their errors for a second, and no other pair explains either as well.
+//! - *Whether two tracks are one target* is a test of hypotheses ([`likeness`]): for a second their
+//!   places are where one target's would be, clearly likelier than by chance, and no other track of
+//!   either centre explains that as well.
 //! - *Which number* is a comparison of what both centres have said, so that both come to the same end:
-//!   that of the track that began earlier. The younger one takes it.
+//!   that of the track that began earlier. The younger one takes it. Where they part again, who took
+//!   a number gives it back.
 //! - *Which centre says it* is the one that knows where the target is; where both do, the one that
 //!   has said it so far ([`Voice`]).
+//!
+//! Each centre's time is its own: how long ago something was said counts by who said it.
 //!
 //! There is no border on a map, no message but the tracks themselves, and nobody who decides: a
 //! centre that falls silent leaves its targets to those beside it.
@@ -27,7 +31,7 @@ use crossfix_message::{
 use nalgebra::{Matrix6, Vector6};
 
 use crate::{FusionConfig, Output};
-use likeness::{Likenesses, Pair};
+use likeness::{Likenesses, Said};
 
 /// A track of which nothing has been heard for so long is not said any more, s: each is said at least
 /// every half second. With half of it a message that is lost ends it; with twice as much a target
@@ -53,6 +57,21 @@ pub struct Share {
     pub of: usize,
 }
 
+impl Share {
+    /// The number of this one's so-many-th track, from 1; `own` is one of the same run.
+    fn number(self, own: Own, count: u64) -> Number {
+        Number(renumbered(own.0, (count - 1) * self.of as u64 + self.index as u64 + 1))
+    }
+}
+
+/// The number that the fusion here has given a track.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Own(u64);
+
+/// The number under which a track is said, here or by a neighbour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Number(u64);
+
 /// The fusion centres of the areas beside one, as it hears them, and what it says itself for that.
 #[derive(Clone, Debug)]
 pub struct Neighbours {
@@ -61,10 +80,12 @@ pub struct Neighbours {
     density: f64,
     /// How long after a track's end something may still be said of it, s.
     smoothing_s: f64,
-    /// By number.
-    theirs: BTreeMap<u64, Theirs>,
-    /// By the number that the fusion here has given.
-    ours: BTreeMap<u64, Ours>,
+    /// What time it is in the data here; `None` before there are any.
+    now: Option<Timestamp>,
+    /// The newest time that each neighbour has said.
+    newest: BTreeMap<usize, Timestamp>,
+    theirs: BTreeMap<Said, Theirs>,
+    ours: BTreeMap<Own, Ours>,
     likenesses: Likenesses,
     numbered: u64,
     sequence: u64,
@@ -73,9 +94,9 @@ pub struct Neighbours {
 /// A track as a neighbour said it last.
 #[derive(Clone, Debug)]
 struct Theirs {
-    /// Whose.
-    index: usize,
     time: Timestamp,
+    /// What time it was here.
+    heard: Option<Timestamp>,
     state: KinematicState,
     grip: Grip,
     born: Timestamp,
@@ -84,22 +105,44 @@ struct Theirs {
 /// A track of the fusion here.
 #[derive(Clone, Debug)]
 struct Ours {
-    /// Under which it is said.
-    number: u64,
-    /// When it began, or the one whose number it has.
+    /// Under which it is said, and when that one began.
+    number: Number,
     born: Timestamp,
+    /// What it was before it took another's.
+    first: (Number, Timestamp),
     voice: Voice,
-    begun: Timestamp,
     compared: Option<Timestamp>,
     ended: Option<Timestamp>,
     /// What has happened to it and is said when it is said itself.
     untold: Vec<TrackEvent>,
 }
 
+impl Ours {
+    fn new(number: Number, now: Timestamp) -> Self {
+        Self {
+            number,
+            born: now,
+            first: (number, now),
+            voice: Voice::Unsaid,
+            compared: None,
+            ended: None,
+            untold: Vec::new(),
+        }
+    }
+
+    fn is_said(&self) -> bool {
+        matches!(self.voice, Voice::Speaking(_))
+    }
+
+    fn is_taken(&self) -> bool {
+        self.number != self.first.0
+    }
+}
+
 /// Whether a track is said here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Voice {
-    /// Not yet.
+    /// Not yet under this number.
     Unsaid,
     /// Since a time.
     Speaking(Timestamp),
@@ -107,8 +150,8 @@ enum Voice {
     Silent,
 }
 
-/// How well a target is held: the lower, the better.
-#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
+/// How well a target is held.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Grip {
     /// 0: its place is known; 1: a direction; 2: it is not seen; 3: it is hardly there.
     rank: u8,
@@ -144,31 +187,16 @@ fn state_of(track: &Track) -> Option<KinematicState> {
     state.is_finite().then_some(state)
 }
 
-impl Share {
-    /// The identity of this one's so-many-th track; `own` is one of the same run.
-    fn number(self, own: u64, count: u64) -> u64 {
-        renumbered(own, (count - 1) * self.of as u64 + self.index as u64 + 1)
+/// Something that happens to a number here.
+fn event(kind: TrackEventKind, now: Timestamp, [track, other]: [u64; 2]) -> TrackEvent {
+    TrackEvent {
+        time_ns: now.nanos(),
+        kind: kind.into(),
+        track_id: track,
+        other_id: other,
+        ..Default::default()
     }
-}
-
-impl Ours {
-    fn new(number: u64, now: Timestamp) -> Self {
-        Self {
-            number,
-            born: now,
-            voice: Voice::Unsaid,
-            begun: now,
-            compared: None,
-            ended: None,
-            untold: Vec::new(),
-        }
-    }
-}
-
-impl Theirs {
-    fn is_heard(&self, now: Timestamp) -> bool {
-        now.seconds_since(self.time).abs() < HEARD_FOR_S
-    }
+    .stamped()
 }
 
 impl Neighbours {
@@ -179,6 +207,8 @@ impl Neighbours {
             share,
             density: densities.fold(0.0, f64::max),
             smoothing_s: config.tracking.smoothing_s,
+            now: None,
+            newest: BTreeMap::new(),
             theirs: BTreeMap::new(),
             ours: BTreeMap::new(),
             likenesses: Likenesses::default(),
@@ -189,21 +219,35 @@ impl Neighbours {
 
     /// Takes in what the neighbour at a place among all centres says of its tracks.
     pub fn hear(&mut self, index: usize, frame: &TrackFrame) {
-        let time = Timestamp::from_nanos(frame.time_ns);
-        self.theirs.retain(|_, track| track.is_heard(time));
+        let (time, heard) = (Timestamp::from_nanos(frame.time_ns), self.now);
+        self.newest.insert(index, time);
+        let is_said = |track: &Theirs| time.seconds_since(track.time).abs() < HEARD_FOR_S;
+        self.theirs.retain(|(who, _), track| *who != index || is_said(track));
         for track in &frame.tracks {
-            let state = state_of(track).filter(|_| track.state() != TrackState::Lost);
-            match state {
-                // Before it is sure, it may be nothing.
-                _ if track.state() == TrackState::Tentative => {}
-                Some(state) if self.theirs.len() < MOST_TRACKS => {
-                    let (grip, born) =
-                        (Grip::of(track, &state), Timestamp::from_nanos(track.born_ns));
-                    self.theirs.insert(track.id, Theirs { index, time, state, grip, born });
-                }
-                _ => drop(self.theirs.remove(&track.id)),
+            let said = (index, Number(track.id));
+            // Before a track is sure it may be nothing.
+            let is_sure = !matches!(track.state(), TrackState::Lost | TrackState::Tentative);
+            let Some(state) = state_of(track).filter(|_| is_sure) else {
+                self.theirs.remove(&said);
+                continue;
+            };
+            if self.theirs.len() < MOST_TRACKS || self.theirs.contains_key(&said) {
+                let grip = Grip::of(track, &state);
+                let born = Timestamp::from_nanos(track.born_ns);
+                self.theirs.insert(said, Theirs { time, heard, state, grip, born });
             }
         }
+    }
+
+    /// Whether a neighbour says a track now: by its own time it has done so of late, and by the time
+    /// here it has not fallen silent.
+    fn is_said(&self, (index, _): Said, theirs: &Theirs) -> bool {
+        let newest = self.newest.get(&index).copied().unwrap_or(theirs.time);
+        let silent_s = match (self.now, theirs.heard) {
+            (Some(now), Some(heard)) => now.seconds_since(heard),
+            _ => 0.0,
+        };
+        newest.seconds_since(theirs.time) < HEARD_FOR_S && (0.0..HEARD_FOR_S).contains(&silent_s)
     }
 
     /// What the fusion here says, as it is said beside its neighbours.
@@ -223,23 +267,37 @@ impl Neighbours {
 
     fn pass_tracks(&mut self, mut frame: TrackFrame, said: &mut Vec<Output>) {
         let now = Timestamp::from_nanos(frame.time_ns);
+        if self.now.is_none() {
+            // What was said before there was a time here was said now.
+            self.theirs.values_mut().for_each(|theirs| theirs.heard = Some(now));
+        }
+        self.now = Some(now);
         let mut kept = Vec::new();
         for mut track in frame.tracks {
-            let own = track.id;
-            self.compare(&track, now);
-            said.extend(self.settle_number(own, now).map(Output::Event));
-            self.settle_voice(own, &track, now);
-            let Some(ours) = self.ours.get_mut(&own) else { continue };
+            let own = Own(track.id);
+            let merged =
+                if self.compare(&track, now) { self.settle_number(own, now) } else { None };
+            if let Some(before) = merged {
+                let number = self.ours(own, now).number;
+                let ids = [before.0, number.0];
+                said.push(Output::Event(event(TrackEventKind::Merged, now, ids)));
+                let mut ended = Track { id: before.0, ..track.clone() };
+                ended.set_state(TrackState::Lost);
+                kept.push(ended);
+            }
+            self.settle_voice(&track, now);
+            let ours = self.ours(own, now);
             if track.state() == TrackState::Lost {
                 ours.ended = Some(now);
             }
-            if matches!(ours.voice, Voice::Speaking(_)) {
+            if ours.is_said() {
+                let number = ours.number.0;
+                (track.id, track.born_ns) = (number, ours.born.nanos());
                 said.extend(
                     ours.untold
                         .drain(..)
-                        .map(|event| Output::Event(TrackEvent { track_id: ours.number, ..event })),
+                        .map(|event| Output::Event(TrackEvent { track_id: number, ..event })),
                 );
-                (track.id, track.born_ns) = (ours.number, ours.born.nanos());
                 kept.push(track);
             }
         }
@@ -253,7 +311,7 @@ impl Neighbours {
     }
 
     /// A track of the fusion here; one of which it speaks for the first time gets a number.
-    fn ours(&mut self, own: u64, now: Timestamp) -> &mut Ours {
+    fn ours(&mut self, own: Own, now: Timestamp) -> &mut Ours {
         let Self { share, numbered, .. } = self;
         self.ours.entry(own).or_insert_with(|| {
             *numbered += 1;
@@ -261,95 +319,123 @@ impl Neighbours {
         })
     }
 
-    /// Holds a track against those of the neighbours.
-    fn compare(&mut self, track: &Track, now: Timestamp) {
-        let own = track.id;
+    /// Holds a track against those of the neighbours, if it is time to.
+    fn compare(&mut self, track: &Track, now: Timestamp) -> bool {
+        let own = Own(track.id);
         let ours = self.ours(own, now);
-        if ours.compared.is_some_and(|at| now.seconds_since(at) < COMPARED_EVERY_S) {
-            return;
+        let since = |at: Timestamp| now.seconds_since(at);
+        if ours.compared.is_some_and(|at| (0.0..COMPARED_EVERY_S).contains(&since(at))) {
+            return false;
         }
         ours.compared = Some(now);
-        let said_as = ours.number;
-        let Some(state) = state_of(track) else { return };
-        let heard = self.theirs.iter().filter(|(_, theirs)| theirs.is_heard(now));
-        for (number, theirs) in heard {
-            let there = theirs.state.predicted(now.seconds_since(theirs.time), self.density);
-            let pair = Pair { own, number: *number };
-            self.likenesses.see(pair, *number == said_as, [&state, &there], now);
+        let number = ours.number;
+        if let Some(state) = state_of(track) {
+            for (said, theirs) in &self.theirs {
+                if self.is_said(*said, theirs) {
+                    let there = theirs.state.predicted(since(theirs.time), self.density);
+                    self.likenesses.see((own, *said), said.1 == number, [&state, &there], now);
+                }
+            }
         }
+        true
     }
 
-    /// Takes the number of the elder track of the same target, or gives one up that is another's
-    /// after all; says what becomes of a track that has been said under another number.
-    fn settle_number(&mut self, own: u64, now: Timestamp) -> Option<TrackEvent> {
-        let ours = self.ours.get(&own)?;
-        let (before, voice) = (ours.number, ours.voice);
-        if voice == Voice::Silent && self.likenesses.is_unlike(Pair { own, number: before }) {
-            self.numbered += 1;
-            let number = self.share.number(own, self.numbered);
-            let ours = self.ours.get_mut(&own)?;
-            (ours.number, ours.born, ours.voice) = (number, ours.begun, Voice::Unsaid);
-            return None;
-        }
-        let elder = self.likenesses.same_as(own, now)?;
-        let theirs = self.theirs.get(&elder)?;
-        if elder == before || (theirs.born, elder) >= (ours.born, before) {
-            return None;
-        }
-        let born = theirs.born;
-        let ours = self.ours.get_mut(&own)?;
-        (ours.number, ours.born, ours.voice) = (elder, born, Voice::Unsaid);
-        ours.untold.clear();
-        let merged = TrackEvent {
-            time_ns: now.nanos(),
-            kind: TrackEventKind::Merged.into(),
-            track_id: before,
-            other_id: elder,
-            ..Default::default()
+    /// The neighbours' tracks of a number that are said now.
+    fn of_number(&self, number: Number) -> impl Iterator<Item = (Said, &Theirs)> {
+        let is_of = move |(said, theirs): &(&Said, &Theirs)| {
+            said.1 == number && self.is_said(**said, theirs)
         };
-        matches!(voice, Voice::Speaking(_)).then(|| merged.stamped())
+        self.theirs.iter().filter(is_of).map(|(said, theirs)| (*said, theirs))
+    }
+
+    /// Takes the number of the eldest track of the same target, or gives back one that is another's
+    /// after all. The number of before, if a reader knows it.
+    fn settle_number(&mut self, own: Own, now: Timestamp) -> Option<Number> {
+        let ours = self.ours.get(&own)?;
+        let has_parted = |(said, _): (Said, &Theirs)| self.likenesses.have_parted(own, said);
+        if ours.is_taken() && self.of_number(ours.number).any(has_parted) {
+            let ours = self.ours.get_mut(&own)?;
+            ((ours.number, ours.born), ours.voice) = (ours.first, Voice::Unsaid);
+            ours.untold = [TrackEventKind::Born, TrackEventKind::Confirmed]
+                .map(|kind| event(kind, now, [0; 2]))
+                .into();
+            return None;
+        }
+        let (before, born, was_said) = (ours.number, ours.born, ours.is_said());
+        let is_free = |number: Number| {
+            let has_it = |(other, ours): (&Own, &Ours)| {
+                *other != own && ours.number == number && ours.ended.is_none()
+            };
+            !self.ours.iter().any(has_it)
+        };
+        let same = self.likenesses.same_as(own, now);
+        let elder = same
+            .filter_map(|said| Some((self.theirs.get(&said)?.born, said.1)))
+            .min()
+            .filter(|elder| *elder < (born, before) && is_free(elder.1))?;
+        let ours = self.ours.get_mut(&own)?;
+        ((ours.born, ours.number), ours.voice) = (elder, Voice::Unsaid);
+        ours.untold.clear();
+        (was_said && elder.1 != before).then_some(before)
     }
 
     /// Decides who says a track.
-    fn settle_voice(&mut self, own: u64, track: &Track, now: Timestamp) {
-        let Some(ours) = self.ours.get(&own) else { return };
-        let grip = match state_of(track) {
-            Some(state) => Grip::of(track, &state),
-            None => return,
-        };
-        let theirs = self.theirs.get(&ours.number).filter(|theirs| theirs.is_heard(now));
-        let voice = match (ours.voice, theirs) {
-            (Voice::Speaking(since), Some(theirs)) => {
-                let outdone = theirs.grip.is_better_than(&grip);
-                // Both have begun at once.
-                let yields = theirs.time > since
-                    && theirs.index < self.share.index
-                    && !grip.is_better_than(&theirs.grip);
-                if outdone || yields { Voice::Silent } else { ours.voice }
-            }
-            (Voice::Speaking(_), None) => ours.voice,
-            // Nobody has missed what is lost before it was said.
-            _ if track.state() == TrackState::Lost => ours.voice,
-            (_, Some(theirs)) if !grip.is_better_than(&theirs.grip) => Voice::Silent,
-            (Voice::Silent, _) | (Voice::Unsaid, Some(_)) => Voice::Speaking(now),
-            (Voice::Unsaid, None) => {
-                let may_be_theirs = now.seconds_since(ours.begun) < HELD_BACK_S
-                    && self.likenesses.may_be_theirs(own, now);
-                let is_seen = track.state() != TrackState::Coasting;
-                if may_be_theirs || !is_seen { Voice::Unsaid } else { Voice::Speaking(now) }
-            }
-        };
-        if let Some(ours) = self.ours.get_mut(&own) {
+    fn settle_voice(&mut self, track: &Track, now: Timestamp) {
+        // Whoever has said it so far says its end.
+        if track.state() != TrackState::Lost
+            && let Some(voice) = self.voice_of(track, now)
+            && let Some(ours) = self.ours.get_mut(&Own(track.id))
+        {
             ours.voice = voice;
         }
     }
 
+    fn voice_of(&self, track: &Track, now: Timestamp) -> Option<Voice> {
+        let own = Own(track.id);
+        let ours = self.ours.get(&own)?;
+        // Somebody who says the number of something else says nothing of this.
+        let of_number = self.of_number(ours.number);
+        let mut theirs =
+            of_number.filter(|(said, _)| self.likenesses.may_be_one(own, *said)).peekable();
+        if theirs.peek().is_none() {
+            return Some(match ours.voice {
+                Voice::Unsaid if self.is_held_back(own, track, now) => Voice::Unsaid,
+                Voice::Unsaid | Voice::Silent => Voice::Speaking(now),
+                Voice::Speaking(_) => ours.voice,
+            });
+        }
+        let grip = Grip::of(track, &state_of(track)?);
+        let is_outdone = theirs.any(|((index, _), theirs)| match ours.voice {
+            Voice::Speaking(since) => {
+                // What was said before this one began is what it began for. Where both began at once,
+                // one goes on.
+                let is_new = theirs.heard.is_some_and(|heard| heard > since);
+                let yields = index < self.share.index && !grip.is_better_than(&theirs.grip);
+                is_new && (theirs.grip.is_better_than(&grip) || yields)
+            }
+            Voice::Silent | Voice::Unsaid => !grip.is_better_than(&theirs.grip),
+        });
+        Some(match ours.voice {
+            _ if is_outdone => Voice::Silent,
+            Voice::Speaking(_) => ours.voice,
+            Voice::Silent | Voice::Unsaid => Voice::Speaking(now),
+        })
+    }
+
+    /// Whether a track that has not been said waits: it may be a neighbour's, or is not seen.
+    fn is_held_back(&self, own: Own, track: &Track, now: Timestamp) -> bool {
+        let is_new = self
+            .ours
+            .get(&own)
+            .is_some_and(|ours| (0.0..HELD_BACK_S).contains(&now.seconds_since(ours.first.1)));
+        is_new && self.likenesses.may_be_theirs(own, now) || track.state() == TrackState::Coasting
+    }
+
     fn pass_smoothed(&self, mut frame: TrackFrame) -> Option<Output> {
         frame.tracks.retain_mut(|track| {
-            let ours = self.ours.get(&track.id);
-            let ours = ours.filter(|ours| matches!(ours.voice, Voice::Speaking(_)));
+            let ours = self.ours.get(&Own(track.id)).filter(|ours| ours.is_said());
             if let Some(ours) = ours {
-                (track.id, track.born_ns) = (ours.number, ours.born.nanos());
+                (track.id, track.born_ns) = (ours.number.0, ours.born.nanos());
             }
             ours.is_some()
         });
@@ -359,23 +445,41 @@ impl Neighbours {
 
     /// What happens to a track is said by who says the track.
     fn pass_event(&mut self, event: TrackEvent) -> Option<Output> {
-        let other_id = self.ours.get(&event.other_id).map_or(0, |ours| ours.number);
-        let ours = self.ours(event.track_id, Timestamp::from_nanos(event.time_ns));
-        if matches!(ours.voice, Voice::Speaking(_)) {
-            let track_id = ours.number;
-            return Some(Output::Event(TrackEvent { track_id, other_id, ..event }));
+        let (own, now) = (Own(event.track_id), Timestamp::from_nanos(event.time_ns));
+        let kind = event.kind();
+        let number = self.ours(own, now).number;
+        let ends = matches!(kind, TrackEventKind::Lost | TrackEventKind::Merged);
+        let goes_on =
+            ends && self.of_number(number).any(|(said, _)| self.likenesses.may_be_one(own, said));
+        let ours = self.ours(own, now);
+        if goes_on {
+            ours.voice = Voice::Silent;
         }
-        let begins = matches!(event.kind(), TrackEventKind::Born | TrackEventKind::Confirmed);
-        if begins && ours.voice == Voice::Unsaid {
+        let is_said = ours.is_said();
+        if !is_said && ours.voice == Voice::Unsaid && !ends && kind != TrackEventKind::Manoeuvre {
             ours.untold.push(event);
         }
-        None
+        if ends {
+            ours.ended = Some(now);
+        }
+        if !is_said {
+            return None;
+        }
+        let other = (event.other_id != 0).then(|| self.ours(Own(event.other_id), now));
+        let other_id = other.map_or(0, |other| {
+            // Who knows this one is to find the other.
+            if other.voice == Voice::Unsaid {
+                other.voice = Voice::Speaking(now);
+            }
+            other.number.0
+        });
+        Some(Output::Event(TrackEvent { track_id: number.0, other_id, ..event }))
     }
 
     fn pass_cues(&self, mut frame: CueFrame) -> CueFrame {
         for of in frame.cues.iter_mut().filter_map(|cue| cue.of.as_mut()) {
-            if let Some(ours) = self.ours.get(&of.track_id) {
-                of.track_id = ours.number;
+            if let Some(ours) = self.ours.get(&Own(of.track_id)) {
+                of.track_id = ours.number.0;
             }
         }
         frame
@@ -384,8 +488,8 @@ impl Neighbours {
     /// Forgets what has ended.
     fn forget(&mut self, now: Timestamp) {
         let kept_s = HEARD_FOR_S + self.smoothing_s;
-        let is_over = |ours: &Ours| ours.ended.is_some_and(|at| now.seconds_since(at) > kept_s);
-        self.ours.retain(|_, ours| !is_over(ours));
+        let is_kept = |ended: Timestamp| (0.0..kept_s).contains(&now.seconds_since(ended));
+        self.ours.retain(|_, ours| ours.ended.is_none_or(is_kept));
         self.likenesses.forget(now);
     }
 }

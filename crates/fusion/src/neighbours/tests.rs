@@ -101,7 +101,8 @@ fn a_target_of_which_nobody_hears_any_more_is_said_by_who_is_left() {
         let east = vec![said(7, f64::from(step), 0.5, 1.0, Confirmed)];
         numbers(&exchange(&mut centres, f64::from(step) * 0.1, [vec![], east])).is_empty()
     });
-    assert_eq!(silent.count(), 9, "for as long as it may still be said");
+    let tenths = silent.count();
+    assert!((8..=10).contains(&tenths), "for as long as it may still be said: {tenths}");
 }
 
 #[test]
@@ -131,7 +132,7 @@ fn what_may_be_either_of_two_targets_is_neither() {
 }
 
 #[test]
-fn who_was_taken_for_another_target_gets_a_number_of_its_own() {
+fn who_was_taken_for_another_target_gets_its_own_number_back() {
     let mut centres = centres();
     let mut last = Vec::new();
     for step in 0..120 {
@@ -145,13 +146,13 @@ fn who_was_taken_for_another_target_gets_a_number_of_its_own() {
             assert_eq!(last, [1]);
         }
     }
-    assert_eq!(last, [1, 4], "a fresh one");
+    assert_eq!(last, [1, 2], "its own");
 }
 
 #[test]
 fn the_elder_number_wins_whoever_has_the_better_view() {
     let mut centres = centres();
-    let mut merged = Vec::new();
+    let (mut merged, mut lost) = (Vec::new(), Vec::new());
     for step in 0..40 {
         let x = f64::from(step);
         let seconds = f64::from(step) * 0.1;
@@ -162,8 +163,16 @@ fn the_elder_number_wins_whoever_has_the_better_view() {
                 .pass(vec![Output::Tracks(frame(seconds, vec![said(5, x, 0.0, 0.5, Confirmed)]))]);
             for output in &outputs {
                 match output {
-                    Output::Event(event) => merged.push((event.track_id, event.other_id)),
-                    Output::Tracks(said) if step >= 12 => east.hear(0, said),
+                    Output::Event(event) => {
+                        merged.push((event.kind(), (event.track_id, event.other_id)));
+                    }
+                    Output::Tracks(said) => {
+                        let ended = said.tracks.iter().filter(|track| track.state() == Lost);
+                        lost.extend(ended.map(|track| track.id));
+                        if step >= 12 {
+                            east.hear(0, said);
+                        }
+                    }
                     _ => {}
                 }
             }
@@ -178,7 +187,10 @@ fn the_elder_number_wins_whoever_has_the_better_view() {
             }
         }
     }
+    let merged_of = |(kind, ids)| (kind == TrackEventKind::Merged).then_some(ids);
+    let merged: Vec<(u64, u64)> = merged.into_iter().filter_map(merged_of).collect();
     assert_eq!(merged, [(1, 2)], "west's own number goes into east's, and that is said");
+    assert_eq!(lost, [1], "and what follows tracks knows that west's is no more");
 }
 
 #[test]
@@ -201,4 +213,142 @@ fn what_a_neighbour_says_goes_over_the_wire_and_may_be_anything() {
         west.hear(1, &decode(&bytes).unwrap());
     }
     assert!(matches!(&seen[..], [Output::Tracks(frame)] if frame.tracks[0].id == 1));
+}
+
+/// Any number of centres, each of which hears all others, as they say their tracks at a time. What
+/// each has said.
+fn exchange_all(
+    centres: &mut [Neighbours],
+    seconds: f64,
+    tracks: &[Vec<Track>],
+) -> Vec<Vec<Track>> {
+    let mut all = Vec::new();
+    for (index, tracks) in tracks.iter().enumerate() {
+        let outputs = centres[index].pass(vec![Output::Tracks(frame(seconds, tracks.clone()))]);
+        let mut said = Vec::new();
+        for output in outputs {
+            if let Output::Tracks(frame) = output {
+                let others = (0..centres.len()).filter(|other| *other != index);
+                others.for_each(|other| centres[other].hear(index, &frame));
+                said.extend(frame.tracks);
+            }
+        }
+        all.push(said);
+    }
+    all
+}
+
+#[test]
+fn where_three_areas_meet_a_target_has_one_number() {
+    let mut centres: Vec<Neighbours> = (0..3)
+        .map(|index| Neighbours::new(Share { index, of: 3 }, &FusionConfig::default()))
+        .collect();
+    let mut said = Vec::new();
+    for step in 0..60 {
+        // They find it at the same time, and are not sure at first, when nobody listens.
+        let state = if step < 5 { TrackState::Tentative } else { Confirmed };
+        let tracks: Vec<Vec<Track>> =
+            [0.0, 0.4, -0.5].map(|off| vec![said_at(step, off, state)]).into();
+        said = exchange_all(&mut centres, f64::from(step) * 0.1, &tracks);
+    }
+    let numbers: Vec<u64> = said.iter().flatten().map(|track| track.id).collect();
+    assert_eq!(numbers, [1]);
+}
+
+fn said_at(step: i32, off_m: f64, state: TrackState) -> Track {
+    said(1, f64::from(step), off_m, 1.0, state)
+}
+
+#[test]
+fn poses_that_disagree_take_a_target_nowhere_and_back() {
+    let mut centres = centres();
+    let mut changes = 0;
+    let mut before = Vec::new();
+    for step in 0..900 {
+        // They say a metre each, and are 5 to 6.2 m apart, coming and going.
+        let off = 5.6 + 0.6 * (f64::from(step) * 0.1).sin();
+        let both = [vec![said_at(step, 0.0, Confirmed)], vec![said_at(step, off, Confirmed)]];
+        let now = numbers(&exchange(&mut centres, f64::from(step) * 0.1, both));
+        changes += i32::from(now != before);
+        before = now;
+    }
+    assert!(changes <= 3, "{changes}");
+}
+
+#[test]
+fn a_target_that_is_not_seen_lends_its_number_to_nobody_beside_it() {
+    let mut centres = centres();
+    for step in 0..140 {
+        let x = f64::from(step);
+        // West's is not seen from 5 s to 9 s; meanwhile east finds another, 35 m beside.
+        let coasting_m = (f64::from(step) - 50.0) * 0.5;
+        let west = match step {
+            50..90 => said(1, x, 0.0, 1.0 + coasting_m, Coasting),
+            _ => said(1, x, 0.0, 1.0, Confirmed),
+        };
+        let east = if step < 60 { vec![] } else { vec![said(1, x, 35.0, 1.0, Confirmed)] };
+        let said = exchange(&mut centres, f64::from(step) * 0.1, [vec![west], east]);
+        let of_east: Vec<u64> = said[1].iter().map(|track| track.id).collect();
+        assert!(of_east.is_empty() || of_east == [2], "at step {step}: {of_east:?}");
+        assert_eq!(said[0].iter().map(|track| track.id).collect::<Vec<_>>(), [1], "at {step}");
+    }
+}
+
+#[test]
+fn centres_whose_times_are_apart_know_their_targets_all_the_same() {
+    for behind_s in [0.5, 0.8, -0.8] {
+        let mut centres = centres();
+        let mut heard = Vec::new();
+        for step in 0..60 {
+            let seconds = f64::from(step) * 0.1;
+            let [west, east] = &mut centres;
+            let tracks = |seconds: f64| vec![said(1, 10.0 * seconds, 0.3, 0.5, Confirmed)];
+            heard.clear();
+            for output in west.pass(vec![Output::Tracks(frame(seconds, tracks(seconds)))]) {
+                if let Output::Tracks(frame) = output {
+                    east.hear(0, &frame);
+                    heard.extend(frame.tracks.iter().map(|track| track.id));
+                }
+            }
+            let late_s = seconds - behind_s;
+            for output in east.pass(vec![Output::Tracks(frame(late_s, tracks(late_s)))]) {
+                if let Output::Tracks(frame) = output {
+                    west.hear(1, &frame);
+                    heard.extend(frame.tracks.iter().map(|track| track.id));
+                }
+            }
+        }
+        // That of the one that has seen it since an earlier time.
+        assert_eq!(heard, if behind_s > 0.0 { [2] } else { [1] }, "{behind_s}");
+    }
+}
+
+#[test]
+fn who_says_anothers_number_elsewhere_silences_nobody() {
+    let mut west = Neighbours::new(Share { index: 1, of: 2 }, &FusionConfig::default());
+    for step in 0..60 {
+        let seconds = f64::from(step) * 0.1;
+        let own = vec![said_at(step, 0.0, Confirmed)];
+        let outputs = west.pass(vec![Output::Tracks(frame(seconds, own))]);
+        let is_said = matches!(&outputs[..], [Output::Tracks(frame)] if frame.tracks[0].id == 2);
+        assert!(is_said, "at {seconds} s: {outputs:?}");
+        // By somebody whose list of areas is another, 500 m away.
+        west.hear(0, &frame(seconds, vec![said(2, f64::from(step), 500.0, 0.1, Confirmed)]));
+    }
+}
+
+#[test]
+fn time_that_goes_back_leaves_nothing_behind() {
+    let mut west = Neighbours::new(Share { index: 0, of: 2 }, &FusionConfig::default());
+    for round in 0..20 {
+        for step in 0..30 {
+            let seconds = f64::from(step) * 0.1 - f64::from(round) * 100.0;
+            let tracks = vec![said(round as u64 + 1, f64::from(step), 0.0, 1.0, Confirmed)];
+            west.pass(vec![Output::Tracks(frame(seconds, tracks))]);
+        }
+        // As where event time is taken up anew: an event, and no frame.
+        let lost = event(TrackEventKind::Lost, west.now.unwrap(), [round as u64 + 1, 0]);
+        assert_eq!(west.pass(vec![Output::Event(lost)]).len(), 1, "it is said");
+    }
+    assert!(west.ours.len() <= 2, "{}", west.ours.len());
 }

@@ -4,8 +4,8 @@
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
-    CameraCalibration, Channel, CueFrame, Health, Timestamp, TrackEvent, TrackFrame, TruthFrame,
-    decode, glance,
+    CameraCalibration, Channel, CueFrame, Health, Key, SiteName, Timestamp, TrackEvent, TrackFrame,
+    TruthFrame, decode, glance,
 };
 use crossfix_outlet::foxglove::{FoxgloveView, Pictures};
 use crossfix_outlet::{
@@ -29,7 +29,7 @@ fn channels() -> [Channel; 9] {
 
 pub fn drive(data: &[u8]) {
     let Some((kind, data)) = data.split_first() else { return };
-    let site = || "field".parse().expect("a name");
+    let site = || "field".parse::<SiteName>().expect("a name");
     let channels = channels();
     let Some(channel) = channels.get(usize::from(*kind)) else {
         let mut sapient = Sapient::of_site(site());
@@ -41,14 +41,14 @@ pub fn drive(data: &[u8]) {
     let _ = (decode::<CueFrame>(data), decode::<Health>(data), decode::<TruthFrame>(data));
     let anchor = Geodetic::from_degrees(48.0, 11.0, 500.0).expect("a place");
     let mut view = FoxgloveView::new(&site(), Some(anchor), Pictures::Said);
-    let _ = view.of(channel, data, Timestamp::EPOCH);
+    let _ = view.of(&Key::new(site(), channel.clone()), data, Timestamp::EPOCH);
     let mut situation = Situation::new(site(), anchor);
     if let Ok(calibration) = decode::<CameraCalibration>(data) {
         let _ = calibration.parse();
         situation.hear_calibration(&calibration);
     }
     if let Ok(frame) = decode::<TrackFrame>(data) {
-        situation.hear(&frame);
+        situation.hear(None, &frame);
     }
     let mut outlets: [Box<dyn Outlet>; 6] = [
         Box::<CursorOnTarget>::default(),

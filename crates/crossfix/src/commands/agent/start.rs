@@ -1,8 +1,9 @@
 //! When an agent begins: with those who must hear it, and in step with the other cameras.
 
+use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use crossfix_message::{CameraName, Channel, Health, Key, Timestamp, decode};
+use crossfix_message::{AreaName, CameraName, Channel, Health, Key, Timestamp, decode};
 use crossfix_transport::NetworkConfig;
 
 use super::{Agent, BEHIND};
@@ -108,7 +109,10 @@ impl Agent {
         while !self.shutdown.requested() {
             lookout.look(Instant::now());
             service::alive();
-            let [fusion, recording] = [lookout.all_are_here(), lookout.is_here(&recorder_alive)];
+            let recording = lookout.is_here(&recorder_alive);
+            // Of several areas one is enough, if the others do not come.
+            let is_long = begun.elapsed() >= FUSION_PATIENCE;
+            let fusion = lookout.all_are_here() || is_long && lookout.any_is_here();
             if fusion && (recording || !recorder) && has_ears(self)? {
                 break;
             }
@@ -138,11 +142,14 @@ impl Agent {
         network: &NetworkConfig,
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
-        // Of the first of its areas: that one must be complete.
-        let area = network.heard_by(&self.identity.name).into_iter().next();
-        let cameras = network.cameras_of(area.as_ref())?;
-        let key = Key::of_centre(self.link.site().clone(), area, Channel::FusionHealth);
-        let reports = self.link.subscribe(&[key.to_string()])?;
+        // A camera of several areas begins when all of them are complete, or joins the one that plays.
+        let key = |area: &Option<AreaName>| {
+            Key::of_centre(self.link.site().clone(), area.clone(), Channel::FusionHealth)
+        };
+        let areas = network.centres_of(&self.identity.name);
+        let keys: Vec<String> = areas.iter().map(|area| key(area).to_string()).collect();
+        let reports = self.link.subscribe(&keys)?;
+        let mut complete: BTreeSet<Option<AreaName>> = BTreeSet::new();
         self.appear()?;
         let begun = Instant::now();
         tracing::info!(
@@ -159,16 +166,18 @@ impl Agent {
                 );
                 return Ok(Some(Start::now()));
             }
-            let Some(health) = reports.next(POLL).and_then(|r| decode::<Health>(&r.data).ok())
-            else {
-                continue;
-            };
-            match judge(&health, &cameras) {
+            let Some(received) = reports.next(POLL) else { continue };
+            let Ok(health) = decode::<Health>(&received.data) else { continue };
+            let area = received.key.area;
+            match judge(&health, &network.cameras_of(area.as_ref())?) {
                 Site::Plays { now, scene_begins } => {
                     return Ok(Some(self.join(file, begins, now, scene_begins)));
                 }
-                Site::IsComplete => return Ok(Some(Start::together())),
-                Site::Waits => {}
+                Site::IsComplete => drop(complete.insert(area)),
+                Site::Waits => drop(complete.remove(&area)),
+            }
+            if areas.iter().all(|area| complete.contains(area)) {
+                return Ok(Some(Start::together()));
             }
         }
         Ok(None)

@@ -165,7 +165,7 @@ impl Told<'_> {
                 channel if channel == self.channel => {
                     let Some(frame) = lacks.read::<TrackFrame>(&entry.data) else { return Ok(()) };
                     frames += 1;
-                    situation.hear(&frame);
+                    situation.hear(entry.key.area.as_ref(), &frame);
                     last = Timestamp::from_nanos(frame.time_ns);
                     // A recording may have gaps, and runs of earlier times: nothing is made up for.
                     let is_due = next.is_none_or(|next| {

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use crossfix_fusion::Output;
 use crossfix_message::{CameraName, Channel, Key, Payload, SiteName, Timestamp};
-use crossfix_transport::{Delivery, Link, LinkPublisher, Received, Reception, Role, Subscription};
+use crossfix_transport::{
+    Delivery, Identity, Link, LinkPublisher, Received, Reception, Role, Subscription,
+};
 
 use self::border::Border;
 use crate::centre::Centre;
@@ -235,6 +237,7 @@ impl Station {
             ("received_missing", self.reception.missing()),
             ("received_too_long", refused.too_long),
         ]);
+        health.component = Identity::Fusion(self.link.key(Channel::Tracks).area).to_string();
         health.ended = ended;
         health.present = self.lookout.cameras_here();
         let gone = self.lookout.cameras_gone().filter(|camera| !self.centre.has_ended(camera));

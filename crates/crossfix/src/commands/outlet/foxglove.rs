@@ -66,7 +66,7 @@ impl Served {
                 self.put(&format!("/{key}"), (name, definitions), seen.time, data)?;
             }
         }
-        for message in view.of(&key.channel, data, seen.time) {
+        for message in view.of(key, data, seen.time) {
             let schema = (message.schema, file_descriptor_set());
             self.put(&message.topic, schema, message.time, &message.data)?;
         }

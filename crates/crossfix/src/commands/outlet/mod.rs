@@ -199,7 +199,7 @@ impl Heard {
             Channel::Tracks => {
                 if let Ok(frame) = decode::<TrackFrame>(&received.data) {
                     self.tracks_at = received.at;
-                    self.situation.hear(&frame);
+                    self.situation.hear(received.key.area.as_ref(), &frame);
                 }
             }
             Channel::Calibration(_) => {

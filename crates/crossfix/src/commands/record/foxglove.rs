@@ -36,7 +36,7 @@ pub fn write<W: std::io::Write + std::io::Seek>(
     entry: &Entry,
 ) -> Result<(), RecordingError> {
     let Entry { key, data_time, arrival, data } = entry;
-    for message in view.of(&key.channel, data, *data_time) {
+    for message in view.of(key, data, *data_time) {
         writer.write_beside(&Beside {
             topic: &message.topic,
             schema: message.schema,

@@ -1,8 +1,8 @@
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 use crossfix_message::{
-    CameraName, Channel, Counter, Health, Key, Payload, SiteName, Timestamp, decode, glance,
+    Channel, Counter, Health, Key, Payload, SiteName, Timestamp, decode, glance,
 };
 use crossfix_outlet::foxglove::FoxgloveView;
 use crossfix_recording::{Entry, RecordingError};
@@ -26,7 +26,7 @@ pub struct Recorder {
     writer: FileWriter,
     site: SiteName,
     run: RunId,
-    cameras: BTreeSet<CameraName>,
+    network: NetworkConfig,
     times: DataTime,
     held: Vec<Entry>,
     held_bytes: usize,
@@ -48,7 +48,7 @@ pub struct Recorder {
 /// What was not recorded, or not as it should be.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
-    /// Of cameras that the network's file does not name.
+    /// Of cameras and fusion centres that the network's file does not name.
     foreign: u64,
     malformed: u64,
     /// Of a newer major version: recorded all the same.
@@ -94,7 +94,7 @@ impl Recorder {
             writer,
             site: network.site.clone(),
             run,
-            cameras: network.cameras.keys().cloned().collect(),
+            network: network.clone(),
             times: DataTime::default(),
             held: Vec::new(),
             held_bytes: 0,
@@ -155,10 +155,10 @@ impl Recorder {
         {
             return Ok(());
         }
-        if key.channel.camera().is_some_and(|camera| !self.cameras.contains(camera)) {
+        if !self.network.names(&key) {
             self.counts.foreign += 1;
             self.repeats.warn("foreign", at, || {
-                format!("`{key}` is of no camera of the network's file: not recorded")
+                format!("`{key}` is of nobody in the network's file: not recorded")
             });
             return Ok(());
         }

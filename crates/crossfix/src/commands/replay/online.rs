@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use crossfix_message::{
-    BearingFrame, CameraName, Channel, CueFrame, Health, Payload, Preview, Timestamp, TrackEvent,
-    TrackFrame, TruthFrame, decode,
+    BearingFrame, CameraName, Channel, CueFrame, Health, Key, Payload, Preview, Timestamp,
+    TrackEvent, TrackFrame, TruthFrame, decode,
 };
 use crossfix_recording::Entry;
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
@@ -92,7 +92,7 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
 struct Stage {
     link: Link,
     delivery: Delivery,
-    publishers: BTreeMap<Channel, LinkPublisher>,
+    publishers: BTreeMap<Key, LinkPublisher>,
     /// That those whom it stands in for are there.
     alive: Vec<AliveToken>,
     published: u64,
@@ -100,22 +100,24 @@ struct Stage {
 
 impl Stage {
     fn appear(&mut self, network: &NetworkConfig, and_fusion: bool) -> anyhow::Result<()> {
-        let cameras = network.cameras.keys().map(|camera| Channel::Alive(camera.clone()));
-        for channel in cameras.chain(and_fusion.then_some(Channel::FusionAlive)) {
-            self.alive.push(self.link.declare_alive(channel)?);
+        for camera in network.cameras.keys() {
+            self.alive.push(self.link.declare_alive(Channel::Alive(camera.clone()))?);
+        }
+        for (area, _) in network.centres().filter(|_| and_fusion) {
+            self.alive.push(self.link.declare_alive_of(area, Channel::FusionAlive)?);
         }
         Ok(())
     }
 
     fn put(&mut self, entry: Entry) -> anyhow::Result<()> {
-        let channel = entry.key.channel;
-        if !self.publishers.contains_key(&channel) {
+        let Key { area, channel, .. } = &entry.key;
+        if !self.publishers.contains_key(&entry.key) {
             let is_picture = matches!(channel, Channel::Preview(_));
             let delivery = if is_picture { Delivery::Picture } else { self.delivery };
-            let publisher = self.link.publisher(channel.clone(), delivery)?;
-            self.publishers.insert(channel.clone(), publisher);
+            let publisher = self.link.publisher_of(area.clone(), channel.clone(), delivery)?;
+            self.publishers.insert(entry.key.clone(), publisher);
         }
-        if let Some(publisher) = self.publishers.get(&channel) {
+        if let Some(publisher) = self.publishers.get(&entry.key) {
             publisher.put(entry.data)?;
             self.published += 1;
         }

@@ -131,10 +131,15 @@ impl Board {
 
     /// How the site does.
     pub fn status(&self, now: Instant) -> Status {
+        // What a fusion centre that has died thought is not what is.
+        let is_heard = |heard: &&Heard| now.saturating_duration_since(heard.at) <= SILENT;
         let heard = self.centres.iter().filter_map(|centre| self.parts.get(centre));
-        let clocks: Vec<&CameraHealth> = heard.flat_map(|heard| &heard.health.cameras).collect();
+        let clocks: Vec<&CameraHealth> =
+            heard.filter(is_heard).flat_map(|heard| &heard.health.cameras).collect();
         let cameras = self.cameras.iter().map(|camera| {
-            let clock = clocks.iter().find(|clock| clock.camera == camera.as_str());
+            // Of several that hear it, the one that believes it least.
+            let of_camera = clocks.iter().filter(|clock| clock.camera == camera.as_str());
+            let clock = of_camera.max_by_key(|clock| clock.standing);
             self.part(camera.as_str(), clock.copied(), now)
         });
         let centres = self.centres.iter().map(|centre| self.part(centre, None, now));
