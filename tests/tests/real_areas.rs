@@ -61,11 +61,10 @@ impl Known {
     fn hear(&mut self, who: usize, frame: &TrackFrame) {
         let seconds = Timestamp::from_nanos(frame.time_ns).seconds();
         for track in &frame.tracks {
-            match track.state() {
-                TrackState::Confirmed => {
-                    drop(self.0.insert(track.id, (seconds, who, track.clone())))
-                }
-                _ => drop(self.0.remove(&track.id)),
+            if track.state() == TrackState::Confirmed {
+                self.0.insert(track.id, (seconds, who, track.clone()));
+            } else {
+                self.0.remove(&track.id);
             }
         }
     }

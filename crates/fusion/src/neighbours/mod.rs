@@ -342,10 +342,11 @@ impl Neighbours {
 
     /// The neighbours' tracks of a number that are said now.
     fn of_number(&self, number: Number) -> impl Iterator<Item = (Said, &Theirs)> {
-        let is_of = move |(said, theirs): &(&Said, &Theirs)| {
-            said.1 == number && self.is_said(**said, theirs)
+        let of_neighbour = move |index: &usize| {
+            let (said, theirs) = self.theirs.get_key_value(&(*index, number))?;
+            self.is_said(*said, theirs).then_some((*said, theirs))
         };
-        self.theirs.iter().filter(is_of).map(|(said, theirs)| (*said, theirs))
+        self.newest.keys().filter_map(of_neighbour)
     }
 
     /// Takes the number of the eldest track of the same target, or gives back one that is another's

@@ -162,6 +162,8 @@ impl Board {
     fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> Part {
         let nobody = Health::default();
         let heard = self.parts.get(name);
+        // Of one that nobody hears, what its clock showed once says nothing.
+        let clock = clock.filter(|_| heard.is_some());
         let health = heard.map_or(&nobody, |heard| &heard.health);
         let load = health.load.as_ref();
         let p99_us = health.counters.iter().find(|one| one.name == "arrival_to_bearings_p99_us");
