@@ -1,28 +1,29 @@
 mod jumps;
+mod saying;
 mod smoothing;
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{
-    BearingFrame, CalibrationError, CameraCalibration, CameraName, CueFrame, Payload, Timestamp,
-    TrackEvent, TrackFrame,
+    BearingFrame, CalibrationError, CameraCalibration, CameraName, CueFrame, Timestamp, TrackEvent,
+    TrackFrame,
 };
 
 use crate::cameras::{CameraStanding, Cameras, Fittings, KnownCamera, PoseFinding, Sample};
 use crate::clocks::{ClockEstimate, ClockEstimator};
-use crate::cueing::{self, Cueing, OwnClock};
+use crate::cueing::Cueing;
 use crate::event_time::{Arrival, EventBuffer, ReorderQueue};
 use crate::ingress::{self, Exposure, Rejection, RejectionReason};
 use crate::initiation::Initiator;
 use crate::motion::Motion;
 use crate::site_time::{SiteTime, Turn, moved};
-use crate::track::{Track, TrackId, TrackStatus};
+use crate::track::{Track, TrackId};
 use crate::tracker::{TrackChange, Tracker};
 use smoothing::Smoothing;
 
 use crate::uncertainty::{LastingNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
-use crate::{ConfigError, Counters, FusionConfig, messages};
+use crate::{ConfigError, Counters, FusionConfig};
 
 /// What comes out of the fusion centre.
 #[derive(Clone, Debug, PartialEq)]
@@ -439,102 +440,6 @@ impl Fusion {
             });
             outputs.push(Output::Camera(camera.clone(), standing));
         }
-    }
-
-    /// Tells what has happened.
-    fn emit_events(
-        &mut self,
-        changes: Vec<TrackChange>,
-        time: Timestamp,
-        outputs: &mut Vec<Output>,
-    ) {
-        for change in changes {
-            self.counters.count(match change.kind {
-                crossfix_message::TrackEventKind::Born => "tracks_born",
-                crossfix_message::TrackEventKind::Confirmed => "tracks_confirmed",
-                crossfix_message::TrackEventKind::Merged => "tracks_merged",
-                crossfix_message::TrackEventKind::Manoeuvre => "tracks_manoeuvred",
-                _ => "tracks_lost",
-            });
-            outputs.push(Output::Event(messages::event(change, time)));
-        }
-    }
-
-    /// Tells what has happened, and where all tracks are now.
-    fn emit_tracks(
-        &mut self,
-        exposure: &Exposure,
-        changes: Vec<TrackChange>,
-        outputs: &mut Vec<Output>,
-    ) {
-        self.emit_events(changes, exposure.time, outputs);
-        let due = self.tracker.due(exposure.time);
-        let tracks: Vec<crossfix_message::Track> = due
-            .iter()
-            .filter_map(|id| self.tracker.track(*id))
-            .map(|t| messages::track(t, exposure.time, self.tracker.motion()))
-            .collect();
-        if !tracks.is_empty() {
-            let frame = TrackFrame {
-                sequence: self.sequence,
-                time_ns: exposure.time.nanos(),
-                camera: exposure.camera.to_string(),
-                camera_sequence: exposure.sequence,
-                tracks,
-                time_sd_s: self.true_time_sd_s(exposure),
-                ..Default::default()
-            };
-            self.sequence += 1;
-            let frame = frame.stamped();
-            if self.smoothing.is_wanted() {
-                self.smoothing.wait(frame.clone());
-            }
-            outputs.push(Output::Tracks(frame));
-        }
-        if self.smoothing.is_wanted() {
-            self.smooth(exposure.time, &due, outputs);
-        }
-    }
-
-    /// Tells the cameras that look where they are told what they should look for.
-    fn cue(&mut self, now: Timestamp, outputs: &mut Vec<Output>) {
-        let Self { cameras, tracker, initiator, cueing, clocks, config, site_time, .. } = self;
-        let due: Vec<(&CameraName, &KnownCamera)> = cameras
-            .iter()
-            .filter(|(_, camera)| !camera.is_excluded() && camera.at_rest().takes_cues)
-            .filter(|(name, _)| cueing.is_due(name, now))
-            .map(|(name, camera)| (name, camera.at_rest()))
-            .collect();
-        if due.is_empty() {
-            return;
-        }
-        let mut targets = tracker.known(now);
-        targets.extend(initiator.known(now));
-        for (name, known) in due {
-            let [ahead_s, sd_s] = clocks
-                .estimate(name)
-                .map_or([0.0; 2], |clock| [clock.offset_s, clock.relative_sd_s]);
-            let clock = OwnClock { ahead_s: ahead_s + site_time.ahead_s(name), sd_s };
-            let max_range_m = config.initiation.max_range_m;
-            let cues = cueing::cues(name, known, (now, clock), &targets, max_range_m);
-            outputs.push(Output::Cues(cues));
-        }
-    }
-
-    /// Keeps where tracks are now for what later bearings tell of it, and says what these have told
-    /// of what was kept before.
-    fn smooth(&mut self, now: Timestamp, due: &[TrackId], outputs: &mut Vec<Output>) {
-        let Self { smoothing, tracker, .. } = self;
-        tracker.remember(due, now);
-        for ended in tracker.tracks().filter(|track| track.status == TrackStatus::Lost) {
-            smoothing.settle(ended);
-        }
-        outputs.extend(smoothing.due(now, tracker).into_iter().map(Output::Smoothed));
-    }
-
-    /// Says what is known of all that was kept: no later bearings tell of it.
-    fn smooth_all(&mut self, outputs: &mut Vec<Output>) {
-        outputs.extend(self.smoothing.all(&mut self.tracker).into_iter().map(Output::Smoothed));
     }
 }
 
