@@ -145,7 +145,10 @@ fn a_target_that_crosses_the_border_is_one_target_and_each_centre_shows_who_it_i
 
 #[test]
 fn a_centre_that_dies_leaves_its_targets_to_the_one_beside() {
-    let site = divided();
+    let mut site = divided();
+    // Here everything goes through a router.
+    site.route();
+    let router = site.start(&["router", "-c", &site.path("network.toml")]);
     let [west, east] = ["west", "east"]
         .map(|area| site.start(&["fuse", "-c", &site.path(&format!("fusion-{area}.toml"))]));
     // In the middle of the way, where the cameras of the middle see it: both centres have it.
@@ -154,7 +157,7 @@ fn a_centre_that_dies_leaves_its_targets_to_the_one_beside() {
         std::thread::sleep(Duration::from_secs_f64(begin + dies_at_s / 2.0 - now_seconds()));
         west.crash();
     });
-    assert!(east.stop());
+    assert!(east.stop() && router.stop());
     let numbers: BTreeSet<u64> = said.iter().map(|one| one.number).collect();
     let last_of_west = of_area(&said, "west").map(|one| one.seconds).fold(0.0, f64::max);
     let next = of_area(&said, "east").map(|one| one.seconds).find(|at| *at > last_of_west);

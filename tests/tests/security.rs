@@ -252,7 +252,7 @@ fn tracks_of_a_secured_site(routed: bool) {
     let _router = routed.then(|| site.start(&["router", "-c", &network]));
     let fusion = site.start_fusion();
     let recorder = site.start_recorder("live.mcap");
-    for mut agent in site.start_agents(now_seconds() + 2.0, &[]) {
+    for mut agent in site.start_agents(now_seconds() + 2.0, &["--wait-for-recorder"]) {
         assert!(agent.wait(), "an agent ends well");
     }
     std::thread::sleep(Duration::from_secs(1));

@@ -466,7 +466,7 @@ pub struct CameraHealth {
 pub struct Health {
     #[prost(message, optional, tag = "1")]
     pub version: ::core::option::Option<Version>,
-    /// Name of the camera, "fusion" or "recorder".
+    /// Name of the camera, "fusion" ("fusion-west" of area west) or "recorder".
     #[prost(string, tag = "2")]
     pub component: ::prost::alloc::string::String,
     /// Data time of the report; 0 as long as the component has seen none.

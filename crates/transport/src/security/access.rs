@@ -95,3 +95,33 @@ pub(crate) fn access_control(security: &Security, network: &NetworkConfig) -> Va
         "rules": rules, "subjects": subjects, "policies": policies,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+
+    #[test]
+    fn the_fusion_centre_of_an_area_speaks_for_its_own_alone() {
+        let area =
+            |port: u16| json!({ "fusion": format!("tcp/127.0.0.1:{port}"), "cameras": ["a"] });
+        let network = json!({
+            "site": "field", "cameras": { "a": "tcp/127.0.0.1:1" },
+            "areas": { "west": area(2), "east": area(3) },
+        });
+        let network: NetworkConfig = serde_json::from_value(network).unwrap();
+        let security = Security { certificates: "c".into(), revoked: BTreeMap::new() };
+        let access = access_control(&security, &network);
+        let says = |who: &str| -> Vec<String> {
+            let rules = access["rules"].as_array().unwrap().iter();
+            let of_who = rules.filter(|rule| rule["id"] == format!("{who} says"));
+            let keys = of_who.flat_map(|rule| rule["key_exprs"].as_array().unwrap());
+            keys.map(|key| key.as_str().unwrap().to_owned()).collect()
+        };
+        assert_eq!(says("fusion-west"), ["crossfix/field/fusion/west/**"]);
+        assert_eq!(says("fusion-east"), ["crossfix/field/fusion/east/**"]);
+        assert!(says("fusion").is_empty(), "there is none for all");
+        assert_eq!(says("camera-a"), ["crossfix/field/a/**"]);
+    }
+}

@@ -313,7 +313,7 @@ mod tests {
         assert!(text.contains("east") && text.contains("not heard"), "{text}");
         assert!(text.ends_with("north: sees nothing: the stream has ended"), "{text}");
         let later = board.status(begun + Duration::from_secs(5));
-        assert_eq!(later.parts[0].state, "silent for 5 s");
+        assert_eq!(later.parts[1].state, "silent for 5 s");
     }
 
     #[test]
