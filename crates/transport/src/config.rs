@@ -1,7 +1,7 @@
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 
 use crossfix_message::{AreaName, CameraName, Channel, Key, SiteName};
@@ -124,6 +124,9 @@ pub enum NetworkError {
         /// The camera.
         camera: CameraName,
     },
+    /// An area that could place no target.
+    #[error("area `{0}` needs two cameras or more, each named once: one alone places no target")]
+    CamerasOfArea(AreaName),
     /// A camera that no fusion centre hears.
     #[error("camera `{0}` is in no area: nobody would hear it")]
     CameraOfNoArea(CameraName),
@@ -269,10 +272,17 @@ impl NetworkConfig {
             let camera = of.cameras.iter().find(|camera| !self.cameras.contains_key(camera))?;
             Some(NetworkError::CameraOfArea { area: area.clone(), camera: camera.clone() })
         });
+        let are_too_few = |(_, of): &(&AreaName, &Area)| {
+            let distinct: BTreeSet<&CameraName> = of.cameras.iter().collect();
+            distinct.len() < of.cameras.len() || distinct.len() < 2
+        };
+        let too_few = self.areas.iter().find(are_too_few);
+        let too_few = too_few.map(|(area, _)| NetworkError::CamerasOfArea(area.clone()));
         let unheard =
             |camera: &&CameraName| !self.areas.is_empty() && self.heard_by(camera).is_empty();
         let unheard = self.cameras.keys().find(unheard);
         unknown
+            .or(too_few)
             .or_else(|| unheard.map(|camera| NetworkError::CameraOfNoArea(camera.clone())))
             .map_or(Ok(()), Err)
     }

@@ -233,7 +233,9 @@ impl Neighbours {
             };
             if self.theirs.len() < MOST_TRACKS || self.theirs.contains_key(&said) {
                 let grip = Grip::of(track, &state);
-                let born = Timestamp::from_nanos(track.born_ns);
+                // Who does not say when it began has not said it before.
+                let began = (track.born_ns != 0).then(|| Timestamp::from_nanos(track.born_ns));
+                let born = began.unwrap_or(time);
                 self.theirs.insert(said, Theirs { time, heard, state, grip, born });
             }
         }

@@ -117,6 +117,13 @@ fn impossible_areas_are_named() {
         let _ = network.cameras.remove(&"a".parse::<CameraName>().unwrap());
     });
     assert!(matches!(unknown, NetworkError::CameraOfArea { .. }), "{unknown}");
+    for cameras in [vec!["a"], vec!["a", "a", "b"], vec![]] {
+        let mut network = divided();
+        let west = network.areas.get_mut(&"west".parse::<AreaName>().unwrap()).unwrap();
+        west.cameras = cameras.into_iter().map(|name| name.parse().unwrap()).collect();
+        let error = network.validate().unwrap_err();
+        assert!(matches!(error, NetworkError::CamerasOfArea(_)), "{error}");
+    }
     let nowhere = Role::Fusion(Some("north".parse().unwrap()));
     assert!(matches!(divided().endpoints(&nowhere), Err(NetworkError::UnknownArea(_))));
     assert_eq!(divided().endpoints(&Role::Fusion(None)), Err(NetworkError::WhichArea));
