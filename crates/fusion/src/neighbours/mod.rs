@@ -17,20 +17,19 @@
 //! There is no border on a map, no message but the tracks themselves, and nobody who decides: a
 //! centre that falls silent leaves its targets to those beside it.
 
+mod known;
 mod likeness;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 
-use crossfix_filter::KinematicState;
 use crossfix_message::{
-    CueFrame, Payload, Timestamp, Track, TrackEvent, TrackEventKind, TrackFrame, TrackState,
-    renumbered,
+    CueFrame, Timestamp, Track, TrackEvent, TrackEventKind, TrackFrame, TrackState, renumbered,
 };
-use nalgebra::{Matrix6, Vector6};
 
 use crate::{FusionConfig, Output};
+use known::{Grip, Ours, Theirs, Voice, event, state_of};
 use likeness::{Likenesses, Said};
 
 /// A track of which nothing has been heard for so long is not said any more, s: each is said at least
@@ -42,9 +41,6 @@ const COMPARED_EVERY_S: f64 = 0.1;
 /// So long a new track that may be a neighbour's is not said, s: twice what it takes to find out. Its
 /// place is said all the while, by the neighbour.
 const HELD_BACK_S: f64 = 2.0;
-/// Who knows a target's place so many times better says it. Below 1.5 two centres that see it alike
-/// would take turns.
-const MUCH_BETTER: f64 = 2.0;
 /// Tracks of neighbours that are kept in mind.
 const MOST_TRACKS: usize = 10_000;
 
@@ -73,6 +69,22 @@ struct Own(u64);
 struct Number(u64);
 
 /// The fusion centres of the areas beside one, as it hears them, and what it says itself for that.
+///
+/// ```
+/// use crossfix_fusion::{FusionConfig, Neighbours, Output, Share};
+/// use crossfix_message::{Track, TrackFrame, TrackState};
+/// let config = FusionConfig::default();
+/// // The second of two centres by name: its tracks are 2, 4, 6.
+/// let mut west = Neighbours::new(Share { index: 1, of: 2 }, &config);
+/// let seen = Track { id: 1, state: TrackState::Confirmed.into(), ..Default::default() };
+/// let frame = TrackFrame { tracks: vec![seen], ..Default::default() };
+/// let said = west.pass(vec![Output::Tracks(frame)]);
+/// let [Output::Tracks(frame)] = &said[..] else { return Err("nobody else says it".into()) };
+/// assert_eq!(frame.tracks[0].id, 2);
+/// // What the first one says is heard as it comes.
+/// west.hear(0, &TrackFrame::default());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Neighbours {
     share: Share,
@@ -89,114 +101,6 @@ pub struct Neighbours {
     likenesses: Likenesses,
     numbered: u64,
     sequence: u64,
-}
-
-/// A track as a neighbour said it last.
-#[derive(Clone, Debug)]
-struct Theirs {
-    time: Timestamp,
-    /// What time it was here.
-    heard: Option<Timestamp>,
-    state: KinematicState,
-    grip: Grip,
-    born: Timestamp,
-}
-
-/// A track of the fusion here.
-#[derive(Clone, Debug)]
-struct Ours {
-    /// Under which it is said, and when that one began.
-    number: Number,
-    born: Timestamp,
-    /// What it was before it took another's.
-    first: (Number, Timestamp),
-    voice: Voice,
-    compared: Option<Timestamp>,
-    ended: Option<Timestamp>,
-    /// What has happened to it and is said when it is said itself.
-    untold: Vec<TrackEvent>,
-}
-
-impl Ours {
-    fn new(number: Number, now: Timestamp) -> Self {
-        Self {
-            number,
-            born: now,
-            first: (number, now),
-            voice: Voice::Unsaid,
-            compared: None,
-            ended: None,
-            untold: Vec::new(),
-        }
-    }
-
-    fn is_said(&self) -> bool {
-        matches!(self.voice, Voice::Speaking(_))
-    }
-
-    fn is_taken(&self) -> bool {
-        self.number != self.first.0
-    }
-}
-
-/// Whether a track is said here.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Voice {
-    /// Not yet under this number.
-    Unsaid,
-    /// Since a time.
-    Speaking(Timestamp),
-    /// A neighbour says it.
-    Silent,
-}
-
-/// How well a target is held.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Grip {
-    /// 0: its place is known; 1: a direction; 2: it is not seen; 3: it is hardly there.
-    rank: u8,
-    worst_sd_m: f64,
-}
-
-impl Grip {
-    fn of(track: &Track, state: &KinematicState) -> Self {
-        let rank = match track.state() {
-            TrackState::Confirmed => 0,
-            TrackState::OneCamera => 1,
-            TrackState::Coasting => 2,
-            TrackState::Tentative | TrackState::Lost | TrackState::Unspecified => 3,
-        };
-        Self { rank, worst_sd_m: state.worst_position_sd() }
-    }
-
-    fn is_better_than(&self, other: &Self) -> bool {
-        self.rank < other.rank
-            || self.rank == other.rank && self.worst_sd_m * MUCH_BETTER < other.worst_sd_m
-    }
-}
-
-/// The state of a track of the wire; `None` where it is none.
-fn state_of(track: &Track) -> Option<KinematicState> {
-    let (position, velocity) = (track.position.as_ref()?, track.velocity.as_ref()?);
-    let covariance: &[f64; 36] = track.covariance.as_slice().try_into().ok()?;
-    let mean = [position.x, position.y, position.z, velocity.x, velocity.y, velocity.z];
-    let state = KinematicState {
-        mean: Vector6::from(mean),
-        covariance: Matrix6::from_column_slice(covariance),
-    };
-    state.is_finite().then_some(state)
-}
-
-/// Something that happens to a number here.
-fn event(kind: TrackEventKind, now: Timestamp, [track, other]: [u64; 2]) -> TrackEvent {
-    TrackEvent {
-        time_ns: now.nanos(),
-        kind: kind.into(),
-        track_id: track,
-        other_id: other,
-        ..Default::default()
-    }
-    .stamped()
 }
 
 impl Neighbours {

@@ -1,6 +1,6 @@
 //! Two fusion centres as each hears the other.
 
-use crossfix_message::{Vector3, decode};
+use crossfix_message::{Payload, Vector3, decode};
 
 use super::*;
 

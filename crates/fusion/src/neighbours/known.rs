@@ -1,0 +1,119 @@
+//! What is known of a track of a neighbour, and of one here.
+
+use crossfix_filter::KinematicState;
+use crossfix_message::{Payload, Timestamp, Track, TrackEvent, TrackEventKind, TrackState};
+use nalgebra::{Matrix6, Vector6};
+
+use super::Number;
+
+/// Who knows a target's place so many times better says it. Below 1.5 two centres that see it alike
+/// would take turns.
+const MUCH_BETTER: f64 = 2.0;
+
+/// A track as a neighbour said it last.
+#[derive(Clone, Debug)]
+pub(super) struct Theirs {
+    pub(super) time: Timestamp,
+    /// What time it was here.
+    pub(super) heard: Option<Timestamp>,
+    pub(super) state: KinematicState,
+    pub(super) grip: Grip,
+    pub(super) born: Timestamp,
+}
+
+/// A track of the fusion here.
+#[derive(Clone, Debug)]
+pub(super) struct Ours {
+    /// Under which it is said, and when that one began.
+    pub(super) number: Number,
+    pub(super) born: Timestamp,
+    /// What it was before it took another's.
+    pub(super) first: (Number, Timestamp),
+    pub(super) voice: Voice,
+    pub(super) compared: Option<Timestamp>,
+    pub(super) ended: Option<Timestamp>,
+    /// What has happened to it and is said when it is said itself.
+    pub(super) untold: Vec<TrackEvent>,
+}
+
+impl Ours {
+    pub(super) fn new(number: Number, now: Timestamp) -> Self {
+        Self {
+            number,
+            born: now,
+            first: (number, now),
+            voice: Voice::Unsaid,
+            compared: None,
+            ended: None,
+            untold: Vec::new(),
+        }
+    }
+
+    pub(super) fn is_said(&self) -> bool {
+        matches!(self.voice, Voice::Speaking(_))
+    }
+
+    pub(super) fn is_taken(&self) -> bool {
+        self.number != self.first.0
+    }
+}
+
+/// Whether a track is said here.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Voice {
+    /// Not yet under this number.
+    Unsaid,
+    /// Since a time.
+    Speaking(Timestamp),
+    /// A neighbour says it.
+    Silent,
+}
+
+/// How well a target is held.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Grip {
+    /// 0: its place is known; 1: a direction; 2: it is not seen; 3: it is hardly there.
+    rank: u8,
+    worst_sd_m: f64,
+}
+
+impl Grip {
+    pub(super) fn of(track: &Track, state: &KinematicState) -> Self {
+        let rank = match track.state() {
+            TrackState::Confirmed => 0,
+            TrackState::OneCamera => 1,
+            TrackState::Coasting => 2,
+            TrackState::Tentative | TrackState::Lost | TrackState::Unspecified => 3,
+        };
+        Self { rank, worst_sd_m: state.worst_position_sd() }
+    }
+
+    pub(super) fn is_better_than(&self, other: &Self) -> bool {
+        self.rank < other.rank
+            || self.rank == other.rank && self.worst_sd_m * MUCH_BETTER < other.worst_sd_m
+    }
+}
+
+/// The state of a track of the wire; `None` where it is none.
+pub(super) fn state_of(track: &Track) -> Option<KinematicState> {
+    let (position, velocity) = (track.position.as_ref()?, track.velocity.as_ref()?);
+    let covariance: &[f64; 36] = track.covariance.as_slice().try_into().ok()?;
+    let mean = [position.x, position.y, position.z, velocity.x, velocity.y, velocity.z];
+    let state = KinematicState {
+        mean: Vector6::from(mean),
+        covariance: Matrix6::from_column_slice(covariance),
+    };
+    state.is_finite().then_some(state)
+}
+
+/// Something that happens to a number here.
+pub(super) fn event(kind: TrackEventKind, now: Timestamp, [track, other]: [u64; 2]) -> TrackEvent {
+    TrackEvent {
+        time_ns: now.nanos(),
+        kind: kind.into(),
+        track_id: track,
+        other_id: other,
+        ..Default::default()
+    }
+    .stamped()
+}
