@@ -73,8 +73,15 @@ kill $camera",
     }
     let late_s = along / squares;
     println!("{count} places, {:.2} ms late, {:.2?} px beside", late_s * 1e3, beside.as_slice());
-    // Whole pixels leave 0.1 ms of standard deviation. The target's template may hold it half a pixel
-    // beside its middle, more so on a busy machine, whose agent leaves out frames.
+    // Whole pixels leave 0.1 ms of standard deviation.
     assert!(late_s.abs() < 1e-3, "{late_s}");
-    assert!(beside.amax() < 0.5, "{beside}");
+    for axis in [0, 1] {
+        let mut off: Vec<f64> = off.iter().map(|(off, _)| off[axis]).collect();
+        off.sort_unstable_by(f64::total_cmp);
+        let at = |share: f64| off[(share * (off.len() - 1) as f64) as usize];
+        println!("{:.2} {:.2} {:.2} px", at(0.05), at(0.5), at(0.95));
+        // The template of an agent that leaves out frames holds the target a quarter of a pixel beside
+        // its middle: this test has the machine for itself (.config/nextest.toml).
+        assert!(at(0.5).abs() < 0.2 && at(0.05) > -0.8 && at(0.95) < 0.8, "{off:?}");
+    }
 }
