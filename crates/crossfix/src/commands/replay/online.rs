@@ -191,6 +191,7 @@ impl Pass {
                 moved(&mut message.time_ns);
                 for track in &mut message.tracks {
                     moved(&mut track.updated_ns);
+                    moved(&mut track.born_ns);
                     track.residuals.iter_mut().for_each(|residual| moved(&mut residual.time_ns));
                 }
                 message.encode_unstamped()
