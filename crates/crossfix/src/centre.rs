@@ -203,7 +203,9 @@ impl Centre {
     pub fn flush(&mut self) -> Vec<Output> {
         let outputs = self.fusion.flush();
         self.poses.finish(&self.fusion);
-        self.follow(outputs)
+        let outputs = self.follow(outputs);
+        self.repeats.end();
+        outputs
     }
 
     /// Keeps count of what the fusion says, and says to people what is theirs.

@@ -40,6 +40,11 @@ impl Repeats {
         }
     }
 
+    /// Says all that still waits to be said: nothing comes after it.
+    pub fn end(&mut self) {
+        self.kinds.values_mut().filter_map(Kind::rest).for_each(|line| tracing::warn!("{line}"));
+    }
+
     fn line(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) -> Option<String> {
         let has_room = self.kinds.len() < MAX_KINDS || self.kinds.contains_key(kind);
         let kind = if has_room { kind } else { "others" };
@@ -58,12 +63,18 @@ impl Repeats {
 
 impl Kind {
     fn due(&mut self, now: Instant) -> Option<String> {
-        if self.more == 0 || now.saturating_duration_since(self.said) < PERIOD {
+        if now.saturating_duration_since(self.said) < PERIOD {
             return None;
         }
-        let more = std::mem::take(&mut self.more);
+        let line = self.rest()?;
         self.said = now;
-        Some(format!("{} ({more} times since this was said last)", self.first))
+        Some(line)
+    }
+
+    /// What has not been said of it.
+    fn rest(&mut self) -> Option<String> {
+        let more = std::mem::take(&mut self.more);
+        (more > 0).then(|| format!("{} ({more} times since this was said last)", self.first))
     }
 }
 
@@ -92,6 +103,10 @@ mod tests {
             Some("gap (1 times since this was said last)")
         );
         assert_eq!(kind.due(now + 3 * PERIOD), None);
+        repeats.line("gap", now + PERIOD, || "another".to_owned());
+        let kind = repeats.kinds.get_mut("gap").unwrap();
+        assert_eq!(kind.rest().as_deref(), Some("another (1 times since this was said last)"));
+        assert_eq!(kind.rest(), None, "at the end, once");
     }
 
     #[test]

@@ -335,6 +335,7 @@ impl Recorder {
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
     pub fn finish(mut self) -> Result<(u64, u64), RecordingError> {
+        self.repeats.end();
         // Nothing ever said what time it is in the data: it is that of the wall.
         for held in std::mem::take(&mut self.held) {
             self.put(&Entry { data_time: held.arrival, ..held })?;
