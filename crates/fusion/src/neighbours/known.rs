@@ -1,5 +1,7 @@
 //! What is known of a track of a neighbour, and of one here.
 
+use std::collections::VecDeque;
+
 use crossfix_filter::KinematicState;
 use crossfix_message::{Payload, Timestamp, Track, TrackEvent, TrackEventKind, TrackState};
 use nalgebra::{Matrix6, Vector6};
@@ -10,13 +12,45 @@ use super::Number;
 /// would take turns.
 const MUCH_BETTER: f64 = 2.0;
 
+/// So far back states are kept, s: two centres may be as far apart in the time of the data. With half of
+/// it those that wait for a slow camera do not know their neighbours' targets.
+const KEPT_S: f64 = 2.0;
+/// They are kept this often, s: between two of them a target's manoeuvre is no matter.
+pub(super) const KEPT_EVERY_S: f64 = 0.2;
+
+/// Where a track was of late, the oldest first.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Past(VecDeque<(Timestamp, KinematicState)>);
+
+impl Past {
+    pub(super) fn add(&mut self, time: Timestamp, state: &KinematicState) {
+        match self.0.back().map(|(last, _)| time.seconds_since(*last)) {
+            Some(since_s) if (0.0..KEPT_EVERY_S).contains(&since_s) => return,
+            Some(since_s) if since_s < 0.0 => self.0.clear(),
+            _ => {}
+        }
+        self.0.push_back((time, state.clone()));
+        while self.0.front().is_some_and(|(first, _)| time.seconds_since(*first) > KEPT_S) {
+            self.0.pop_front();
+        }
+    }
+
+    /// Where it was at a time, from the last state before it; what of its acceleration nobody knows has
+    /// that density, m^2/s^3. `None` of a track without a past.
+    pub(super) fn at(&self, time: Timestamp, density: f64) -> Option<KinematicState> {
+        let before = self.0.iter().rfind(|(at, _)| *at <= time);
+        let (at, state) = before.or(self.0.front())?;
+        Some(state.predicted(time.seconds_since(*at), density))
+    }
+}
+
 /// A track as a neighbour said it last.
 #[derive(Clone, Debug)]
 pub(super) struct Theirs {
     pub(super) time: Timestamp,
     /// What time it was here.
     pub(super) heard: Option<Timestamp>,
-    pub(super) state: KinematicState,
+    pub(super) past: Past,
     pub(super) grip: Grip,
     pub(super) born: Timestamp,
 }
@@ -30,6 +64,7 @@ pub(super) struct Ours {
     /// What it was before it took another's.
     pub(super) first: (Number, Timestamp),
     pub(super) voice: Voice,
+    pub(super) past: Past,
     pub(super) compared: Option<Timestamp>,
     pub(super) ended: Option<Timestamp>,
     /// What has happened to it and is said when it is said itself.
@@ -43,6 +78,7 @@ impl Ours {
             born: now,
             first: (number, now),
             voice: Voice::Unsaid,
+            past: Past::default(),
             compared: None,
             ended: None,
             untold: Vec::new(),

@@ -29,7 +29,7 @@ use crossfix_message::{
 };
 
 use crate::{FusionConfig, Output};
-use known::{Grip, Ours, Theirs, Voice, event, state_of};
+use known::{Grip, KEPT_EVERY_S, Ours, Theirs, Voice, event, state_of};
 use likeness::{Likenesses, Said};
 
 /// A track of which nothing has been heard for so long is not said any more, s: each is said at least
@@ -140,7 +140,10 @@ impl Neighbours {
                 // Who does not say when it began has not said it before.
                 let began = (track.born_ns != 0).then(|| Timestamp::from_nanos(track.born_ns));
                 let born = began.unwrap_or(time);
-                self.theirs.insert(said, Theirs { time, heard, state, grip, born });
+                let known = self.theirs.remove(&said).map(|known| known.past);
+                let mut past = known.unwrap_or_default();
+                past.add(time, &state);
+                self.theirs.insert(said, Theirs { time, heard, past, grip, born });
             }
         }
     }
@@ -234,13 +237,20 @@ impl Neighbours {
             return false;
         }
         ours.compared = Some(now);
-        let number = ours.number;
-        if let Some(state) = state_of(track) {
-            for (said, theirs) in &self.theirs {
-                if self.is_said(*said, theirs) {
-                    let there = theirs.state.predicted(since(theirs.time), self.density);
-                    self.likenesses.see((own, *said), said.1 == number, [&state, &there], now);
-                }
+        let Some(state) = state_of(track) else { return true };
+        ours.past.add(now, &state);
+        let (number, past) = (ours.number, ours.past.clone());
+        for (said, theirs) in &self.theirs {
+            if !self.is_said(*said, theirs) {
+                continue;
+            }
+            // At the earlier of both times where these are apart: what is known is not a prediction there.
+            let is_behind = since(theirs.time) > KEPT_EVERY_S;
+            let earlier = if is_behind { past.at(theirs.time, self.density) } else { None };
+            let here = earlier.as_ref().unwrap_or(&state);
+            let when = if is_behind { theirs.time } else { now };
+            if let Some(there) = theirs.past.at(when, self.density) {
+                self.likenesses.see((own, *said), said.1 == number, [here, &there], now);
             }
         }
         true

@@ -296,7 +296,7 @@ fn a_target_that_is_not_seen_lends_its_number_to_nobody_beside_it() {
 
 #[test]
 fn centres_whose_times_are_apart_know_their_targets_all_the_same() {
-    for behind_s in [0.5, 0.8, -0.8] {
+    for behind_s in [0.5, 1.5, -1.5] {
         let mut centres = centres();
         let mut heard = Vec::new();
         for step in 0..60 {
