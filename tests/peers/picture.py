@@ -16,7 +16,7 @@ from PIL import Image
 from rerun.experimental import RrdReader
 
 PLACES = ("Points3D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips", "Arrows3D:origins",
-          "Transform3D:translation")
+          "Transform3D:translation", "GeoPoints:positions", "Mesh3D:vertex_positions")
 
 
 def points(value):

@@ -34,8 +34,15 @@ pub fn renumbered(id: u64, number: u64) -> u64 {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TrackNumber(pub u64);
 
+impl TrackNumber {
+    /// The number that people call it by.
+    pub fn in_run(self) -> u64 {
+        self.0 % TRACKS_A_RUN
+    }
+}
+
 impl fmt::Display for TrackNumber {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.0 % TRACKS_A_RUN)
+        write!(f, "{}", self.in_run())
     }
 }

@@ -1,7 +1,7 @@
 use nalgebra::Point3;
 use rerun::blueprint::{
-    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal,
-    SelectionPanel, Spatial2DView, Spatial3DView, TextDocumentView, TextLogView, TimePanel,
+    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, MapView,
+    SelectionPanel, Spatial2DView, Spatial3DView, Tabs, TextDocumentView, TextLogView, TimePanel,
     TimeSeriesView, Vertical,
 };
 use rerun::external::re_log_types::BlueprintActivationCommand;
@@ -12,6 +12,7 @@ use rerun_types::blueprint::components::{BackgroundKind, PanelState, PlayState};
 use rerun_types::components::Color;
 use rerun_types::datatypes::Range2D;
 
+use crate::earth::{Earth, MAP};
 use crate::extent::Extent;
 use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, eye};
@@ -30,8 +31,10 @@ pub(crate) fn send(
     stream: &RecordingStream,
     cameras: &[CameraPanel],
     extent: &Extent,
+    earth: Option<&Earth>,
 ) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
+    let (site, map_path) = if earth.is_some() { with_map(site) } else { (site, None) };
     let (images, image_paths): (Vec<_>, Vec<_>) =
         cameras.iter().map(|camera| image_view(&camera.name)).unzip();
     let plots: [ContainerLike; 3] = [
@@ -55,14 +58,28 @@ pub(crate) fn send(
         .with_timeline(TIMELINE)
         .with_play_state(PlayState::Following);
     let shown = cameras.iter().map(|camera| camera.shown.map(visual_bounds));
-    let zooms: Vec<(EntityPath, VisualBounds2D)> = image_paths
+    let bounds: Vec<(EntityPath, VisualBounds2D)> = image_paths
         .into_iter()
         .zip(shown)
         .filter_map(|(path, shown)| {
             Some((EntityPath::from(format!("{}/VisualBounds2D", path?)), shown?))
         })
         .collect();
-    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &zooms)
+    let zoom = earth.map(|earth| earth.zoom(extent));
+    let mut zooms: Vec<(EntityPath, &dyn AsComponents)> =
+        bounds.iter().map(|(path, bounds)| (path.clone(), bounds as &dyn AsComponents)).collect();
+    if let (Some(path), Some(zoom)) = (map_path, &zoom) {
+        zooms.push((EntityPath::from(format!("{path}/MapZoom")), zoom));
+    }
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, zooms)
+}
+
+/// The site with a map behind it, which asks for its tiles only when somebody turns to it.
+/// Also where the map's properties are written.
+fn with_map(site: ContainerLike) -> (ContainerLike, Option<EntityPath>) {
+    let map: ContainerLike = MapView::new("map").with_origin(MAP).into();
+    let path = path_of(&map);
+    (Tabs::new([site, map]).into(), path)
 }
 
 /// The view of a camera's images, and where its properties are written.
@@ -105,7 +122,7 @@ pub(crate) fn send_flight(
     let root =
         Horizontal::new([ContainerLike::from(left), right.into()]).with_column_shares([1.9, 1.0]);
     let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
-    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &[])
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, vec![])
 }
 
 /// Lays runs beside each other out: the site, how far each is from the truth below it, and the words.
@@ -118,7 +135,7 @@ pub(crate) fn send_comparison(stream: &RecordingStream, extent: &Extent) -> Resu
     let below = Horizontal::new(below).with_column_shares([2.0, 1.0]);
     let root = Vertical::new([site, below.into()]).with_row_shares([2.0, 1.0]);
     let time = TimePanel::new().with_state(PanelState::Collapsed).with_timeline(TIMELINE);
-    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, &[])
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, vec![])
 }
 
 /// Lays a volume out: the site on the left, the scale of colours and the words on the right.
@@ -135,7 +152,7 @@ pub(crate) fn send_volume(
     let root = Horizontal::new([site, right.into()]).with_column_shares([1.8, 1.0]);
     let time = TimePanel::new().with_state(PanelState::Collapsed);
     let extent = Extent::of(places.iter().copied());
-    send_site(stream, &without_panels(root).with_time_panel(time), site_path, &extent, &[])
+    send_site(stream, &without_panels(root).with_time_panel(time), site_path, &extent, vec![])
 }
 
 /// The view of the world, and where its properties are written.
@@ -160,7 +177,7 @@ fn send_site(
     blueprint: &Blueprint,
     site_path: Option<EntityPath>,
     extent: &Extent,
-    zooms: &[(EntityPath, VisualBounds2D)],
+    zooms: Vec<(EntityPath, &dyn AsComponents)>,
 ) -> Result<(), ViewError> {
     let background =
         Background::new(BackgroundKind::SolidColor).with_color(Color::from_rgb(18, 20, 28));
@@ -168,14 +185,12 @@ fn send_site(
     let eye = eye::on(extent);
     let of_site: [(&str, &dyn AsComponents); 3] =
         [("EyeControls3D", &eye), ("Background", &background), ("LineGrid3D", &grid)];
-    let mut properties: Vec<(EntityPath, &dyn AsComponents)> = Vec::new();
+    let mut properties = zooms;
     if let Some(path) = site_path {
         let places =
             of_site.map(|(name, property)| (EntityPath::from(format!("{path}/{name}")), property));
         properties.extend(places);
     }
-    properties
-        .extend(zooms.iter().map(|(path, bounds)| (path.clone(), bounds as &dyn AsComponents)));
     send_with(stream, blueprint, &properties)
 }
 

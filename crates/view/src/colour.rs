@@ -1,15 +1,17 @@
+use crossfix_message::TrackNumber;
 use rerun_types::components::Color;
 
 /// Colours of cameras that can be told apart, also by those who see red and green alike.
 const PALETTE: [[u8; 3]; 6] =
     [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [180, 180, 180]];
 
-/// Colours of tracks: none is a camera's.
+/// Colours of tracks: none is a camera's, and the first two are a warm one and a cold one.
 const TRACKS: [[u8; 3]; 5] =
-    [[255, 105, 97], [193, 140, 255], [255, 190, 225], [255, 80, 190], [190, 120, 90]];
+    [[255, 190, 225], [255, 80, 70], [185, 130, 255], [255, 60, 190], [190, 120, 90]];
 
+/// By the number that is shown, so that the colours of a run come in their order.
 fn of_id(id: u64) -> [u8; 3] {
-    TRACKS[(id % TRACKS.len() as u64) as usize]
+    TRACKS[(TrackNumber(id).in_run() % TRACKS.len() as u64) as usize]
 }
 
 /// The colour of a track, the same for as long as it lives.

@@ -32,6 +32,7 @@ mod blueprint;
 mod colour;
 mod comparison;
 mod draw;
+mod earth;
 mod extent;
 mod eye;
 mod flight;
@@ -46,6 +47,7 @@ mod tracking;
 mod volume;
 
 pub use comparison::{ComparedRun, ComparisonPicture, PlaceInTime};
+pub use earth::GroundPicture;
 pub use flight::{FlightCamera, FlightPicture, LoggedPlace, SeenTarget};
 pub use picture::Picture;
 pub use rerun::RecordingStream;

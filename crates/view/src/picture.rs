@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use crossfix_geometry::Camera;
+use crossfix_geometry::{Camera, Geodetic};
 use crossfix_message::{
     BearingFrame, Calibration, CameraCalibration, Channel, DecodeError, Health, ImageTrackState,
     Preview, Timestamp, Track, TrackEvent, TrackFrame, TrackNumber, TrackState, TruthFrame, decode,
@@ -12,16 +12,19 @@ use rerun_types::archetypes::{Clear, EncodedImage, Points3D, Scalars, TextLog, V
 use rerun_types::components::{Color, MediaType, Radius, TextLogLevel};
 
 use crate::arrivals::Arrivals;
+use crate::earth::{Earth, GroundPicture};
 use crate::extent::Extent;
 use crate::image::{self, Region, Ring};
 use crate::limiter::Limiter;
 use crate::paths::{TIMELINE, image_path};
-use crate::{ViewError, ViewerWatch, blueprint, draw, ground, legend};
+use crate::{ViewError, ViewerWatch, blueprint, colour, draw, ground, legend};
 
 /// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
 const PREVIEW_RATE_HZ: f64 = 5.0;
 const LINE_RATE_HZ: f64 = 10.0;
 const TRACK_RATE_HZ: f64 = 15.0;
+/// On the map a track's whole way is said each time; between two it goes less than a point of the screen.
+const MAP_RATE_HZ: f64 = 2.0;
 /// Points of a trail, at the rate of the tracks: ten seconds.
 const TRAIL_POINTS: usize = 150;
 /// Fusion centres whose problems are kept in mind.
@@ -92,6 +95,7 @@ pub struct Picture {
     limiter: Limiter,
     arrivals: Arrivals,
     viewer: ViewerWatch,
+    earth: Option<Earth>,
     /// Where confirmed tracks have been.
     flown: Extent,
     /// What the fusion centre has said last that a person should look at.
@@ -115,9 +119,24 @@ impl Picture {
             limiter: Limiter::default(),
             arrivals: Arrivals::default(),
             viewer: ViewerWatch::default(),
+            earth: None,
             flown: Extent::default(),
             problems: BTreeMap::new(),
         })
+    }
+
+    /// The same on the Earth: with a map beside the site, whose origin is at the anchor, and with a picture
+    /// of the ground under it.
+    ///
+    /// # Errors
+    /// [`ViewError`] if the stream does not take it.
+    pub fn on_earth(
+        self,
+        anchor: Geodetic,
+        ground: Option<GroundPicture>,
+    ) -> Result<Self, ViewError> {
+        let earth = Earth::new(&self.stream, anchor, ground)?;
+        Ok(Self { earth: Some(earth), ..self })
     }
 
     /// Draws a message that arrived at `arrival`; what cannot be read is left out and said.
@@ -202,6 +221,10 @@ impl Picture {
             view.calibration = parsed;
             draw::camera(&self.stream, &name, view.index, &view.camera, view.scale)?;
             draw::residual_plot(&self.stream, &name, view.index)?;
+            if let Some(earth) = &self.earth {
+                let place = view.camera.pose().position();
+                earth.camera(&self.stream, &name, place, colour::of(view.index))?;
+            }
             self.lay_out(Shown::WholeImages)?;
         }
         Ok(())
@@ -218,6 +241,9 @@ impl Picture {
             self.flown.corners().for_each(|corner| extent.include(corner));
         }
         ground::draw(&self.stream, &extent)?;
+        if let Some(earth) = &self.earth {
+            earth.ground(&self.stream, &extent)?;
+        }
         let cameras: Vec<blueprint::CameraPanel> = self
             .cameras
             .iter()
@@ -231,7 +257,7 @@ impl Picture {
                 },
             })
             .collect();
-        blueprint::send(&self.stream, &cameras, &extent)
+        blueprint::send(&self.stream, &cameras, &extent, self.earth.as_ref())
     }
 
     fn preview(&mut self, preview: &Preview) -> Result<(), ViewError> {
@@ -307,7 +333,13 @@ impl Picture {
                 trail.pop_front();
             }
             let place = Point3::from(position);
-            draw::track(&self.stream, track, trail.make_contiguous())?;
+            let trail = trail.make_contiguous();
+            draw::track(&self.stream, track, trail)?;
+            if let Some(earth) = &self.earth
+                && self.limiter.allows(&format!("map/{}", track.id), time, MAP_RATE_HZ)
+            {
+                earth.track(&self.stream, track, place, trail)?;
+            }
             self.drawn
                 .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
             let is_sure = draw::position_sd(track) < LAID_OUT_SD_M;
@@ -363,6 +395,9 @@ impl Picture {
         self.trails.remove(&id);
         if self.drawn.remove(&id).is_some() {
             self.stream.log(format!("world/tracks/{id}"), &Clear::recursive())?;
+            if let Some(earth) = &self.earth {
+                earth.clear(&self.stream, id)?;
+            }
             self.rings()?;
         }
         Ok(())

@@ -13,7 +13,7 @@ use crossfix_vision::{DetectorConfig, TrackerConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::commands::evaluate::{Question, evaluate, render};
-use crate::commands::view::save_recording;
+use crate::commands::view::{EarthArgs, save_recording};
 use crate::config::{
     self, CameraFile, ClockConfig, ClockSourceName, FusionFile, MountConfig, PoseConfig,
     SourceConfig, StreamConfig,
@@ -182,7 +182,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         return Ok(());
     }
     tracing::info!("drawing the picture");
-    save_recording(&files.recording, &files.picture)?;
+    save_recording(&files.recording, &files.picture, &EarthArgs::default())?;
     let truth = files.streams.as_ref().map(|streams| streams.truth.clone());
     let question = Question { skip_s: 1.0 + SETTLING_S, truth, ..Question::default() };
     let evaluation = evaluate(&files.recording, &question)?;

@@ -55,7 +55,7 @@ pub fn rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 10_000.0, " frames a second")
 }
 
-#[cfg(feature = "centre")]
+#[cfg(any(feature = "centre", feature = "viewer"))]
 pub fn triple(text: &str) -> Result<[f64; 3], String> {
     let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
     numbers.try_into().map_err(|_| {
@@ -64,11 +64,29 @@ pub fn triple(text: &str) -> Result<[f64; 3], String> {
 }
 
 /// A place on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
-#[cfg(feature = "centre")]
+#[cfg(any(feature = "centre", feature = "viewer"))]
 pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
     let [latitude, longitude, height] = triple(text)?;
     crossfix_geometry::Geodetic::from_degrees(latitude, longitude, height)
         .map_err(|error| error.to_string())
+}
+
+/// The edges of a picture of the ground: its south-western and north-eastern corner.
+#[cfg(feature = "viewer")]
+pub fn edges(text: &str) -> Result<[crossfix_geometry::Geodetic; 2], String> {
+    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
+    let [south, west, north, east]: [f64; 4] = numbers.try_into().map_err(|_| {
+        "it must be four numbers with commas between them, e.g. 48.352,11.783,48.356,11.789"
+            .to_owned()
+    })?;
+    if south >= north || west >= east {
+        return Err("south must be below north, and west below east".to_owned());
+    }
+    let corner = |latitude, longitude| {
+        crossfix_geometry::Geodetic::from_degrees(latitude, longitude, 0.0)
+            .map_err(|error| error.to_string())
+    };
+    Ok([corner(south, west)?, corner(north, east)?])
 }
 
 #[cfg(test)]

@@ -1,3 +1,5 @@
+mod earth;
+
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -16,10 +18,12 @@ use crate::recorded::{self, Lacks};
 use crate::repeats::Repeats;
 use crate::shutdown::{LEAVE, Shutdown};
 
+pub use earth::EarthArgs;
+
 /// Show a site in Rerun: live, from a recording, or saved to an .rrd file.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  crossfix view recordings/two-uavs.mcap\n  crossfix view recordings/two-uavs.mcap --save two-uavs.rrd\n  crossfix view -c configs/site/network.toml"
+    after_help = "Examples:\n  crossfix view recordings/two-uavs.mcap\n  crossfix view recordings/two-uavs.mcap --save two-uavs.rrd\n  crossfix view -c configs/site/network.toml\n  crossfix view today.mcap --anchor 48.3538,11.7861,490 --map site.png --map-edges 48.352,11.783,48.356,11.789"
 )]
 pub struct Args {
     /// The recording (MCAP) to show.
@@ -35,6 +39,8 @@ pub struct Args {
     /// A viewer that runs already, e.g. 127.0.0.1:9876; one is started without.
     #[arg(long, value_name = "ADDRESS", conflicts_with = "save")]
     connect: Option<SocketAddr>,
+    #[command(flatten)]
+    earth: EarthArgs,
     /// Stop when stdin ends.
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
@@ -44,11 +50,11 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     match (&args.recording, &args.config) {
         (Some(recording), _) => match &args.save {
             Some(rrd) => {
-                save_recording(recording, rrd)?;
+                save_recording(recording, rrd, &args.earth)?;
                 say_saved(rrd);
                 Ok(())
             }
-            None => draw_recording(Picture::new(viewer(args)?)?, recording),
+            None => draw_recording(args.earth.picture(viewer(args)?, None)?, recording),
         },
         (None, Some(network)) => draw_live(args, network),
         (None, None) => bail!("give a recording, or a network file with -c"),
@@ -71,9 +77,9 @@ fn say_saved(rrd: &Path) {
 }
 
 /// Draws a recording into an .rrd file.
-pub fn save_recording(recording: &Path, rrd: &Path) -> anyhow::Result<()> {
+pub fn save_recording(recording: &Path, rrd: &Path, earth: &EarthArgs) -> anyhow::Result<()> {
     let draft = Draft::new(rrd, &[recording])?;
-    draw_recording(Picture::new(crossfix_view::save(draft.path())?)?, recording)?;
+    draw_recording(earth.picture(crossfix_view::save(draft.path())?, None)?, recording)?;
     draft.keep()
 }
 
@@ -115,7 +121,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
         }
         _ => viewer(args)?,
     };
-    let mut picture = Picture::new(stream)?;
+    let mut picture = args.earth.picture(stream, config::anchor_of(&network)?)?;
     let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;

@@ -1,0 +1,73 @@
+//! Where on Earth the site is that is shown, and a picture of its ground.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use crossfix_geometry::Geodetic;
+use crossfix_video::{Pixels, decode_still};
+use crossfix_view::{GroundPicture, Picture, RecordingStream};
+
+use crate::commands::numbers;
+
+/// Longest side of a picture of the ground, pixels: what every graphics card takes as one texture.
+const MOST_SIDE: usize = 8192;
+
+#[derive(Debug, Default, clap::Args)]
+pub struct EarthArgs {
+    /// Where on Earth the site's origin is: degrees north, degrees east, metres above the WGS84 ellipsoid.
+    /// A map is beside the site then; live it is the network file's `[anchor]` without.
+    #[arg(long, value_name = "LAT,LON,HEIGHT", value_parser = numbers::place, allow_hyphen_values = true)]
+    anchor: Option<Geodetic>,
+    /// A picture of the ground from above, north up (PNG or JPEG), to lie under the site.
+    #[arg(long, value_name = "FILE", requires = "map_edges")]
+    map: Option<PathBuf>,
+    /// Where the picture of the ground ends: degrees north and east of its edges.
+    #[arg(long, value_name = "SOUTH,WEST,NORTH,EAST", value_parser = numbers::edges, allow_hyphen_values = true,
+          requires = "map")]
+    map_edges: Option<[Geodetic; 2]>,
+}
+
+impl EarthArgs {
+    /// An empty picture on a stream, on Earth if it is known where; `known` is what the network's file says.
+    pub fn picture(
+        &self,
+        stream: RecordingStream,
+        known: Option<Geodetic>,
+    ) -> anyhow::Result<Picture> {
+        let picture = Picture::new(stream)?;
+        let ground = match (&self.map, self.map_edges) {
+            (Some(path), Some(edges)) => {
+                let has_error = || format!("cannot lay {} under the site", path.display());
+                Some(ground(path, edges).with_context(has_error)?)
+            }
+            _ => None,
+        };
+        let anchor = self.anchor.or(known);
+        ensure!(
+            anchor.is_some() || ground.is_none(),
+            "where under the picture of the ground is the site? Say where on Earth its origin is, with --anchor"
+        );
+        Ok(match anchor {
+            Some(anchor) => picture.on_earth(anchor, ground)?,
+            None => picture,
+        })
+    }
+}
+
+fn ground(path: &Path, [south_west, north_east]: [Geodetic; 2]) -> anyhow::Result<GroundPicture> {
+    let (width, height, pixels) =
+        decode_still(&std::fs::read(path)?).map_err(anyhow::Error::msg)?;
+    ensure!(
+        width.max(height) <= MOST_SIDE,
+        "it is {width}x{height} pixels, and {MOST_SIDE} a side are the most"
+    );
+    let grey = |sample: u8| [sample; 3];
+    let high = |sample: u16| (sample >> 8) as u8;
+    let rgb = match pixels {
+        Pixels::Gray8(samples) => samples.into_iter().flat_map(grey).collect(),
+        Pixels::Gray16(samples) => samples.into_iter().map(high).flat_map(grey).collect(),
+        Pixels::Rgb8(samples) => samples,
+        Pixels::Rgb16(samples) => samples.into_iter().map(high).collect(),
+    };
+    Ok(GroundPicture { size: [width as u32, height as u32], rgb, south_west, north_east })
+}

@@ -1,0 +1,144 @@
+//! Where on Earth the site is: what is drawn on a map, and a picture of the ground.
+
+use crossfix_geometry::{Geodetic, LocalFrame};
+use crossfix_message::{Track, TrackState};
+use nalgebra::Point3;
+use rerun::RecordingStream;
+use rerun_types::archetypes::{Clear, GeoLineStrings, GeoPoints, Image, Mesh3D, Transform3D};
+use rerun_types::blueprint::archetypes::MapZoom;
+use rerun_types::components::{AlbedoFactor, Color, Radius};
+use rerun_types::datatypes::Rgba32;
+
+use crate::extent::Extent;
+use crate::{ViewError, colour};
+
+/// Where the map's view finds its points.
+pub(crate) const MAP: &str = "map";
+/// The picture of the ground.
+const PICTURE: &str = "world/ground/picture";
+/// So much of a picture's light is left, of 255: sight lines and trails must stand out from it.
+const DIMMED: u8 = 130;
+/// The picture lies so far below the grid, parts of the site's length: in one plane they would flicker.
+const BELOW_GRID: f64 = 1e-3;
+
+/// What a point of the map is at the equator where all of it is 256 points wide, m.
+const WHOLE_MAP_M: f64 = 156_543.0;
+/// The site is so many points of the map high, so that it fits into the smallest view.
+const SITE_POINTS: f64 = 250.0;
+
+/// A picture of the ground from above, north up: an orthophoto, a plan, a piece of a map.
+#[derive(Clone, Debug)]
+pub struct GroundPicture {
+    /// Its pixels across and down.
+    pub size: [u32; 2],
+    /// Red, green and blue of each, row by row from the north-west.
+    pub rgb: Vec<u8>,
+    /// Where its south-western corner is.
+    pub south_west: Geodetic,
+    /// Where its north-eastern corner is.
+    pub north_east: Geodetic,
+}
+
+/// The site's place on Earth, and what is drawn with it.
+pub(crate) struct Earth {
+    frame: LocalFrame,
+    has_picture: bool,
+}
+
+impl Earth {
+    pub(crate) fn new(
+        stream: &RecordingStream,
+        anchor: Geodetic,
+        picture: Option<GroundPicture>,
+    ) -> Result<Self, ViewError> {
+        let earth = Self { frame: LocalFrame::at(anchor), has_picture: picture.is_some() };
+        if let Some(picture) = picture {
+            // Once: it may be many megabytes.
+            stream.log_static(format!("{PICTURE}/mesh"), &earth.mesh(picture))?;
+        }
+        Ok(earth)
+    }
+
+    /// A picture of the ground, at the height of the site's origin.
+    fn mesh(&self, picture: GroundPicture) -> Mesh3D {
+        let [from, to] =
+            [picture.south_west, picture.north_east].map(|corner| self.frame.local(corner));
+        let corners = [(from.x, from.y), (to.x, from.y), (to.x, to.y), (from.x, to.y)];
+        Mesh3D::new(corners.map(|(x, y)| [x as f32, y as f32, 0.0]))
+            .with_triangle_indices([[0, 1, 2], [0, 2, 3]])
+            .with_vertex_texcoords([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+            .with_albedo_factor(AlbedoFactor(Rgba32::from_rgb(DIMMED, DIMMED, DIMMED)))
+            .with_albedo_texture_image(Image::from_rgb24(picture.rgb, picture.size))
+    }
+
+    fn lat_lon(&self, point: Point3<f64>) -> (f64, f64) {
+        let place = self.frame.geodetic(point);
+        (place.latitude_deg(), place.longitude_deg())
+    }
+
+    /// What has a site as a whole on the map.
+    pub(crate) fn zoom(&self, extent: &Extent) -> MapZoom {
+        let (low, high) = extent.bounds();
+        let across = (high - low).norm().max(1.0);
+        let (latitude_deg, _) = self.lat_lon(extent.middle());
+        let point_m = WHOLE_MAP_M * latitude_deg.to_radians().cos();
+        MapZoom::new((point_m * SITE_POINTS / across).log2().clamp(0.0, 20.0))
+    }
+
+    /// A camera on the map.
+    pub(crate) fn camera(
+        &self,
+        stream: &RecordingStream,
+        name: &str,
+        place: Point3<f64>,
+        colour: Color,
+    ) -> Result<(), ViewError> {
+        let point = GeoPoints::from_lat_lon([self.lat_lon(place)])
+            .with_radii([Radius::new_ui_points(6.0)])
+            .with_colors([colour]);
+        Ok(stream.log_static(format!("{MAP}/cameras/{name}"), &point)?)
+    }
+
+    /// A track on the map, with its way; one that only one camera sees is nowhere on it.
+    pub(crate) fn track(
+        &self,
+        stream: &RecordingStream,
+        track: &Track,
+        place: Point3<f64>,
+        trail: &[[f32; 3]],
+    ) -> Result<(), ViewError> {
+        if track.state() == TrackState::OneCamera {
+            return self.clear(stream, track.id);
+        }
+        let (id, colour) = (track.id, colour::of_track(track.id));
+        let point = GeoPoints::from_lat_lon([self.lat_lon(place)])
+            .with_radii([Radius::new_ui_points(5.0)])
+            .with_colors([colour]);
+        stream.log(format!("{MAP}/tracks/{id}"), &point)?;
+        let way: Vec<(f64, f64)> =
+            trail.iter().map(|point| self.lat_lon(point.map(f64::from).into())).collect();
+        let way = GeoLineStrings::from_lat_lon([way])
+            .with_radii([Radius::new_ui_points(1.5)])
+            .with_colors([colour]);
+        Ok(stream.log(format!("{MAP}/tracks/{id}/trail"), &way)?)
+    }
+
+    /// A track that is none any more.
+    pub(crate) fn clear(&self, stream: &RecordingStream, id: u64) -> Result<(), ViewError> {
+        Ok(stream.log(format!("{MAP}/tracks/{id}"), &Clear::recursive())?)
+    }
+
+    /// Lays the picture of the ground, if there is one, under the grid of a site.
+    pub(crate) fn ground(
+        &self,
+        stream: &RecordingStream,
+        extent: &Extent,
+    ) -> Result<(), ViewError> {
+        if !self.has_picture {
+            return Ok(());
+        }
+        let (low, high) = extent.bounds();
+        let height = low.z - BELOW_GRID * (high - low).norm();
+        Ok(stream.log_static(PICTURE, &Transform3D::from_translation([0.0, 0.0, height as f32]))?)
+    }
+}
