@@ -6,6 +6,7 @@ mod server;
 mod stream_clock;
 
 use std::collections::{BTreeMap, VecDeque};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -181,18 +182,19 @@ impl RtspSource {
             .build()
             .map_err(|error| wrong(error.to_string()))?;
         let sessions = Arc::new(SessionGroup::default());
-        let opened = runtime.block_on(async {
-            let connected = tokio::time::timeout(ANSWER, connect(options, &sessions)).await;
-            let connected = connected.unwrap_or_else(|_| {
+        let connected = unharmed(&url, || {
+            let answer = async { tokio::time::timeout(ANSWER, connect(options, &sessions)).await };
+            runtime.block_on(answer).unwrap_or_else(|_| {
                 Err(wrong(format!("it does not answer within {} s", ANSWER.as_secs())))
-            });
-            if connected.is_err() {
-                // It may have given a place to whoever does not come.
-                let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
-            }
-            connected
+            })
         });
-        let (stream, stream_id, codec) = opened?;
+        if connected.is_err() {
+            // It may have given a place to whoever does not come.
+            runtime.block_on(async {
+                let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
+            });
+        }
+        let (stream, stream_id, codec) = connected?;
         let host = HostClock::read();
         Ok(Self {
             runtime,
@@ -240,16 +242,18 @@ impl RtspSource {
         let Some(stream) = &mut self.stream else {
             return Ok(None);
         };
-        let item = self
-            .runtime
-            .block_on(async { tokio::time::timeout(left, stream.next()).await })
-            .map_err(|_| VideoError::Silent {
+        unharmed(&self.url, || {
+            let item = self
+                .runtime
+                .block_on(async { tokio::time::timeout(left, stream.next()).await })
+                .map_err(|_| VideoError::Silent {
+                    url: self.url.clone(),
+                    seconds: patience.as_secs_f64(),
+                })?;
+            item.transpose().map_err(|error| VideoError::Stream {
                 url: self.url.clone(),
-                seconds: patience.as_secs_f64(),
-            })?;
-        item.transpose().map_err(|error| VideoError::Stream {
-            url: self.url.clone(),
-            what: first_line(&error.to_string()),
+                what: first_line(&error.to_string()),
+            })
         })
     }
 
@@ -346,6 +350,15 @@ pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
     let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
     let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
     (ntp != 0).then(|| Timestamp::from_nanos((seconds - NTP_TO_UNIX_S) * 1_000_000_000 + nanos))
+}
+
+/// What a camera says is read by libraries that it can make panic (a line without `=` in a session's
+/// description does it): then it is the stream that is wrong.
+fn unharmed<T>(url: &str, read: impl FnOnce() -> Result<T, VideoError>) -> Result<T, VideoError> {
+    catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|_| {
+        let what = "what it sends cannot be read".to_owned();
+        Err(VideoError::Stream { url: url.to_owned(), what })
+    })
 }
 
 /// What is to be said of an error of the protocol: the details of the connection follow in further

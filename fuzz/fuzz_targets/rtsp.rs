@@ -1,0 +1,14 @@
+//! A network camera that answers with any bytes.
+#![no_main]
+
+#[path = "../../crates/video/tests/hostile/driver.rs"]
+mod driver;
+
+libfuzzer_sys::fuzz_target!(
+    // What panics in the libraries that read a stream is caught and no finding, so it must not end the
+    // fuzzer; what panics in ours is not caught, and does.
+    init: std::panic::set_hook(Box::new(|_| {})),
+    |data: &[u8]| {
+        driver::drive(data);
+    }
+);
