@@ -5,15 +5,20 @@ mod file;
 #[cfg(feature = "centre")]
 mod fusion;
 mod mount;
+mod pose;
 mod site;
 mod source;
 mod stream;
 
-pub use camera::{CameraFile, ClockConfig, ClockSourceName, PoseConfig};
+pub use camera::{CameraFile, ClockConfig, ClockSourceName};
 pub use file::{Kind, load, parse};
 #[cfg(feature = "centre")]
 pub use fusion::FusionFile;
 pub use mount::{MountConfig, OnvifConfig};
+pub use pose::PoseConfig;
 pub use site::{Site, anchor_of, load_cameras, load_network};
 pub use source::SourceConfig;
 pub use stream::{GstreamerConfig, StreamConfig, login};
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,74 @@
+use anyhow::{Context, bail, ensure};
+use crossfix_geometry::Pose;
+use nalgebra::{Matrix3, Point3};
+use serde::{Deserialize, Serialize};
+
+/// Where a camera stands and how it is turned.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseConfig {
+    /// The camera's centre, local ENU, m.
+    pub position_m: [f64; 3],
+    /// A level camera whose axis goes through this point, m. Either this or `rotation`.
+    pub look_at_m: Option<[f64; 3]>,
+    /// The rotation world_from_camera, row by row: its columns are the camera's axes (x right,
+    /// y down, z forward) in the world.
+    pub rotation: Option<[[f64; 3]; 3]>,
+    /// Standard deviation of the rotation about each axis, mrad. 0 to 1000. With `position_sd_m`;
+    /// absent: a careful survey's (1 mrad, 5 cm) is assumed, and how good the pose is is learnt
+    /// from the sight lines.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rotation_sd_mrad: Option<f64>,
+    /// Standard deviation of the centre along each axis, m. 0 to 1000.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub position_sd_m: Option<f64>,
+}
+
+impl PoseConfig {
+    /// A pose by its rotation.
+    pub fn of(pose: &Pose) -> Self {
+        let m = pose.rotation().matrix();
+        let row = |r: usize| [m[(r, 0)], m[(r, 1)], m[(r, 2)]];
+        let p = pose.position();
+        Self {
+            position_m: [p.x, p.y, p.z],
+            look_at_m: None,
+            rotation: Some([row(0), row(1), row(2)]),
+            rotation_sd_mrad: None,
+            position_sd_m: None,
+        }
+    }
+
+    /// How sure the pose is: rotation, rad, and position, m; `None` where nobody has said.
+    pub(super) fn deviations(&self) -> Option<(f64, f64)> {
+        Some((self.rotation_sd_mrad? * 1e-3, self.position_sd_m?))
+    }
+
+    /// Both deviations are given or neither, and each is one.
+    fn check_deviations(&self) -> anyhow::Result<()> {
+        let given = [self.rotation_sd_mrad, self.position_sd_m];
+        let possible = given.iter().flatten().all(|sd| (0.0..=1000.0).contains(sd));
+        ensure!(
+            possible && given[0].is_some() == given[1].is_some(),
+            "give both `rotation_sd_mrad` and `position_sd_m`, from 0 to 1000, or neither"
+        );
+        Ok(())
+    }
+
+    pub(super) fn pose(&self) -> anyhow::Result<Pose> {
+        self.check_deviations()?;
+        let position = Point3::from(self.position_m);
+        match (self.look_at_m, self.rotation) {
+            (Some(target), None) => {
+                Pose::looking_at(position, Point3::from(target)).context("key `look_at_m`")
+            }
+            (None, Some(rows)) => {
+                // nalgebra takes columns.
+                Pose::new(Matrix3::from(rows).transpose(), position).context(
+                    "key `rotation` (rows of world_from_camera; its columns are the camera's x right, y down, z forward)",
+                )
+            }
+            _ => bail!("give either `look_at_m` or `rotation`, and not both"),
+        }
+    }
+}
