@@ -189,7 +189,10 @@ impl Lookout {
             named.push(format!("{} more", missing.len() - NAMED));
         }
         let named = named.join(", ");
-        if missing.len() == self.others.len() {
+        let are_cameras = missing.iter().any(|other| other.key.channel.camera().is_some());
+        if missing.len() == self.others.len() && !are_cameras {
+            format!("nobody of site `{}` hears this camera: waiting for {named}", self.site)
+        } else if missing.len() == self.others.len() {
             format!("nobody of site `{}` is there: waiting for {named}", self.site)
         } else {
             format!("waiting for {named}; the others of site `{}` are there", self.site)

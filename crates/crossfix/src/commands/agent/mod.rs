@@ -1,5 +1,6 @@
 mod live;
 mod reload;
+mod report;
 mod seeking;
 #[cfg(feature = "centre")]
 mod simulated;
@@ -11,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use crossfix_correlation::Plane;
-use crossfix_message::{BearingFrame, Channel, Counter, Health, Payload, Timestamp};
+use crossfix_message::{BearingFrame, Channel, Payload, Timestamp};
 use crossfix_transport::{AliveToken, Delivery, Link, LinkPublisher, NetworkConfig, Role};
 use crossfix_video::{CaptureTime, Frame, FrameClock, FrameSource};
 use crossfix_vision::ImageTracker;
@@ -23,7 +24,8 @@ use crate::calibrated::Calibrated;
 use crate::commands::numbers;
 use crate::config::{self, CameraFile, ClockConfig, SourceConfig};
 use crate::eye::{CameraIdentity, brightness};
-use crate::health::{self, HealthArgs, HealthReporter};
+use crate::health::{HealthArgs, HealthReporter};
+use crate::lookout::Lookout;
 use crate::network;
 use crate::output;
 use crate::pace::wall_seconds;
@@ -37,8 +39,6 @@ use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 #[cfg(feature = "centre")]
 pub use self::simulated::truth_frame;
 
-/// How often the calibration is said again, for those who came late.
-const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 /// An agent that is this far behind its source is too slow for it: the fusion centre waits half a
 /// second.
 pub const BEHIND: Duration = Duration::from_millis(500);
@@ -81,6 +81,8 @@ struct Agent {
     calibrated: Option<Calibrated>,
     calibration: Vec<u8>,
     link: Link,
+    /// For the fusion centres that hear it.
+    lookout: Lookout,
     /// That it hears what is said to it; from the moment on at which it does.
     alive: Option<AliveToken>,
     bearings: LinkPublisher,
@@ -119,7 +121,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Camera(file.name.clone()), &shutdown)? else {
         return Ok(());
     };
-    let mut agent = Agent::new(args, identity, link, file.source.is_unpaced(), shutdown)?;
+    let mut agent = Agent::new(args, identity, link, &network, file.source.is_unpaced(), shutdown)?;
     agent.calibrated = calibrated;
     service::ready(&format!("camera {}", file.name));
     let Some(start) = agent.begin(args, &file, &network, begins)? else {
@@ -156,13 +158,16 @@ impl Agent {
         args: &Args,
         identity: CameraIdentity,
         link: Link,
+        network: &NetworkConfig,
         is_unpaced: bool,
         shutdown: Shutdown,
     ) -> anyhow::Result<Self> {
         // What is played as fast as it goes waits for those who listen; life does not.
         let delivery = if is_unpaced { Delivery::Every } else { Delivery::Queued };
         let name = identity.name.clone();
+        let lookout = Lookout::for_centres_of(&link, network, &name)?;
         Ok(Self {
+            lookout,
             config: args.config.clone(),
             sets: args.sets.clone(),
             bearings: link.publisher(Channel::Bearings(name.clone()), delivery)?,
@@ -277,84 +282,6 @@ impl Agent {
             }
             #[cfg(not(feature = "centre"))]
             SourceConfig::Simulation { .. } => Err(parts::is_left_out("the simulator", "centre")),
-        }
-    }
-
-    /// Says calibration and health again when it is time.
-    fn keep_up(&mut self) -> anyhow::Result<()> {
-        let due =
-            |at: Option<Instant>, period: Duration| at.is_none_or(|at| at.elapsed() >= period);
-        if due(self.calibrated_at, CALIBRATION_PERIOD) {
-            self.calibrations.put(self.calibration.clone())?;
-            self.calibrated_at = Some(Instant::now());
-        }
-        if due(self.healthy_at, health::PERIOD) {
-            service::alive();
-            self.repeats.remind(Instant::now());
-            // A live camera's file is read again where it is watched.
-            if self.stream.is_none() && self.shutdown.take_reload() {
-                tracing::warn!("a source that is played keeps its configuration to its end");
-            }
-            self.say_health(false)?;
-            self.healthy_at = Some(Instant::now());
-        }
-        Ok(())
-    }
-
-    fn say_health(&mut self, ended: bool) -> anyhow::Result<()> {
-        let mut counters = vec![
-            ("bad_frames", self.bad_frames),
-            ("behind_ms", u64::try_from(self.behind.as_millis()).unwrap_or(u64::MAX)),
-            ("frames_without_pointing", self.without_pointing),
-            ("unseen_bearings", self.unseen_bearings),
-        ];
-        counters.extend(self.stream.as_mut().map(StreamHealth::counters).unwrap_or_default());
-        counters.sort_unstable();
-        let health = Health {
-            component: self.identity.name.to_string(),
-            time_ns: self.now.nanos(),
-            handled: self.frames,
-            counters: counters
-                .into_iter()
-                .map(|(name, value)| Counter { name: name.to_owned(), value })
-                .collect(),
-            ended,
-            problems: self.problems(),
-            scene_begins_ns: self.scene_begins.nanos(),
-            tracks: if self.stream.as_ref().is_some_and(StreamHealth::is_lost) {
-                0
-            } else {
-                self.tracks
-            },
-            ..Default::default()
-        };
-        let health = self.health.completed(health);
-        self.health.say(&health)
-    }
-
-    fn problems(&self) -> Vec<String> {
-        let behind = (self.behind > BEHIND).then(|| {
-            format!(
-                "{:.1} s behind its source: this host is too slow for it",
-                self.behind.as_secs_f64()
-            )
-        });
-        let stream = self.stream.as_ref().map(|stream| stream.problems(Instant::now()));
-        let mount = self.trouble_of_mount();
-        behind.into_iter().chain(mount).chain(stream.unwrap_or_default()).collect()
-    }
-
-    /// Notes how far behind the source the agent is.
-    fn note_behind(&mut self, behind: Duration) {
-        self.behind = behind;
-        if behind > BEHIND {
-            let name = self.identity.name.clone();
-            self.repeats.warn("behind", Instant::now(), || {
-                format!(
-                    "camera `{name}` is {:.1} s behind its source: this host is too slow for it",
-                    behind.as_secs_f64()
-                )
-            });
         }
     }
 

@@ -8,7 +8,6 @@ use crossfix_transport::NetworkConfig;
 
 use super::{Agent, BEHIND};
 use crate::config::{CameraFile, SourceConfig};
-use crate::lookout::Lookout;
 use crate::pace::{Pace, wall_seconds};
 use crate::service;
 
@@ -101,18 +100,17 @@ impl Agent {
         begins: Timestamp,
         has_start: bool,
     ) -> anyhow::Result<Option<Start>> {
-        let mut lookout = Lookout::for_centres_of(&self.link, network, &self.identity.name)?;
         let recorder_alive = self.link.key(Channel::RecorderAlive);
         let begun = Instant::now();
         // A token comes with its peer's other declarations, but the subscription may come after it.
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
-            lookout.look(Instant::now());
+            self.lookout.look(Instant::now());
             service::alive();
-            let recording = lookout.is_here(&recorder_alive);
+            let recording = self.lookout.is_here(&recorder_alive);
             // Of several areas one is enough, if the others do not come.
             let is_long = begun.elapsed() >= FUSION_PATIENCE;
-            let fusion = lookout.all_are_here() || is_long && lookout.any_is_here();
+            let fusion = self.lookout.all_are_here() || is_long && self.lookout.any_is_here();
             if fusion && (recording || !recorder) && has_ears(self)? {
                 break;
             }
