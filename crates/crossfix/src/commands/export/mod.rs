@@ -2,7 +2,7 @@ mod others;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use crossfix_evaluation::{Estimate, TrackHistory};
 use crossfix_message::{Channel, Timestamp, TrackFrame, TrackState};
 use serde::Deserialize;
@@ -21,6 +21,8 @@ use crate::recorded::{self, Lacks};
 /// times from its last frame at or before them, extrapolated with its velocity.
 #[derive(Debug, clap::Args)]
 #[command(
+    group = clap::ArgGroup::new("written").required(true).multiple(true)
+        .args(["csv", "geojson", "kml", "cot", "sapient", "asterix", "foxglove"]),
     after_help = "Examples:\n  crossfix export tracks.mcap --csv tracks.csv --times times.csv\n  crossfix export tracks.mcap --kml flights.kml --anchor 48.3538,11.7861,490\n  crossfix export site.mcap --foxglove shown.mcap"
 )]
 pub struct Args {
@@ -60,10 +62,6 @@ struct TimeRow {
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    ensure!(
-        args.csv.is_some() || args.others.are_asked_for(),
-        "what is to be written? Give --csv FILE, or a format of others (--help)"
-    );
     if let Some(csv) = &args.csv {
         write_table(args, csv)?;
     }

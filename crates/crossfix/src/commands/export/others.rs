@@ -54,13 +54,6 @@ pub struct Others {
 }
 
 impl Others {
-    /// Whether anything is asked for.
-    pub fn are_asked_for(&self) -> bool {
-        let files =
-            [&self.geojson, &self.kml, &self.cot, &self.sapient, &self.asterix, &self.foxglove];
-        files.into_iter().any(Option::is_some)
-    }
-
     /// Writes what is asked for.
     pub fn write(&self, recording: &Path, channel: &Channel) -> anyhow::Result<()> {
         let site = site_of(recording)?;
@@ -69,8 +62,8 @@ impl Others {
             let formats = &self.formats;
             told.write(self.geojson.as_deref(), || Ok(Box::<GeoJsonFlights>::default()))?;
             told.write(self.kml.as_deref(), || Ok(Box::new(Kml::above_geoid(self.geoid))))?;
-            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cursor_on_target()?)))?;
-            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix()?)))?;
+            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cursor_on_target.clone())))?;
+            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix.clone())))?;
             let sapient = || Ok(Box::new(Sapient::of_site(site.clone())) as Box<dyn Outlet>);
             told.write(self.sapient.as_deref(), sapient)?;
         }

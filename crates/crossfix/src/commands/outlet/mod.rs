@@ -70,29 +70,24 @@ pub struct Args {
 pub struct FormatArgs {
     /// What targets are in Cursor on Target: a-u-A (unknown, in the air) claims nothing more;
     /// a-u-A-M-H-Q is a rotary drone.
-    #[arg(long, value_name = "TYPE", default_value = "a-u-A")]
-    pub cot_type: String,
+    #[arg(long = "cot-type", value_name = "TYPE", default_value = "a-u-A", value_parser = cursor_on_target)]
+    pub cursor_on_target: CursorOnTarget,
     /// The data source in ASTERIX: system area code and system identification code.
-    #[arg(long, value_name = "SAC,SIC", default_value = "0,0")]
-    pub asterix_source: String,
+    #[arg(long = "asterix-source", value_name = "SAC,SIC", default_value = "0,0", value_parser = asterix)]
+    pub asterix: Asterix,
 }
 
-impl FormatArgs {
-    pub fn cursor_on_target(&self) -> anyhow::Result<CursorOnTarget> {
-        CursorOnTarget::of_type(&self.cot_type).with_context(|| {
-            format!("--cot-type {}: no type of Cursor on Target, e.g. a-u-A", self.cot_type)
-        })
-    }
+fn cursor_on_target(kind: &str) -> Result<CursorOnTarget, String> {
+    CursorOnTarget::of_type(kind)
+        .ok_or_else(|| "it is no type of Cursor on Target, e.g. a-u-A".to_owned())
+}
 
-    pub fn asterix(&self) -> anyhow::Result<Asterix> {
-        let codes = self.asterix_source.split_once(',').and_then(|(area, identification)| {
-            Some((area.trim().parse().ok()?, identification.trim().parse().ok()?))
-        });
-        let (area, identification) = codes.with_context(|| {
-            format!("--asterix-source {}: two numbers from 0 to 255", self.asterix_source)
-        })?;
-        Ok(Asterix::of_source(area, identification))
-    }
+fn asterix(codes: &str) -> Result<Asterix, String> {
+    let codes = codes.split_once(',').and_then(|(area, identification)| {
+        Some((area.trim().parse().ok()?, identification.trim().parse().ok()?))
+    });
+    let (area, identification) = codes.ok_or("it must be two numbers from 0 to 255, e.g. 25,1")?;
+    Ok(Asterix::of_source(area, identification))
 }
 
 /// The formats that go out live.
@@ -137,9 +132,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         "SAPIENT waits for an answer: --to tcp://HOST:PORT or tls://HOST:PORT"
     );
     let mut outlet: Box<dyn Outlet> = match args.format {
-        Format::Cot => Box::new(args.formats.cursor_on_target()?),
+        Format::Cot => Box::new(args.formats.cursor_on_target.clone()),
         Format::Sapient => Box::new(Sapient::of_site(site.clone())),
-        Format::Asterix => Box::new(args.formats.asterix()?),
+        Format::Asterix => Box::new(args.formats.asterix.clone()),
         Format::Geojson => Box::new(GeoJsonLines),
         Format::Foxglove => bail!("Foxglove is served"),
     };
