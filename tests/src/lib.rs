@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossfix_calibration::intrinsics_to_yaml;
@@ -384,13 +385,22 @@ impl Site {
     }
 }
 
-/// So many endpoints on this machine that nobody uses now.
+/// Ports below those that the system gives to whoever asks for none.
+const PORTS: std::ops::Range<u32> = 10_240..32_000;
+/// Tests that run at the same time begin so many ports from each other.
+const PORTS_A_PROCESS: u32 = 131;
+
+/// So many endpoints on this machine that nobody uses now, and that no other test is given: it listens at
+/// them later, so those that the system gives would be given again meanwhile.
 pub fn free_endpoints(count: usize) -> Vec<String> {
-    // All are held until all are known, so that none is given twice.
-    let held: Vec<_> = (0..count).map(|_| TcpListener::bind("127.0.0.1:0").unwrap()).collect();
-    held.iter()
-        .map(|listener| format!("tcp/127.0.0.1:{}", listener.local_addr().unwrap().port()))
-        .collect()
+    static GIVEN: AtomicU32 = AtomicU32::new(0);
+    let begin = std::process::id().wrapping_mul(PORTS_A_PROCESS);
+    let ports = std::iter::repeat_with(|| {
+        let place = begin.wrapping_add(GIVEN.fetch_add(1, Ordering::Relaxed));
+        PORTS.start + place % PORTS.len() as u32
+    });
+    let is_free = |port: &u32| TcpListener::bind(("127.0.0.1", *port as u16)).is_ok();
+    ports.filter(is_free).take(count).map(|port| format!("tcp/127.0.0.1:{port}")).collect()
 }
 
 /// A network of some cameras at endpoints on this machine that nobody uses now.
