@@ -357,6 +357,23 @@ fn the_doctor_says_whose_certificate_is_wrong_and_why() {
 }
 
 #[test]
+fn check_says_whose_certificates_are_there_and_which_is_wrong() {
+    let mut site = Site::new(1.0);
+    site.enroll(&[]);
+    site.write("fusion.toml", "network = \"network.toml\"\n");
+    let folder = site.path("");
+    let said = succeed(&["check", "-c", &folder]);
+    for identity in ["camera-north", "fusion", "viewer"] {
+        let words = format!("certificate of {identity}: is good for 89 more days");
+        assert!(said.contains(&words), "{identity}: {said}");
+    }
+    fs::copy(site.path("certificates/viewer.pem"), site.path("certificates/fusion.pem")).unwrap();
+    let output = crossfix(&["check", "-c", &folder]);
+    let words = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && words.contains("the certificate of fusion"), "{words}");
+}
+
+#[test]
 fn a_component_without_its_certificate_says_so_and_does_not_start() {
     let mut site = Site::new(1.0);
     site.enroll(&[]);

@@ -13,7 +13,8 @@ use crate::parts;
 
 /// Check configuration files before anything starts, and print what they resolve to.
 ///
-/// Videos are opened and held against the intrinsics; of a folder, all files must fit together.
+/// Videos are opened and held against the intrinsics; of a folder, all files must fit together,
+/// and certificates that are there must be believed.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  crossfix check -c configs/site\n  crossfix check -c configs/site/north.toml"
@@ -44,6 +45,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
                 "is for the fusion centre to check"
             };
             output::line(format!("fusion centre: {} {verdict}", path.display()));
+        }
+        for (identity, days) in &site.certificates {
+            output::line(format!("certificate of {identity}: is good for {days} more days"));
         }
         return Ok(());
     }

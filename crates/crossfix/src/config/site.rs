@@ -1,10 +1,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use anyhow::{Context, bail, ensure};
 use crossfix_geometry::{Camera, Geodetic};
 use crossfix_message::CameraName;
-use crossfix_transport::{Anchor, NetworkConfig};
+use crossfix_transport::{Anchor, Credentials, Identity, NetworkConfig};
 
 #[cfg(feature = "centre")]
 use super::FusionFile;
@@ -73,6 +74,8 @@ pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>>
 pub struct Site {
     pub cameras: BTreeMap<CameraName, CheckedCamera>,
     pub fusion: Vec<PathBuf>,
+    /// Whose certificates are in the network's folder of them, and for how many days they are good.
+    pub certificates: BTreeMap<Identity, u64>,
 }
 
 /// A camera's file that is good by itself.
@@ -85,12 +88,16 @@ pub struct CheckedCamera {
 impl Site {
     /// Reads every TOML file of a folder and checks that they fit together.
     pub fn load(folder: &Path) -> anyhow::Result<Self> {
-        let mut site = Self { cameras: BTreeMap::new(), fusion: Vec::new() };
+        let mut site = Self {
+            cameras: BTreeMap::new(),
+            fusion: Vec::new(),
+            certificates: BTreeMap::new(),
+        };
         let mut fusion = Vec::new();
         for (path, keys) in toml_files(folder)? {
             match Kind::of(&keys) {
                 Some(Kind::Camera) => site.add_camera(&path)?,
-                Some(Kind::Network) => drop(load_network(&path)?),
+                Some(Kind::Network) => site.add_certificates(&load_network(&path)?)?,
                 Some(Kind::Calibration) => drop(calibrated::load(&path)?),
                 // A scene of the simulator, or a tracker's settings.
                 Some(Kind::Scene | Kind::Tracker) => {}
@@ -131,6 +138,23 @@ impl Site {
                 other.path.display(),
                 path.display()
             );
+        }
+        Ok(())
+    }
+
+    /// Checks the certificates that are here: a host has its own only.
+    fn add_certificates(&mut self, network: &NetworkConfig) -> anyhow::Result<()> {
+        let Some(security) = &network.security else { return Ok(()) };
+        // None are here before they were made.
+        let entries = std::fs::read_dir(&security.certificates).into_iter().flatten().flatten();
+        let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+        let identities = names.filter_map(|name| name.strip_suffix(".pem")?.parse().ok());
+        let now = SystemTime::now();
+        for identity in identities {
+            let credentials = Credentials::load(security, &identity, now)
+                .with_context(|| format!("the certificate of {identity}"))?;
+            let left = credentials.not_after().duration_since(now).unwrap_or_default();
+            self.certificates.insert(identity, left.as_secs() / (24 * 3600));
         }
         Ok(())
     }
