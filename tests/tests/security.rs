@@ -8,7 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crossfix_message::{Channel, Health, Key, TrackFrame, TrackState, decode};
+use crossfix_message::{AreaName, Channel, Health, Key, TrackFrame, TrackState, decode};
 use crossfix_tests::{PATIENCE, Process, Site, crossfix, messages, now_seconds, succeed};
 use crossfix_transport::{Authority, Identity, Link, Role, Subscription, address};
 use time::OffsetDateTime;
@@ -114,6 +114,21 @@ impl Guarded {
         Self { site, endpoint, _processes: processes, health, before: 0, _ear: ear }
     }
 
+    /// The fusion centre of one of two areas.
+    fn of_area(mut site: Site, area: &str) -> Self {
+        site.divide(&[("west", &["west", "north"]), ("east", &["east", "north"])], "");
+        site.enroll(&[]);
+        let process = site.start(&["fuse", "-c", &site.path(&format!("fusion-{area}.toml"))]);
+        let area: AreaName = area.parse().unwrap();
+        let ear = Link::open(site.network(), &Role::Observer).unwrap();
+        let key = |channel| Key::of_centre(ear.site().clone(), Some(area.clone()), channel);
+        let health = ear.subscribe(&[key(Channel::FusionHealth).to_string()]).unwrap();
+        // It says how it does once a second from its beginning on.
+        assert!(health.next(PATIENCE).is_some());
+        let endpoint = site.network().areas[&area].fusion.clone();
+        Self { site, endpoint, _processes: vec![process], health, before: 0, _ear: ear }
+    }
+
     /// How many unreadable messages the fusion centre has had of its cameras.
     fn got_in(&self) -> u64 {
         counted(&self.health).get("received_malformed").copied().unwrap_or(0)
@@ -200,6 +215,21 @@ fn only_a_cameras_own_agent_says_what_it_sees() {
 #[test]
 fn only_a_cameras_own_agent_says_through_a_router_what_it_sees() {
     only_its_own_agent_gets_anything_in(true);
+}
+
+#[test]
+fn only_an_areas_own_fusion_centre_says_its_tracks_to_a_neighbour() {
+    let mut guarded = Guarded::of_area(Site::new(1.0), "east");
+    let tracks = "crossfix/test/fusion/west/tracks";
+    for who in ["fusion-east", "camera-north", "viewer", "recorder"] {
+        let shown = guarded.own(who);
+        assert_eq!(guarded.got_in_of(true, Some(&shown), tracks), 0, "{who}");
+    }
+    let neighbour = guarded.own("fusion-west");
+    assert_eq!(guarded.got_in_of(true, Some(&neighbour), tracks), SENT, "its own fusion centre");
+    // Nor may the neighbour speak for a camera.
+    let bearings = "crossfix/test/east/bearings";
+    assert_eq!(guarded.got_in_of(true, Some(&neighbour), bearings), 0, "for a camera");
 }
 
 #[test]

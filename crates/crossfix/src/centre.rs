@@ -178,25 +178,38 @@ impl Centre {
 
     /// A message that was read, or `None` and why not is counted.
     fn used<M>(&mut self, camera: &CameraName, read: Result<M, Unread>, sender: &str) -> Option<M> {
-        let error = match read {
+        match read {
             Ok(message) => return Some(message),
-            Err(error) => error,
-        };
+            Err(Unread::Decode(error)) => {
+                self.refuse(
+                    &format!("a message under the key of camera `{camera}`"),
+                    sender,
+                    &error,
+                );
+            }
+            Err(error @ Unread::Mismatched { .. }) => {
+                self.refused.mismatched += 1;
+                self.repeats.warn(&format!("mismatched {camera}"), Instant::now(), || {
+                    format!(
+                        "a message under the key of camera `{camera}`{sender} is not used: {error}"
+                    )
+                });
+            }
+        }
+        None
+    }
+
+    /// Counts what cannot be read, and warns of it; `sender` is for the warning.
+    pub fn refuse(&mut self, what: &str, sender: &str, error: &DecodeError) {
         let (counter, kind) = match error {
-            Unread::Decode(DecodeError::Malformed { .. }) => {
-                (&mut self.refused.malformed, "malformed")
-            }
-            Unread::Decode(DecodeError::TooLarge { .. }) => {
-                (&mut self.refused.too_large, "too large")
-            }
-            Unread::Decode(DecodeError::NewerMajor { .. }) => (&mut self.refused.newer, "newer"),
-            Unread::Mismatched { .. } => (&mut self.refused.mismatched, "mismatched"),
+            DecodeError::Malformed { .. } => (&mut self.refused.malformed, "malformed"),
+            DecodeError::TooLarge { .. } => (&mut self.refused.too_large, "too large"),
+            DecodeError::NewerMajor { .. } => (&mut self.refused.newer, "newer"),
         };
         *counter += 1;
-        self.repeats.warn(&format!("{kind} {camera}"), Instant::now(), || {
-            format!("a message under the key of camera `{camera}`{sender} is not used: {error}")
+        self.repeats.warn(&format!("{kind} {what}"), Instant::now(), || {
+            format!("{what}{sender} is not used: {error}")
         });
-        None
     }
 
     /// Handles everything that still waits.

@@ -88,11 +88,8 @@ pub struct CheckedCamera {
 impl Site {
     /// Reads every TOML file of a folder and checks that they fit together.
     pub fn load(folder: &Path) -> anyhow::Result<Self> {
-        let mut site = Self {
-            cameras: BTreeMap::new(),
-            fusion: Vec::new(),
-            certificates: BTreeMap::new(),
-        };
+        let mut site =
+            Self { cameras: BTreeMap::new(), fusion: Vec::new(), certificates: BTreeMap::new() };
         let mut fusion = Vec::new();
         for (path, keys) in toml_files(folder)? {
             match Kind::of(&keys) {

@@ -199,9 +199,8 @@ impl Station {
         );
         if let (Some(border), Some(area)) = (&mut self.border, &key.area) {
             if let Err(error) = border.hear(area, data) {
-                self.centre.warn(&format!("beside {area}"), || {
-                    format!("what area `{area}` says of its tracks{sender} is not used: {error}")
-                });
+                let what = format!("what area `{area}` says of its tracks");
+                self.centre.refuse(&what, &sender, &error);
             }
             return Ok(());
         }
