@@ -134,12 +134,27 @@ pub(crate) fn bearings(
     Ok(())
 }
 
-/// A track: where it is, how fast, how sure, and where it has been.
-pub(crate) fn track(
+fn tint(track: &Track) -> Color {
+    match track.state() {
+        TrackState::Confirmed => colour::of_track(track.id),
+        _ => colour::of_unsure_track(track.id),
+    }
+}
+
+/// Where a track has been.
+pub(crate) fn trail(
     stream: &RecordingStream,
     track: &Track,
     trail: &[[f32; 3]],
 ) -> Result<(), ViewError> {
+    let strip = LineStrips3D::new([trail.to_vec()])
+        .with_colors([tint(track)])
+        .with_radii([Radius::new_ui_points(1.5)]);
+    Ok(stream.log(format!("world/tracks/{}/trail", track.id), &strip)?)
+}
+
+/// A track: where it is, how fast, and how sure.
+pub(crate) fn track(stream: &RecordingStream, track: &Track) -> Result<(), ViewError> {
     let (Some(position), Some(velocity)) = (track.position, track.velocity) else {
         return Ok(());
     };
@@ -147,9 +162,7 @@ pub(crate) fn track(
     let velocity: Vector3<f64> = velocity.into();
     let place = f32s(&position.coords);
     let path = format!("world/tracks/{}", track.id);
-    let sure = track.state() == TrackState::Confirmed;
-    let tint: Color =
-        if sure { colour::of_track(track.id) } else { colour::of_unsure_track(track.id) };
+    let tint = tint(track);
     let text = label(track, velocity.norm(), position.z);
     stream.log(
         format!("{path}/position"),
@@ -163,12 +176,6 @@ pub(crate) fn track(
         format!("{path}/velocity"),
         &Arrows3D::from_vectors([f32s(&(velocity * ARROW_S))])
             .with_origins([place])
-            .with_colors([tint])
-            .with_radii([Radius::new_ui_points(1.5)]),
-    )?;
-    stream.log(
-        format!("{path}/trail"),
-        &LineStrips3D::new([trail.to_vec()])
             .with_colors([tint])
             .with_radii([Radius::new_ui_points(1.5)]),
     )?;

@@ -44,6 +44,7 @@ mod paths;
 mod picture;
 mod sink;
 mod tracking;
+mod trail;
 mod volume;
 
 pub use comparison::{ComparedRun, ComparisonPicture, PlaceInTime};

@@ -1,4 +1,4 @@
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crossfix_geometry::{Camera, Geodetic};
@@ -17,16 +17,13 @@ use crate::extent::Extent;
 use crate::image::{self, Region, Ring};
 use crate::limiter::Limiter;
 use crate::paths::{TIMELINE, image_path};
+use crate::trail::Trail;
 use crate::{ViewError, ViewerWatch, blueprint, colour, draw, ground, legend};
 
 /// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
 const PREVIEW_RATE_HZ: f64 = 5.0;
 const LINE_RATE_HZ: f64 = 10.0;
 const TRACK_RATE_HZ: f64 = 15.0;
-/// On the map a track's whole way is said each time; between two it goes less than a point of the screen.
-const MAP_RATE_HZ: f64 = 2.0;
-/// Points of a trail, at the rate of the tracks: ten seconds.
-const TRAIL_POINTS: usize = 150;
 /// Fusion centres whose problems are kept in mind.
 const MOST_CENTRES: usize = 1000;
 /// Sight lines reach this far where no track says how far, m.
@@ -90,7 +87,7 @@ struct DrawnTrack {
 pub struct Picture {
     stream: RecordingStream,
     cameras: BTreeMap<String, CameraView>,
-    trails: BTreeMap<u64, VecDeque<[f32; 3]>>,
+    trails: BTreeMap<u64, Trail>,
     drawn: BTreeMap<u64, DrawnTrack>,
     limiter: Limiter,
     arrivals: Arrivals,
@@ -324,22 +321,10 @@ impl Picture {
             if since.is_some_and(|since| (0.0..TRACK_RATE_HZ.recip()).contains(&since)) {
                 continue;
             }
-            let trail = self.trails.entry(track.id).or_default();
-            // How far away it is one camera alone does not see: its way would be a guess.
-            if track.state() != TrackState::OneCamera {
-                trail.push_back([position.x as f32, position.y as f32, position.z as f32]);
-            }
-            while trail.len() > TRAIL_POINTS {
-                trail.pop_front();
-            }
             let place = Point3::from(position);
-            let trail = trail.make_contiguous();
-            draw::track(&self.stream, track, trail)?;
-            if let Some(earth) = &self.earth
-                && self.limiter.allows(&format!("map/{}", track.id), time, MAP_RATE_HZ)
-            {
-                earth.track(&self.stream, track, place, trail)?;
-            }
+            draw::track(&self.stream, track)?;
+            let trail = self.trails.entry(track.id).or_default();
+            trail.go_on(&self.stream, self.earth.as_ref(), track, place, time)?;
             self.drawn
                 .insert(track.id, DrawnTrack { track: track.clone(), time, place, heard: arrival });
             let is_sure = draw::position_sd(track) < LAID_OUT_SD_M;

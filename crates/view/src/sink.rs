@@ -13,8 +13,11 @@ use thiserror::Error;
 /// Bytes on their way to a viewer, as Rerun reckons them (it takes several times as much), before
 /// drawing waits for it: some seconds of a site of three cameras.
 const MOST_IN_FLIGHT: u64 = 8 << 20;
-/// Most memory that a viewer started by us takes.
+/// When a viewer started by us forgets the oldest it was shown; it takes half as much again.
 const VIEWER_MEMORY: &str = "1GB";
+/// What it keeps a second time, for other viewers that may want to see what it has been sent. Without this it
+/// is a gigabyte.
+const FOR_OTHER_VIEWERS: &str = "64MB";
 
 /// What can go wrong with the picture.
 #[derive(Debug, Error)]
@@ -126,6 +129,7 @@ impl ViewerWatch {
 pub fn spawn_viewer() -> Result<SocketAddr, ViewError> {
     let options = SpawnOptions {
         memory_limit: VIEWER_MEMORY.into(),
+        server_memory_limit: FOR_OTHER_VIEWERS.into(),
         wait_for_bind: true,
         hide_welcome_screen: true,
         // The viewer's own default is all interfaces.

@@ -62,8 +62,8 @@ impl Others {
             let formats = &self.formats;
             told.write(self.geojson.as_deref(), || Ok(Box::<GeoJsonFlights>::default()))?;
             told.write(self.kml.as_deref(), || Ok(Box::new(Kml::above_geoid(self.geoid))))?;
-            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cursor_on_target.clone())))?;
-            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix.clone())))?;
+            told.write(self.cot.as_deref(), || Ok(Box::new(formats.cot_type.clone())))?;
+            told.write(self.asterix.as_deref(), || Ok(Box::new(formats.asterix_source.clone())))?;
             let sapient = || Ok(Box::new(Sapient::of_site(site.clone())) as Box<dyn Outlet>);
             told.write(self.sapient.as_deref(), sapient)?;
         }

@@ -70,11 +70,11 @@ pub struct Args {
 pub struct FormatArgs {
     /// What targets are in Cursor on Target: a-u-A (unknown, in the air) claims nothing more;
     /// a-u-A-M-H-Q is a rotary drone.
-    #[arg(long = "cot-type", value_name = "TYPE", default_value = "a-u-A", value_parser = cursor_on_target)]
-    pub cursor_on_target: CursorOnTarget,
+    #[arg(long, value_name = "TYPE", default_value = "a-u-A", value_parser = cursor_on_target)]
+    pub cot_type: CursorOnTarget,
     /// The data source in ASTERIX: system area code and system identification code.
-    #[arg(long = "asterix-source", value_name = "SAC,SIC", default_value = "0,0", value_parser = asterix)]
-    pub asterix: Asterix,
+    #[arg(long, value_name = "SAC,SIC", default_value = "0,0", value_parser = asterix)]
+    pub asterix_source: Asterix,
 }
 
 fn cursor_on_target(kind: &str) -> Result<CursorOnTarget, String> {
@@ -132,9 +132,9 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         "SAPIENT waits for an answer: --to tcp://HOST:PORT or tls://HOST:PORT"
     );
     let mut outlet: Box<dyn Outlet> = match args.format {
-        Format::Cot => Box::new(args.formats.cursor_on_target.clone()),
+        Format::Cot => Box::new(args.formats.cot_type.clone()),
         Format::Sapient => Box::new(Sapient::of_site(site.clone())),
-        Format::Asterix => Box::new(args.formats.asterix.clone()),
+        Format::Asterix => Box::new(args.formats.asterix_source.clone()),
         Format::Geojson => Box::new(GeoJsonLines),
         Format::Foxglove => bail!("Foxglove is served"),
     };
