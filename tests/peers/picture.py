@@ -55,7 +55,9 @@ def shown(path, png):
     command = [viewer, "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", "1600x900",
                "--screenshot-to", png, path]
     try:
-        subprocess.run(command, check=True, timeout=120, capture_output=True)
+        # What it logs it shows as well, over the picture.
+        quiet = dict(os.environ, RUST_LOG="off")
+        subprocess.run(command, check=True, timeout=120, capture_output=True, env=quiet)
         return len(Image.open(png).convert("RGB").getcolors(1 << 24))
     except (OSError, subprocess.SubprocessError):
         return None

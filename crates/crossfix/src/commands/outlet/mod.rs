@@ -10,7 +10,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use crossfix_geometry::Geodetic;
-use crossfix_message::{CameraCalibration, Channel, Key, TrackEvent, TrackFrame, decode};
+use crossfix_message::{
+    CameraCalibration, Channel, Key, Timestamp, TrackEvent, TrackFrame, decode,
+};
 use crossfix_outlet::{
     Asterix, CursorOnTarget, GeoJsonLines, Outlet, Sapient, Situation, Snapshot,
 };
@@ -21,9 +23,13 @@ use self::tls::TlsFiles;
 use crate::commands::numbers;
 use crate::config;
 use crate::network;
+use crate::pace::wall_seconds;
+use crate::repeats::Repeats;
 use crate::shutdown::{LEAVE, Shutdown};
 
 const POLL: Duration = Duration::from_millis(20);
+/// What is older is nothing to receivers, s: so long is an event of Cursor on Target good.
+const STALE_S: f64 = 10.0;
 /// Events that wait for the other side to be there; more are old news.
 const MOST_EVENTS: usize = 1000;
 
@@ -152,6 +158,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         situation: Situation::new(site, anchor),
         tracks_at: Instant::now(),
         events: Vec::new(),
+        repeats: Repeats::default(),
     };
     let period = Duration::from_secs_f64(
         args.rate_hz.map_or(args.format.period_s(), |rate_hz| rate_hz.recip()),
@@ -180,6 +187,7 @@ struct Heard {
     /// When the fusion centre said something of its tracks last.
     tracks_at: Instant,
     events: Vec<TrackEvent>,
+    repeats: Repeats,
 }
 
 impl Heard {
@@ -188,12 +196,26 @@ impl Heard {
         self.situation.snapshot(self.tracks_at.elapsed().as_secs_f64())
     }
 
+    /// Says that a site is of another time, as one that is replayed is: whoever is told of it says nothing.
+    fn check_time(&mut self, frame: &TrackFrame, now: Instant) {
+        let off_s = wall_seconds() - Timestamp::from_nanos(frame.time_ns).seconds();
+        if off_s.abs() > STALE_S {
+            self.repeats.warn("time", now, || {
+                format!(
+                    "the site's time is {off_s:.0} s behind this host's clock: programs that hold it \
+                     against theirs leave its targets out"
+                )
+            });
+        }
+    }
+
     /// What is no message of this version is the viewer's and the recorder's to report.
     fn hear(&mut self, received: &Received) {
         match received.key.channel {
             Channel::Tracks => {
                 if let Ok(frame) = decode::<TrackFrame>(&received.data) {
                     self.tracks_at = received.at;
+                    self.check_time(&frame, received.at);
                     self.situation.hear(received.key.area.as_ref(), &frame);
                 }
             }

@@ -27,14 +27,12 @@ pub struct EarthArgs {
     map_edges: Option<[Geodetic; 2]>,
 }
 
+/// The site's place on Earth, if it is known, and a picture of its ground.
+pub struct OnEarth(Option<(Geodetic, Option<GroundPicture>)>);
+
 impl EarthArgs {
-    /// An empty picture on a stream, on Earth if it is known where; `known` is what the network's file says.
-    pub fn picture(
-        &self,
-        stream: RecordingStream,
-        known: Option<Geodetic>,
-    ) -> anyhow::Result<Picture> {
-        let picture = Picture::new(stream)?;
+    /// Reads what is asked for; `known` is the anchor that the network's file says.
+    pub fn read(&self, known: Option<Geodetic>) -> anyhow::Result<OnEarth> {
         let ground = match (&self.map, self.map_edges) {
             (Some(path), Some(edges)) => {
                 let has_error = || format!("cannot lay {} under the site", path.display());
@@ -47,8 +45,16 @@ impl EarthArgs {
             anchor.is_some() || ground.is_none(),
             "where under the picture of the ground is the site? Say where on Earth its origin is, with --anchor"
         );
-        Ok(match anchor {
-            Some(anchor) => picture.on_earth(anchor, ground)?,
+        Ok(OnEarth(anchor.map(|anchor| (anchor, ground))))
+    }
+}
+
+impl OnEarth {
+    /// An empty picture of the site there.
+    pub fn picture(self, stream: RecordingStream) -> anyhow::Result<Picture> {
+        let picture = Picture::new(stream)?;
+        Ok(match self.0 {
+            Some((anchor, ground)) => picture.on_earth(anchor, ground)?,
             None => picture,
         })
     }

@@ -54,7 +54,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
                 say_saved(rrd);
                 Ok(())
             }
-            None => draw_recording(args.earth.picture(viewer(args)?, None)?, recording),
+            None => {
+                let earth = args.earth.read(None)?;
+                draw_recording(earth.picture(viewer(args)?)?, recording)
+            }
         },
         (None, Some(network)) => draw_live(args, network),
         (None, None) => bail!("give a recording, or a network file with -c"),
@@ -78,8 +81,9 @@ fn say_saved(rrd: &Path) {
 
 /// Draws a recording into an .rrd file.
 pub fn save_recording(recording: &Path, rrd: &Path, earth: &EarthArgs) -> anyhow::Result<()> {
+    let earth = earth.read(None)?;
     let draft = Draft::new(rrd, &[recording])?;
-    draw_recording(earth.picture(crossfix_view::save(draft.path())?, None)?, recording)?;
+    draw_recording(earth.picture(crossfix_view::save(draft.path())?)?, recording)?;
     draft.keep()
 }
 
@@ -108,6 +112,7 @@ const LAST_LOOK: Duration = Duration::from_secs(1);
 fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_stdin(args.stop_with_stdin);
     let network = config::load_network(network)?;
+    let earth = args.earth.read(config::anchor_of(&network)?)?;
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
@@ -121,7 +126,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
         }
         _ => viewer(args)?,
     };
-    let mut picture = args.earth.picture(stream, config::anchor_of(&network)?)?;
+    let mut picture = earth.picture(stream)?;
     let cameras: Vec<CameraName> = network.cameras.keys().cloned().collect();
     let mut lookout = Lookout::for_cameras(&link, &network, &cameras)?;
     let subscription = link.subscribe(&[Key::everything_of(link.site())])?;
