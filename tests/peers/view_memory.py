@@ -8,6 +8,7 @@ that Crossfix is built with; it draws without a screen (Vulkan, such as Debian's
 """
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -70,9 +71,10 @@ with tempfile.TemporaryDirectory() as folder:
     for process in (replay, view):
         process.terminate()
         process.wait()
+    # The viewer outlives whoever started it.
     for pid in left[1:]:
         try:
-            os.kill(pid, 15)
+            os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:
             pass
 print(f"view: {most[0]:.0f} MB at most, the viewer: {most[1]:.0f} MB at most")
