@@ -387,11 +387,11 @@ impl Site {
 
 /// Ports below those that the system gives to whoever asks for none.
 const PORTS: std::ops::Range<u32> = 10_240..32_000;
-/// Tests that run at the same time begin so many ports from each other.
+/// Tests whose processes follow one another begin so many ports from each other.
 const PORTS_A_PROCESS: u32 = 131;
 
-/// So many endpoints on this machine that nobody uses now, and that no other test is given: it listens at
-/// them later, so those that the system gives would be given again meanwhile.
+/// So many endpoints on this machine that nobody uses now. They are listened at later, so those that the system
+/// gives would be given again meanwhile; here no test gives one twice, and another test hardly the same.
 pub fn free_endpoints(count: usize) -> Vec<String> {
     static GIVEN: AtomicU32 = AtomicU32::new(0);
     let begin = std::process::id().wrapping_mul(PORTS_A_PROCESS);

@@ -191,7 +191,10 @@ impl Lookout {
         let named = named.join(", ");
         let are_cameras = missing.iter().any(|other| other.key.channel.camera().is_some());
         if missing.len() == self.others.len() && !are_cameras {
-            format!("nobody of site `{}` hears this camera: waiting for {named}", self.site)
+            format!(
+                "nobody of site `{}` fuses what this camera sees: waiting for {named}",
+                self.site
+            )
         } else if missing.len() == self.others.len() {
             format!("nobody of site `{}` is there: waiting for {named}", self.site)
         } else {

@@ -134,7 +134,7 @@ pub(crate) fn bearings(
     Ok(())
 }
 
-fn tint(track: &Track) -> Color {
+pub(crate) fn tint(track: &Track) -> Color {
     match track.state() {
         TrackState::Confirmed => colour::of_track(track.id),
         _ => colour::of_unsure_track(track.id),

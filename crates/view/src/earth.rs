@@ -10,7 +10,7 @@ use rerun_types::components::{AlbedoFactor, Color, Radius};
 use rerun_types::datatypes::Rgba32;
 
 use crate::extent::Extent;
-use crate::{ViewError, colour};
+use crate::{ViewError, draw};
 
 /// Where the map's view finds its points.
 pub(crate) const MAP: &str = "map";
@@ -110,7 +110,7 @@ impl Earth {
         if track.state() == TrackState::OneCamera {
             return self.clear(stream, track.id);
         }
-        let (id, colour) = (track.id, colour::of_track(track.id));
+        let (id, colour) = (track.id, draw::tint(track));
         let point = GeoPoints::from_lat_lon([self.lat_lon(place)])
             .with_radii([Radius::new_ui_points(5.0)])
             .with_colors([colour]);

@@ -146,8 +146,13 @@ impl Site {
         let entries = std::fs::read_dir(&security.certificates).into_iter().flatten().flatten();
         let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
         let identities = names.filter_map(|name| name.strip_suffix(".pem")?.parse().ok());
+        // One of a camera that has been taken away is nobody's trouble.
+        let is_known = |identity: &Identity| match identity {
+            Identity::Camera(camera) => network.cameras.contains_key(camera),
+            _ => true,
+        };
         let now = SystemTime::now();
-        for identity in identities {
+        for identity in identities.filter(is_known) {
             let credentials = Credentials::load(security, &identity, now)
                 .with_context(|| format!("the certificate of {identity}"))?;
             let left = credentials.not_after().duration_since(now).unwrap_or_default();

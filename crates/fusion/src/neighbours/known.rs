@@ -18,28 +18,34 @@ const KEPT_S: f64 = 2.0;
 /// They are kept this often, s: between two of them a target's manoeuvre is no matter.
 pub(super) const KEPT_EVERY_S: f64 = 0.2;
 
-/// Where a track was of late, the oldest first.
+/// Where a track was of late.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Past(VecDeque<(Timestamp, KinematicState)>);
+pub(super) struct Past {
+    newest: Option<(Timestamp, KinematicState)>,
+    /// Some of what was the newest, the oldest first.
+    kept: VecDeque<(Timestamp, KinematicState)>,
+}
 
 impl Past {
     pub(super) fn add(&mut self, time: Timestamp, state: &KinematicState) {
-        match self.0.back().map(|(last, _)| time.seconds_since(*last)) {
+        self.newest = Some((time, state.clone()));
+        match self.kept.back().map(|(last, _)| time.seconds_since(*last)) {
             Some(since_s) if (0.0..KEPT_EVERY_S).contains(&since_s) => return,
-            Some(since_s) if since_s < 0.0 => self.0.clear(),
+            Some(since_s) if since_s < 0.0 => self.kept.clear(),
             _ => {}
         }
-        self.0.push_back((time, state.clone()));
-        while self.0.front().is_some_and(|(first, _)| time.seconds_since(*first) > KEPT_S) {
-            self.0.pop_front();
+        self.kept.push_back((time, state.clone()));
+        while self.kept.front().is_some_and(|(first, _)| time.seconds_since(*first) > KEPT_S) {
+            self.kept.pop_front();
         }
     }
 
     /// Where it was at a time, from the last state before it; what of its acceleration nobody knows has
     /// that density, m^2/s^3. `None` of a track without a past.
     pub(super) fn at(&self, time: Timestamp, density: f64) -> Option<KinematicState> {
-        let before = self.0.iter().rfind(|(at, _)| *at <= time);
-        let (at, state) = before.or(self.0.front())?;
+        let newest = self.newest.iter().filter(|(at, _)| *at <= time);
+        let before = newest.chain(self.kept.iter().rev().filter(|(at, _)| *at <= time)).next();
+        let (at, state) = before.or(self.kept.front())?;
         Some(state.predicted(time.seconds_since(*at), density))
     }
 }

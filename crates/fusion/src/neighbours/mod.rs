@@ -236,7 +236,7 @@ impl Neighbours {
         if ours.compared.is_some_and(|at| (0.0..COMPARED_EVERY_S).contains(&since(at))) {
             return false;
         }
-        ours.compared = Some(now);
+        let before = ours.compared.replace(now);
         let Some(state) = state_of(track) else { return true };
         ours.past.add(now, &state);
         let (number, past) = (ours.number, ours.past.clone());
@@ -244,8 +244,12 @@ impl Neighbours {
             if !self.is_said(*said, theirs) {
                 continue;
             }
-            // At the earlier of both times where these are apart: what is known is not a prediction there.
+            // At the earlier of both times where these are apart: there neither is predicted far.
             let is_behind = since(theirs.time) > KEPT_EVERY_S;
+            // And once: what was compared there already tells nothing new.
+            if is_behind && theirs.heard < before {
+                continue;
+            }
             let earlier = if is_behind { past.at(theirs.time, self.density) } else { None };
             let here = earlier.as_ref().unwrap_or(&state);
             let when = if is_behind { theirs.time } else { now };

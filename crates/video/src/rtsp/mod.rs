@@ -355,8 +355,10 @@ pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
 /// What a camera says is read by libraries that it can make panic (a line without `=` in a session's
 /// description does it): then it is the stream that is wrong.
 fn unharmed<T>(url: &str, read: impl FnOnce() -> Result<T, VideoError>) -> Result<T, VideoError> {
-    catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|_| {
-        let what = "what it sends cannot be read".to_owned();
+    catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|panic| {
+        let said = panic.downcast_ref::<String>().map(String::as_str);
+        let said = said.or(panic.downcast_ref::<&str>().copied()).unwrap_or("without a word");
+        let what = format!("what it sends cannot be read ({})", said.replace('\n', " "));
         Err(VideoError::Stream { url: url.to_owned(), what })
     })
 }

@@ -175,6 +175,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
     }
     carrier.finish(&mut *outlet)?;
+    heard.repeats.end();
     drop(subscription);
     link.close(LEAVE)?;
     crate::output::line(format!("outlet: {} messages", carrier.messages()));
@@ -202,8 +203,10 @@ impl Heard {
         if off_s.abs() > STALE_S {
             self.repeats.warn("time", now, || {
                 format!(
-                    "the site's time is {off_s:.0} s behind this host's clock: programs that hold it \
-                     against theirs leave its targets out"
+                    "the site's time is {:.0} s {} this host's clock: programs that hold it against theirs \
+                     leave its targets out",
+                    off_s.abs(),
+                    if off_s > 0.0 { "behind" } else { "before" }
                 )
             });
         }
