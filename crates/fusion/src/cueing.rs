@@ -9,7 +9,7 @@
 use std::collections::BTreeMap;
 
 use crossfix_filter::KinematicState;
-use crossfix_geometry::{BearingModel, tangent_basis, turn_vector};
+use crossfix_geometry::{BearingModel, tangent_basis, turn_between, turn_vector};
 use crossfix_message::{
     CameraName, Cue, CueFrame, Cued, Expected, Payload, Timestamp, Vector3 as WireVector,
 };
@@ -187,7 +187,7 @@ fn seen(
     let mut covariance = Matrix2::zeros();
     for (weight, model, spread) in models {
         // Along great circles: a stripe may be longer than a tangent plane is flat.
-        let turn = Rotation3::rotation_between(&model.direction, &direction)?;
+        let turn = turn_between(&model.direction, &direction)?;
         let aside = tangents * turn_vector(&turn).cross(&-direction.into_inner());
         let by = tangents * (turn.matrix() * model.basis) * model.by_position();
         covariance += (aside * aside.transpose() + by * spread * by.transpose()) * weight;

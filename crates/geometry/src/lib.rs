@@ -40,5 +40,5 @@ pub use error::GeometryError;
 pub use geodetic::{Geodetic, LocalFrame};
 pub use model::BearingModel;
 pub use pan_tilt::PanTilt;
-pub use pose::{Pose, turn_vector};
+pub use pose::{Pose, turn_between, turn_vector};
 pub use scanning::{ScanAngles, ScanMeasurement, camera_from_paper, optical_bearing};

@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Point3, Quaternion, Rotation3, Unit, UnitQuaternion, Vector3};
 
 use crate::GeometryError;
 
@@ -20,6 +20,16 @@ pub struct Pose {
 /// makes the matrix' trace larger than three.
 pub fn turn_vector(rotation: &Rotation3<f64>) -> Vector3<f64> {
     UnitQuaternion::from_rotation_matrix(rotation).scaled_axis()
+}
+
+/// The smallest turn of one direction onto another; `None` where they are opposite within a microradian.
+///
+/// [`Rotation3::rotation_between`] is no number where rounding makes the cosine of directions that are next
+/// to equal larger than one, and knows a small angle no better than to 1e-8 rad.
+pub fn turn_between(from: &Unit<Vector3<f64>>, to: &Unit<Vector3<f64>>) -> Option<Rotation3<f64>> {
+    // 1 + cos a = 2 cos^2 (a/2) and sin a = 2 sin (a/2) cos (a/2): twice the cosine times the half turn.
+    let half = Quaternion::from_parts(1.0 + from.dot(to), from.cross(to));
+    Unit::try_new(half, 1e-6).map(|half| half.to_rotation_matrix())
 }
 
 impl Pose {
@@ -83,7 +93,13 @@ impl Pose {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::TAU;
+
+    use nalgebra::Vector2;
+    use proptest::prelude::*;
+
     use super::*;
+    use crate::tangent_basis;
 
     #[test]
     fn a_camera_looking_north_sees_east_on_its_right_and_up_above() {
@@ -104,6 +120,34 @@ mod tests {
         let mut shear = Matrix3::identity();
         shear[(0, 1)] = 0.01;
         assert!(Pose::new(shear, Point3::origin()).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn a_turn_between_directions_is_the_smallest(
+            (up, round, about) in (-1.0..1.0f64, 0.0..TAU, 0.0..TAU),
+            log_angle in -18.0..0.49f64,
+        ) {
+            let angle = 10f64.powf(log_angle);
+            let level = (1.0 - up * up).sqrt();
+            let from = Vector3::new(level * round.cos(), level * round.sin(), up);
+            let from = Unit::new_normalize(from);
+            let axis = tangent_basis(&from) * Vector2::new(about.cos(), about.sin());
+            let axis = Unit::new_normalize(axis);
+            let to = Unit::new_normalize(Rotation3::from_axis_angle(&axis, angle) * *from);
+            let turn = turn_between(&from, &to).unwrap();
+            // By rounding, which weighs the more the nearer they are to opposite.
+            let exact = 1e-14 / (angle / 2.0).cos();
+            prop_assert!((turn * *from - *to).norm() < exact);
+            prop_assert!((turn_vector(&turn) - *axis * angle).norm() < exact);
+        }
+    }
+
+    #[test]
+    fn there_is_no_smallest_turn_between_opposite_directions() {
+        let (up, down) = (Vector3::z_axis(), -Vector3::z_axis());
+        assert_eq!(turn_between(&up, &down), None);
+        assert_eq!(turn_between(&up, &up), Some(Rotation3::identity()));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A site that was put together from what cameras saw is brought to where it stands.
 
-use crossfix_geometry::{Pose, turn_vector};
+use crossfix_geometry::{Pose, turn_between, turn_vector};
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
 use super::adjustment::State;
@@ -265,7 +265,7 @@ fn upright(cameras: &[CameraState]) -> Rotation3<f64> {
     // Rows go down in the image.
     let up: Vector3<f64> = cameras.iter().map(|camera| camera.rotation * -Vector3::y()).sum();
     let up = if across.dot(&up) < 0.0 { -across } else { across };
-    Rotation3::rotation_between(&up, &Vector3::z())
+    turn_between(&Unit::new_normalize(up), &Vector3::z_axis())
         .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
 }
 

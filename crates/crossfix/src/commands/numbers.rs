@@ -55,12 +55,18 @@ pub fn rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 10_000.0, " frames a second")
 }
 
+/// So many numbers with commas between them.
+#[cfg(any(feature = "centre", feature = "viewer"))]
+fn several<const N: usize>(text: &str, example: &str) -> Result<[f64; N], String> {
+    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
+    numbers
+        .try_into()
+        .map_err(|_| format!("it must be {N} numbers with commas between them, e.g. {example}"))
+}
+
 #[cfg(any(feature = "centre", feature = "viewer"))]
 pub fn triple(text: &str) -> Result<[f64; 3], String> {
-    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
-    numbers.try_into().map_err(|_| {
-        "it must be three numbers with commas between them, e.g. -80,-80,10".to_owned()
-    })
+    several(text, "-80,-80,10")
 }
 
 /// A place on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
@@ -74,11 +80,7 @@ pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
 /// The edges of a picture of the ground: its south-western and north-eastern corner.
 #[cfg(feature = "viewer")]
 pub fn edges(text: &str) -> Result<[crossfix_geometry::Geodetic; 2], String> {
-    let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
-    let [south, west, north, east]: [f64; 4] = numbers.try_into().map_err(|_| {
-        "it must be four numbers with commas between them, e.g. 48.352,11.783,48.356,11.789"
-            .to_owned()
-    })?;
+    let [south, west, north, east] = several(text, "48.352,11.783,48.356,11.789")?;
     if south >= north || west >= east {
         return Err("south must be below north, and west below east".to_owned());
     }

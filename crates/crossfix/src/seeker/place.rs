@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use crossfix_geometry::{tangent_basis, turn_vector};
+use crossfix_geometry::{tangent_basis, turn_between, turn_vector};
 use crossfix_message::{BearingTrack, Cue, Expected, Timestamp};
 use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
 
@@ -31,7 +31,7 @@ pub(super) fn squared_distance(
     let own = Unit::try_new(Vector3::from(track.bearing?), 1e-6)?;
     let direction = turned * own;
     let tangents = tangent_basis(&expected.direction).transpose();
-    let turn = Rotation3::rotation_between(&expected.direction, &direction)?;
+    let turn = turn_between(&expected.direction, &direction)?;
     let offset: Vector2<f64> = tangents * turn_vector(&turn).cross(&expected.direction);
     let [xx, xy, yy] = [track.covariance_xx, track.covariance_xy, track.covariance_yy];
     // The track's tangents as they lie in those of the expectation.
@@ -53,7 +53,7 @@ pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
     let share = if to_s > from_s { -from_s / (to_s - from_s) } else { 0.0 };
     // What is earlier than it says is as it says.
     let share = share.clamp(0.0, 1.5);
-    let turn = Rotation3::rotation_between(&from.direction, &to.direction)?;
+    let turn = turn_between(&from.direction, &to.direction)?;
     let part = Rotation3::new(turn_vector(&turn) * share);
     Some(Place {
         direction: part * from.direction,

@@ -206,7 +206,7 @@ impl Heard {
                     "the site's time is {:.0} s {} this host's clock: programs that hold it against theirs \
                      leave its targets out",
                     off_s.abs(),
-                    if off_s > 0.0 { "behind" } else { "before" }
+                    if off_s > 0.0 { "behind" } else { "ahead of" }
                 )
             });
         }
