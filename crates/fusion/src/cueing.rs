@@ -9,7 +9,7 @@
 use std::collections::BTreeMap;
 
 use crossfix_filter::KinematicState;
-use crossfix_geometry::{BearingModel, tangent_basis, turn_between, turn_vector};
+use crossfix_geometry::{Bearing, BearingModel, tangent_basis, turn_between, turn_vector};
 use crossfix_message::{
     CameraName, Cue, CueFrame, Cued, Expected, Payload, Timestamp, Vector3 as WireVector,
 };
@@ -115,7 +115,7 @@ pub(crate) fn cues(
     frame.stamped()
 }
 
-/// `None` if it lies at the camera itself.
+/// `None` if it lies at the camera itself, or may lie anywhere.
 fn cue(
     camera: (&KnownCamera, &CameraUncertainty),
     own_now: Timestamp,
@@ -153,6 +153,9 @@ fn expected(
     // Both have tangents of their own at the direction.
     let turn = (to_world.matrix() * tangent_basis(&own)).transpose() * model.basis;
     let covariance = turn * (covariance + shared) * turn.transpose();
+    if covariance.diagonal().max() > Bearing::WIDEST_RAD.powi(2) {
+        return None;
+    }
     Some(Expected {
         time_ns: time.nanos(),
         bearing: Some(WireVector::from(own.into_inner())),

@@ -1,3 +1,5 @@
+use std::f64::consts::PI;
+
 use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2, Vector3};
 
 use crate::GeometryError;
@@ -26,11 +28,15 @@ pub struct Bearing {
 }
 
 impl Bearing {
+    /// The largest standard deviation along a tangent, rad: what is known no better than to half a turn
+    /// may be anywhere.
+    pub const WIDEST_RAD: f64 = PI;
+
     /// A bearing from a vector of length one and a positive definite covariance.
     ///
     /// # Errors
-    /// [`GeometryError`] if a number is not finite, the length differs from 1 by
-    /// more than 1e-6 or the covariance is not positive definite.
+    /// [`GeometryError`] if a number is not finite, the length differs from 1 by more than 1e-6, or the
+    /// covariance is not positive definite or wider than [`Self::WIDEST_RAD`].
     pub fn new(vector: Vector3<f64>, covariance: Matrix2<f64>) -> Result<Self, GeometryError> {
         if !vector.iter().chain(covariance.iter()).all(|v| v.is_finite()) {
             return Err(GeometryError::NotFinite { what: "a bearing" });
@@ -42,6 +48,9 @@ impl Bearing {
         let [xx, xy, yy] = [covariance.m11, covariance.m12, covariance.m22];
         if xx <= 0.0 || yy <= 0.0 || xx * yy <= xy * xy {
             return Err(GeometryError::NotPositive { xx, xy, yy });
+        }
+        if xx.max(yy) > Self::WIDEST_RAD.powi(2) {
+            return Err(GeometryError::Anywhere { sd: xx.max(yy).sqrt() });
         }
         let direction = Unit::new_unchecked(vector / length);
         Ok(Self { direction, covariance: Matrix2::new(xx, xy, xy, yy) })

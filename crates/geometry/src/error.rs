@@ -25,6 +25,12 @@ pub enum GeometryError {
         /// Variance along the second axis.
         yy: f64,
     },
+    /// A direction that may be any.
+    #[error("a bearing with a standard deviation of {sd:.3e} rad may lie anywhere")]
+    Anywhere {
+        /// The larger of its two standard deviations, rad.
+        sd: f64,
+    },
     /// A matrix that should be a rotation is none.
     #[error(
         "the rotation is not orthonormal: R'R differs from the identity by {deviation:.2e} \

@@ -6,10 +6,16 @@ use prost::Message;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
+use crate::covariance::is_covariance;
 use crate::{
     CameraCalibration, CameraName, Datum, DistortionModel, NameError, PanTiltMount, Payload,
     Pointing, Timestamp, Vector3,
 };
+
+/// A pose whose rotation about an axis is known no better than this is not known, rad.
+pub const MOST_ROTATION_SD: f64 = 1.0;
+/// The same of its place along an axis, m: a site is smaller than some of these.
+pub const MOST_POSITION_SD: f64 = 1000.0;
 
 /// A [`CameraCalibration`] that has been read and found possible.
 #[derive(Clone, Debug)]
@@ -65,8 +71,12 @@ pub enum CalibrationError {
         /// The camera.
         camera: CameraName,
     },
-    /// The pose's covariance is none: not finite, not symmetric, or negative along some axis.
-    #[error("the calibration of camera `{camera}`: pose_covariance is no covariance")]
+    /// The pose's covariance is none: not finite, not symmetric, or negative along some axis; or it is that
+    /// of a pose that nobody knows ([`MOST_ROTATION_SD`], [`MOST_POSITION_SD`]).
+    #[error(
+        "the calibration of camera `{camera}`: pose_covariance is no covariance, or of a pose that is not known \
+         to {MOST_ROTATION_SD} rad and {MOST_POSITION_SD} m"
+    )]
     Covariance {
         /// The camera.
         camera: CameraName,
@@ -332,14 +342,12 @@ impl PanTiltMount {
 /// `None` if it is no covariance.
 fn read_pose_covariance(values: &[f64; 36], camera: &Camera) -> Option<Matrix6<f64>> {
     let own = Matrix6::from_row_slice(values);
-    let scale = own.amax();
-    let symmetric = (own - own.transpose()).amax() <= 1e-9 * scale;
-    let possible = own.iter().all(|value| value.is_finite())
-        && symmetric
-        && own.symmetric_eigenvalues().min() >= -1e-9 * scale;
+    let sd = own.diagonal().map(|variance| variance.max(0.0).sqrt());
+    let is_known = sd.fixed_rows::<3>(0).max() <= MOST_ROTATION_SD
+        && sd.fixed_rows::<3>(3).max() <= MOST_POSITION_SD;
     let mut turn = Matrix6::identity();
     turn.fixed_view_mut::<3, 3>(0, 0).copy_from(camera.pose().rotation().matrix());
-    possible.then(|| turn * own * turn.transpose())
+    (is_known && is_covariance(&own, &[0..3, 3..6])).then(|| turn * own * turn.transpose())
 }
 
 impl From<Point3<f64>> for Vector3 {
@@ -455,6 +463,10 @@ mod tests {
             let mut nan = message().with_pose_sd(0.01, 0.1);
             nan.pose_covariance[place] = f64::NAN;
             assert!(matches!(nan.parse(), Err(CalibrationError::Covariance { .. })), "{place}");
+        }
+        for (rotation_sd, position_sd) in [(1.1, 0.1), (0.01, 1e150)] {
+            let unknown = message().with_pose_sd(rotation_sd, position_sd);
+            assert!(matches!(unknown.parse(), Err(CalibrationError::Covariance { .. })));
         }
     }
 

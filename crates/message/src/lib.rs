@@ -16,6 +16,7 @@
 //! ```
 
 mod camera;
+mod covariance;
 mod datum;
 mod glance;
 mod key;
@@ -25,7 +26,7 @@ mod size;
 mod time;
 mod track;
 
-pub use camera::{Calibration, CalibrationError, LastingNoise};
+pub use camera::{Calibration, CalibrationError, LastingNoise, MOST_POSITION_SD, MOST_ROTATION_SD};
 pub use datum::Datum;
 pub use glance::{Glance, glance};
 pub use key::{Channel, Key, KeyError};

@@ -176,6 +176,20 @@ fn a_fragment_that_claims_four_thousand_million_frames_is_read_in_time() {
     }
 }
 
+/// Whoever follows them one within the other runs out of stack.
+#[test]
+fn an_mp4_file_of_boxes_within_boxes_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mp4");
+    for kind in [b"moov", b"moof"] {
+        let boxes = (1..=200_000_u32).rev();
+        let bytes: Vec<u8> =
+            boxes.flat_map(|rest| [&(8 * rest).to_be_bytes(), &kind[..]].concat()).collect();
+        fs::write(&path, bytes).unwrap();
+        assert!(open(&path, FrameClock::default()).is_err());
+    }
+}
+
 #[test]
 fn a_thousand_damaged_mp4_files_end_with_frames_or_an_error() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,6 @@
 use anyhow::{Context, bail, ensure};
 use crossfix_geometry::Pose;
+use crossfix_message::{MOST_POSITION_SD, MOST_ROTATION_SD};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
@@ -46,11 +47,15 @@ impl PoseConfig {
 
     /// Both deviations are given or neither, and each is one.
     fn check_deviations(&self) -> anyhow::Result<()> {
+        let most = [MOST_ROTATION_SD * 1e3, MOST_POSITION_SD];
         let given = [self.rotation_sd_mrad, self.position_sd_m];
-        let possible = given.iter().flatten().all(|sd| (0.0..=1000.0).contains(sd));
+        let possible =
+            given.iter().zip(most).all(|(sd, most)| sd.is_none_or(|sd| (0.0..=most).contains(&sd)));
         ensure!(
             possible && given[0].is_some() == given[1].is_some(),
-            "give both `rotation_sd_mrad` and `position_sd_m`, from 0 to 1000, or neither"
+            "give both `rotation_sd_mrad`, from 0 to {}, and `position_sd_m`, from 0 to {}, or neither",
+            most[0],
+            most[1]
         );
         Ok(())
     }

@@ -1,8 +1,6 @@
 //! Where a target should be, by a cue, and how far a track is from there.
 
-use std::f64::consts::TAU;
-
-use crossfix_geometry::{tangent_basis, turn_between, turn_vector};
+use crossfix_geometry::{Bearing, tangent_basis, turn_between, turn_vector};
 use crossfix_message::{BearingTrack, Cue, Expected, Timestamp};
 use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
 
@@ -62,10 +60,7 @@ pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
 }
 
 fn read(expected: &Expected) -> Option<Place> {
-    let direction = Unit::try_new(Vector3::from(expected.bearing?), 1e-6)?;
     let [xx, xy, yy] = [expected.covariance_xx, expected.covariance_xy, expected.covariance_yy];
-    let covariance = Matrix2::new(xx, xy, xy, yy);
-    let possible = covariance.cholesky().is_some() && covariance.trace() < TAU.powi(2);
-    let finite = direction.iter().all(|part| part.is_finite());
-    (possible && finite).then_some(Place { direction, covariance })
+    let bearing = Bearing::new(expected.bearing?.into(), Matrix2::new(xx, xy, xy, yy)).ok()?;
+    Some(Place { direction: bearing.direction(), covariance: *bearing.covariance() })
 }

@@ -172,7 +172,7 @@ fn configure_more(config: &mut FusionConfig, bytes: &mut Bytes<'_>) {
 /// Standard deviations of clocks, s: good, unsure, very unsure.
 const CLOCKS: [f64; 6] = [0.0, 0.9e-3, 2e-3, 0.02, 0.1, 9.9];
 /// Standard deviations of poses, rad and m: of a survey, of a guess, and of nothing.
-const POSES: [(f64, f64); 5] = [(1e-3, 0.05), (1e-6, 1e-5), (0.1, 3.0), (0.0, 0.0), (3.0, 1e6)];
+const POSES: [(f64, f64); 5] = [(1e-3, 0.05), (1e-6, 1e-5), (0.1, 3.0), (0.0, 0.0), (1.0, 1e3)];
 
 /// A camera's pose as well known as a byte says.
 fn with_pose(message: CameraCalibration, choice: u8, odd: f64) -> CameraCalibration {

@@ -48,7 +48,8 @@ pub struct BearingTrack {
     /// Unit vector towards the target in the camera's frame.
     #[prost(message, optional, tag = "2")]
     pub bearing: ::core::option::Option<Vector3>,
-    /// Variance along the first tangent, the camera's x axis made perpendicular to the bearing; rad^2.
+    /// Variance along the first tangent, the camera's x axis made perpendicular to the bearing; rad^2. A
+    /// bearing with more than pi rad (standard deviation) along a tangent is refused: it may lie anywhere.
     #[prost(double, tag = "3")]
     pub covariance_xx: f64,
     /// Covariance of both tangents; rad^2.
@@ -209,7 +210,8 @@ pub struct CameraCalibration {
     /// Covariance of the pose's error, 6x6 row by row: a small rotation about the camera's axes (rad), then the
     /// position in the world (m). The error is the true pose less the stated one: a camera that is turned by d more
     /// than it says, and stands by c farther than it says. All zeros: exact. Empty: not declared; then a careful
-    /// survey's (1 mrad, 5 cm an axis) is assumed, and what the sight lines show of it is learnt.
+    /// survey's (1 mrad, 5 cm an axis) is assumed, and what the sight lines show of it is learnt. One of more
+    /// than 1 rad or 1 km along an axis (standard deviation) is refused.
     #[prost(double, repeated, tag = "13")]
     pub pose_covariance: ::prost::alloc::vec::Vec<f64>,
     /// The calibration holds from this time on: frames that were captured before it are read with the one before it.

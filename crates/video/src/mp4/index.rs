@@ -1,11 +1,12 @@
 //! Where the compressed frames of an MP4 file lie, and when each is shown.
 //!
 //! The boxes are `mp4-atom`'s business. It is given whole boxes out of a buffer, which it cannot
-//! leave, and every loop here goes on to a later byte of the file or ends: a damaged file costs no
-//! more time and memory than its size.
+//! leave, with nothing in them but what is read here, and every loop here goes on to a later byte of
+//! the file or ends: a damaged file costs no more time and memory than its size.
 
 use std::io::{Read, Seek, SeekFrom};
 
+use super::boxes::{self, known};
 use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak};
 
 /// The longest index that is read, bytes: a day of 60 frames per second.
@@ -101,9 +102,11 @@ fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), Stri
                 .map_err(text)?;
             let damaged = |error: mp4_atom::Error| format!("its index is damaged: {error}");
             if kind == *b"moov" {
-                moov = Some(Moov::decode(&mut bytes.as_slice()).map_err(damaged)?);
+                let known = known(&bytes, boxes::MOOV)?;
+                moov = Some(Moov::decode(&mut known.as_slice()).map_err(damaged)?);
             } else {
-                moofs.push((at, Moof::decode(&mut bytes.as_slice()).map_err(damaged)?));
+                let known = known(&bytes, boxes::MOOF)?;
+                moofs.push((at, Moof::decode(&mut known.as_slice()).map_err(damaged)?));
             }
         }
         at += size;

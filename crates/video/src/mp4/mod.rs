@@ -1,3 +1,4 @@
+mod boxes;
 mod index;
 
 use std::collections::VecDeque;

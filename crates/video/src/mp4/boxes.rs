@@ -1,0 +1,192 @@
+//! What of an index is read, and the rest left out.
+//!
+//! `mp4-atom` reads every box that it knows wherever it meets it, boxes within boxes without an end, and some
+//! of them take memory by what they claim and not by their length. It is given only those that are asked for
+//! here, each where it belongs.
+
+use std::ops::Range;
+
+use self::Holds::{Boxes, Counted, Picture, Values};
+
+/// A kind of box that is read, and what it has within.
+#[derive(Clone, Copy)]
+pub(super) struct Known([u8; 4], Holds);
+
+#[derive(Clone, Copy)]
+enum Holds {
+    /// What is read as it is.
+    Values,
+    /// Boxes.
+    Boxes(&'static [Known]),
+    /// A version, how many boxes there are, and the boxes.
+    Counted(&'static [Known]),
+    /// A picture's description, and boxes.
+    Picture(&'static [Known]),
+}
+
+/// The boxes of a whole file's index.
+pub(super) const MOOV: &[Known] = &[
+    Known(*b"mvhd", Values),
+    Known(*b"mvex", Boxes(&[Known(*b"trex", Values)])),
+    Known(*b"trak", Boxes(&[Known(*b"tkhd", Values), Known(*b"mdia", Boxes(MDIA))])),
+];
+
+const MDIA: &[Known] =
+    &[Known(*b"mdhd", Values), Known(*b"hdlr", Values), Known(*b"minf", Boxes(MINF))];
+
+/// It must say where its data are, though they are always in this file.
+const MINF: &[Known] =
+    &[Known(*b"dinf", Boxes(&[Known(*b"dref", Counted(&[]))])), Known(*b"stbl", Boxes(STBL))];
+
+const STBL: &[Known] = &[
+    Known(*b"stsd", Counted(&[Known(*b"avc1", Picture(&[Known(*b"avcC", Values)]))])),
+    Known(*b"stts", Values),
+    Known(*b"ctts", Values),
+    Known(*b"stsc", Values),
+    Known(*b"stsz", Values),
+    Known(*b"stco", Values),
+    Known(*b"co64", Values),
+    Known(*b"stss", Values),
+];
+
+/// The boxes of a fragment's index.
+pub(super) const MOOF: &[Known] = &[
+    Known(*b"mfhd", Values),
+    Known(
+        *b"traf",
+        Boxes(&[Known(*b"tfhd", Values), Known(*b"tfdt", Values), Known(*b"trun", Values)]),
+    ),
+];
+
+/// The length of a picture's description, bytes (ISO/IEC 14496-12, 12.1.3).
+const PICTURE_BYTES: usize = 78;
+
+/// A box with what of it is read.
+///
+/// # Errors
+/// What is wrong with it, in words, if a box within it is cut off.
+pub(super) fn known(whole: &[u8], within: &'static [Known]) -> Result<Vec<u8>, String> {
+    let (kind, body, _) = split(whole)?;
+    let mut kept = Vec::with_capacity(whole.len());
+    append(Known(kind, Boxes(within)), body, &mut kept)?;
+    Ok(kept)
+}
+
+/// Appends a box with what of it is read.
+fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<(), String> {
+    const COUNT: Range<usize> = 4..8;
+    let begins = kept.len();
+    kept.extend([0; 4]);
+    kept.extend(kind);
+    let head = |length| body.split_at_checked(length).ok_or_else(cut_off);
+    match holds {
+        Values => kept.extend(body),
+        Boxes(within) => _ = append_within(within, body, kept)?,
+        Picture(within) => {
+            let (head, rest) = head(PICTURE_BYTES)?;
+            kept.extend(head);
+            append_within(within, rest, kept)?;
+        }
+        Counted(within) => {
+            let (head, rest) = head(COUNT.end)?;
+            let at = kept.len();
+            kept.extend(head);
+            let count = append_within(within, rest, kept)?;
+            kept[at..][COUNT].copy_from_slice(&count.to_be_bytes());
+        }
+    }
+    let size = u32::try_from(kept.len() - begins).map_err(|error| error.to_string())?;
+    kept[begins..][..4].copy_from_slice(&size.to_be_bytes());
+    Ok(())
+}
+
+/// Appends those of a box's boxes that are read, and says how many.
+fn append_within(
+    within: &'static [Known],
+    mut rest: &[u8],
+    kept: &mut Vec<u8>,
+) -> Result<u32, String> {
+    /// What is shorter than a box's head is padding.
+    const LEAST: usize = 8;
+    let mut count = 0;
+    while rest.len() >= LEAST {
+        let (kind, body, after) = split(rest)?;
+        if let Some(&known) = within.iter().find(|Known(known, _)| *known == kind) {
+            append(known, body, kept)?;
+            count += 1;
+        }
+        rest = after;
+    }
+    Ok(count)
+}
+
+/// The kind of the first box, what is in it, and what comes after it.
+fn split(bytes: &[u8]) -> Result<([u8; 4], &[u8], &[u8]), String> {
+    let (head, rest) = bytes.split_first_chunk::<8>().ok_or_else(cut_off)?;
+    let [s0, s1, s2, s3, kind @ ..] = *head;
+    let (size, head) = match u32::from_be_bytes([s0, s1, s2, s3]) {
+        // To the end.
+        0 => (bytes.len(), 8),
+        1 => {
+            let long = rest.first_chunk::<8>().ok_or_else(cut_off)?;
+            (usize::try_from(u64::from_be_bytes(*long)).map_err(|_| cut_off())?, 16)
+        }
+        size => (usize::try_from(size).map_err(|_| cut_off())?, 8),
+    };
+    let (whole, after) = bytes.split_at_checked(size).ok_or_else(cut_off)?;
+    Ok((kind, whole.get(head..).ok_or_else(cut_off)?, after))
+}
+
+fn cut_off() -> String {
+    "its index is damaged: a part of it is cut off".to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn a_box(kind: &[u8; 4], parts: &[&[u8]]) -> Vec<u8> {
+        let body = parts.concat();
+        let size = u32::try_from(body.len() + 8).unwrap();
+        [&size.to_be_bytes(), &kind[..], &body].concat()
+    }
+
+    #[test]
+    fn what_is_not_read_is_left_out_wherever_it_is() {
+        let times = a_box(b"stts", &[&[7; 16]]);
+        let groups = a_box(b"sgpd", &[&[0xff; 16]]);
+        let header = a_box(b"mvhd", &[&[1; 20]]);
+        let index = |inner: &[&[u8]], outer: &[&[u8]]| {
+            let table = a_box(b"stbl", inner);
+            let media = a_box(b"mdia", &[&a_box(b"minf", &[&table])]);
+            a_box(b"moov", &[outer, &[&a_box(b"trak", &[&media])]].concat())
+        };
+        // A box that belongs elsewhere is not read either, and what is shorter than a box is padding.
+        let full = index(&[&groups, &times, &[0; 4]], &[&groups, &header, &times]);
+        assert_eq!(known(&full, MOOV).unwrap(), index(&[&times], &[&header]));
+    }
+
+    #[test]
+    fn what_is_left_out_is_not_counted() {
+        let sound = a_box(b"mp4a", &[&[0; 30]]);
+        let numbers = a_box(b"avcC", &[&[1, 2, 3]]);
+        let video =
+            |with: &[&[u8]]| a_box(b"avc1", &[&[[5; PICTURE_BYTES].as_slice()], with].concat());
+        let table = |count: u8, parts: &[&[u8]]| {
+            a_box(b"stsd", &[&[&[0, 0, 0, 0, 0, 0, 0, count][..]], parts].concat())
+        };
+        let mut kept = Vec::new();
+        let full = table(2, &[&sound, &video(&[&numbers, &a_box(b"pasp", &[&[0; 8]])])]);
+        append_within(STBL, &full, &mut kept).unwrap();
+        assert_eq!(kept, table(1, &[&video(&[&numbers])]));
+    }
+
+    #[test]
+    fn a_box_that_is_cut_off_is_named() {
+        let whole = a_box(b"moov", &[&a_box(b"mvhd", &[&[1; 20]])]);
+        let mut torn = whole.clone();
+        torn[11] += 1;
+        assert!(known(&torn, MOOV).unwrap_err().contains("cut off"));
+        assert!(known(&whole[..whole.len() - 1], MOOV).is_err());
+    }
+}
