@@ -66,7 +66,7 @@ const PICTURE_BYTES: usize = 78;
 /// # Errors
 /// What is wrong with it, in words, if a box within it is cut off.
 pub(super) fn known(whole: &[u8], within: &'static [Known]) -> Result<Vec<u8>, String> {
-    let (kind, body, _) = split(whole)?;
+    let First { kind, body, .. } = first(whole)?;
     let mut kept = Vec::with_capacity(whole.len());
     append(Known(kind, Boxes(within)), body, &mut kept)?;
     Ok(kept)
@@ -103,25 +103,32 @@ fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<
 /// Appends those of a box's boxes that are read, and says how many.
 fn append_within(
     within: &'static [Known],
-    mut rest: &[u8],
+    mut bytes: &[u8],
     kept: &mut Vec<u8>,
 ) -> Result<u32, String> {
     /// What is shorter than a box's head is padding.
     const LEAST: usize = 8;
     let mut count = 0;
-    while rest.len() >= LEAST {
-        let (kind, body, after) = split(rest)?;
+    while bytes.len() >= LEAST {
+        let First { kind, body, rest } = first(bytes)?;
         if let Some(&known) = within.iter().find(|Known(known, _)| *known == kind) {
             append(known, body, kept)?;
             count += 1;
         }
-        rest = after;
+        bytes = rest;
     }
     Ok(count)
 }
 
-/// The kind of the first box, what is in it, and what comes after it.
-fn split(bytes: &[u8]) -> Result<([u8; 4], &[u8], &[u8]), String> {
+/// The first of some boxes.
+struct First<'a> {
+    kind: [u8; 4],
+    body: &'a [u8],
+    /// What comes after it.
+    rest: &'a [u8],
+}
+
+fn first(bytes: &[u8]) -> Result<First<'_>, String> {
     let (head, rest) = bytes.split_first_chunk::<8>().ok_or_else(cut_off)?;
     let [s0, s1, s2, s3, kind @ ..] = *head;
     let (size, head) = match u32::from_be_bytes([s0, s1, s2, s3]) {
@@ -133,8 +140,8 @@ fn split(bytes: &[u8]) -> Result<([u8; 4], &[u8], &[u8]), String> {
         }
         size => (usize::try_from(size).map_err(|_| cut_off())?, 8),
     };
-    let (whole, after) = bytes.split_at_checked(size).ok_or_else(cut_off)?;
-    Ok((kind, whole.get(head..).ok_or_else(cut_off)?, after))
+    let (whole, rest) = bytes.split_at_checked(size).ok_or_else(cut_off)?;
+    Ok(First { kind, body: whole.get(head..).ok_or_else(cut_off)?, rest })
 }
 
 fn cut_off() -> String {
