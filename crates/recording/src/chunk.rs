@@ -75,6 +75,23 @@ pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     }
 }
 
+/// Whether the records of a chunk that is not packed, as other programs write them, end where it ends. Of one
+/// that goes on, the library would count less than nothing as left.
+fn is_filled(body: &[u8]) -> bool {
+    let Ok(Record::Chunk { header, data }) = mcap::parse_record(op::CHUNK, body) else {
+        return false;
+    };
+    let mut rest = &data[..];
+    while header.compression.is_empty() && !rest.is_empty() {
+        let Some((head, after)) = rest.split_first_chunk::<HEAD_BYTES>() else { return false };
+        let [_, length @ ..] = *head;
+        let length = usize::try_from(u64::from_le_bytes(length)).ok();
+        let Some(after) = length.and_then(|length| after.get(length..)) else { return false };
+        rest = after;
+    }
+    true
+}
+
 /// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a
 /// damaged chunk none is handed on.
 ///
@@ -88,6 +105,9 @@ pub(crate) fn for_each_record<E>(
     let name_bytes =
         body.get(28..32).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
     if name_bytes.is_none_or(|bytes| bytes as usize > LONGEST_NAME) {
+        return Ok(Err(McapError::UnexpectedEoc));
+    }
+    if !is_filled(body) {
         return Ok(Err(McapError::UnexpectedEoc));
     }
     let options = LinearReaderOptions::default()

@@ -102,6 +102,31 @@ fn one_wrong_bit_anywhere_costs_one_chunk_at_most_and_is_said() {
     }
 }
 
+/// As other programs may write it.
+fn unpacked(bytes: &[u8]) -> Vec<u8> {
+    let mut copy = Cursor::new(Vec::new());
+    let unpacked = mcap::WriteOptions::new().compression(None).calculate_chunk_crcs(false);
+    let mut writer = unpacked.create(&mut copy).unwrap();
+    for message in mcap::MessageStream::new(bytes).unwrap() {
+        writer.write(&message.unwrap()).unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    copy.into_inner()
+}
+
+#[test]
+fn a_record_that_is_longer_than_its_unpacked_chunk_costs_that_chunk_and_is_said() {
+    let mut bytes = unpacked(&recording(10));
+    assert_eq!(read(&bytes).unwrap().0, (0..10).map(entry).collect::<Vec<_>>());
+    // Heads of chunk and record, times, size, checksum, no name of a compression.
+    let length = chunks(&bytes)[0].start + 9 + 24 + 4 + 4 + 8 + 1;
+    bytes[length + 1] += 0x40;
+    let (entries, report) = read(&bytes).unwrap();
+    assert_eq!(entries, []);
+    assert!(report.damage.is_some());
+}
+
 #[test]
 fn a_chunk_that_says_it_is_something_else_is_known_by_its_shape() {
     let whole = recording(100);
