@@ -72,6 +72,12 @@ pub(crate) struct Fit {
 }
 
 impl Fit {
+    /// Log-likelihood ratio of the bearing being a target's that is seen with a probability against being
+    /// one of so many false ones, 1/sr.
+    pub(crate) fn log_ratio(&self, detection: f64, clutter_per_sr: f64) -> f64 {
+        detection.ln() + self.log_density - clutter_per_sr.ln()
+    }
+
     /// The likelier of two readings of a bearing, by what was known of its camera's errors or as
     /// those that last have been drawn anew, which is of a probability.
     pub(crate) fn likelier(

@@ -8,7 +8,7 @@ use crossfix_filter::Gate;
 use crate::cameras::KnownCamera;
 use crate::motion::Motion;
 use crate::track::{Track, TrackId};
-use crate::tracker::{log_likelihood_ratio, missed};
+use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
 
 /// A leaf is the track when the bearings are so many times (logarithm) likelier the target's than
@@ -36,7 +36,7 @@ pub(crate) struct Reacquisition {
 }
 
 /// What an exposure is compared with.
-pub(crate) struct Look<'a> {
+pub(crate) struct Context<'a> {
     pub(crate) exposure: &'a Exposure,
     pub(crate) known: &'a KnownCamera,
     pub(crate) motion: &'a Motion,
@@ -47,7 +47,7 @@ pub(crate) struct Look<'a> {
     pub(crate) owners: &'a [Option<TrackId>],
 }
 
-impl Look<'_> {
+impl Context<'_> {
     /// The sightings (by index) that may be a track's, with their log-likelihood ratios against
     /// strangers, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
@@ -64,7 +64,7 @@ impl Look<'_> {
         let open = open.filter(|(i, _)| self.owners[*i].is_none_or(|id| id == owner));
         let fit = |(i, sighting): (usize, &crate::Sighting)| {
             let fit = expected.fit(&sighting.line, self.gate)?;
-            Some((log_likelihood_ratio(&fit, detection, exposure.clutter_per_sr), i))
+            Some((fit.log_ratio(detection, exposure.clutter_per_sr), i))
         };
         let mut fits: Vec<(f64, usize)> = open.filter_map(fit).collect();
         fits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
@@ -102,7 +102,8 @@ impl Look<'_> {
         }
         if self.expects(&leaf.track) {
             let detection = self.config.detection_probability;
-            leaf.log_ratio += missed(leaf.track.visible_to(camera, *time, self.motion), detection);
+            let visible = leaf.track.visible_to(camera, *time, self.motion);
+            leaf.log_ratio += log_missed(visible, detection);
             leaf.track.look(camera, *time, false, detection, self.motion);
         }
         (leaf.log_ratio > GIVEN_UP).then_some((leaf, None))
@@ -129,7 +130,7 @@ impl Reacquisition {
     pub(crate) fn advance(
         &mut self,
         tracks: &BTreeMap<TrackId, Track>,
-        look: &Look<'_>,
+        context: &Context<'_>,
     ) -> Vec<(Track, Option<usize>)> {
         self.leaves.retain(|id, _| tracks.get(id).is_some_and(|track| !track.is_held()));
         let mut found = Vec::new();
@@ -137,8 +138,8 @@ impl Reacquisition {
         for track in alone {
             let before = self.leaves.remove(&track.id).unwrap_or_default();
             let mut next: Vec<_> =
-                before.into_iter().filter_map(|leaf| look.advanced(leaf, track.id)).collect();
-            next.extend(look.begun(track));
+                before.into_iter().filter_map(|leaf| context.advanced(leaf, track.id)).collect();
+            next.extend(context.begun(track));
             next.sort_by(|a, b| b.0.log_ratio.total_cmp(&a.0.log_ratio));
             next.truncate(MAX_LEAVES);
             match next.first() {

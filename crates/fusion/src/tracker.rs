@@ -12,8 +12,7 @@ use crossfix_message::{CameraName, Timestamp, TrackEventKind};
 use crate::cameras::{Cameras, ClockChange, Fittings, KnownCamera, Sample};
 use crate::cueing::Known;
 use crate::motion::Motion;
-use crate::prediction::Fit;
-use crate::reacquisition::{Look, Reacquisition};
+use crate::reacquisition::{Context, Reacquisition};
 use crate::track::{Track, TrackId, TrackStatus};
 
 use association::fitting;
@@ -218,8 +217,7 @@ impl Tracker {
             let expected =
                 track.expectation(exposure.time, camera, &exposure.uncertainty, &self.motion)?;
             let fits = exposure.sightings.iter().filter_map(|s| expected.fit(&s.line, self.gate));
-            fits.map(|fit| log_likelihood_ratio(&fit, 1.0, self.config.clutter_per_sr))
-                .max_by(f64::total_cmp)
+            fits.map(|fit| fit.log_ratio(1.0, self.config.clutter_per_sr)).max_by(f64::total_cmp)
         };
         self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
     }
@@ -288,7 +286,7 @@ impl Tracker {
         known: &KnownCamera,
         owners: &mut [Option<TrackId>],
     ) {
-        let look = Look {
+        let context = Context {
             exposure,
             known,
             motion: &self.motion,
@@ -297,7 +295,7 @@ impl Tracker {
             max_range_m: self.max_range_m,
             owners,
         };
-        for (track, sighting) in self.reacquisition.advance(&self.tracks, &look) {
+        for (track, sighting) in self.reacquisition.advance(&self.tracks, &context) {
             if let Some(owner) = sighting.and_then(|index| owners.get_mut(index)) {
                 *owner = Some(track.id);
             }
@@ -308,18 +306,6 @@ impl Tracker {
             self.tracks.insert(track.id, track);
         }
     }
-}
-
-/// Log-likelihood ratio of a bearing being a target's that is seen with a probability against being
-/// one of so many false ones, 1/sr.
-pub(crate) fn log_likelihood_ratio(fit: &Fit, detection: f64, clutter_per_sr: f64) -> f64 {
-    detection.ln() + fit.log_density - clutter_per_sr.ln()
-}
-
-/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a
-/// probability.
-pub(crate) fn missed(visible: f64, detection: f64) -> f64 {
-    (1.0 - visible * detection).ln()
 }
 
 /// Squared Mahalanobis distance of two states' positions, three degrees of freedom.

@@ -18,6 +18,12 @@ const HIDDEN: f64 = 0.075;
 /// How often one that is hidden comes into sight again within that time: every two seconds.
 const APPEARS: f64 = 0.75;
 
+/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a probability, and
+/// that it reports with another where it is.
+pub(crate) fn log_missed(visible: f64, detection: f64) -> f64 {
+    (1.0 - visible * detection).ln()
+}
+
 /// Whether a camera can see a target: a chain of two states, visible and hidden. A camera that
 /// misses a target ten times running has it behind something; that is one event and not ten.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -12,7 +12,7 @@ use viva_genicam::{
     StreamOptions, blocking,
 };
 
-use crate::rtsp::{HostClock, StreamClock};
+use crate::stream_clock::{HostClock, StreamClock};
 use crate::{
     Arrival, CaptureTime, Frame, FrameSource, Latency, Losses, MAX_PIXELS, Pixels, TimedBy,
     VideoError,

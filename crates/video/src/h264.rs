@@ -11,7 +11,7 @@ use openh264::encoder::{
 };
 use openh264::formats::{YUVSlices, YUVSource};
 
-use crate::rtsp::units;
+use crate::annex_b::units;
 use crate::{MAX_PIXELS, Pixels};
 
 /// No decoder holds back more pictures than this: H.264 allows 16.

@@ -41,6 +41,7 @@
 //! # Ok::<(), VideoError>(())
 //! ```
 
+mod annex_b;
 mod avi;
 mod error;
 mod frame;
@@ -53,6 +54,7 @@ mod mp4;
 mod rtsp;
 mod sequence;
 mod still;
+mod stream_clock;
 mod usb;
 mod y4m_file;
 

@@ -14,8 +14,9 @@ use crate::cameras::{Cameras, KnownCamera};
 use crate::motion::Motion;
 use crate::spatial::{Fix, LineId, Observability, VelocityKnowledge};
 use crate::track::{Expectation, Track, TrackId, TrackStatus};
-use crate::tracker::{log_likelihood_ratio, missed, same_target};
+use crate::tracker::same_target;
 use crate::uncertainty::CameraUncertainty;
+use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
 
 /// Bearings of one exposure that continue one hypothesis, the best first.
@@ -87,7 +88,7 @@ impl Hypothesis {
 
 /// An exposure with what its lines are compared by.
 #[derive(Clone, Copy)]
-struct Look<'a> {
+struct Context<'a> {
     exposure: &'a Exposure,
     known: &'a KnownCamera,
     motion: &'a Motion,
@@ -165,11 +166,11 @@ impl Hypotheses {
         let detection = self.tracking.detection_probability;
         let before = self.exposed.insert(exposure.camera.clone(), exposure.time);
         let interval_s = before.map_or(f64::INFINITY, |before| exposure.time.seconds_since(before));
-        let look =
-            Look { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
+        let context =
+            Context { exposure, known, motion, lines: &lines, uncertainty, detection, interval_s };
         let mut next = Vec::with_capacity(self.hypotheses.len());
         for hypothesis in std::mem::take(&mut self.hypotheses) {
-            self.extend_one(hypothesis, &look, &mut next);
+            self.extend_one(hypothesis, &context, &mut next);
         }
         self.hypotheses = next;
         self.prune_families();
@@ -177,8 +178,14 @@ impl Hypotheses {
 
     /// Lets one hypothesis go on with each bearing in its gate that is likely enough beside the
     /// likeliest way, and without any if that is.
-    fn extend_one(&self, mut hypothesis: Hypothesis, look: &Look<'_>, next: &mut Vec<Hypothesis>) {
-        let Look { exposure, known, motion, lines, uncertainty, detection, interval_s } = *look;
+    fn extend_one(
+        &self,
+        mut hypothesis: Hypothesis,
+        context: &Context<'_>,
+        next: &mut Vec<Hypothesis>,
+    ) {
+        let Context { exposure, known, motion, lines, uncertainty, detection, interval_s } =
+            *context;
         let expected = known.expects(hypothesis.track.position_at(exposure.time), self.max_range_m);
         let prediction = hypothesis.track.expectation(
             exposure.time,
@@ -188,10 +195,10 @@ impl Hypotheses {
         );
         let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
         // Where the camera does not look, a line that is left out costs nothing.
-        let miss = if expected { missed(visible, detection) } else { 0.0 };
+        let miss = if expected { log_missed(visible, detection) } else { 0.0 };
         let ratio = |(i, (_, line)): (usize, &NamedLine)| {
             let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
-            Some((log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr), i))
+            Some((fit.log_ratio(visible * detection, exposure.clutter_per_sr), i))
         };
         let mut near: Vec<(f64, usize)> = lines.iter().enumerate().filter_map(ratio).collect();
         near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));

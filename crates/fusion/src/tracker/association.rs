@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 
 use crossfix_message::TrackEventKind;
 
-use super::{Noted, TrackChange, Tracker, log_likelihood_ratio, missed};
+use super::{Noted, TrackChange, Tracker};
 use crate::assignment::{Candidate, assign};
 use crate::cameras::Fitting;
 use crate::cameras::KnownCamera;
 use crate::reacquisition::FOUND_AGAIN_MARGIN;
 use crate::track::{Track, TrackId, TrackStatus};
+use crate::visibility::log_missed;
 use crate::{Exposure, Sighting};
 
 /// A bearing is not compared with tracks beyond this many times the range of the cameras.
@@ -77,8 +78,8 @@ impl Tracker {
                 .extend(taken.filter(|_| sure).and_then(|taken| taken.third_difference));
             let silent = exposure.time.seconds_since(track.updated) > self.config.coasting_after_s;
             let detection = self.config.detection_probability;
-            let missed =
-                missed(track.visible_to(&exposure.camera, exposure.time, &self.motion), detection);
+            let visible = track.visible_to(&exposure.camera, exposure.time, &self.motion);
+            let missed = log_missed(visible, detection);
             let seen_since = !sure || track.is_seen_since_look_of(&exposure.camera);
             let silent = sure && silent;
             let change = match gain {
@@ -141,9 +142,8 @@ impl Tracker {
             for (column, sighting) in open {
                 let fit = prediction.fit(&sighting.line, self.gate);
                 if let Some(fit) = fit.filter(|fit| !lost_sight || fit.log_density > stranger) {
-                    let gain =
-                        log_likelihood_ratio(&fit, visible * detection, exposure.clutter_per_sr)
-                            - missed(visible, detection);
+                    let gain = fit.log_ratio(visible * detection, exposure.clutter_per_sr)
+                        - log_missed(visible, detection);
                     candidates.push(Candidate { row, column, gain });
                 }
             }

@@ -11,7 +11,7 @@ use std::time::Duration;
 #[cfg(feature = "gstreamer")]
 pub(crate) use self::h265::H265Decoder;
 
-use crate::rtsp::ClockMemory;
+use crate::stream_clock::ClockMemory;
 use crate::{FrameSource, Latency, Login, VideoError};
 
 /// A pipeline to watch and how.

@@ -7,7 +7,7 @@ use gstreamer_app::AppSink;
 use gstreamer_video::{VideoFrameExt, VideoFrameRef, VideoInfo};
 
 use super::GstreamerOptions;
-use crate::rtsp::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
+use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
 use crate::{Arrival, Frame, FrameSource, MAX_PIXELS, Pixels, TimedBy, VideoError};
 
 /// Ends every pipeline: brightness alone, as soon as it is there. Whoever watches takes each frame at once, and

@@ -3,14 +3,12 @@
 mod address;
 mod packets;
 mod server;
-mod stream_clock;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crossfix_message::Timestamp;
 use futures_util::StreamExt;
 use retina::client::{
     Credentials, Demuxed, PlayOptions, Session, SessionGroup, SessionOptions, SetupOptions,
@@ -21,14 +19,13 @@ use retina::rtcp::{ReceivedCompoundPacket, TypedPacketRef};
 use tokio::runtime::Runtime;
 
 pub use self::address::{Login, StreamAddress};
-pub(crate) use self::packets::units;
 pub use self::server::{Mount, RtspServer};
-pub(crate) use self::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock};
 
 #[cfg(feature = "gstreamer")]
 use crate::gstreamer::H265Decoder;
 use crate::h264::{H264Decoder, Picture};
 use crate::live::SILENCE;
+use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
 use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
 /// What can be decoded, as sessions' descriptions name it.
@@ -47,8 +44,6 @@ const REMEMBERED_INTERVALS: usize = 8;
 const UNDECODED: Duration = Duration::from_secs(30);
 /// Units whose pictures may be held back.
 const MOST_ARRIVALS: usize = 64;
-/// Seconds from the beginning of NTP's count, in 1900, to 1970.
-const NTP_TO_UNIX_S: i64 = 2_208_988_800;
 
 /// How a stream is brought here.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -343,15 +338,6 @@ impl RtspSource {
     }
 }
 
-/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count; `None` where a camera says
-/// that it knows none. The count begins again in 2036 (RFC 4330, 3).
-pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
-    let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
-    let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
-    let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
-    (ntp != 0).then(|| Timestamp::from_nanos((seconds - NTP_TO_UNIX_S) * 1_000_000_000 + nanos))
-}
-
 /// What a camera says is read by libraries that it can make panic (a line without `=` in a session's
 /// description does it): then it is the stream that is wrong.
 fn unharmed<T>(url: &str, read: impl FnOnce() -> Result<T, VideoError>) -> Result<T, VideoError> {
@@ -466,21 +452,5 @@ impl FrameSource for RtspSource {
             }
         }
         Ok(None)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_of_ntp_are_read_before_and_after_their_count_begins_again() {
-        let of = |seconds: u64| unix_time(seconds << 32 | 1 << 31).map(Timestamp::seconds);
-        assert_eq!(of(2_208_988_800), Some(0.5));
-        // 2026-01-01, and 2036-02-07 06:28:17.
-        assert_eq!(of(3_976_214_400), Some(1_767_225_600.5));
-        assert_eq!(of(1), Some(2_085_978_497.5));
-        assert_eq!(unix_time(0), None);
-        assert!(unix_time(u64::MAX).is_some());
     }
 }

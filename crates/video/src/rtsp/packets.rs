@@ -2,6 +2,9 @@
 
 use crossfix_message::Timestamp;
 
+use crate::annex_b::units;
+use crate::stream_clock::NTP_TO_UNIX_S;
+
 /// The longest payload of a packet, bytes: what an Ethernet frame takes.
 const LONGEST_PAYLOAD: usize = 1400;
 /// Type of the payload, as the session's description names it.
@@ -10,33 +13,6 @@ pub(super) const PAYLOAD_TYPE: u8 = 96;
 pub(super) const CLOCK_HZ: u32 = 90_000;
 /// Kind of a unit that is a part of one (FU-A).
 const FRAGMENT: u8 = 28;
-/// Kind of a picture that builds on no other.
-const KEY: u8 = 5;
-/// Seconds from the beginning of NTP's count to Unix's.
-const NTP_TO_UNIX_S: u64 = 2_208_988_800;
-
-/// The units of an Annex B stream, without start codes.
-pub(crate) fn units(stream: &[u8]) -> impl Iterator<Item = &[u8]> {
-    let mut starts: Vec<(usize, usize)> = Vec::new();
-    let mut at = 0;
-    while at + 3 <= stream.len() {
-        if stream[at..at + 3] == [0, 0, 1] {
-            let begin = if at > 0 && stream[at - 1] == 0 { at - 1 } else { at };
-            starts.push((begin, at + 3));
-            at += 3;
-        } else {
-            at += 1;
-        }
-    }
-    let ends: Vec<usize> =
-        starts.iter().skip(1).map(|(begin, _)| *begin).chain([stream.len()]).collect();
-    starts.into_iter().zip(ends).map(|((_, from), to)| &stream[from..to.max(from)])
-}
-
-/// Whether a stream holds a picture that builds on no other.
-pub(super) fn is_key(stream: &[u8]) -> bool {
-    units(stream).any(|unit| unit.first().is_some_and(|head| head & 0x1f == KEY))
-}
 
 /// Numbers packets of one stream.
 #[derive(Debug)]
@@ -119,6 +95,7 @@ fn interleaved(channel: u8, packet: &[u8]) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::annex_b::is_key;
 
     #[test]
     fn a_long_unit_goes_in_parts_that_make_it_again() {

@@ -10,7 +10,8 @@ use base64::prelude::BASE64_STANDARD;
 use crossfix_message::Timestamp;
 
 use super::Login;
-use super::packets::{CLOCK_HZ, PAYLOAD_TYPE, Packetiser, is_key};
+use super::packets::{CLOCK_HZ, PAYLOAD_TYPE, Packetiser};
+use crate::annex_b::is_key;
 
 /// Frames that may wait for one who watches; who is farther behind is sent away.
 const WAITING: usize = 64;

@@ -8,6 +8,8 @@ use crossfix_message::Timestamp;
 
 use crate::{CaptureTime, Latency, TimedBy};
 
+/// Seconds from the beginning of NTP's count, in 1900, to that of Unix's, in 1970.
+pub(crate) const NTP_TO_UNIX_S: u64 = 2_208_988_800;
 /// Sender reports of this long tell what the camera's clock shows, s. They come every five seconds
 /// or so and each may be some milliseconds off; over a minute a quartz stays a straight line.
 const REPORTS_S: f64 = 60.0;
@@ -253,6 +255,16 @@ impl StreamClock {
     }
 }
 
+/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count; `None` where a camera says
+/// that it knows none. The count begins again in 2036 (RFC 4330, 3).
+pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
+    let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
+    let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
+    let nanos = ((u128::from(fraction) * 1_000_000_000) >> 32) as i64;
+    (ntp != 0)
+        .then(|| Timestamp::from_nanos((seconds - NTP_TO_UNIX_S as i64) * 1_000_000_000 + nanos))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -412,5 +424,16 @@ mod tests {
                 assert!(found.sd_s.is_finite());
             }
         }
+    }
+
+    #[test]
+    fn times_of_ntp_are_read_before_and_after_their_count_begins_again() {
+        let of = |seconds: u64| unix_time(seconds << 32 | 1 << 31).map(Timestamp::seconds);
+        assert_eq!(of(2_208_988_800), Some(0.5));
+        // 2026-01-01, and 2036-02-07 06:28:17.
+        assert_eq!(of(3_976_214_400), Some(1_767_225_600.5));
+        assert_eq!(of(1), Some(2_085_978_497.5));
+        assert_eq!(unix_time(0), None);
+        assert!(unix_time(u64::MAX).is_some());
     }
 }

@@ -1,0 +1,297 @@
+//! Targets that cameras see one after another, and never two at a time.
+//!
+//! What one camera alone follows is a direction that turns. When it loses sight of it, another may
+//! have begun to see it: the new camera's line crosses the direction that the old one would have by
+//! now in one place, and place and turning give a velocity across the old line. How the new line
+//! turns, and where the next camera sees it, tells whether that was so.
+
+mod reading;
+mod seen;
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+use crossfix_message::{CameraName, Cued, Timestamp};
+
+use self::reading::{Context, Reading, Rules, TOGETHER_S};
+use self::seen::{Seen, TURNING_DENSITY, pose_variance};
+use super::one_target::OneTargetTest;
+use super::{Start, lines_with_pose};
+use crate::cameras::{KnownCamera, Rooted};
+use crate::cueing::Known;
+use crate::motion::Motion;
+use crate::spatial::TimedLine;
+use crate::track::{Track, TrackId, TrackStatus};
+use crate::tracker::same_target;
+use crate::{Exposure, FusionConfig};
+
+/// That it is one target must be so many times (logarithm) likelier than that each camera sees
+/// another, and than any other reading of the same lines: a chance of 1 in 3000.
+const MARGIN: f64 = 8.0;
+/// A reading less likely than this (logarithm) is given up.
+const GIVEN_UP: f64 = -5.0;
+/// What one camera alone sees is hardly nearer than this, m: with the largest range it gives the
+/// middle of those that are possible.
+const NEAREST_M: f64 = 30.0;
+/// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others
+/// tried with one: time is bounded.
+const MAX_SEEN: usize = 20;
+const MAX_LOST: usize = 20;
+const MAX_READINGS: usize = 4;
+const MAX_TRIED: usize = 50;
+
+/// What the cameras follow one by one, and how it goes together.
+#[derive(Debug)]
+pub(super) struct Handover {
+    rules: Rules,
+    seen: BTreeMap<CameraName, Vec<Seen>>,
+    /// How many directions have been followed.
+    count: u64,
+}
+
+/// A line that a camera has begun to follow, by its index, with what it follows there.
+#[derive(Clone, Copy, Debug)]
+struct Begun {
+    index: usize,
+    number: u64,
+    first: Timestamp,
+}
+
+impl Handover {
+    pub(super) fn new(config: &FusionConfig) -> Self {
+        Self { rules: Rules::new(config), seen: BTreeMap::new(), count: 0 }
+    }
+
+    /// Forgets what a camera has followed.
+    pub(super) fn forget_camera(&mut self, camera: &CameraName) {
+        self.seen.remove(camera);
+    }
+
+    /// What one camera alone sees for sure, as far as it is known now: its range is anywhere.
+    pub(super) fn known(&self, now: Timestamp) -> Vec<Known> {
+        let range = (NEAREST_M * self.rules.max_range_m).sqrt();
+        let sure = self.seen.iter().flat_map(|(camera, seen)| {
+            let open = |one: &&Seen| {
+                one.is_sure(&self.rules.tracking) && !one.is_lost(now, &self.rules.tracking)
+            };
+            seen.iter().filter(open).map(move |one| (camera, one))
+        });
+        let known = sure.filter_map(|(camera, one)| {
+            let state = one.state_at(range, self.rules.speed)?;
+            let of =
+                Cued { track_id: 0, camera: camera.to_string(), image_track_id: one.image_track };
+            let seen_from = Some(one.line.line.origin);
+            let expected = |time: Timestamp| {
+                let ahead_s = time.seconds_since(one.sight.time);
+                state.predicted(ahead_s, TURNING_DENSITY * range.powi(2))
+            };
+            Some(Known::new(of, now, seen_from, expected))
+        });
+        known.collect()
+    }
+
+    /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks
+    /// that are sure now.
+    pub(super) fn see(
+        &mut self,
+        exposure: &Exposure,
+        used: &[(usize, TrackId)],
+        known: &KnownCamera,
+        motion: &Motion,
+    ) -> Vec<Start> {
+        let mut is_owned = vec![false; exposure.sightings.len()];
+        used.iter().for_each(|(index, _)| is_owned[*index] = true);
+        let context = Context { exposure, known, motion, is_owned: &is_owned };
+        self.forget(exposure.time);
+        let begun = self.follow(&context);
+        self.advance(&context);
+        self.cross(&context, &begun);
+        self.settle(&context)
+    }
+
+    /// Forgets what no camera has seen for as long as a track would be kept, and what was never
+    /// sure at once.
+    fn forget(&mut self, now: Timestamp) {
+        let (tracking, pair_s) = (&self.rules.tracking, self.rules.pair_s);
+        let lost_after_s = tracking.lost_after_s;
+        for seen in self.seen.values_mut() {
+            for one in seen.iter_mut() {
+                one.readings.retain(|reading| {
+                    now.seconds_since(reading.track.updated) <= lost_after_s
+                        && reading.ratio() > GIVEN_UP
+                });
+            }
+            seen.retain(|one| {
+                let silent_s = now.seconds_since(one.sight.time);
+                if one.is_sure(tracking) {
+                    silent_s <= lost_after_s || !one.readings.is_empty()
+                } else {
+                    silent_s <= pair_s || !one.is_lost(now, tracking)
+                }
+            });
+        }
+    }
+
+    /// Goes on with what the exposure's camera follows; returns its lines of that.
+    fn follow(&mut self, context: &Context<'_>) -> Vec<Begun> {
+        let Context { exposure, known, is_owned, .. } = *context;
+        let factor = exposure.uncertainty.factor;
+        let strangers = self.rules.strangers_per_sr(known).ln();
+        let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
+        let seen = self.seen.entry(exposure.camera.clone()).or_default();
+        let mut taken = vec![false; with_pose.len()];
+        let (gate, mut begun, mut explained) = (self.rules.gate, Vec::new(), BTreeSet::new());
+        let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
+        // Those that are best known choose first; one that is lost takes nothing that may be a
+        // stranger.
+        let mut order: Vec<usize> = (0..seen.len()).collect();
+        order.sort_by(|&a, &b| {
+            seen[a].at(exposure.time).variance.total_cmp(&seen[b].at(exposure.time).variance)
+        });
+        for place in order {
+            let one = &mut seen[place];
+            let sight = one.at(exposure.time);
+            let is_lost = one.is_lost(exposure.time, &self.rules.tracking);
+            let near =
+                exposure.sightings.iter().enumerate().take(taken.len()).filter(|(i, _)| !taken[*i]);
+            let fits = near.filter_map(|(i, sighting)| {
+                Some((sight.density(&sighting.line, factor, gate)?, i))
+            });
+            let fits =
+                fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > strangers + MARGIN));
+            let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
+            let Some((log_density, index)) = best else {
+                one.missed += 1.0;
+                continue;
+            };
+            taken[index] = true;
+            if is_known(index) {
+                explained.insert(place);
+                continue;
+            }
+            one.score = (one.score + log_density - exposure.clutter_per_sr.ln())
+                .min(2.0 * self.rules.tracking.confirm_score);
+            one.sight = sight;
+            one.sight.update(&exposure.sightings[index].line);
+            one.gaps += std::mem::take(&mut one.missed);
+            one.lines += 1.0;
+            one.pose_variance = pose_variance(&with_pose[index], exposure, index);
+            one.line = with_pose[index].clone();
+            one.image_track = exposure.sightings[index].image_track;
+            begun.push(Begun { index, number: one.number, first: one.first });
+        }
+        let mut place = 0..;
+        seen.retain(|_| !place.next().is_some_and(|place| explained.contains(&place)));
+        for (index, line) in with_pose.into_iter().enumerate() {
+            if !taken[index] && !is_known(index) && seen.len() < MAX_SEEN {
+                self.count += 1;
+                seen.push(Seen::first(self.count, line, exposure, index));
+            }
+        }
+        begun
+    }
+
+    /// Goes on with the readings that the exposure's lines may be part of.
+    fn advance(&mut self, context: &Context<'_>) {
+        for one in self.seen.values_mut().flatten() {
+            one.readings.retain_mut(|reading| reading.advance(context, &self.rules));
+        }
+    }
+
+    /// Tries what other cameras have lost sight of with what this one has begun to see since.
+    fn cross(&mut self, context: &Context<'_>, begun: &[Begun]) {
+        let Context { exposure, known, motion, is_owned } = *context;
+        let now = exposure.time;
+        let others = self.seen.iter_mut().filter(|(camera, _)| **camera != exposure.camera);
+        let lost = others.flat_map(|(camera, seen)| seen.iter_mut().map(move |one| (camera, one)));
+        let mut lost: Vec<(&CameraName, &mut Seen)> = lost
+            .filter(|(_, one)| {
+                let silent_s = now.seconds_since(one.sight.time);
+                one.is_sure(&self.rules.tracking)
+                    && one.is_lost(now, &self.rules.tracking)
+                    && (self.rules.pair_s..=self.rules.tracking.lost_after_s).contains(&silent_s)
+            })
+            .collect();
+        lost.sort_by_key(|(_, one)| Reverse(one.sight.time));
+        for (camera, one) in lost.into_iter().take(MAX_LOST) {
+            let since =
+                begun.iter().filter(|other| one.sight.time.seconds_since(other.first) < TOGETHER_S);
+            for &Begun { index, number, .. } in since.filter(|other| !is_owned[other.index]) {
+                let name = (exposure.camera.clone(), exposure.sequence, index);
+                let is_read = one.readings.iter().any(|reading| reading.newest == name);
+                let is_full = one.readings.len() >= MAX_READINGS || one.tried.len() >= MAX_TRIED;
+                if is_read || is_full || !one.tried.insert(number) {
+                    continue;
+                }
+                let line = &exposure.sightings[index].line;
+                let reading = one
+                    .placed(camera, (line, now), (self.rules.speed, self.rules.max_range_m), motion)
+                    .and_then(|track| {
+                        let unlikely = track.state().velocity().norm_squared()
+                            / (2.0 * self.rules.speed.powi(2));
+                        let expected = context.expectation(&track)?;
+                        let fit = expected.fit(line, self.rules.gate)?;
+                        let ratio =
+                            fit.log_ratio(1.0, self.rules.strangers_per_sr(known)) - unlikely;
+                        let one_target = OneTargetTest::of_one(camera, one.sight.clone());
+                        let mut reading = Reading {
+                            of: (camera.clone(), one.number),
+                            track: Box::new(track),
+                            one_target,
+                            newest: name,
+                        };
+                        reading.take(context, index, &expected, ratio, &self.rules)?;
+                        (reading.ratio() > GIVEN_UP).then_some(reading)
+                    });
+                one.readings.extend(reading);
+            }
+        }
+    }
+
+    /// The readings that an exposure has made sure. Others of the same lines are rivals, unless
+    /// they are the same target.
+    fn settle(&mut self, context: &Context<'_>) -> Vec<Start> {
+        let Context { exposure, motion, .. } = *context;
+        let is_new = |reading: &Reading| {
+            let (camera, sequence, _) = &reading.newest;
+            *camera == exposure.camera && *sequence == exposure.sequence
+        };
+        let state = |reading: &Reading| reading.track.predicted(exposure.time, motion);
+        let all: Vec<&Reading> =
+            self.seen.values().flatten().flat_map(|one| &one.readings).collect();
+        let mut sure: Vec<&Reading> = all
+            .iter()
+            .copied()
+            .filter(|one| is_new(one) && one.ratio() >= MARGIN && one.track.is_placed())
+            .filter(|one| {
+                let mut rivals = all.iter().filter(|other| {
+                    other.ratio() > one.ratio() - MARGIN
+                        && (other.newest == one.newest || other.of == one.of)
+                });
+                rivals.all(|other| same_target(&state(one), &state(other)))
+            })
+            .collect();
+        sure.sort_by(|one, other| other.ratio().total_cmp(&one.ratio()));
+        let mut found: Vec<Track> = Vec::new();
+        for reading in sure {
+            if found.iter().all(|track| !same_target(track.state(), &state(reading))) {
+                let mut track = Track::clone(&reading.track);
+                track.status = TrackStatus::Confirmed;
+                track.score = self.rules.tracking.confirm_score;
+                track.born = track.updated;
+                track.observe();
+                found.push(track);
+            }
+        }
+        let is_found = |reading: &Reading| {
+            found.iter().any(|track| same_target(track.state(), &state(reading)))
+        };
+        let settled: BTreeSet<u64> =
+            all.iter().filter(|reading| is_found(reading)).map(|reading| reading.of.1).collect();
+        for seen in self.seen.values_mut() {
+            seen.retain(|one| !settled.contains(&one.number));
+        }
+        let start = |track| Start { track, cameras: 2, claimed_by: BTreeSet::new() };
+        found.into_iter().map(start).collect()
+    }
+}

@@ -1,0 +1,163 @@
+//! What one camera alone follows.
+
+use std::collections::BTreeSet;
+
+use crossfix_filter::KinematicState;
+use crossfix_geometry::{BearingModel, SightLine, passing_ranges};
+use crossfix_message::{CameraName, Solver, Timestamp};
+use nalgebra::{Matrix3, Vector3, Vector6};
+
+use super::super::sight::Sight;
+use super::reading::Reading;
+use crate::motion::Motion;
+use crate::spatial::{Fix, Observability, TimedLine, VelocityKnowledge};
+use crate::track::Track;
+use crate::uncertainty::CameraUncertainty;
+use crate::{Exposure, Tracking};
+
+/// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what
+/// flies past a camera is lost again and again; twice as much takes strangers for it.
+const TURNING_SD: f64 = 0.3;
+/// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of
+/// it what turns hard is lost, with twice as much two directions are too soon alike.
+pub(super) const TURNING_DENSITY: f64 = 3e-4;
+/// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if
+/// all ranges over a factor of 150 were equally likely.
+const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
+/// A camera has lost sight of what it followed if it would so seldom (logarithm) have missed it so
+/// often by chance: once in 100 times, which are two exposures where it reports nine of ten.
+const LOST: f64 = -4.6;
+
+/// What one camera alone follows, as of its last line.
+#[derive(Clone, Debug)]
+pub(super) struct Seen {
+    /// Two that begin with one exposure are told apart by it.
+    pub(super) number: u64,
+    /// The number that the camera gives it.
+    pub(super) image_track: u64,
+    pub(super) sight: Sight,
+    pub(super) first: Timestamp,
+    /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2),
+    /// ...
+    pub(super) line: TimedLine,
+    pub(super) pose_variance: f64,
+    /// ... and of the camera.
+    pub(super) uncertainty: CameraUncertainty,
+    /// Log-likelihood ratio of being a target, whatever its place, against being clutter.
+    pub(super) score: f64,
+    /// Its lines so far, ...
+    pub(super) lines: f64,
+    /// ... the exposures between them without one, ...
+    pub(super) gaps: f64,
+    /// ... and those since the last.
+    pub(super) missed: f64,
+    /// The ways in which other cameras may have seen it since, ...
+    pub(super) readings: Vec<Reading>,
+    /// ... and what has been tried: what is refuted once is not tried again.
+    pub(super) tried: BTreeSet<u64>,
+}
+
+impl Seen {
+    pub(super) fn first(number: u64, line: TimedLine, exposure: &Exposure, index: usize) -> Self {
+        let time = exposure.time;
+        Self {
+            number,
+            image_track: exposure.sightings[index].image_track,
+            sight: Sight::first(&exposure.sightings[index].line, time, TURNING_SD),
+            first: time,
+            pose_variance: pose_variance(&line, exposure, index),
+            line,
+            uncertainty: CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty },
+            score: 0.0,
+            lines: 1.0,
+            gaps: 0.0,
+            missed: 0.0,
+            readings: Vec::new(),
+            tried: BTreeSet::new(),
+        }
+    }
+
+    /// Whether the camera no longer sees it, and has not only missed it a few times; or is silent
+    /// itself.
+    pub(super) fn is_lost(&self, now: Timestamp, tracking: &Tracking) -> bool {
+        let share = (self.lines / (self.lines + self.gaps)).min(tracking.detection_probability);
+        let is_silent = now.seconds_since(self.sight.time) > tracking.coasting_after_s;
+        is_silent || self.missed * (1.0 - share).ln() <= LOST
+    }
+
+    /// Whether it is sure to be something, and not the camera's false alarms.
+    pub(super) fn is_sure(&self, tracking: &Tracking) -> bool {
+        self.score >= tracking.confirm_score
+    }
+
+    /// Where it is expected at a time.
+    pub(super) fn at(&self, time: Timestamp) -> Sight {
+        let mut sight = self.sight.clone();
+        sight.predict(time, TURNING_DENSITY);
+        sight
+    }
+
+    /// A track of it, in the place where its direction at a time crosses another line; the target
+    /// may be as fast as `speed` (m/s, standard deviation) along the direction.
+    pub(super) fn placed(
+        &self,
+        camera: &CameraName,
+        (line, time): (&SightLine, Timestamp),
+        (speed, max_range_m): (f64, f64),
+        motion: &Motion,
+    ) -> Option<Track> {
+        let Self { sight, line: last, uncertainty, .. } = self;
+        let by_now = self.at(time).direction;
+        let [range, there] =
+            passing_ranges((last.line.origin, &by_now), (line.origin, &line.direction));
+        if ![range, there].iter().all(|range| (f64::MIN_POSITIVE..=max_range_m).contains(range)) {
+            return None;
+        }
+        let state = self.state_at(range, speed)?;
+        let observability = Observability::unexamined(6);
+        let (velocity, solver) = (VelocityKnowledge::Solved, Solver::Map);
+        let fix = Fix { time: sight.time, state, velocity, solver, observability };
+        Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
+    }
+
+    /// Where it is and how it moves if its range is about `range` (m), which is not known, as of its
+    /// last line; the target may be as fast as `speed` (m/s, standard deviation) along the
+    /// direction.
+    pub(super) fn state_at(&self, range: f64, speed: f64) -> Option<KinematicState> {
+        let Self { sight, line: last, .. } = self;
+        let along = sight.direction.into_inner();
+        let velocity = (sight.rate - along * along.dot(&sight.rate)) * range;
+        let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
+        let [across, along_squared] =
+            [model.basis * model.basis.transpose(), along * along.transpose()];
+        // A range that is off by a share has the place off along the direction, and the velocity by
+        // the same share.
+        let scale = stacked(along * range, velocity) * UNKNOWN_LOG_RANGE_SD;
+        let direction_variance = sight.variance + self.pose_variance;
+        let (tie, turning) = (sight.tie, sight.rate_variance);
+        let mut covariance = scale * scale.transpose();
+        let mut add = |row: usize, column: usize, block: Matrix3<f64>| {
+            let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
+            view += block;
+        };
+        add(0, 0, across * (direction_variance * range.powi(2)));
+        add(0, 3, across * (tie * range.powi(2)));
+        add(3, 0, across * (tie * range.powi(2)));
+        add(3, 3, across * (turning * range.powi(2)) + along_squared * speed.powi(2));
+        let mean = stacked(last.line.origin.coords + along * range, velocity);
+        Some(KinematicState { mean, covariance })
+    }
+}
+
+/// What the pose adds to a line's variance along each tangent, rad^2.
+pub(super) fn pose_variance(with_pose: &TimedLine, exposure: &Exposure, index: usize) -> f64 {
+    let own = exposure.sightings[index].line.covariance * exposure.uncertainty.factor;
+    (with_pose.line.covariance - own).trace().max(0.0) / 2.0
+}
+
+fn stacked(place: Vector3<f64>, velocity: Vector3<f64>) -> Vector6<f64> {
+    let mut both = Vector6::zeros();
+    both.fixed_rows_mut::<3>(0).copy_from(&place);
+    both.fixed_rows_mut::<3>(3).copy_from(&velocity);
+    both
+}
