@@ -271,7 +271,7 @@ pub struct View {
 impl Resampler {
     /// A plane as it is seen in a view: `to` keeps its size, and its middle lies at the view's.
     /// Cubic where the view is only shifted, linear where it is scaled or turned.
-    pub fn look(&mut self, from: &Plane, view: View, to: &mut Plane) {
+    pub fn resample(&mut self, from: &Plane, view: View, to: &mut Plane) {
         let half = [to.width(), to.height()].map(|side| (side as f64 - 1.0) / 2.0);
         if view.scale == 1.0 && view.turn_rad == 0.0 {
             self.sample(from, view.x - half[0], view.y - half[1], to);
@@ -378,7 +378,7 @@ mod tests {
         let plane = Plane::from_fn(30, 30, |x, y| (2 * x + 7 * y) as f32);
         let mut seen = Plane::from_fn(5, 3, |_, _| 0.0);
         let turn_rad = std::f64::consts::FRAC_PI_2;
-        Resampler::default().look(
+        Resampler::default().resample(
             &plane,
             View { x: 15.0, y: 14.0, scale: 2.0, turn_rad },
             &mut seen,

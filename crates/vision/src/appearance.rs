@@ -178,7 +178,7 @@ impl Appearance {
         let (width, height) = (side(place.width), side(place.height));
         let centre = place.centre();
         let mut own = Plane::from_fn(width, height, |_, _| 0.0);
-        buffers.resampler.look(
+        buffers.resampler.resample(
             image,
             View { x: centre.x, y: centre.y, scale: 1.0, turn_rad: 0.0 },
             &mut own,
@@ -295,7 +295,7 @@ impl Appearance {
         let mut view = std::mem::take(&mut buffers.view);
         view.reshape(self.own.width(), self.own.height());
         let seen = View { x: place.x, y: place.y, scale: self.scale, turn_rad: self.turn_rad };
-        buffers.resampler.look(image, seen, &mut view);
+        buffers.resampler.resample(image, seen, &mut view);
         replace_invalid(&mut view);
         without_mean(&mut view);
         let noise = noise * noise_kept(place);
@@ -380,7 +380,7 @@ impl Appearance {
             image.reshape(odd(*scale * width + 0.5), odd(*scale * height + 0.5));
             let middle = [width, height].map(|side| (side - 1.0) / 2.0);
             let (scale, turn_rad) = (1.0 / *scale, -*turn_rad);
-            buffers.resampler.look(
+            buffers.resampler.resample(
                 smooth,
                 View { x: middle[0], y: middle[1], scale, turn_rad },
                 image,

@@ -100,10 +100,10 @@ impl Arrival {
 
 impl Comparison {
     /// Looks at the reference's place in the image.
-    pub(crate) fn look(&mut self, image: &Plane, placed: Placed<'_>, resampler: &mut Resampler) {
+    pub(crate) fn take(&mut self, image: &Plane, placed: Placed<'_>, resampler: &mut Resampler) {
         self.now.reshape(placed.reference.width(), placed.reference.height());
         let ImagePoint { x, y } = placed.place;
-        resampler.look(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
+        resampler.resample(image, View { x, y, scale: 1.0, turn_rad: 0.0 }, &mut self.now);
         replace_invalid(&mut self.now);
     }
 
@@ -124,7 +124,7 @@ impl Comparison {
         }
         let (width, height) = (reference.width(), reference.height());
         self.before.reshape(width, height);
-        resampler.look(
+        resampler.resample(
             picture.image(),
             View { x: then.x, y: then.y, scale: 1.0, turn_rad: 0.0 },
             &mut self.before,

@@ -56,3 +56,10 @@ pub(crate) struct Step {
     /// Normalised innovation squared of both axes.
     pub(crate) nis: Option<f64>,
 }
+
+impl Step {
+    /// The target was not seen; the best place correlates by so much.
+    pub(crate) fn unseen(score: f64) -> Self {
+        Self { measured: None, score, certainty: 0.0, nis: None }
+    }
+}

@@ -11,7 +11,8 @@ use crate::frame::Frame;
 use crate::likelihood::log_ratios;
 use crate::motion::Motion;
 use crate::posterior::{Posterior, Prior};
-use crate::target::{Scratch, Target};
+use crate::scratch::Scratch;
+use crate::state::State;
 
 /// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target
 /// cannot be seen when it cannot. A blur is shorter, a cloud longer. When it was chosen, of ten
@@ -34,9 +35,9 @@ pub(crate) struct Region {
 }
 
 impl Region {
-    pub(crate) fn about(target: &Target, half: [usize; 2]) -> Self {
-        let expected = target.motion.found();
-        let reference = target.appearance.working.image();
+    pub(crate) fn about(state: &State, half: [usize; 2]) -> Self {
+        let expected = state.motion.found();
+        let reference = state.appearance.working.image();
         let reference = [reference.width(), reference.height()];
         let origin = [0, 1].map(|i| expected[i].position.round() - half[i] as f64);
         let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
@@ -44,7 +45,7 @@ impl Region {
     }
 }
 
-impl Target {
+impl State {
     /// Half sides of the gate (Herasymenko 2021, section 1; Lytvynets 2020, eq. 5.12): how far from
     /// the prediction the reference is placed.
     pub(crate) fn half_gate(&self, image: &Plane, config: &TrackerConfig) -> [usize; 2] {
@@ -84,9 +85,6 @@ impl Target {
         config: &TrackerConfig,
     ) -> Option<[usize; 2]> {
         let GateRule::Innovation { sigmas } = config.gate else { return None };
-        if !self.hypotheses.is_empty() {
-            return None;
-        }
         let (peak, expected) = (self.peak_half(), self.motion.found());
         let half = [0, 1].map(|i| {
             let spread = (sigmas * expected[i].variance.sqrt()).ceil() as usize;

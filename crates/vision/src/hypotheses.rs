@@ -6,16 +6,16 @@
 
 use crossfix_filter::AxisMeasurement;
 
-use crate::config::GateRule;
-use crate::frame::{Frame, Step};
+use crate::ImagePoint;
+use crate::frame::Frame;
 use crate::gate::Region;
 use crate::motion::Motion;
 use crate::posterior::Posterior;
-use crate::target::{SEEN, Scratch, Target};
-use crate::{ImagePoint, TrackerConfig};
+use crate::scratch::Scratch;
+use crate::state::State;
 
 /// Certainty of the best place below which the others are kept too.
-const DOUBT: f64 = 0.9;
+pub(crate) const DOUBT: f64 = 0.9;
 /// Hypotheses that are kept, and places in an image that each of them may go to.
 const MOST: usize = 12;
 const MOST_PEAKS: usize = 4;
@@ -27,9 +27,6 @@ const SAME: f64 = 2.0;
 /// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the
 /// target has been elsewhere.
 const UNEXPECTED: f64 = 16.0;
-/// A turn of the camera by less than this is within what is not known of a target's motion anyway,
-/// px.
-const LEAST_MOVE_PX: f64 = 2.0;
 /// A target of which this long no place is sure counts as lost, s, ...
 const LOST_S: f64 = 0.4;
 /// ... and is searched for after so long, s: it is fainter than noise for a second as a cloud
@@ -40,15 +37,20 @@ const LONGEST_S: f64 = 2.0;
 /// A place where the target may be, and how it moves then.
 #[derive(Clone, Debug)]
 pub(crate) struct Hypothesis {
-    weight: f64,
-    motion: Motion,
+    pub(crate) weight: f64,
+    pub(crate) motion: Motion,
     /// How likely it could not be seen in the image before.
-    hidden: f64,
+    pub(crate) hidden: f64,
     /// Whether it has been seen there in this image, and on which placement of the map.
-    peak: Option<[usize; 2]>,
+    pub(crate) peak: Option<[usize; 2]>,
 }
 
 impl Hypothesis {
+    /// Where it is believed to be, as long as that is one place.
+    fn of(state: &State) -> Self {
+        Self { weight: 1.0, motion: state.motion.clone(), hidden: state.hidden, peak: None }
+    }
+
     fn at(&self) -> [f64; 2] {
         let ImagePoint { x, y } = self.motion.position();
         [x, y]
@@ -84,6 +86,16 @@ impl Hypotheses {
         self.doubted_s = 0.0;
     }
 
+    /// None has been sure in one more image.
+    pub(crate) fn note_doubt(&mut self, interval: f64) {
+        self.doubted_s += interval;
+    }
+
+    /// Whether no place has been sure for so long that it must be searched for.
+    pub(crate) fn are_hopeless(&self) -> bool {
+        self.doubted_s > LONGEST_S
+    }
+
     /// Whether for long no place has been sure.
     pub(crate) fn are_doubted(&self) -> bool {
         self.doubted_s > LOST_S
@@ -99,8 +111,15 @@ impl Hypotheses {
         }
     }
 
+    /// They begin with what is believed, unless there are some.
+    pub(crate) fn begin(&mut self, state: &State) {
+        if self.all.is_empty() {
+            self.all.push(Hypothesis::of(state));
+        }
+    }
+
     /// Each may have moved by so many pixels, or not.
-    fn fork(&mut self, by: [f64; 2]) {
+    pub(crate) fn fork(&mut self, by: [f64; 2]) {
         self.all.iter_mut().for_each(|hypothesis| hypothesis.weight *= 0.5);
         let mut moved = self.all.clone();
         moved.iter_mut().for_each(|hypothesis| hypothesis.motion.move_by(by));
@@ -125,122 +144,52 @@ impl Hypotheses {
             self.all.iter().map(far).fold(0.0, f64::max)
         })
     }
-}
 
-impl Target {
-    /// The camera may have turned: then everything in its image has moved, the target too. Light
-    /// that changes may be taken for a turn, so it may have stayed as well.
-    pub(crate) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
-        let by = frame.scene_moved;
-        let is_followed = !self.is_searching() && !self.identity.is_on_probation();
-        if !is_followed
-            || by[0].hypot(by[1]) < LEAST_MOVE_PX
-            || !matches!(frame.config.gate, GateRule::Innovation { .. })
-        {
-            return;
-        }
-        if self.hypotheses.is_empty() {
-            self.hypotheses.all.push(Hypothesis {
-                weight: 1.0,
-                motion: self.motion.clone(),
-                hidden: self.hidden,
-                peak: None,
-            });
-        }
-        self.hypotheses.fork(by);
+    /// The likeliest.
+    pub(crate) fn best(&self) -> Option<&Hypothesis> {
+        self.all.first()
     }
 
-    /// Whether a posterior leaves more than one place to be kept.
-    pub(crate) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
-        let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
-        in_doubt
-            && matches!(config.gate, GateRule::Innovation { .. })
-            && !self.identity.is_on_probation()
+    /// The share of those that have been seen in this image.
+    pub(crate) fn seen_share(&self) -> f64 {
+        self.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum()
     }
 
-    /// Follows all places where the target may be into the image whose log ratios are in the
-    /// scratch's map.
-    pub(crate) fn follow_hypotheses(
-        &mut self,
-        frame: Frame<'_>,
-        region: Region,
-        scratch: &mut Scratch,
-    ) -> Step {
-        let config = frame.config;
-        let mut before = std::mem::take(&mut self.hypotheses.all);
-        if before.is_empty() {
-            before.push(Hypothesis {
-                weight: 1.0,
-                motion: self.motion.clone(),
-                hidden: self.hidden,
-                peak: None,
-            });
-        }
-        if let Some(one) = self.one_place(&before, frame, region, scratch) {
-            return self.settle_on(one, frame, region, scratch);
-        }
-        let branches = self.branches(&before, frame, region, scratch);
-        self.hypotheses.all = kept(branches);
-        let Some(best) = self.hypotheses.all.first().cloned() else {
-            self.hypotheses.clear();
-            self.missed += 1;
-            return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
-        };
-        let seen: f64 =
-            self.hypotheses.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum();
-        (self.motion, self.hidden) = (best.motion.clone(), best.hidden);
-        let Some([column, row]) = best.peak else {
-            self.hypotheses.doubted_s += frame.interval;
-            if seen < 1.0 - DOUBT || self.hypotheses.doubted_s > LONGEST_S {
-                self.missed += 1;
-            }
-            self.settle(0.0);
-            return Step { measured: None, score: 0.0, certainty: 0.0, nis: None };
-        };
-        let near = self.peak_half();
+    /// The share of those that have been seen about a placement.
+    pub(crate) fn share_near(&self, [column, row]: [usize; 2], near: [usize; 2]) -> f64 {
         let here = |h: &&Hypothesis| {
             h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
         };
-        let sure: f64 = self.hypotheses.all.iter().filter(here).map(|h| h.weight).sum();
-        let look = self.look(column, row, region.origin, scratch, config);
-        let is_there = self.doubt(frame, look, scratch);
-        let certainty = sure * is_there;
-        self.hypotheses.doubted_s += frame.interval;
-        if certainty > SEEN {
-            self.motion.tell_noise(look.found().map(|at| at.variance));
-            self.seen(look.place);
-        } else if seen < 1.0 - DOUBT || is_there < SEEN || self.hypotheses.doubted_s > LONGEST_S {
-            self.missed += 1;
-        }
-        self.learn(frame, look.place, look, certainty, scratch);
-        self.settle(best.weight);
-        let measured = (certainty > SEEN).then(|| self.measurement(&look));
-        Step { measured, score: look.score, certainty, nis: None }
+        self.all.iter().filter(here).map(|h| h.weight).sum()
     }
 
-    /// One place is left, or none: the others are forgotten.
-    fn settle(&mut self, weight: f64) {
-        if weight > DOUBT || self.is_searching() {
-            self.hypotheses.clear();
-        }
+    /// Follows each into the image whose log ratios are in the scratch's map.
+    pub(crate) fn advance(
+        &mut self,
+        state: &State,
+        frame: Frame<'_>,
+        region: Region,
+        scratch: &mut Scratch,
+    ) {
+        self.all = kept(self.branches(state, frame, region, scratch));
     }
 
     /// The likeliest of the hypotheses, with the posterior that it leads to, if all of them lead to
     /// one place.
-    fn one_place(
+    pub(crate) fn one_place(
         &self,
-        before: &[Hypothesis],
+        state: &State,
         frame: Frame<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Option<(Motion, Posterior)> {
-        let near = self.peak_half();
-        let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(before.len());
+        let near = state.peak_half();
+        let mut ways: Vec<(f64, usize, Posterior)> = Vec::with_capacity(self.all.len());
         let mut all = 0.0;
-        for (index, hypothesis) in before.iter().enumerate() {
+        for (index, hypothesis) in self.all.iter().enumerate() {
             let posterior = scratch.map.of(
                 &scratch.ratios,
-                &self.prior(&hypothesis.motion, hypothesis.hidden, region, frame),
+                &state.prior(&hypothesis.motion, hypothesis.hidden, region, frame),
             );
             all += hypothesis.weight * posterior.evidence;
             ways.push((
@@ -254,36 +203,21 @@ impl Target {
             |peak: [usize; 2]| (0..2).all(|i| peak[i].abs_diff(posterior.peak[i]) <= near[i]);
         let there: f64 =
             ways.iter().filter(|(.., way)| here(way.peak)).map(|(mass, ..)| mass).sum();
-        (there > DOUBT * all).then(|| (before[best].motion.clone(), posterior))
-    }
-
-    /// No doubt is left: the target has been where its likeliest hypothesis was.
-    fn settle_on(
-        &mut self,
-        (motion, posterior): (Motion, Posterior),
-        frame: Frame<'_>,
-        region: Region,
-        scratch: &mut Scratch,
-    ) -> Step {
-        self.motion = motion;
-        self.hypotheses.clear();
-        let [column, row] = posterior.peak;
-        let look = self.look(column, row, region.origin, scratch, frame.config);
-        self.update(frame, &posterior, look, region.origin, scratch)
+        (there > DOUBT * all).then(|| (self.all[best].motion.clone(), posterior))
     }
 
     /// Where each hypothesis may have gone, with their weights.
     fn branches(
         &self,
-        before: &[Hypothesis],
+        state: &State,
         frame: Frame<'_>,
         region: Region,
         scratch: &mut Scratch,
     ) -> Vec<Hypothesis> {
         let config = frame.config;
-        let mut branches = Vec::with_capacity(before.len() * (MOST_PEAKS + 1));
-        for hypothesis in before {
-            let prior = self.prior(&hypothesis.motion, hypothesis.hidden, region, frame);
+        let mut branches = Vec::with_capacity(self.all.len() * (MOST_PEAKS + 1));
+        for hypothesis in &self.all {
+            let prior = state.prior(&hypothesis.motion, hypothesis.hidden, region, frame);
             let posterior = scratch.map.of(&scratch.ratios, &prior);
             let weight = hypothesis.weight * posterior.evidence;
             branches.push(Hypothesis {

@@ -3,11 +3,12 @@
 
 use crate::ImagePoint;
 use crate::arrival::Placed;
-use crate::frame::{FRAME_INTERVAL, Frame, Step};
-use crate::look::Look;
+use crate::fit::TargetFit;
+use crate::frame::{FRAME_INTERVAL, Frame};
 use crate::motion::Motion;
 use crate::scene::{Picture, Scene};
-use crate::target::{Scratch, Target};
+use crate::scratch::Scratch;
+use crate::state::State;
 
 /// A target that was found again is believed after so long, s: until then a mistake costs what is
 /// known of where it went, and nothing is learnt of it.
@@ -85,33 +86,31 @@ impl Identity {
     pub(crate) fn is_on_probation(&self) -> bool {
         self.probation.is_some()
     }
-}
 
-impl Target {
     /// Notes where in the scene it was in the image before, if it was seen for sure.
-    pub(crate) fn note_last_place(&mut self, frame: Frame<'_>) {
-        if self.unseen_s > 0.0 || self.identity.probation.is_some() {
+    pub(crate) fn note_last_place(&mut self, state: &State, frame: Frame<'_>) {
+        if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
         }
         let (turned, moved) = (frame.scene.turned(), frame.scene_moved);
-        let ImagePoint { x, y } = self.last_seen;
-        self.identity.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
+        let ImagePoint { x, y } = state.last_seen;
+        self.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
     }
 
     /// Notes where it was when a picture of the scene was taken, if it was seen.
-    pub(crate) fn note_picture(&mut self, number: u64) {
+    pub(crate) fn note_picture(&mut self, state: &State, number: u64) {
         // In doubt it is not known where it was.
-        if self.unseen_s > 0.0 {
+        if state.unseen_s > 0.0 {
             return;
         }
-        if self.identity.probation.is_none() {
-            self.identity.speed_px_s = self.velocity().x.hypot(self.velocity().y);
+        if self.probation.is_none() {
+            self.speed_px_s = state.velocity().x.hypot(state.velocity().y);
         }
-        let in_pictures = &mut self.identity.in_pictures;
+        let in_pictures = &mut self.in_pictures;
         if in_pictures.len() >= MOST_PICTURES {
             in_pictures.remove(0);
         }
-        in_pictures.push((number, self.last_seen));
+        in_pictures.push((number, state.last_seen));
     }
 
     /// Log-likelihood ratio of the target's having come to a place against what is there having
@@ -123,28 +122,28 @@ impl Target {
     /// is where it was, may be in all of them.
     pub(crate) fn arrival_log_ratio(
         &self,
+        state: &State,
         frame: Frame<'_>,
         place: ImagePoint,
         scratch: &mut Scratch,
     ) -> f64 {
         let placed = Placed {
-            reference: self.appearance.working.image(),
-            energy: f64::from(self.appearance.energy()),
+            reference: state.appearance.working.image(),
+            energy: f64::from(state.appearance.energy()),
             place,
-            noise: f64::from(self.noise),
+            noise: f64::from(state.noise),
         };
         let longest = placed.reference.width().max(placed.reference.height()) as f64;
-        let lost_since = self.identity.probation.as_ref().map(|probation| probation.picture);
+        let lost_since = self.probation.as_ref().map(|probation| probation.picture);
         let Scratch { buffers, comparison, .. } = scratch;
-        comparison.look(frame.image, placed, &mut buffers.resampler);
-        let usual = self.usual_contrast * f64::from(self.appearance.clear_share());
-        let speed = self.identity.speed_px_s.max(self.least_speed(frame, place));
+        comparison.take(frame.image, placed, &mut buffers.resampler);
+        let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
+        let speed = self.speed_px_s.max(self.least_speed(state, frame, place));
         let mut against = |picture: &Picture, then: ImagePoint| {
-            let seen =
-                self.identity.in_pictures.iter().find(|(number, _)| *number == picture.number());
+            let seen = self.in_pictures.iter().find(|(number, _)| *number == picture.number());
             let seen = seen.map(|(_, seen)| *seen);
             let was_lost =
-                self.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
+                state.is_searching() || lost_since.is_some_and(|newest| picture.number() <= newest);
             let has_moved_on = speed * picture.age_s() > longest;
             if seen.is_none() && !(was_lost && has_moved_on) {
                 return None;
@@ -162,83 +161,91 @@ impl Target {
     }
 
     /// How fast a lost target has gone at least to be at a place now, px/s.
-    fn least_speed(&self, frame: Frame<'_>, place: ImagePoint) -> f64 {
-        let Some([x, y]) = self.identity.last_in_scene else { return 0.0 };
+    fn least_speed(&self, state: &State, frame: Frame<'_>, place: ImagePoint) -> f64 {
+        let Some([x, y]) = self.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
-        let lost_s =
-            self.identity.probation.as_ref().map_or(self.unseen_s, |probation| probation.unseen_s);
+        let lost_s = self.probation.as_ref().map_or(state.unseen_s, |probation| probation.unseen_s);
         (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
-    }
-
-    /// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against
-    /// its being that of the best of so many placements in noise.
-    fn above_noise_log_ratio(&self, contrast: f64, placements: f64) -> f64 {
-        let deviation =
-            f64::from(self.noise / self.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
-        let clear = f64::from(self.appearance.clear_share());
-        if clear < CLEAR {
-            return 0.0;
-        }
-        let usual = self.usual_contrast * clear;
-        let best_of_noise = deviation * (2.0 * placements.max(2.0).ln()).sqrt();
-        let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
-        let target = normal(contrast - usual, (CONTRAST_SD * usual).hypot(deviation));
-        (target - normal(contrast - best_of_noise, BEST_SD * deviation)).clamp(-MOST, 0.0)
     }
 
     /// The probability that what is followed is the target and neither the scene nor noise: a chain
     /// of two states that sees whether what is at a place has come there, and stands out as the
     /// target does.
-    pub(crate) fn doubt(&mut self, frame: Frame<'_>, look: Look, scratch: &mut Scratch) -> f64 {
+    pub(crate) fn doubt(
+        &mut self,
+        state: &State,
+        frame: Frame<'_>,
+        fit: TargetFit,
+        scratch: &mut Scratch,
+    ) -> f64 {
         // Images that follow each other sooner tell no more together than one.
         let share = (frame.interval / FRAME_INTERVAL).min(1.0);
         let placements = scratch.ratios.samples().len() as f64;
-        let above_noise = self.above_noise_log_ratio(look.contrast, placements);
-        let log_ratio = share * (self.arrival_log_ratio(frame, look.place, scratch) + above_noise);
+        let above_noise = above_noise_log_ratio(state, fit.contrast, placements);
+        let log_ratio =
+            share * (self.arrival_log_ratio(state, frame, fit.place, scratch) + above_noise);
         let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
         let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
-        let before = settled + (self.identity.is_there - settled) * kept;
-        self.identity.is_there = before / (before + (1.0 - before) * (-log_ratio).exp());
-        self.identity.is_there
+        let before = settled + (self.is_there - settled) * kept;
+        self.is_there = before / (before + (1.0 - before) * (-log_ratio).exp());
+        self.is_there
     }
 
     /// A search has found something.
-    pub(crate) fn begin_probation(&mut self, scene: &Scene) {
-        self.identity.probation = Some(Probation {
-            motion: self.motion.clone(),
-            unseen_s: self.unseen_s,
-            last_seen: self.last_seen,
-            missed: self.missed,
+    pub(crate) fn begin_probation(&mut self, state: &State, scene: &Scene) {
+        self.probation = Some(Probation {
+            motion: state.motion.clone(),
+            unseen_s: state.unseen_s,
+            last_seen: state.last_seen,
+            missed: state.missed,
             picture: scene.newest(),
             seen_s: 0.0,
         });
-        self.identity.is_there = FOUND;
+        self.is_there = FOUND;
     }
 
-    /// Follows what a search has found. If it is lost again soon it was something else, and the
-    /// search goes on from what was known before.
-    pub(crate) fn follow_on_probation(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
-        if let Some(probation) = &mut self.identity.probation {
+    /// Goes on, to the time of the next image, with what was known before it was found again.
+    pub(crate) fn predict_probation(&mut self, frame: Frame<'_>) {
+        if let Some(probation) = &mut self.probation {
             probation.motion.predict(frame.interval, frame.sides());
             probation.unseen_s += frame.interval;
         }
-        let step = self.follow(frame, scratch);
-        if self.is_searching()
-            && let Some(before) = self.identity.probation.take()
-        {
-            (self.motion, self.unseen_s, self.last_seen) =
-                (before.motion, before.unseen_s, before.last_seen);
-            self.missed = self.missed.max(before.missed);
-            self.take_last_look();
-            self.identity.in_pictures.retain(|(number, _)| *number <= before.picture);
-            return step;
-        }
-        if let Some(probation) = &mut self.identity.probation {
-            probation.seen_s += step.certainty * frame.interval;
+    }
+
+    /// What was found again is lost again: it was something else, and what was known before holds.
+    /// False if it was on no probation.
+    pub(crate) fn fail_probation(&mut self, state: &mut State) -> bool {
+        let Some(before) = self.probation.take() else { return false };
+        (state.motion, state.unseen_s, state.last_seen) =
+            (before.motion, before.unseen_s, before.last_seen);
+        state.missed = state.missed.max(before.missed);
+        self.in_pictures.retain(|(number, _)| *number <= before.picture);
+        true
+    }
+
+    /// It has been seen for so long, s, weighed by how surely.
+    pub(crate) fn go_on_with_probation(&mut self, seen_s: f64) {
+        if let Some(probation) = &mut self.probation {
+            probation.seen_s += seen_s;
             if probation.seen_s >= PROBATION_S {
-                self.identity.probation = None;
+                self.probation = None;
             }
         }
-        step
     }
+}
+
+/// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against
+/// its being that of the best of so many placements in noise.
+fn above_noise_log_ratio(state: &State, contrast: f64, placements: f64) -> f64 {
+    let deviation =
+        f64::from(state.noise / state.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
+    let clear = f64::from(state.appearance.clear_share());
+    if clear < CLEAR {
+        return 0.0;
+    }
+    let usual = state.usual_contrast * clear;
+    let best_of_noise = deviation * (2.0 * placements.max(2.0).ln()).sqrt();
+    let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
+    let target = normal(contrast - usual, (CONTRAST_SD * usual).hypot(deviation));
+    (target - normal(contrast - best_of_noise, BEST_SD * deviation)).clamp(-MOST, 0.0)
 }

@@ -9,7 +9,7 @@ use nalgebra::Matrix2;
 use crate::crop::replace_invalid;
 use crate::frame::{Measurement, Step};
 use crate::reference::Adaptation;
-use crate::target::Scratch;
+use crate::scratch::Scratch;
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// A target under track.

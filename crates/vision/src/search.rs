@@ -6,11 +6,14 @@ use crossfix_correlation::{Plane, Reference, Resampler, View, Window};
 
 use crate::TrackerConfig;
 use crate::crop::{crop, replace_invalid};
+use crate::fit::TargetFit;
 use crate::frame::Frame;
+use crate::identity::Identity;
 use crate::likelihood::log_ratios;
-use crate::look::Look;
 use crate::noise::{OF_MEDIAN, median};
-use crate::target::{Scratch, Target};
+use crate::scratch::{Scratch, SearchScratch};
+use crate::search_memory::{Background, SearchMemory};
+use crate::state::State;
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
@@ -31,27 +34,10 @@ const LEAST_LIKENESS: f64 = 1e-3;
 /// leaves of the picture's.
 const NOISE_OF_CHANGE: f32 = 1.6;
 
-/// What the scene itself looks like to a target's reference: the log ratios in a picture in which
-/// the target was elsewhere.
-#[derive(Clone, Debug)]
-pub(crate) struct Background {
-    coarseness: usize,
-    ratios: Plane,
-}
-
-/// Memory for the search.
-#[derive(Debug, Default)]
-pub(crate) struct Search {
-    coarse: Plane,
-    fine: Plane,
-    change: Plane,
-    contrasts: Vec<f32>,
-}
-
 /// The best place of a search.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Found {
-    pub(crate) look: Option<Look>,
+    pub(crate) fit: Option<TargetFit>,
     pub(crate) accepted: bool,
 }
 
@@ -76,15 +62,15 @@ fn coarsened(from: &Plane, side: usize, to: &mut Plane) {
 }
 
 /// The target's reference on the coarse picture.
-fn coarse_reference(target: &Target, coarseness: usize, resampler: &mut Resampler) -> Reference {
-    let working = target.appearance.working.image();
+fn coarse_reference(state: &State, coarseness: usize, resampler: &mut Resampler) -> Reference {
+    let working = state.appearance.working.image();
     let side = |length: usize| 2 * (length / (2 * coarseness)) + 1;
     let (width, height) = (side(working.width()), side(working.height()));
     let mut whole = Plane::from_fn(width * coarseness, height * coarseness, |_, _| 0.0);
     let middle = |length: usize| (length as f64 - 1.0) / 2.0;
     let view =
         View { x: middle(working.width()), y: middle(working.height()), scale: 1.0, turn_rad: 0.0 };
-    resampler.look(working, view, &mut whole);
+    resampler.resample(working, view, &mut whole);
     let mut image = Plane::default();
     coarsened(&whole, coarseness, &mut image);
     let window = Window::uniform(image.width(), image.height());
@@ -102,7 +88,7 @@ impl Coarse {
     /// `scratch.ratios`.
     fn ratios(
         &self,
-        target: &Target,
+        state: &State,
         noise: f32,
         picture: &Plane,
         [columns, rows]: &[Range<usize>; 2],
@@ -119,15 +105,14 @@ impl Coarse {
         // The mean of n pixels has an n-th of their noise's variance.
         let noise = noise / (self.coarseness * self.coarseness) as f32;
         let noise = noise.max((config.noise_floor * config.noise_floor) as f32);
-        let expected =
-            target.expectation(noise, self.reference.variance() * pixels, pixels, config);
+        let expected = state.expectation(noise, self.reference.variance() * pixels, pixels, config);
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
     }
 
     /// How much what has been correlated last looks like the reference.
     fn likeness(&self, scratch: &mut Scratch) -> Likeness {
         let covariances = scratch.statistics.covariance.samples();
-        let Search { contrasts, .. } = &mut scratch.search;
+        let SearchScratch { contrasts, .. } = &mut scratch.search;
         contrasts.clear();
         contrasts.extend(covariances.iter().map(|covariance| covariance.abs()));
         let deviation =
@@ -168,85 +153,85 @@ struct Searched<'a> {
     is_change: bool,
 }
 
-/// Looks for a lost target: by turns in what has changed, where no cloud is, and in the image,
-/// where it may hover; and by turns in its last look and its first, which stays if it is found by
-/// that.
-pub(crate) fn find(target: &mut Target, frame: Frame<'_>, scratch: &mut Scratch) -> Found {
-    let mut change = std::mem::take(&mut scratch.search.change);
-    let is_change =
-        target.searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
-    if target.searches / 2 % 2 == 1 {
-        target.take_first_look(frame.config, &mut scratch.buffers);
-    }
-    target.searches += 1;
-    let searched = if is_change {
-        Searched { picture: &change, noise: NOISE_OF_CHANGE * target.noise, is_change }
-    } else {
-        Searched { picture: frame.image, noise: target.noise, is_change }
-    };
-    let found = find_in(target, frame, searched, scratch);
-    scratch.search.change = change;
-    if !found.accepted {
-        target.take_last_look();
-    }
-    found
+/// A lost target, as it is searched for.
+pub(crate) struct Sought<'a> {
+    pub(crate) state: &'a mut State,
+    pub(crate) identity: &'a Identity,
+    pub(crate) memory: &'a mut SearchMemory,
 }
 
-fn find_in(
-    target: &mut Target,
-    frame: Frame<'_>,
-    searched: Searched<'_>,
-    scratch: &mut Scratch,
-) -> Found {
-    let config = frame.config;
-    let Searched { picture: image, noise, is_change } = searched;
-    let working = target.appearance.working.image();
-    let sides = [working.width(), working.height()];
-    let coarseness = (sides[0].min(sides[1]) / COARSE_SIDE).clamp(1, MOST_COARSE);
-    let side = coarseness as f64;
-    if image.width() < 2 * coarseness || image.height() < 2 * coarseness {
-        return Found { look: None, accepted: false };
-    }
-    let predicted = target.position();
-    let at = [predicted.x, predicted.y];
-    let half = half_sides(target, image, sides, config);
-    let image_sides = [image.width(), image.height()];
-    let ranges = [0, 1].map(|i| {
-        let last = image_sides[i] / coarseness - 1;
-        let first = (((at[i] - half[i]) / side).max(0.0) as usize).min(last);
-        first..(((at[i] + half[i]) / side).max(0.0) as usize + 1).min(last).max(first) + 1
-    });
-    let coarse = Coarse {
-        reference: coarse_reference(target, coarseness, &mut scratch.buffers.resampler),
-        coarseness,
-    };
-    if !is_change {
-        remember_background(target, frame, &coarse, scratch);
+impl Sought<'_> {
+    /// Looks for it: by turns in what has changed, where no cloud is, and in the image, where it may
+    /// hover; and by turns as it looked last and at first, as which it stays if it is found by that.
+    pub(crate) fn find(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Found {
+        let mut change = std::mem::take(&mut scratch.search.change);
+        let searches = self.memory.searches;
+        let is_change = searches.is_multiple_of(2) && frame.scene.change(frame.image, &mut change);
+        if searches / 2 % 2 == 1 {
+            self.memory.take_first(self.state, frame.config, &mut scratch.buffers);
+        }
+        self.memory.searches += 1;
+        let noise = self.state.noise;
+        let searched = if is_change {
+            Searched { picture: &change, noise: NOISE_OF_CHANGE * noise, is_change }
+        } else {
+            Searched { picture: frame.image, noise, is_change }
+        };
+        let found = self.find_in(frame, searched, scratch);
+        scratch.search.change = change;
+        if !found.accepted {
+            self.memory.take_last(self.state);
+        }
+        found
     }
 
-    let mut picture = std::mem::take(&mut scratch.search.coarse);
-    coarsened(image, coarseness, &mut picture);
-    replace_invalid(&mut picture);
-    coarse.ratios(target, noise, &picture, &ranges, scratch, config);
-    scratch.search.coarse = picture;
-    let likeness = coarse.likeness(scratch);
-    let area = Area { ranges, predicted: at, half, sides, coarseness, is_change };
-    let best = area.best_place(target, scratch, config);
+    fn find_in(
+        &mut self,
+        frame: Frame<'_>,
+        searched: Searched<'_>,
+        scratch: &mut Scratch,
+    ) -> Found {
+        let config = frame.config;
+        let Searched { picture: image, noise, is_change } = searched;
+        let state = &mut *self.state;
+        let working = state.appearance.working.image();
+        let sides = [working.width(), working.height()];
+        let coarseness = (sides[0].min(sides[1]) / COARSE_SIDE).clamp(1, MOST_COARSE);
+        if image.width() < 2 * coarseness || image.height() < 2 * coarseness {
+            return Found { fit: None, accepted: false };
+        }
+        let coarse = Coarse {
+            reference: coarse_reference(state, coarseness, &mut scratch.buffers.resampler),
+            coarseness,
+        };
+        let area = Area::new(state, image, &coarse, is_change, config);
+        if !is_change {
+            remember_background(self.memory, state, frame, &coarse, scratch);
+        }
 
-    // Once more at full resolution, where the coarse search says.
-    let peak =
-        best_near(target, image, noise, best.place, (coarseness + 1) as f64, scratch, config);
-    if is_change {
-        // Where it is the image says best: the change has the noise of two.
-        crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
+        let mut picture = std::mem::take(&mut scratch.search.coarse);
+        coarsened(image, coarseness, &mut picture);
+        replace_invalid(&mut picture);
+        coarse.ratios(state, noise, &picture, &area.ranges, scratch, config);
+        scratch.search.coarse = picture;
+        let likeness = coarse.likeness(scratch);
+        let best = area.best_place(state, self.memory, scratch, config);
+
+        // Once more at full resolution, where the coarse search says.
+        let reach = (coarseness + 1) as f64;
+        let peak = state.best_near(image, noise, best.place, reach, scratch, config);
+        if is_change {
+            // Where it is the image says best: the change has the noise of two.
+            crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
+        }
+        let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
+        let usual = state.usual_contrast * f64::from(state.appearance.clear_share());
+        let accepted = peak.log_ratio - best.background > LEAST_RATIO
+            && best.margin > MARGIN
+            && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
+            && self.identity.arrival_log_ratio(state, frame, fit.place, scratch) >= 0.0;
+        Found { fit: Some(fit), accepted }
     }
-    let look = target.look(peak.column, peak.row, peak.origin, scratch, config);
-    let usual = target.usual_contrast * f64::from(target.appearance.clear_share());
-    let accepted = peak.log_ratio - best.background > LEAST_RATIO
-        && best.margin > MARGIN
-        && likeness.log_ratio(peak.contrast, usual, config.contrast_sd) > ABOVE_CHANCE
-        && target.arrival_log_ratio(frame, look.place, scratch) >= 0.0;
-    Found { look: Some(look), accepted }
 }
 
 /// The best placement of a reference near a place.
@@ -262,79 +247,78 @@ pub(crate) struct Peak {
     pub(crate) sides: [usize; 2],
 }
 
-/// The best of the placements within a reach of a place, px, at full resolution; the part that they
-/// cover is left in the scratch's gate.
-pub(crate) fn best_near(
-    target: &Target,
-    image: &Plane,
-    noise: f32,
-    place: [f64; 2],
-    reach: f64,
-    scratch: &mut Scratch,
-    config: &TrackerConfig,
-) -> Peak {
-    let working = target.appearance.working.image();
-    let reference = [working.width(), working.height()];
-    let origin = place.map(|at| at.round() - reach.ceil());
-    let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
-    let sides = reference.map(|side| 2 * reach.ceil() as usize + side);
-    crop(image, corner, sides, &mut scratch.gate);
-    scratch.correlator.statistics(
-        &scratch.gate,
-        &target.appearance.working,
-        &mut scratch.statistics,
-    );
-    let (energy, pixels) = (target.appearance.energy(), target.appearance.pixels());
-    let mut fine = std::mem::take(&mut scratch.search.fine);
-    log_ratios(&scratch.statistics, target.expectation(noise, energy, pixels, config), &mut fine);
-    let peak = fine.peak();
-    scratch.search.fine = fine;
-    let covariance = scratch.statistics.covariance.row(peak.row)[peak.column];
-    let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
-    Peak {
-        column: peak.column,
-        row: peak.row,
-        log_ratio: peak.score,
-        contrast,
-        origin,
-        corner,
-        sides,
+impl State {
+    /// The best of the placements of its reference within a reach of a place, px, at full resolution;
+    /// the part that they cover is left in the scratch's gate.
+    pub(crate) fn best_near(
+        &self,
+        image: &Plane,
+        noise: f32,
+        place: [f64; 2],
+        reach: f64,
+        scratch: &mut Scratch,
+        config: &TrackerConfig,
+    ) -> Peak {
+        let working = self.appearance.working.image();
+        let reference = [working.width(), working.height()];
+        let origin = place.map(|at| at.round() - reach.ceil());
+        let corner = [0, 1].map(|i| origin[i] as isize - (reference[i] as isize - 1) / 2);
+        let sides = reference.map(|side| 2 * reach.ceil() as usize + side);
+        crop(image, corner, sides, &mut scratch.gate);
+        scratch.correlator.statistics(
+            &scratch.gate,
+            &self.appearance.working,
+            &mut scratch.statistics,
+        );
+        let (energy, pixels) = (self.appearance.energy(), self.appearance.pixels());
+        let fine = &mut scratch.search.fine;
+        log_ratios(&scratch.statistics, self.expectation(noise, energy, pixels, config), fine);
+        let peak = fine.peak();
+        let covariance = scratch.statistics.covariance.row(peak.row)[peak.column];
+        let contrast = f64::from(covariance * pixels / energy.max(1e-12)).max(0.0);
+        Peak {
+            column: peak.column,
+            row: peak.row,
+            log_ratio: peak.score,
+            contrast,
+            origin,
+            corner,
+            sides,
+        }
     }
-}
 
-/// Half sides of the search, px: they grow from frame to frame.
-pub(crate) fn half_sides(
-    target: &Target,
-    image: &Plane,
-    sides: [usize; 2],
-    config: &TrackerConfig,
-) -> [f64; 2] {
-    let grown = config.search_growth_px * target.unseen_s;
-    let gate = target.half_gate(image, config);
-    let most = [image.width(), image.height()];
-    [0, 1].map(|i| (gate[i] as f64).max(sides[i] as f64 + grown).min(most[i] as f64))
+    /// Half sides of the search, px: they grow from frame to frame.
+    pub(crate) fn search_half_sides(&self, image: &Plane, config: &TrackerConfig) -> [f64; 2] {
+        let working = self.appearance.working.image();
+        let sides = [working.width(), working.height()];
+        let grown = config.search_growth_px * self.unseen_s;
+        let gate = self.half_gate(image, config);
+        let most = [image.width(), image.height()];
+        [0, 1].map(|i| (gate[i] as f64).max(sides[i] as f64 + grown).min(most[i] as f64))
+    }
 }
 
 /// The scene's own log ratios, once a loss.
 fn remember_background(
-    target: &mut Target,
+    memory: &mut SearchMemory,
+    state: &State,
     frame: Frame<'_>,
     coarse: &Coarse,
     scratch: &mut Scratch,
 ) {
     let coarseness = coarse.coarseness;
     let known =
-        target.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
-    let Some(snapshot) = frame.snapshot.filter(|_| !known && target.in_snapshot.is_some()) else {
+        memory.background.as_ref().is_some_and(|background| background.coarseness == coarseness);
+    let Some(snapshot) = frame.snapshot.filter(|_| !known && state.in_snapshot.is_some()) else {
         return;
     };
     let mut picture = std::mem::take(&mut scratch.search.coarse);
     coarsened(snapshot, coarseness, &mut picture);
     replace_invalid(&mut picture);
     let whole = [0..picture.width(), 0..picture.height()];
-    coarse.ratios(target, target.noise, &picture, &whole, scratch, frame.config);
+    coarse.ratios(state, state.noise, &picture, &whole, scratch, frame.config);
     scratch.search.coarse = picture;
-    target.background = Some(Background { coarseness, ratios: scratch.ratios.clone() });
+    memory.background = Some(Background { coarseness, ratios: scratch.ratios.clone() });
 }
 
 /// The best placement on the coarse picture.
@@ -362,20 +346,50 @@ struct Area {
 }
 
 impl Area {
-    fn best_place(&self, target: &Target, scratch: &mut Scratch, config: &TrackerConfig) -> Best {
+    fn new(
+        state: &State,
+        image: &Plane,
+        coarse: &Coarse,
+        is_change: bool,
+        config: &TrackerConfig,
+    ) -> Self {
+        let coarseness = coarse.coarseness;
+        let working = state.appearance.working.image();
+        let sides = [working.width(), working.height()];
+        let position = state.position();
+        let predicted = [position.x, position.y];
+        let half = state.search_half_sides(image, config);
+        let image_sides = [image.width(), image.height()];
+        let side = coarseness as f64;
+        let ranges = [0, 1].map(|i| {
+            let last = image_sides[i] / coarseness - 1;
+            let first = (((predicted[i] - half[i]) / side).max(0.0) as usize).min(last);
+            let end = (((predicted[i] + half[i]) / side).max(0.0) as usize + 1).min(last);
+            first..end.max(first) + 1
+        });
+        Self { ranges, predicted, half, sides, coarseness, is_change }
+    }
+
+    fn best_place(
+        &self,
+        state: &State,
+        memory: &SearchMemory,
+        scratch: &mut Scratch,
+        config: &TrackerConfig,
+    ) -> Best {
         let Self { ranges, predicted, half, sides, coarseness, is_change } = self;
         let (sides, coarseness) = (*sides, *coarseness);
         let side = coarseness as f64;
         let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
-        let variances = target.motion.found().map(|found| found.variance);
+        let variances = state.motion.found().map(|found| found.variance);
         let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
-        let anywhere = target.anywhere(config);
+        let anywhere = state.anywhere(config);
         let flat = anywhere / ((2.0 * half[0] + 1.0) * (2.0 * half[1] + 1.0));
         let background_at = |column: usize, row: usize| -> f32 {
             if *is_change {
                 return 0.0;
             }
-            let (Some(background), Some(seen)) = (&target.background, target.in_snapshot) else {
+            let (Some(background), Some(seen)) = (&memory.background, state.in_snapshot) else {
                 return 0.0;
             };
             let near = (middle(column) - seen.x).abs() <= sides[0] as f64

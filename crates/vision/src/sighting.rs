@@ -1,10 +1,11 @@
-//! What the detector finds while a target is lost, held against its looks.
+//! What the detector finds while a target is lost, compared with what it looked like.
 
 use crate::PixelBox;
+use crate::fit::TargetFit;
 use crate::frame::{Frame, Step};
-use crate::look::Look;
-use crate::search::{LEAST_RATIO, best_near, half_sides};
-use crate::target::{Scratch, Target};
+use crate::scratch::Scratch;
+use crate::search::LEAST_RATIO;
+use crate::target::Target;
 
 /// What is found may be so many times larger or smaller than the target was, a side: outlines lose
 /// what is as bright as the sky behind it. With half of it a panning camera's target is right in
@@ -16,10 +17,10 @@ const OFF_SIDES: f64 = 0.5;
 /// What the detector has found, as a lost target.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sighting {
-    look: Look,
+    fit: TargetFit,
     /// Logarithm of the likelihood ratio of the target's being there against background.
     pub(crate) log_ratio: f32,
-    by_first_look: bool,
+    as_at_first: bool,
 }
 
 impl Target {
@@ -31,16 +32,16 @@ impl Target {
         found: PixelBox,
         scratch: &mut Scratch,
     ) -> Option<Sighting> {
-        if !self.is_searching() || !self.may_be(frame, found) {
+        if !self.state.is_searching() || !self.may_be(frame, found) {
             return None;
         }
         let last = self.seen_as_it_looks(frame, found, scratch);
-        if !self.take_first_look(frame.config, &mut scratch.buffers) {
+        if !self.search_memory.take_first(&mut self.state, frame.config, &mut scratch.buffers) {
             return last;
         }
         let first = self.seen_as_it_looks(frame, found, scratch);
-        self.take_last_look();
-        let first = first.map(|first| Sighting { by_first_look: true, ..first });
+        self.search_memory.take_last(&mut self.state);
+        let first = first.map(|first| Sighting { as_at_first: true, ..first });
         [last, first]
             .into_iter()
             .flatten()
@@ -49,32 +50,37 @@ impl Target {
 
     /// Whether it may be where something has been found, and as large.
     fn may_be(&self, frame: Frame<'_>, found: PixelBox) -> bool {
-        let working = self.appearance.working.image();
-        let half = half_sides(self, frame.image, [working.width(), working.height()], frame.config);
-        let (at, predicted) = (found.centre(), self.position());
+        let half = self.state.search_half_sides(frame.image, frame.config);
+        let (at, predicted) = (found.centre(), self.state.position());
         let is_near =
             (at.x - predicted.x).abs() <= half[0] && (at.y - predicted.y).abs() <= half[1];
-        let [width, height] = self.appearance.sides();
+        let [width, height] = self.state.appearance.sides();
         let larger = ((found.width * found.height) / (width * height)).sqrt();
         is_near && (1.0 / SIZES..=SIZES).contains(&larger)
     }
 
-    /// The best placement of the look in use about what has been found, if it is one.
+    /// The best placement of the appearance in use about what has been found, if it is one.
     fn seen_as_it_looks(
         &mut self,
         frame: Frame<'_>,
         found: PixelBox,
         scratch: &mut Scratch,
     ) -> Option<Sighting> {
-        let [width, height] = self.appearance.sides();
+        let [width, height] = self.state.appearance.sides();
         let reach = OFF_SIDES * found.width.max(found.height).max(width).max(height);
         let at = found.centre();
-        let peak =
-            best_near(self, frame.image, self.noise, [at.x, at.y], reach, scratch, frame.config);
-        let look = self.look(peak.column, peak.row, peak.origin, scratch, frame.config);
+        let peak = self.state.best_near(
+            frame.image,
+            self.state.noise,
+            [at.x, at.y],
+            reach,
+            scratch,
+            frame.config,
+        );
+        let fit = self.state.fit_at(peak.column, peak.row, peak.origin, scratch, frame.config);
         let has_come = peak.log_ratio > LEAST_RATIO
-            && self.arrival_log_ratio(frame, look.place, scratch) >= 0.0;
-        has_come.then_some(Sighting { look, log_ratio: peak.log_ratio, by_first_look: false })
+            && self.identity.arrival_log_ratio(&self.state, frame, fit.place, scratch) >= 0.0;
+        has_come.then_some(Sighting { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }
 
     /// Goes on where the detector has found it, on probation.
@@ -84,17 +90,17 @@ impl Target {
         sighting: Sighting,
         scratch: &mut Scratch,
     ) -> Step {
-        let Sighting { look, by_first_look, .. } = sighting;
-        if by_first_look {
-            self.take_first_look(frame.config, &mut scratch.buffers);
+        let Sighting { fit, as_at_first, .. } = sighting;
+        if as_at_first {
+            self.search_memory.take_first(&mut self.state, frame.config, &mut scratch.buffers);
         }
         self.hypotheses.clear();
-        self.begin_probation(frame.scene);
-        self.motion.restart(look.found(), frame.config.search_velocity_sd_px);
-        self.seen(look.place);
+        self.identity.begin_probation(&self.state, frame.scene);
+        self.state.motion.restart(fit.found(), frame.config.search_velocity_sd_px);
+        self.seen(fit.place);
         Step {
-            measured: Some(self.measurement(&look)),
-            score: look.score,
+            measured: Some(self.state.measurement(&fit)),
+            score: fit.score,
             certainty: 1.0,
             nis: None,
         }

@@ -7,7 +7,8 @@ use crate::detector::Detector;
 use crate::frame::{Frame, Measurement, Step};
 use crate::paper::PaperTarget;
 use crate::scene::Scene;
-use crate::target::{Scratch, Target};
+use crate::scratch::Scratch;
+use crate::target::Target;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
 /// Steps longer or shorter than these are taken as these: after a pause nothing is known of a
@@ -115,14 +116,14 @@ impl Follower {
 
     pub(crate) fn position(&self) -> ImagePoint {
         match self {
-            Self::Posterior(target) => target.position(),
+            Self::Posterior(target) => target.state.position(),
             Self::Paper(target) => target.position(),
         }
     }
 
     fn velocity(&self) -> ImagePoint {
         match self {
-            Self::Posterior(target) => target.velocity(),
+            Self::Posterior(target) => target.state.velocity(),
             Self::Paper(target) => target.velocity(),
         }
     }
@@ -137,7 +138,7 @@ impl Follower {
     /// Width and height of the target, px.
     pub(crate) fn size(&self) -> [f64; 2] {
         match self {
-            Self::Posterior(target) => target.appearance.sides(),
+            Self::Posterior(target) => target.state.appearance.sides(),
             Self::Paper(target) => target.size,
         }
     }
@@ -147,11 +148,11 @@ impl Follower {
     }
 
     pub(crate) fn is_searching(&self) -> bool {
-        matches!(self, Self::Posterior(target) if target.is_searching())
+        matches!(self, Self::Posterior(target) if target.state.is_searching())
     }
 
     pub(crate) fn is_seen(&self) -> bool {
-        !matches!(self, Self::Posterior(target) if target.unseen_s > 0.0 || target.identity.is_on_probation())
+        !matches!(self, Self::Posterior(target) if target.state.unseen_s > 0.0 || target.identity.is_on_probation())
     }
 }
 
@@ -364,7 +365,7 @@ impl ImageTracker {
         if posterior && let Some(number) = self.scene.keep(image) {
             for followed in &mut self.followed {
                 if let Follower::Posterior(target) = &mut followed.target {
-                    target.note_picture(number);
+                    target.identity.note_picture(&target.state, number);
                 }
             }
         }
@@ -414,7 +415,7 @@ impl ImageTracker {
         let new = self
             .followed
             .iter()
-            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.in_snapshot.is_none()));
+            .any(|f| matches!(&f.target, Follower::Posterior(t) if t.state.in_snapshot.is_none()));
         let old =
             self.snapshot.as_ref().is_none_or(|k| time.seconds_since(k.taken) >= SNAPSHOT_AGE_S);
         let posterior = self.config.algorithm == Algorithm::Posterior;
@@ -428,7 +429,7 @@ impl ImageTracker {
         snapshot.taken = time;
         for followed in &mut self.followed {
             if let Follower::Posterior(target) = &mut followed.target {
-                target.in_snapshot = Some(target.last_seen);
+                target.state.in_snapshot = Some(target.state.last_seen);
             }
         }
     }

@@ -5,9 +5,14 @@ use crossfix_filter::AxisMeasurement;
 use nalgebra::Matrix2;
 
 use crate::appearance::Drift;
-use crate::target::{LEAST_MEASUREMENT_SD, Scratch, Target};
+use crate::frame::Measurement;
+use crate::scratch::Scratch;
+use crate::state::State;
 use crate::{ImagePoint, TrackerConfig};
 
+/// Floor of a measurement's standard deviation, px: the fit's bias over the phases of a pixel,
+/// which no noise shows.
+const LEAST_MEASUREMENT_SD: f64 = 0.005;
 /// What noise and the reference do not explain is something else before the target: parts of it, of
 /// so many pixels, change together, and displace the fit as noise of so many times its variance
 /// would.
@@ -18,7 +23,7 @@ const MOST_MEASUREMENT_SD: f64 = 1e3;
 
 /// A reference fitted to the image at the best placement.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Look {
+pub(crate) struct TargetFit {
     pub(crate) place: ImagePoint,
     pub(crate) covariance: Matrix2<f64>,
     /// Contrast over the reference's.
@@ -29,7 +34,7 @@ pub(crate) struct Look {
     pub(crate) score: f64,
 }
 
-impl Look {
+impl TargetFit {
     /// Where the reference is found, as a measurement of either axis.
     pub(crate) fn found(&self) -> [AxisMeasurement; 2] {
         let Self { place, covariance, .. } = self;
@@ -38,16 +43,16 @@ impl Look {
     }
 }
 
-impl Target {
+impl State {
     /// Fits the reference at a placement of the gate.
-    pub(crate) fn look(
+    pub(crate) fn fit_at(
         &mut self,
         column: usize,
         row: usize,
         origin: [f64; 2],
         scratch: &mut Scratch,
         config: &TrackerConfig,
-    ) -> Look {
+    ) -> TargetFit {
         let working = &self.appearance.working;
         let freedom = if config.follow_shape { Freedom::ShiftScaleTurn } else { Freedom::Shift };
         let options = FitOptions { steps: 2, freedom, ..FitOptions::default() };
@@ -76,7 +81,17 @@ impl Target {
         let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
         let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
         let score = (energy / (energy + rest + 1e-12)).sqrt();
-        Look { place, covariance, contrast, shape, score }
+        TargetFit { place, covariance, contrast, shape, score }
+    }
+
+    /// What a fit measured, the reference's offset taken out, with all that its covariance must hold.
+    pub(crate) fn measurement(&self, fit: &TargetFit) -> Measurement {
+        let [x, y] = self.motion.offset();
+        let place = ImagePoint { x: fit.place.x - x.position, y: fit.place.y - y.position };
+        Measurement {
+            place,
+            covariance: fit.covariance + Matrix2::new(x.variance, 0.0, 0.0, y.variance),
+        }
     }
 
     /// The covariance of a fit by a reference that is not the target itself: see

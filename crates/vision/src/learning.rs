@@ -1,0 +1,97 @@
+//! What an image teaches of a target: its contrast, size, direction and appearance.
+
+use crate::ImagePoint;
+use crate::fit::TargetFit;
+use crate::frame::{FRAME_INTERVAL, Frame};
+use crate::scratch::Scratch;
+use crate::state::{SEEN, State};
+
+/// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
+const USUAL_S: f64 = 3.0;
+/// Time constant with which a lost target's contrast is taken for what it usually is again, s:
+/// about a cloud's edge.
+const FADES_S: f64 = 0.5;
+/// Correlations at which an image is not learned at all, and fully.
+const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
+/// Certainties below which nothing is learnt of an image, before and after its correlation is
+/// weighed in.
+const LEAST_CERTAINTY: [f64; 2] = [0.05, 0.02];
+/// How fast the contrast wanders, a share per frame of a thirtieth of a second, and the floor of its
+/// measurement's standard deviation.
+const CONTRAST_WALK: f64 = 0.14;
+const CONTRAST_FLOOR: f64 = 0.1;
+/// Floor of the standard deviation of a measured log scale or turn.
+const SHAPE_FLOOR: f64 = 0.05;
+
+/// 0 below the first value, 1 above the second, linear between.
+fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
+    ((value - low) / (high - low)).clamp(0.0, 1.0)
+}
+
+impl State {
+    /// Follows contrast, size, direction and appearance, the more the surer the target was seen.
+    pub(crate) fn learn(
+        &mut self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        fit: TargetFit,
+        certainty: f64,
+        scratch: &mut Scratch,
+    ) {
+        let Frame { image, interval, .. } = frame;
+        if certainty < LEAST_CERTAINTY[0] {
+            return;
+        }
+        let seen = certainty > SEEN;
+        if seen {
+            let clear = f64::from(self.appearance.clear_share());
+            let measured = fit.contrast / clear;
+            let variance = f64::from(self.noise / self.appearance.energy().max(1e-12))
+                / clear.powi(2)
+                + CONTRAST_FLOOR.powi(2);
+            self.contrast_variance +=
+                (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
+            let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
+            self.contrast = (self.contrast + gain * (measured - self.contrast)).clamp(0.2, 5.0);
+            self.contrast_variance *= 1.0 - gain;
+            let share = (certainty * interval / USUAL_S).min(1.0);
+            self.usual_contrast += share * (self.contrast - self.usual_contrast);
+        }
+        let certainty = certainty * ramp(fit.score, LEARNING_SCORES);
+        if certainty >= LEAST_CERTAINTY[1] {
+            // Size and direction take effect with the learning; without it they would run away.
+            if seen && self.appearance.is_in_shape() {
+                self.follow_shape(fit);
+            }
+            let (certainty, buffers) = (certainty as f32, &mut scratch.buffers);
+            let share =
+                self.appearance.learn(image, place, self.noise, certainty, interval, buffers);
+            let variances = [fit.covariance.m11, fit.covariance.m22];
+            self.motion.learn(place, f64::from(share), Some(variances));
+        }
+    }
+
+    fn follow_shape(&mut self, fit: TargetFit) {
+        let Some(shape) = fit.shape else { return };
+        let limits = [0.2, 0.5];
+        let mut steps = [0.0; 2];
+        for i in 0..2 {
+            let (change, variance) = shape[i];
+            if variance < 0.1 && change.abs() < limits[i] {
+                let known = &mut self.shape_variances[i];
+                let gain = *known / (*known + variance + SHAPE_FLOOR.powi(2));
+                steps[i] = gain * change;
+                *known *= 1.0 - gain;
+            }
+        }
+        self.appearance.reshape(steps[0], steps[1]);
+    }
+
+    /// Nothing is known of a lost target's contrast any more but what it usually is.
+    pub(crate) fn forget_contrast(&mut self, interval: f64) {
+        let share = (interval / FADES_S).min(1.0);
+        self.contrast += share * (self.usual_contrast - self.contrast);
+        self.contrast_variance +=
+            share * ((0.5 * self.usual_contrast).powi(2) - self.contrast_variance);
+    }
+}

@@ -1,0 +1,145 @@
+//! What is believed of one target: what it looks like, how it moves, how well it can be seen.
+//!
+//! The stages of a step read and change it: the gate (`gate.rs`), the fit (`fit.rs`), learning
+//! (`learning.rs`), and where it is lost the search (`search.rs`). [`crate::target`] puts them together.
+
+use crossfix_correlation::Plane;
+use crossfix_filter::AxisMeasurement;
+
+use crate::appearance::Appearance;
+use crate::crop::crop;
+use crate::frame::{FRAME_INTERVAL, Frame};
+use crate::likelihood::Expectation;
+use crate::motion::Motion;
+use crate::scratch::Scratch;
+use crate::{ImagePoint, PixelBox, TrackerConfig};
+
+/// Frames without the target after which it is searched for.
+const SEARCH_AFTER_FRAMES: u32 = 3;
+/// Share of a frame's noise in the running estimate.
+const NOISE_SHARE: f32 = 0.3;
+/// Certainty above which a target counts as seen.
+pub(crate) const SEEN: f64 = 0.5;
+/// How fast the log scale and the turn wander, a frame of a thirtieth of a second, and their largest
+/// variances.
+const SHAPE_WALK: [f64; 2] = [0.006, 0.02];
+const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
+
+/// What is believed of a target.
+#[derive(Clone, Debug)]
+pub(crate) struct State {
+    pub(crate) appearance: Appearance,
+    pub(crate) motion: Motion,
+    /// How likely it could not be seen in the last image.
+    pub(crate) hidden: f64,
+    /// Variance of the image's noise.
+    pub(crate) noise: f32,
+    pub(crate) contrast: f64,
+    pub(crate) contrast_variance: f64,
+    /// What the contrast is over seconds, as long as the target is seen.
+    pub(crate) usual_contrast: f64,
+    /// Variances of the log scale and of the turn.
+    pub(crate) shape_variances: [f64; 2],
+    /// Images since it was last seen, ...
+    pub(crate) missed: u32,
+    /// ... and the time, s.
+    pub(crate) unseen_s: f64,
+    pub(crate) last_seen: ImagePoint,
+    /// Whether it has never been seen but where it was given.
+    pub(crate) is_new: bool,
+    /// Where it was in the tracker's snapshot picture.
+    pub(crate) in_snapshot: Option<ImagePoint>,
+}
+
+impl State {
+    /// Of a target that somebody shows: the box and a margin become the reference (Lytvynets 2020,
+    /// object model).
+    pub(crate) fn new(
+        image: &Plane,
+        place: PixelBox,
+        scratch: &mut Scratch,
+        config: &TrackerConfig,
+    ) -> Self {
+        let centre = place.centre();
+        let around = [place.width, place.height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
+        let corner = [centre.x - around[0] as f64 / 2.0, centre.y - around[1] as f64 / 2.0];
+        crop(image, corner.map(|at| at as isize), around, &mut scratch.gate);
+        let noise = scratch.meter.variance(&scratch.gate, config.noise_floor as f32);
+        let variance = config.given_sd_px.powi(2) + config.centre_sd_px.powi(2);
+        let given = [centre.x, centre.y].map(|position| AxisMeasurement { position, variance });
+        Self {
+            appearance: Appearance::new(image, place, noise, config, &mut scratch.buffers),
+            motion: Motion::at_rest(given, config.start_velocity_sd_px, config.acceleration_sd_px),
+            hidden: 0.0,
+            noise,
+            contrast: 1.0,
+            contrast_variance: 0.0,
+            usual_contrast: 1.0,
+            shape_variances: [1e-6; 2],
+            missed: 0,
+            unseen_s: 0.0,
+            last_seen: centre,
+            is_new: true,
+            in_snapshot: None,
+        }
+    }
+
+    /// Where the target is believed to be.
+    pub(crate) fn position(&self) -> ImagePoint {
+        self.motion.position()
+    }
+
+    /// How fast it is believed to move, px/s.
+    pub(crate) fn velocity(&self) -> ImagePoint {
+        self.motion.velocity()
+    }
+
+    /// Whether it is searched for.
+    pub(crate) fn is_searching(&self) -> bool {
+        self.missed >= SEARCH_AFTER_FRAMES
+    }
+
+    /// It was seen at a place.
+    pub(crate) fn seen(&mut self, place: ImagePoint) {
+        (self.missed, self.unseen_s, self.hidden) = (0, 0.0, 0.0);
+        self.is_new = false;
+        self.last_seen = place;
+    }
+
+    /// Goes on to the time of the next image.
+    pub(crate) fn predict(&mut self, frame: Frame<'_>) {
+        self.motion.predict(frame.interval, frame.sides());
+        self.unseen_s += frame.interval;
+        let frames = frame.interval / FRAME_INTERVAL;
+        for (i, variance) in self.shape_variances.iter_mut().enumerate() {
+            *variance = (*variance + SHAPE_WALK[i].powi(2) * frames).min(MOST_SHAPE_VARIANCE[i]);
+        }
+    }
+
+    /// Takes the noise of an image into the running estimate.
+    pub(crate) fn note_noise(&mut self, noise: f32) {
+        self.noise =
+            if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
+    }
+
+    /// What is expected of the target in the image.
+    pub(crate) fn expectation(
+        &self,
+        noise: f32,
+        energy: f32,
+        pixels: f32,
+        config: &TrackerConfig,
+    ) -> Expectation {
+        let contrast = self.contrast * f64::from(self.appearance.clear_share());
+        let variance = (config.contrast_sd * contrast).powi(2) + self.contrast_variance;
+        Expectation {
+            // A reference of nothing is found nowhere.
+            energy: energy.max(1e-3 * pixels * noise),
+            pixels,
+            noise: noise.max(f32::MIN_POSITIVE),
+            contrast: contrast as f32,
+            contrast_variance: variance as f32,
+            mismatch: config.mismatch as f32,
+        }
+    }
+}
