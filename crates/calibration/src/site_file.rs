@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
-use crate::flight::{CameraResult, FlightResult};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
@@ -163,6 +162,11 @@ impl SiteCalibration {
         Self { cameras, datum: None }
     }
 
+    /// The same with what they are off by together, if that is known.
+    pub(crate) fn with_datum(cameras: Vec<CalibratedCamera>, datum: Option<Datum>) -> Self {
+        Self { cameras, datum }
+    }
+
     /// Takes pose and lens of a camera in: where the site has one of its name, that one's clock and
     /// noise stay.
     pub fn put(&mut self, camera: CalibratedCamera) {
@@ -194,37 +198,6 @@ impl SiteCalibration {
     /// The camera of this name.
     pub fn camera(&self, name: &CameraName) -> Option<&CalibratedCamera> {
         self.cameras.iter().find(|camera| camera.name == *name)
-    }
-}
-
-impl From<&FlightResult> for SiteCalibration {
-    fn from(result: &FlightResult) -> Self {
-        let cameras = result.cameras.iter().map(CalibratedCamera::from).collect();
-        Self { cameras, datum: result.datum.clone() }
-    }
-}
-
-impl From<&CameraResult> for CalibratedCamera {
-    fn from(result: &CameraResult) -> Self {
-        let clock = &result.clock;
-        let knots_s =
-            clock.knots.iter().map(|knot| [knot.time_s, knot.ahead_s, knot.sd_s]).collect();
-        Self {
-            name: result.name.clone(),
-            camera: result.camera.clone(),
-            pose_covariance: result.pose_covariance,
-            lens: result.lens.clone(),
-            range_m: result.range_m,
-            clock: ClockCorrection {
-                knots_s,
-                rate: clock.rate,
-                rate_sd: clock.rate_sd,
-                wander_s: clock.wander.sqrt(),
-                readout_s: clock.readout_s,
-            },
-            noise: result.noise,
-            frame_s: result.frame_s,
-        }
     }
 }
 

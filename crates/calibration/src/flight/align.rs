@@ -3,8 +3,8 @@
 use crossfix_geometry::{Pose, turn_between, turn_vector};
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
-use super::adjustment::State;
 use super::model::{CameraLabels, CameraState};
+use super::state::State;
 use super::{linear, triangulation};
 use crate::landmarks::{Landmark, LandmarkError, LandmarkPicture, calibrate_landmarks};
 use crate::lens;

@@ -1,15 +1,14 @@
 //! Where the adjustment begins: each camera's pose and clock, and the target's way.
 
-use super::adjustment::{CameraPriors, Priors, RATE_SD, State};
 use super::align;
 use super::course::Course;
-use super::model::{CameraLabels, CameraState, FlightLog};
+use super::error::{FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal};
+use super::model::{CameraLabels, CameraState, FlightLog, frame_time, hours};
 use super::pairs::{self, Pair, Sights};
 use super::spline::Spline;
-use super::{
-    FlightError, LEAST_LABELS, LONGEST_FLIGHT_H, Refusal, WouldFit, hours, start, things,
-    triangulation, would_fit,
-};
+use super::state::{CameraPriors, Priors, RATE_SD, State};
+use super::would_fit::WouldFit;
+use super::{start, things, triangulation, would_fit};
 use crate::label_noise::LabelNoise;
 use crate::survey::Survey;
 use crossfix_geometry::turn_vector;
@@ -437,14 +436,4 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, Fl
         return Err(FlightError::TwoWays);
     }
     Ok(begun.swap_remove(0).0)
-}
-
-/// The time between a camera's frames: the median between its labels, s.
-pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
-    let mut steps: Vec<f64> =
-        camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
-    // Several labels may be of one frame.
-    steps.retain(|step| *step > 0.0);
-    steps.sort_unstable_by(f64::total_cmp);
-    steps.get(steps.len() / 2).copied().unwrap_or_default().max(1e-3)
 }

@@ -3,9 +3,10 @@
 use crossfix_message::CameraName;
 use nalgebra::{DMatrix, DVector, Dyn, OMatrix, U3, Vector2};
 
-use super::adjustment::{Flight, Row, Sink, State, UNSEEN};
 use super::model::POSE_AND_CLOCK;
 use super::noise::Tails;
+use super::rows::{Row, Sink, UNSEEN};
+use super::state::{Flight, State};
 use crate::landmarks::seen::{self, POSE, Seen};
 use crate::survey::{Click, SurveyedLandmark};
 

@@ -2,10 +2,11 @@
 
 use nalgebra::Point3;
 
-use super::adjustment::{self, Flight, NEARLY_SETTLED, Priors, RATE_SD, State};
+use super::adjustment::{self, NEARLY_SETTLED};
 use super::model::{FlightLog, LogErrors};
 use super::settle::jerk;
 use super::spline::{KNOT_S, Spline, Weights};
+use super::state::{Flight, Priors, RATE_SD, State};
 use crate::survey::Survey;
 
 /// Between samples farther apart than this nobody knows where the target was, s: or so many of the

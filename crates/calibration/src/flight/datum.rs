@@ -6,8 +6,8 @@
 use crossfix_message::{Datum, Timestamp};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, Vector3};
 
-use super::adjustment::State;
 use super::model::{CLOCK, CameraState};
+use super::state::State;
 
 /// Without a log the common time is a camera's, whose clock may show anything, s.
 const UNKNOWN_S: f64 = 1e3;

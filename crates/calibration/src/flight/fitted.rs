@@ -3,8 +3,8 @@
 use crossfix_geometry::Pixel;
 use nalgebra::{Point3, Vector2, Vector3};
 
-use super::adjustment::{Flight, State};
 use super::model::FlightLog;
+use super::state::{Flight, State};
 
 /// A label beside where its target should have been seen.
 #[derive(Clone, Copy, Debug, PartialEq)]

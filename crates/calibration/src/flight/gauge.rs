@@ -7,10 +7,11 @@
 use crossfix_message::Datum;
 use nalgebra::{DMatrix, DVector};
 
-use super::adjustment::{Row, Sink, State};
 use super::datum::Followers;
 use super::model::{CLOCK, step_between};
 use super::noise::Tails;
+use super::rows::{Row, Sink};
+use super::state::State;
 
 /// The site as a whole is held by these: shift (m), turn (rad), growth, lateness (s). Rounding is at
 /// ten digits below them, far under what cameras are known by beside the datum. The clocks' common

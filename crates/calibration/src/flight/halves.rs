@@ -6,10 +6,11 @@
 
 use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Vector3};
 
-use super::LEAST_LABELS;
-use super::adjustment::{self, Adjusted, Flight, NEARLY_SETTLED, Priors, State};
+use super::adjustment::{self, Adjusted, NEARLY_SETTLED};
 use super::datum::Followers;
+use super::error::LEAST_LABELS;
 use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
+use super::state::{Flight, Priors, State};
 use crate::label_noise::LabelNoise;
 
 /// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.

@@ -217,3 +217,19 @@ pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
     step.extend(lenses.map(|(from, to)| to - from));
     step
 }
+
+/// The time between a camera's frames: the median between its labels, s.
+pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
+    let mut steps: Vec<f64> =
+        camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
+    // Several labels may be of one frame.
+    steps.retain(|step| *step > 0.0);
+    steps.sort_unstable_by(f64::total_cmp);
+    steps.get(steps.len() / 2).copied().unwrap_or_default().max(1e-3)
+}
+
+/// How long times last that are in order.
+pub(super) fn hours(mut times_s: impl DoubleEndedIterator<Item = f64>) -> f64 {
+    let (first, last) = (times_s.next(), times_s.next_back());
+    first.zip(last).map_or(0.0, |(first, last)| (last - first) / 3600.0)
+}

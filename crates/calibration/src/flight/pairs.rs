@@ -5,8 +5,8 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
-use super::begin::frame_time;
 use super::model::CameraLabels;
+use super::model::frame_time;
 use super::plane;
 use crate::lens;
 

@@ -3,10 +3,11 @@
 use crossfix_message::Datum;
 use nalgebra::{DMatrix, Matrix3, Vector3};
 
-use super::adjustment::{Cost, Flight, Priors, State};
 use super::model::CLOCK;
 use super::normal::NormalEquations;
+use super::rows::Cost;
 use super::spline::{KNOT_S, SPAN};
+use super::state::{Flight, Priors, State};
 
 /// A way that hovers in a point has no size to be pulled on, m^2.
 const LEAST_SIZE2: f64 = 1.0;

@@ -4,16 +4,20 @@ use crossfix_geometry::{Camera, Intrinsics, Pose};
 use crossfix_message::{CameraName, Datum};
 use nalgebra::{DMatrix, Matrix6};
 
-use super::adjustment::{self, Adjusted, Flight, Priors, State};
+use super::adjustment::Adjusted;
 use super::clicked::LandmarkMisfit;
 use super::datum::Followers;
+use super::error::Refusal;
 use super::fitted::{self, FittedLabel, FittedSample};
 use super::gauge::Gauge;
+use super::halves;
 use super::model::{CLOCK, FlightLog, Label, POSE_AND_CLOCK};
 use super::moved::{self, MovedAt};
-use super::{Refusal, halves};
+use super::state::{Flight, Priors, State, square};
+use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
+use crate::site_file::SiteCalibration;
 
 /// What a flight has shown of one camera.
 #[derive(Clone, Debug)]
@@ -147,7 +151,7 @@ pub(super) fn results(
         let fitted = fitted::labels(flight, state, index);
         let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
         let used = fitted.iter().filter(within);
-        let squares: Vec<f64> = used.map(|label| adjustment::square(label.beside_px)).collect();
+        let squares: Vec<f64> = used.map(|label| square(label.beside_px)).collect();
         // Cameras that one half saw too little of are no better than the others.
         let ratio = ratios[index].unwrap_or(typical).max(1.0).powi(2);
         let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
@@ -290,5 +294,36 @@ impl CameraResult {
     /// The lens as it was found.
     pub fn intrinsics(&self) -> &Intrinsics {
         self.camera.model().intrinsics()
+    }
+}
+
+impl From<&FlightResult> for SiteCalibration {
+    fn from(result: &FlightResult) -> Self {
+        let cameras = result.cameras.iter().map(CalibratedCamera::from).collect();
+        Self::with_datum(cameras, result.datum.clone())
+    }
+}
+
+impl From<&CameraResult> for CalibratedCamera {
+    fn from(result: &CameraResult) -> Self {
+        let clock = &result.clock;
+        let knots_s =
+            clock.knots.iter().map(|knot| [knot.time_s, knot.ahead_s, knot.sd_s]).collect();
+        Self {
+            name: result.name.clone(),
+            camera: result.camera.clone(),
+            pose_covariance: result.pose_covariance,
+            lens: result.lens.clone(),
+            range_m: result.range_m,
+            clock: ClockCorrection {
+                knots_s,
+                rate: clock.rate,
+                rate_sd: clock.rate_sd,
+                wander_s: clock.wander.sqrt(),
+                readout_s: clock.readout_s,
+            },
+            noise: result.noise,
+            frame_s: result.frame_s,
+        }
     }
 }

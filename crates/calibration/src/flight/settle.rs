@@ -2,11 +2,10 @@
 
 use nalgebra::Vector2;
 
-use super::adjustment::{
-    self, Adjusted, CameraPriors, Flight, NEARLY_SETTLED, Priors, SETTLED, State,
-};
+use super::adjustment::{self, Adjusted, NEARLY_SETTLED, SETTLED};
 use super::normal::Term;
 use super::spline::{KNOT_S, THIRD_DIFFERENCE};
+use super::state::{CameraPriors, Flight, Priors, State};
 use crate::label_noise::LabelNoise;
 
 /// Rounds in which deviations and powers are found beside the unknowns.

@@ -2,9 +2,9 @@
 
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
-use super::begin::frame_time;
 use super::course::Course;
 use super::linear::{self, Linear, Seen};
+use super::model::frame_time;
 use super::model::{CameraLabels, CameraState, Clock, Label};
 use super::pieces;
 use crate::lens;

@@ -2,9 +2,10 @@
 
 use nalgebra::{Rotation3, Vector3};
 
-use super::adjustment::{Flight, Row, Sink, State};
 use super::model::CameraLabels;
 use super::noise::Tails;
+use super::rows::{Row, Sink};
+use super::state::{Flight, State};
 use crate::survey::ENOUGH_PLACES;
 
 /// Whoever sets a camera up holds its picture level to this, rad. It turns a site upright that three

@@ -6,11 +6,12 @@
 
 use nalgebra::{Point3, Rotation3};
 
-use super::begin::frame_time;
 use super::course::Course;
+use super::error::LEAST_LABELS;
+use super::model::frame_time;
 use super::model::{CameraLabels, Label};
 use super::pairs::{self, Pair, Sights};
-use super::{LEAST_LABELS, pieces, start, triangulation};
+use super::{pieces, start, triangulation};
 use crate::survey::Survey;
 
 /// Where fewer labels than this share were made at once with others, these are birds, which the fits

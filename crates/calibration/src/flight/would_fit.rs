@@ -6,10 +6,10 @@ use crossfix_geometry::Intrinsics;
 use crossfix_message::CameraName;
 use nalgebra::Matrix3;
 
-use super::begin::frame_time;
 use super::course::Course;
 use super::linear::Linear;
 use super::model::CameraLabels;
+use super::model::frame_time;
 use super::start;
 
 /// What fits does so many times better than what was given.

@@ -1,0 +1,52 @@
+//! A site that no log places is held where an earlier calibration has it.
+
+use super::results::{CameraResult, FlightResult};
+use crate::survey::Survey;
+
+/// No clock is taken to be known better than this at another time than it was calibrated, s: of zeros there
+/// is no mean.
+const LEAST_CLOCK_SD_S: f64 = 1e-3;
+/// The lateness among a datum's ways.
+const LATE: usize = 7;
+
+/// Holds a site as a whole where an earlier calibration has it: it may be off by what was said then. Its
+/// common time is that which the cameras' clocks showed by what was known of them.
+pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
+    if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
+        *datum = known.clone();
+    }
+    let Some((later_s, sd_s)) = later(result, survey) else { return };
+    for camera in &mut result.cameras {
+        camera.clock.knots.iter_mut().for_each(|knot| knot.ahead_s += later_s);
+        camera.fitted.iter_mut().for_each(|label| label.time_s += later_s);
+    }
+    if let Some(datum) = &mut result.datum {
+        datum.covariance[(LATE, LATE)] += sd_s * sd_s;
+    }
+}
+
+/// By how much the common time is later by what was known of the clocks, and its standard deviation, s: the
+/// middle of what the cameras say, as one may have been set anew. Clocks that no flight has calibrated say
+/// nothing.
+fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
+    let says = |found: &CameraResult| {
+        let known = survey.known(&found.name)?;
+        known.clock.knots_s.first()?;
+        let middle = found.clock.knots.get(found.clock.knots.len() / 2)?;
+        let (ahead_s, sd_s) = known.clock.at(middle.time_s);
+        Some((ahead_s - middle.ahead_s, sd_s.max(LEAST_CLOCK_SD_S)))
+    };
+    let mut said: Vec<(f64, f64)> = result.cameras.iter().filter_map(says).collect();
+    said.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half: f64 = said.iter().map(|(_, sd_s)| sd_s.powi(-2)).sum::<f64>() / 2.0;
+    let mut below = 0.0;
+    let (middle, _) = *said.iter().find(|(_, sd_s)| {
+        below += sd_s.powi(-2);
+        below >= half
+    })?;
+    // A median's variance is pi / 2 times a mean's, or more where the cameras lie farther apart than they say.
+    let beside: f64 =
+        said.iter().map(|(later_s, sd_s)| ((later_s - middle) / sd_s).abs().min(3.0).powi(2)).sum();
+    let spread = (beside / said.len() as f64).max(1.0);
+    Some((middle, (std::f64::consts::FRAC_PI_2 * spread / (2.0 * half)).sqrt()))
+}

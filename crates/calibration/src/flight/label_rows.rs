@@ -1,0 +1,141 @@
+//! What a camera's labels say: where the way is seen, with what two in a row err by alike taken out.
+
+use nalgebra::Vector2;
+
+use super::model::{CameraLabels, Label, MOST_OWN, Seen};
+use super::noise::{Tails, Whitening};
+use super::normal::Term;
+use super::rows::{Row, Sink, UNSEEN};
+use super::spline::{KNOT_S, SPAN};
+use super::state::{CameraPriors, State};
+use super::unknowns::Touched;
+
+/// Labels farther apart in time than this have errors of their own, s. No more than the distance of
+/// the spline's knots: a row holds five coefficients.
+pub(super) const LONGEST_PAIR_S: f64 = KNOT_S;
+/// Unknowns of the target's way that two labels in a row touch: five coefficients.
+const OF_A_PAIR: usize = 3 * (SPAN + 1);
+
+impl State {
+    pub(super) fn label_rows<S: Sink>(
+        &self,
+        index: usize,
+        start: usize,
+        camera: &CameraLabels,
+        priors: &CameraPriors,
+        sink: &mut S,
+    ) {
+        let mut before: Option<(f64, Placed)> = None;
+        for label in &camera.labels {
+            let placed = self.placed(index, label);
+            let Some(placed) = placed else {
+                // As far off as can be: or it would pay to have it out of sight.
+                sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
+                before = None;
+                continue;
+            };
+            let earlier = before.filter(|(time_s, earlier)| {
+                // Rows and a clock that wanders may have put the later label first.
+                let ahead = placed.first.checked_sub(earlier.first);
+                label.time_s - time_s < LONGEST_PAIR_S
+                    && ahead.is_some_and(|ahead| ahead <= 1)
+                    && placed.touched().and(earlier.touched()).fit()
+            });
+            let whitening = priors
+                .noise
+                .after(earlier.map(|(time_s, _)| label.time_s - time_s), priors.frame_s);
+            let earlier = earlier.as_ref().map(|(_, earlier)| earlier);
+            let rows = if S::TAKES_TERMS {
+                self.whitened(index, start, &placed, earlier, whitening)
+            } else {
+                whitened_residual(&placed, earlier, whitening)
+                    .map(|residual| (Vec::new(), residual))
+            };
+            sink.take(&rows, Tails::Heavy);
+            before = Some((label.time_s, placed));
+        }
+    }
+
+    /// How both axes of a label, in pixels, follow what is unknown; `None` where it is not seen.
+    pub(super) fn told_by(&self, index: usize, label: &Label) -> Option<[Vec<Term>; 2]> {
+        let placed = self.placed(index, label)?;
+        let alone = Whitening { kept: 0.0, sd_px: 1.0 };
+        let rows = self.whitened(index, self.starts()[index], &placed, None, alone);
+        Some(rows.map(|(terms, _)| terms))
+    }
+
+    fn placed(&self, index: usize, label: &Label) -> Option<Placed> {
+        let (first, weights, seen) = self.see(index, label)?;
+        let clock = &self.cameras[index].clock;
+        let wander = clock.wander.weights(clock.straight_s(label.time_s));
+        let placed = Placed { first, weights, seen, wander };
+        placed.touched().fit().then_some(placed)
+    }
+
+    /// See [`whitened_residual`], with what it hangs on.
+    fn whitened(
+        &self,
+        index: usize,
+        start: usize,
+        now: &Placed,
+        before: Option<&Placed>,
+        whitening: Whitening,
+    ) -> [Row; 2] {
+        let Whitening { kept, sd_px } = whitening;
+        let residuals = whitened_residual(now, before, whitening);
+        let (order, own) = (self.order(), self.cameras[index].own());
+        let first = before.map_or(now.first, |before| before.first);
+        [0, 1].map(|axis| {
+            let mut chain = [0.0; OF_A_PAIR];
+            let mut terms: Vec<Term> = Vec::with_capacity(OF_A_PAIR + own + 4);
+            let mut own_terms = [0.0; MOST_OWN];
+            let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
+            for (part, share) in parts.into_iter().flatten() {
+                let share = share / sd_px;
+                for (k, weight) in part.weights.iter().enumerate() {
+                    for dimension in 0..3 {
+                        chain[3 * (part.first - first + k) + dimension] +=
+                            part.seen.by_place[(axis, dimension)] * weight * share;
+                    }
+                }
+                for (term, by_own) in own_terms.iter_mut().zip(&part.seen.by_own) {
+                    *term += by_own[axis] * share;
+                }
+                for (knot, weight) in part.wander {
+                    let by_knot = part.seen.by_time[axis] * weight * share;
+                    terms.push((order.wander(knot, index), by_knot));
+                }
+            }
+            let used = 3 * (now.first - first + SPAN);
+            let of_way = chain[..used].iter().enumerate();
+            terms.extend(of_way.map(|(k, value)| (order.way(first + k / 3, k % 3), *value)));
+            terms.extend(own_terms[..own].iter().enumerate().map(|(k, value)| (start + k, *value)));
+            (terms, residuals[axis])
+        })
+    }
+}
+
+/// A label's residual and what of the way it hangs on.
+#[derive(Clone, Copy, Debug)]
+struct Placed {
+    first: usize,
+    weights: [f64; SPAN],
+    seen: Seen,
+    wander: [(usize, f64); 2],
+}
+
+/// A label's residual less what of it is the one's before, by the deviation of what is new.
+fn whitened_residual(
+    now: &Placed,
+    before: Option<&Placed>,
+    Whitening { kept, sd_px }: Whitening,
+) -> [f64; 2] {
+    let carried = before.map_or(Vector2::zeros(), |before| before.seen.residual * kept);
+    ((now.seen.residual - carried) / sd_px).into()
+}
+
+impl Placed {
+    fn touched(&self) -> Touched {
+        Touched::by(self.first, self.wander[0].0)
+    }
+}

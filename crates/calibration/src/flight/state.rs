@@ -1,0 +1,115 @@
+//! What is unknown of a flight, and what is known of it before its labels are looked at.
+
+use crossfix_geometry::Intrinsics;
+use nalgebra::{Vector2, Vector3};
+
+use super::model::{CameraLabels, CameraState, FlightLog, Knots, Label, Seen};
+use super::spline::{SPAN, Spline};
+use super::unknowns::Order;
+use crate::label_noise::LabelNoise;
+use crate::lens::LensFreedom;
+use crate::survey::Survey;
+
+/// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
+/// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
+/// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by
+/// 50 ms five minutes later.
+pub(super) const RATE_SD: f64 = 1e-4;
+
+/// A flight to be adjusted.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Flight<'a> {
+    pub(super) cameras: &'a [CameraLabels],
+    pub(super) log: Option<&'a FlightLog>,
+    pub(super) survey: &'a Survey,
+}
+
+/// What all residuals are held against.
+#[derive(Clone, Debug)]
+pub(super) struct Priors {
+    /// Power of the target's jerk, m^2/s^5.
+    pub(super) jerk: f64,
+    /// What a clock's rate may be off by.
+    pub(super) rate_sd: f64,
+    /// Of each camera.
+    pub(super) cameras: Vec<CameraPriors>,
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct CameraPriors {
+    pub(super) noise: LabelNoise,
+    /// Of the lens's file.
+    pub(super) lens: Intrinsics,
+    /// What of it may be otherwise.
+    pub(super) freedom: LensFreedom,
+    /// Time between frames, s.
+    pub(super) frame_s: f64,
+    /// Power of the clock's random walk, s^2/s.
+    pub(super) wander: f64,
+}
+
+/// The unknowns.
+#[derive(Clone, Debug)]
+pub(super) struct State {
+    pub(super) way: Spline,
+    pub(super) cameras: Vec<CameraState>,
+    /// The log's bias, an axis each; empty without a log.
+    pub(super) bias: Vec<Knots>,
+}
+
+impl State {
+    /// In what order its unknowns stand.
+    pub(super) fn order(&self) -> Order {
+        Order::of(&self.way, self.cameras.len(), self.bias.len())
+    }
+
+    /// Where each camera's own unknowns begin, and at last where they end.
+    pub(super) fn starts(&self) -> Vec<usize> {
+        let mut next = self.order().chain();
+        let mut starts = vec![next];
+        for camera in &self.cameras {
+            next += camera.own();
+            starts.push(next);
+        }
+        starts
+    }
+
+    pub(super) fn others(&self) -> usize {
+        self.cameras.iter().map(CameraState::own).sum()
+    }
+
+    pub(super) fn moved(&self, step: &[f64]) -> Self {
+        let mut next = self.clone();
+        let order = self.order();
+        for (k, coefficient) in next.way.coefficients.iter_mut().enumerate() {
+            let first = order.way(k, 0);
+            *coefficient += Vector3::from_column_slice(&step[first..first + 3]);
+        }
+        let mut rest = &step[order.chain()..];
+        for (index, camera) in next.cameras.iter_mut().enumerate() {
+            let (own, after) = rest.split_at(camera.own());
+            camera.step(own);
+            rest = after;
+            let wander = camera.clock.wander.values.iter_mut().enumerate();
+            wander.for_each(|(knot, value)| *value += step[order.wander(knot, index)]);
+        }
+        for (axis, bias) in next.bias.iter_mut().enumerate() {
+            let values = bias.values.iter_mut().enumerate();
+            values.for_each(|(knot, value)| *value += step[order.bias(knot, axis)]);
+        }
+        next
+    }
+
+    /// What a camera's label differs by, where the way reaches it.
+    pub(super) fn see(&self, camera: usize, label: &Label) -> Option<(usize, [f64; SPAN], Seen)> {
+        let camera = &self.cameras[camera];
+        let weights = self.way.weights(camera.time_s(label))?;
+        let seen = camera.see(label, self.way.place(&weights), self.way.velocity(&weights))?;
+        Some((weights.first, weights.place, seen))
+    }
+}
+
+/// Half the square of a residual: the mean of both axes, pixels^2.
+pub(super) fn square(residual: Vector2<f64>) -> f64 {
+    residual.norm_squared() / 2.0
+}

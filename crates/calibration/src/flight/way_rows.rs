@@ -1,0 +1,77 @@
+//! What holds the target's way: its jerk, and the log with its bias.
+
+use super::model::FlightLog;
+use super::noise::Tails;
+use super::rows::Sink;
+use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
+use super::state::{Priors, State};
+
+/// A step of the adjustment moves the way by this where nothing else holds it, m: near enough for ten
+/// minutes without a label. With a tenth of it a way that swings out by kilometres in a gap would say
+/// which way round the site is, to 30 mrad.
+const REST_M: f64 = 1e5;
+
+impl State {
+    /// White jerk: over an interval its mean has the variance power / interval, so that the third
+    /// difference has power x interval^5.
+    pub(super) fn jerk_rows(&self, priors: &Priors, sink: &mut impl Sink) {
+        let scale = (priors.jerk * KNOT_S.powi(5)).sqrt().recip();
+        let order = self.order();
+        for first in 0..self.way.intervals() {
+            let difference = self.way.third_difference(first);
+            for axis in 0..3 {
+                let term = |k: usize| (order.way(first + k, axis), THIRD_DIFFERENCE[k] * scale);
+                let terms = (0..SPAN).map(term).collect();
+                sink.take(&[(terms, difference[axis] * scale)], Tails::Normal);
+            }
+        }
+    }
+
+    /// Where nothing holds the way it stays about where it is: in a gap of minutes white jerk alone
+    /// leaves it to rounding.
+    pub(super) fn rest_rows(&self, sink: &mut impl Sink) {
+        let order = self.order();
+        for k in 0..self.way.coefficients.len() {
+            for axis in 0..3 {
+                sink.take(&[(vec![(order.way(k, axis), 1.0 / REST_M)], 0.0)], Tails::Normal);
+            }
+        }
+    }
+
+    pub(super) fn log_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
+        let order = self.order();
+        let scale = log.errors.sd_m.recip();
+        for sample in &log.samples {
+            let Some(weights) = self.way.weights(sample.time_s) else { continue };
+            let place = self.way.place(&weights);
+            let rows = [0, 1, 2].map(|axis| {
+                let of_bias = self.bias[axis].weights(sample.time_s);
+                let chain = (0..SPAN)
+                    .map(|k| (order.way(weights.first + k, axis), weights.place[k] * scale));
+                let bias = of_bias.map(|(k, weight)| (order.bias(k, axis), weight * scale));
+                let stated = place[axis] + self.bias[axis].at(sample.time_s);
+                (chain.chain(bias).collect(), (stated - sample.position[axis]) * scale)
+            });
+            sink.take(&rows, Tails::Heavy);
+        }
+        self.bias_rows(log, sink);
+    }
+
+    /// A bias that forgets itself: `b' = f b + noise`, of the same deviation at all times.
+    pub(super) fn bias_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
+        let order = self.order();
+        let errors = &log.errors;
+        let kept = (-self.bias[0].step_s / errors.drift_time_s).exp();
+        let first = errors.drift_sd_m.max(1e-9).recip();
+        let next = first / (1.0 - kept * kept).sqrt();
+        for (axis, bias) in self.bias.iter().enumerate() {
+            let begin = (vec![(order.bias(0, axis), first)], bias.values[0] * first);
+            sink.take(&[begin], Tails::Normal);
+            for (k, pair) in bias.values.windows(2).enumerate() {
+                let terms =
+                    vec![(order.bias(k, axis), -kept * next), (order.bias(k + 1, axis), next)];
+                sink.take(&[(terms, (pair[1] - kept * pair[0]) * next)], Tails::Normal);
+            }
+        }
+    }
+}
