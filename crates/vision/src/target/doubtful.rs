@@ -1,0 +1,105 @@
+//! A target that may be in several places.
+
+use super::Target;
+use crate::TrackerConfig;
+use crate::config::GateRule;
+use crate::frame::{Frame, Step};
+use crate::gate::Region;
+use crate::hypotheses::DOUBT;
+use crate::motion::Motion;
+use crate::posterior::Posterior;
+use crate::scratch::Scratch;
+use crate::state::SEEN;
+
+/// A turn of the camera by less than this is within what is not known of a target's motion anyway,
+/// px.
+const LEAST_MOVE_PX: f64 = 2.0;
+
+impl Target {
+    /// The camera may have turned: then everything in its image has moved, the target too. Light
+    /// that changes may be taken for a turn, so it may have stayed as well.
+    pub(super) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
+        let by = frame.scene_moved;
+        let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
+        if is_followed
+            && by[0].hypot(by[1]) >= LEAST_MOVE_PX
+            && matches!(frame.config.gate, GateRule::Innovation { .. })
+        {
+            self.hypotheses.begin(&self.state);
+            self.hypotheses.fork(by);
+        }
+    }
+
+    /// Whether a posterior leaves more than one place to be kept.
+    pub(super) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
+        let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
+        in_doubt
+            && matches!(config.gate, GateRule::Innovation { .. })
+            && !self.identity.is_on_probation()
+    }
+
+    /// Follows all places where the target may be into the image whose log ratios are in the
+    /// scratch's map.
+    pub(super) fn follow_hypotheses(
+        &mut self,
+        frame: Frame<'_>,
+        region: Region,
+        scratch: &mut Scratch,
+    ) -> Step {
+        self.hypotheses.begin(&self.state);
+        if let Some(one) = self.hypotheses.one_place(&self.state, frame, region, scratch) {
+            return self.settle_on(one, frame, region, scratch);
+        }
+        self.hypotheses.advance(&self.state, frame, region, scratch);
+        let Some(best) = self.hypotheses.best().cloned() else {
+            self.hypotheses.clear();
+            self.state.missed += 1;
+            return Step::unseen(0.0);
+        };
+        (self.state.motion, self.state.hidden) = (best.motion, best.hidden);
+        self.hypotheses.note_doubt(frame.interval);
+        let is_unseen =
+            self.hypotheses.seen_share() < 1.0 - DOUBT || self.hypotheses.are_hopeless();
+        let Some([column, row]) = best.peak else {
+            self.state.missed += u32::from(is_unseen);
+            self.settle(0.0);
+            return Step::unseen(0.0);
+        };
+        let sure = self.hypotheses.share_near([column, row], self.state.peak_half());
+        let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
+        let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
+        let certainty = sure * is_there;
+        if certainty > SEEN {
+            self.state.motion.tell_noise(fit.found().map(|at| at.variance));
+            self.seen(fit.place);
+        } else if is_unseen || is_there < SEEN {
+            self.state.missed += 1;
+        }
+        self.learn(frame, fit.place, fit, certainty, scratch);
+        self.settle(best.weight);
+        let measured = (certainty > SEEN).then(|| self.state.measurement(&fit));
+        Step { measured, score: fit.score, certainty, nis: None }
+    }
+
+    /// One place is left, or none: the others are forgotten.
+    fn settle(&mut self, weight: f64) {
+        if weight > DOUBT || self.state.is_searching() {
+            self.hypotheses.clear();
+        }
+    }
+
+    /// No doubt is left: the target has been where its likeliest hypothesis was.
+    fn settle_on(
+        &mut self,
+        (motion, posterior): (Motion, Posterior),
+        frame: Frame<'_>,
+        region: Region,
+        scratch: &mut Scratch,
+    ) -> Step {
+        self.state.motion = motion;
+        self.hypotheses.clear();
+        let [column, row] = posterior.peak;
+        let fit = self.state.fit_at(column, row, region.origin, scratch, frame.config);
+        self.update(frame, &posterior, fit, region.origin, scratch)
+    }
+}

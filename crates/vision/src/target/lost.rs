@@ -1,0 +1,61 @@
+//! A target that is lost, and what is found in its place.
+
+use crossfix_filter::AxisMeasurement;
+
+use super::{MANOEUVRE, Target};
+use crate::frame::{Frame, Step};
+use crate::scratch::Scratch;
+use crate::search::Sought;
+
+impl Target {
+    pub(super) fn search(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+        self.state.forget_contrast(frame.interval);
+        if !frame.may_search {
+            self.state.missed += 1;
+            return Step::unseen(0.0);
+        }
+        self.find_again(frame, scratch).unwrap_or_else(|score| {
+            self.state.missed += 1;
+            Step::unseen(score)
+        })
+    }
+
+    /// Takes what a search finds, if it is believed; else its score.
+    fn find_again(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Result<Step, f64> {
+        let Self { state, identity, search_memory: memory, .. } = self;
+        let found = Sought { state, identity, memory }.find(frame, scratch);
+        let Some(fit) = found.fit.filter(|_| found.accepted) else {
+            return Err(found.fit.map_or(0.0, |fit| fit.score));
+        };
+        self.identity.begin_probation(&self.state, frame.scene);
+        let (found, expected) = (fit.found(), self.state.motion.found());
+        let is_near = |i: usize| {
+            (found[i].position - expected[i].position).powi(2) < MANOEUVRE * expected[i].variance
+        };
+        if self.state.missed < 20 && is_near(0) && is_near(1) {
+            self.state.motion.condition([0, 1].map(|i| AxisMeasurement {
+                variance: found[i].variance.min(expected[i].variance),
+                ..found[i]
+            }));
+        } else {
+            self.state.motion.restart(found, frame.config.search_velocity_sd_px);
+        }
+        self.seen(fit.place);
+        self.hypotheses.clear();
+        let measured = self.state.measurement(&fit);
+        Ok(Step { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
+    }
+
+    /// Follows what a search has found. If it is lost again soon it was something else, and the
+    /// search goes on from what was known before.
+    pub(super) fn follow_on_probation(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+        self.identity.predict_probation(frame);
+        let step = self.follow(frame, scratch);
+        if self.state.is_searching() && self.identity.fail_probation(&mut self.state) {
+            self.search_memory.take_last(&mut self.state);
+            return step;
+        }
+        self.identity.go_on_with_probation(step.certainty * frame.interval);
+        step
+    }
+}

@@ -1,0 +1,299 @@
+//! One target followed by the posterior over its placements: the likelihood of every placement in
+//! the gate and the filters' prediction give where it is, how well that is known, and whether it
+//! can be seen at all.
+//!
+//! A step goes through the stages of `state.rs`: the gate, the posterior, the fit, what that leaves
+//! in doubt (`identity.rs`, and where there are several places `doubtful.rs`), the filters' update, and
+//! learning. One that is lost is searched for (`lost.rs`).
+
+mod doubtful;
+mod lost;
+
+use crossfix_correlation::Plane;
+use crossfix_filter::{AxisMeasurement, Gate};
+use nalgebra::Matrix2;
+
+use crate::config::GateRule;
+use crate::fit::TargetFit;
+use crate::frame::{Frame, Measurement, Step};
+use crate::gate::Region;
+use crate::hypotheses::Hypotheses;
+use crate::identity::Identity;
+use crate::motion::Evidence;
+use crate::posterior::{Part, Posterior};
+use crate::scratch::Scratch;
+use crate::search_memory::SearchMemory;
+use crate::state::{SEEN, State};
+use crate::{ImagePoint, PixelBox, TrackerConfig};
+
+/// Variance below which a fit is narrower than the pixels of the map, px^2.
+const NARROW: f64 = 0.5;
+/// What a map tells of a place is at least this share of what is known then: with less, chance
+/// would be taken for a measurement from afar.
+const LEAST_TOLD: f64 = 0.1;
+/// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
+const MANOEUVRE: f64 = 25.0;
+/// A manoeuvre makes the filters' variances at most so many times larger: from a tenth of a pixel
+/// to ten.
+const MOST_INFLATED: f64 = 1e4;
+/// Certainty above which the rest of the gate is not looked at: what is there could take no more
+/// from it than this leaves.
+const SURE: f64 = 0.99;
+
+/// A target under track.
+#[derive(Clone, Debug)]
+pub(crate) struct Target {
+    pub(crate) state: State,
+    pub(crate) identity: Identity,
+    pub(crate) hypotheses: Hypotheses,
+    pub(crate) search_memory: SearchMemory,
+}
+
+/// The measurement that makes a posterior of a prior: the inverse variances' difference.
+fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeasurement {
+    // A placement stands for a whole pixel, of which the map's prior knows nothing.
+    let known = (posterior.variance - 1.0 / 12.0).max(1e-3 * prior.variance);
+    let share = (1.0 - known / prior.variance).max(LEAST_TOLD);
+    let off = (posterior.position - prior.position) / share;
+    AxisMeasurement {
+        position: prior.position + off,
+        variance: prior.variance * (1.0 / share - 1.0) + 1.0 / 12.0,
+    }
+}
+
+impl Target {
+    /// Takes a target up.
+    ///
+    /// The velocity is unknown but for its prior: with the next measurement the state becomes that
+    /// of Herasymenko 2021, eqs. 13-14, shrunk towards rest by the share of the measurement's
+    /// variance in the prior's.
+    pub(crate) fn new(
+        image: &Plane,
+        place: PixelBox,
+        scratch: &mut Scratch,
+        config: &TrackerConfig,
+    ) -> Self {
+        Self {
+            state: State::new(image, place, scratch, config),
+            identity: Identity::new(),
+            hypotheses: Hypotheses::default(),
+            search_memory: SearchMemory::default(),
+        }
+    }
+
+    /// Covariance of position and velocity on either axis, the other places where the target may be
+    /// included.
+    pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
+        let spread = self.hypotheses.spread(self.state.position());
+        let covariances = self.state.motion.covariances();
+        [0, 1].map(|i| {
+            let mut covariance = covariances[i];
+            covariance.m11 += spread[i];
+            covariance
+        })
+    }
+
+    /// Whether it is searched for, or for long has not been sure in any place.
+    pub(crate) fn is_lost(&self) -> bool {
+        self.state.is_searching() || self.hypotheses.are_doubted()
+    }
+
+    /// Follows the target into the next image.
+    pub(crate) fn step(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+        self.may_move_with_scene(frame);
+        self.identity.note_last_place(&self.state, frame);
+        self.state.predict(frame);
+        self.hypotheses.predict(frame);
+        if self.state.is_searching() {
+            self.search(frame, scratch)
+        } else if self.identity.is_on_probation() {
+            self.follow_on_probation(frame, scratch)
+        } else {
+            self.follow(frame, scratch)
+        }
+    }
+
+    /// Takes a place in the next image from somebody who knows it, instead of measuring it: with
+    /// the box it is the start from two measurements (Herasymenko 2021, eqs. 13-14).
+    pub(crate) fn take_place(
+        &mut self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        scratch: &mut Scratch,
+    ) -> Step {
+        let Frame { image, interval, config, .. } = frame;
+        let variance = config.given_sd_px.powi(2);
+        let searching = self.state.is_searching();
+        let given = [place.x, place.y].map(|position| AxisMeasurement { position, variance });
+        if self.state.is_new {
+            self.state.motion.start(given, interval);
+        } else if searching {
+            self.state.motion.restart_at(given, config.search_velocity_sd_px);
+        } else {
+            self.state.motion.predict(interval, frame.sides());
+            self.state.motion.take_place(given);
+        }
+        self.identity.is_given();
+        let share = self.state.appearance.learn(
+            image,
+            place,
+            self.state.noise,
+            1.0,
+            interval,
+            &mut scratch.buffers,
+        );
+        self.state.motion.learn(place, f64::from(share), None);
+        self.seen(place);
+        self.hypotheses.clear();
+        let covariance = Matrix2::identity() * variance;
+        let measured = Measurement { place, covariance };
+        Step { measured: Some(measured), score: 1.0, certainty: 1.0, nis: None }
+    }
+
+    fn follow(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
+        let Frame { image, config, .. } = frame;
+        let reach = self.hypotheses.reach(self.state.position());
+        let half = self.state.half_gate(image, config);
+        let image_sides = [image.width(), image.height()];
+        let half = [0, 1]
+            .map(|i| (half[i] + (reach[i].ceil() as usize).min(2 * half[i])).min(image_sides[i]));
+        let whole = Region::about(&self.state, half);
+        let noise = scratch.meter.variance_within(
+            image,
+            whole.corner,
+            whole.sides,
+            config.noise_floor as f32,
+        );
+        self.state.note_noise(noise);
+
+        // The whole gate is looked at only where the middle of it leaves a doubt.
+        let middle = if self.hypotheses.is_empty() {
+            self.state.middle_of_gate(whole.half, config)
+        } else {
+            None
+        };
+        let middle = middle.map(|half| Region::about(&self.state, half));
+        let sure = middle.map(|middle| (self.state.posterior(frame, middle, scratch), middle));
+        let (posterior, region) = match sure.filter(|(posterior, _)| posterior.near.mass > SURE) {
+            Some(sure) => sure,
+            None => (self.state.posterior(frame, whole, scratch), whole),
+        };
+        if self.must_doubt(&posterior, config) {
+            return self.follow_hypotheses(frame, region, scratch);
+        }
+        let [column, row] = posterior.peak;
+        let fit = self.state.fit_at(column, row, region.origin, scratch, config);
+        self.update(frame, &posterior, fit, region.origin, scratch)
+    }
+
+    /// Takes the posterior into the filters and the target's image into the reference.
+    fn update(
+        &mut self,
+        frame: Frame<'_>,
+        posterior: &Posterior,
+        fit: TargetFit,
+        origin: [f64; 2],
+        scratch: &mut Scratch,
+    ) -> Step {
+        let is_there = self.identity.doubt(&self.state, frame, fit, scratch);
+        let doubted = posterior.doubted(is_there);
+        let certainty = doubted.near.mass;
+        let found = fit.found();
+        if certainty > SEEN {
+            self.state.motion.tell_noise(found.map(|at| at.variance));
+        }
+        let expected = self.state.motion.found();
+        let distance = self.state.motion.surprise(found);
+        let step = |measured| Step { measured, score: fit.score, certainty, nis: Some(distance) };
+        let measured = self.state.measurement(&fit);
+        if let GateRule::Ellipsoid { probability } = frame.config.gate
+            && !Gate::with_probability(probability).holds(distance)
+        {
+            self.state.missed += 1;
+            return step(None);
+        }
+        if certainty > SEEN && distance > MANOEUVRE {
+            // Certain, and not where it was expected: the filters are too sure of themselves.
+            let off = |i: usize| {
+                (found[i].position - expected[i].position).powi(2) / expected[i].variance
+            };
+            self.state.motion.inflate((off(0).max(off(1)) / MANOEUVRE).clamp(1.0, MOST_INFLATED));
+            self.state.motion.update(&Evidence::of(found));
+            self.seen(fit.place);
+            self.learn(frame, fit.place, fit, certainty, scratch);
+            return step(Some(measured));
+        }
+        // Whether it is the target that is followed is said by the certainty, and the covariance is
+        // that of where it is then.
+        let posterior = if certainty > SEEN { posterior } else { &doubted };
+        self.state.motion.update(&self.evidence(posterior, found, origin, frame.config));
+        let (estimate, hidden) = (self.state.position(), posterior.unseen);
+        if certainty > SEEN {
+            self.seen(estimate);
+            self.state.motion.match_noise(distance);
+        } else {
+            self.state.missed += 1;
+        }
+        self.state.hidden = hidden;
+        self.learn(frame, estimate, fit, certainty, scratch);
+        step((certainty > SEEN).then_some(measured))
+    }
+
+    /// What a posterior over the placements says of where the reference is found. Where the fit is
+    /// narrower than the pixels of the map, it says where in the peak; elsewhere the peak's own
+    /// moments do, the prediction's part taken out.
+    fn evidence(
+        &self,
+        posterior: &Posterior,
+        fitted: [AxisMeasurement; 2],
+        origin: [f64; 2],
+        config: &TrackerConfig,
+    ) -> Evidence {
+        let narrow = fitted.iter().all(|at| at.variance < NARROW);
+        let floor = config.prediction_floor_px.powi(2);
+        let expected = self
+            .state
+            .motion
+            .found()
+            .map(|at| AxisMeasurement { variance: at.variance + floor, ..at });
+        let in_image = |part: &Part, i: usize| AxisMeasurement {
+            position: origin[i] + part.mean[i],
+            variance: part.variance[i],
+        };
+        let at = if narrow {
+            fitted
+        } else {
+            [0, 1].map(|i| without_prior(in_image(&posterior.near, i), expected[i]))
+        };
+        Evidence {
+            near: posterior.near.mass,
+            at,
+            elsewhere: posterior.elsewhere.mass,
+            elsewhere_at: [0, 1].map(|i| in_image(&posterior.elsewhere, i)),
+        }
+    }
+
+    /// It was seen at a place.
+    pub(crate) fn seen(&mut self, place: ImagePoint) {
+        self.state.seen(place);
+        self.search_memory.seen();
+        if !self.identity.is_on_probation() {
+            self.search_memory.forget_other();
+        }
+    }
+
+    /// Follows contrast, size, direction and appearance, the more the surer the target was seen. Of
+    /// one on probation nothing is learnt.
+    fn learn(
+        &mut self,
+        frame: Frame<'_>,
+        place: ImagePoint,
+        fit: TargetFit,
+        certainty: f64,
+        scratch: &mut Scratch,
+    ) {
+        if !self.identity.is_on_probation() {
+            self.state.learn(frame, place, fit, certainty, scratch);
+        }
+    }
+}
