@@ -1,4 +1,4 @@
-//! What a calibration says of one camera.
+//! Calibration of one camera.
 
 use crossfix_geometry::{Bearing, Camera, GeometryError, ImageSize, Pixel, PixelCovariance};
 use crossfix_message::{CameraCalibration, CameraName, LastingNoise, Timestamp};
@@ -9,9 +9,9 @@ use thiserror::Error;
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
-/// Where the lens may be off by so many times what labels err by, a pixel shows no direction: in
-/// the corners of a wide lens that no flight has crossed it is off by 50 pixels. At three a flight of
-/// a minute lost two fifths of its places; with twice it tracks are drawn aside.
+/// A pixel has no bearing where the lens may be off by more than this many deviations of the
+/// labels: in the corners of a wide lens that no flight has crossed it is off by 50 pixels. At
+/// three a flight of a minute lost two fifths of its places; with twice it tracks are drawn aside.
 const MOST_LENS_SHARE: f64 = 5.0;
 
 /// Why a pixel has no bearing.
@@ -20,13 +20,13 @@ pub enum BearingError {
     /// The lens model cannot be undone there.
     #[error("the lens shows no direction there")]
     Lens(#[from] GeometryError),
-    /// Nothing of the calibration was seen in that part of the image.
+    /// The calibration saw nothing in that part of the image.
     #[error(
         "the lens is known to {sd_px:.0} pixels there: calibrate with a flight or landmarks in that part \
          of the image"
     )]
     Uncovered {
-        /// What it may be off by, pixels.
+        /// Standard deviation of the lens there, pixels.
         sd_px: f64,
     },
 }
@@ -40,39 +40,39 @@ pub struct CalibratedCamera {
     pub camera: Camera,
     /// Covariance of the pose: rotation about the camera's axes (rad), then position (m).
     pub pose_covariance: Matrix6<f64>,
-    /// What is still unknown of the lens.
+    /// Remaining uncertainty of the lens.
     pub lens: LensUncertainty,
-    /// Range at which the calibration's targets were seen, in the middle, m.
+    /// Median range at which the calibration's targets were seen, m.
     pub range_m: f64,
     /// Its clock.
     pub clock: ClockCorrection,
-    /// What its bearings err by.
+    /// Error of its bearings.
     pub noise: LabelNoise,
     /// Time between its frames, s.
     pub frame_s: f64,
 }
 
-/// How a camera's times become common ones.
+/// Correction from a camera's times to common ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ClockCorrection {
-    /// `[own time, common time less own, standard deviation]`, s, in order of time; between two it
-    /// is straight.
+    /// `[own time, common time less own, standard deviation]`, s, in order of time; linear between
+    /// two.
     pub knots_s: Vec<[f64; 3]>,
-    /// How the difference grows before the first knot and after the last, s/s.
+    /// Rate at which the difference grows before the first knot and after the last, s/s.
     pub rate: f64,
     /// Standard deviation of that, s/s.
     pub rate_sd: f64,
-    /// What the clock wanders beside, s after one second (it grows with the time's root).
+    /// Random walk of the clock in addition, s after one second (it grows with the root of time).
     pub wander_s: f64,
     /// Time between the read-out of the image's first row and its last, s; frames have the time of
     /// the middle row.
     pub readout_s: f64,
 }
 
-/// No clock shows a time or is off by one beyond this, s: 30 000 years.
+/// Largest time or clock error that is accepted, s: 30 000 years.
 const LARGEST_S: f64 = 1e12;
-/// No camera is said to point better than this, pixels.
+/// Least stated pointing error of a camera, pixels.
 const LEAST_POINTING_PX: f64 = 1e-4;
 
 /// How well a camera points over its image.
@@ -84,10 +84,10 @@ pub struct OverImage {
     pub sd_rad: f64,
 }
 
-/// Columns and rows of the pixels that stand for an image.
+/// Columns and rows of the grid of pixels that stands for an image.
 const GRID: [usize; 2] = [9, 5];
 
-/// Pixels evenly over an image.
+/// Pixels evenly spread over an image.
 pub(crate) fn grid(size: ImageSize) -> impl Iterator<Item = Pixel> {
     let [columns, rows] = GRID;
     (0..columns * rows).map(move |k| {
@@ -100,24 +100,24 @@ pub(crate) fn grid(size: ImageSize) -> impl Iterator<Item = Pixel> {
 }
 
 impl CalibratedCamera {
-    /// What the cameras' channel says of it alone.
+    /// Its message for the cameras' channel, without the site's datum.
     pub(crate) fn message(&self, valid_from: Timestamp) -> CameraCalibration {
         CameraCalibration::new(&self.name, &self.camera, valid_from)
             .with_pose_covariance(&self.pose_covariance)
             .with_lasting_errors(self.lasting_noise(), self.clock.wander_s)
     }
 
-    /// What of its bearings' noise lasts.
+    /// The lasting part of its bearings' noise.
     fn lasting_noise(&self) -> LastingNoise {
         let focal_px = self.camera.model().intrinsics().fx;
         LastingNoise { sd_rad: self.noise.lasting_px / focal_px, time_s: self.noise.lasting_s }
     }
 
-    /// The bearing of a pixel, with the part of its noise that is new in every frame and what the
-    /// lens may be off by there.
+    /// The bearing of a pixel, whose covariance has the white part of the noise and the lens's
+    /// uncertainty there.
     ///
     /// # Errors
-    /// [`BearingError`] where the lens has no direction, or nobody knows which.
+    /// [`BearingError`] where the lens has no direction, or the lens is not known well enough.
     pub fn bearing(&self, pixel: Pixel) -> Result<Bearing, BearingError> {
         let model = self.camera.model();
         let place = (self.range_m, self.camera.pose().rotation());
@@ -131,8 +131,8 @@ impl CalibratedCamera {
         Ok(model.bearing(pixel, PixelCovariance::isotropic(sd_px))?)
     }
 
-    /// Standard deviation across the line to a target that a pixel shows at a range, pose and lens
-    /// together, rad per axis; `None` where the lens shows nothing.
+    /// Standard deviation across the line to a target that a pixel shows at a range, from pose and
+    /// lens together, rad per axis; `None` where the lens has no direction.
     pub fn pointing_sd_rad(&self, pixel: Pixel, range_m: f64) -> Option<f64> {
         let model = self.camera.model();
         let intrinsics = model.intrinsics();
@@ -140,20 +140,20 @@ impl CalibratedCamera {
         let place = (range_m, self.camera.pose().rotation());
         let pose = lens::pose_covariance_px2(intrinsics, &direction, place, &self.pose_covariance)?;
         let lens = self.lens.covariance_px2(intrinsics, &direction, place)?;
-        // No covariance of a bearing is nothing.
+        // A bearing's covariance must not be zero.
         let least = Matrix2::identity() * LEAST_POINTING_PX.powi(2);
         let bearing = model.bearing(pixel, PixelCovariance(pose + lens + least)).ok()?;
         Some((bearing.covariance().trace() / 2.0).sqrt())
     }
 
-    /// What the lens alone may turn a bearing by, at the calibration's range: root mean square over
-    /// the pixels that have one, rad per axis.
+    /// Standard deviation of a bearing due to the lens alone, at the calibration's range: root mean
+    /// square over the pixels that have a bearing, rad per axis.
     pub fn lens_sd_rad(&self) -> f64 {
         let exact = Self { pose_covariance: Matrix6::zeros(), ..self.clone() };
         exact.over_image().sd_rad
     }
 
-    /// How well targets are pointed at over the whole image, at the calibration's range.
+    /// How well it points over the whole image, at the calibration's range.
     pub fn over_image(&self) -> OverImage {
         let pixels = grid(self.camera.model().intrinsics().size);
         let known: Vec<Pixel> = pixels.filter(|pixel| self.bearing(*pixel).is_ok()).collect();
@@ -163,8 +163,8 @@ impl CalibratedCamera {
         OverImage { share, sd_rad: (squares / known.len().max(1) as f64).sqrt() }
     }
 
-    /// The common time of a row of a frame, from the frame's by the camera's own clock, and the
-    /// standard deviation, s.
+    /// The common time of a row of a frame, from the frame's time by the camera's own clock, and
+    /// its standard deviation, s.
     pub fn common_time(&self, own: Timestamp, row: f64) -> (Timestamp, f64) {
         let height = f64::from(self.camera.model().intrinsics().size.height);
         let (ahead_s, sd_s) = self.clock.at(own.seconds());
@@ -174,16 +174,18 @@ impl CalibratedCamera {
 }
 
 impl ClockCorrection {
-    /// None: the camera's times are the common ones, as good as the camera says.
+    /// No correction: the camera's times are the common ones, as good as the camera states.
     pub(crate) fn none() -> Self {
         Self { knots_s: Vec::new(), rate: 0.0, rate_sd: 0.0, wander_s: 0.0, readout_s: 0.0 }
     }
 
-    /// What one of its times is to be corrected by, and the standard deviation, s.
+    /// The correction at one of its times, and the standard deviation, s.
     pub fn at(&self, own_s: f64) -> (f64, f64) {
         let after = self.knots_s.partition_point(|knot| knot[0] <= own_s);
         let beyond = |knot: &[f64; 3]| {
             let away = own_s - knot[0];
+            // Beyond the knots: the end's variance, the rate's times away^2, and the random walk's
+            // times |away|.
             let variance = knot[2].powi(2)
                 + (self.rate_sd * away).powi(2)
                 + self.wander_s.powi(2) * away.abs();

@@ -1,4 +1,4 @@
-//! Two calibrations of one site held against each other.
+//! Comparison of two calibrations of one site.
 
 use crossfix_geometry::{Pixel, tangent_basis};
 use crossfix_message::CameraName;
@@ -7,52 +7,55 @@ use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Unit, Vector2, Vect
 use crate::calibrated_camera::{CalibratedCamera, grid};
 use crate::site_file::SiteCalibration;
 
-/// Of fewer cameras a move of the site would take on what one of them was knocked by.
+/// Least number of cameras for a move of the site: with fewer it would absorb what one of them was
+/// knocked by.
 const LEAST_MOVED: usize = 3;
-/// Gauss and Newton's steps to the move of the site: from what logs lie beside it takes three, and a dozen
-/// more until a camera that was knocked counts no more.
+/// Gauss-Newton steps to the move of the site: a common offset, as logs cause, takes three, and a
+/// dozen more until a camera that was knocked no longer counts.
 const STEPS: usize = 24;
-/// Degrees of freedom of Student's t, a camera's pixels together: one that lies ten deviations beside the others
-/// counts a twentieth.
+/// Degrees of freedom of Student's t for all pixels of a camera together: a camera that differs
+/// from the others by ten deviations counts a twentieth.
 const FREEDOM: f64 = 4.0;
-/// What no sight tells of the move is nothing: deviations that leave what one tells, m, rad, share.
+/// Priors of the move, which is taken to be none where no sight line determines it: deviations wide
+/// enough to leave what a sight line does determine, m, rad, share.
 const UNTOLD: [f64; 7] = [1e3, 1e3, 1e3, 3.0, 3.0, 3.0, 3.0];
 
-/// A calibration that says that it knows a direction better than this, rad, counts no more: a
+/// Least stated deviation of a direction, rad: a calibration that states less counts no more; a
 /// thousandth of a pixel.
 const LEAST_SAID_RAD: f64 = 1e-6;
 
 /// How two calibrations differ.
 #[derive(Clone, Debug)]
 pub struct SiteComparison {
-    /// What brings the first to the second as a whole: where a log lay beside or went ahead, it
-    /// does so for all cameras. `None` where fewer than three are in both: it would take on what one
-    /// of them was knocked by, and they are compared as they are.
+    /// The move of the site that brings the first calibration to the second: what a log was off by
+    /// in place or time is common to all cameras. `None` where fewer than three cameras are in
+    /// both: the move would absorb what one of them was knocked by, and they are compared as they
+    /// are.
     pub moved: Option<SiteMove>,
-    /// How the cameras that both have differ beside that, in the order of the first.
+    /// Remaining differences of the cameras that are in both, in the order of the first.
     pub cameras: Vec<CameraComparison>,
-    /// Cameras that one of them alone has.
+    /// Cameras that are in one calibration only.
     pub missing: Vec<CameraName>,
 }
 
-/// How one site becomes another: `x -> centre + shift + size turn (x - centre)`.
+/// A move of a site: `x -> centre + shift + size turn (x - centre)`, where the centre is
+/// [`Self::middle`].
 #[derive(Clone, Copy, Debug)]
 pub struct SiteMove {
-    /// The middle of what the cameras look at, in the first.
+    /// Mean of the points that the cameras look at, in the first.
     pub middle: Point3<f64>,
-    /// By how much that is shifted, m.
+    /// Shift of that point, m.
     pub shift: Vector3<f64>,
-    /// How the second is turned against the first.
+    /// Rotation of the second against the first.
     pub turn: Rotation3<f64>,
-    /// How many times larger the second is.
+    /// Scale: how many times larger the second is.
     pub size: f64,
-    /// By how much the second's common time is later, s; `None` where no clock was calibrated in
-    /// both.
+    /// How much later the second's common time is, s; `None` where no clock was calibrated in both.
     pub later_s: Option<f64>,
 }
 
 impl SiteMove {
-    /// A site that stays where it is; `None` if nothing is seen.
+    /// The identity about the mean of the sights' targets; `None` if there are none.
     fn none(sights: &[Sight]) -> Option<Self> {
         let sum: Vector3<f64> = sights.iter().map(|sight| sight.target.coords).sum();
         (!sights.is_empty()).then(|| Self {
@@ -68,24 +71,26 @@ impl SiteMove {
         self.middle + self.shift + self.turn * (place - self.middle) * self.size
     }
 
-    /// By how much a target misses the second's line of sight along its tangents, rad, and how that
-    /// follows shift, turn and the size's share.
+    /// How far a moved target misses the second's line of sight, in the line's tangents, rad, and
+    /// the derivative of that by shift, turn and relative size.
     fn miss(&self, sight: &Sight) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>)> {
         let arm = self.turn * (sight.target - self.middle) * self.size;
         let (towards, range) =
             Unit::try_new_and_get(self.middle + self.shift + arm - sight.from, 1e-6)?;
         let towards = towards.into_inner();
+        // d(direction) / d(place) = (I - u u') / range
         let tangents = tangent_basis(&sight.direction).transpose();
         let by_place = tangents * (Matrix3::identity() - towards * towards.transpose()) / range;
         let mut by = SMatrix::<f64, 2, 7>::zeros();
         by.fixed_columns_mut::<3>(0).copy_from(&by_place);
+        // A turn moves the place by turn x arm = -[arm]x turn, growth moves it along the arm.
         by.fixed_columns_mut::<3>(3).copy_from(&(-by_place * arm.cross_matrix()));
         by.set_column(6, &(by_place * arm));
         Some((tangents * towards, by))
     }
 }
 
-/// How one camera differs beside what the site is moved by.
+/// Remaining difference of one camera after the move of the site.
 #[derive(Clone, Debug)]
 pub struct CameraComparison {
     /// Which.
@@ -93,41 +98,43 @@ pub struct CameraComparison {
     /// How far apart its centres are, m.
     pub centre_m: f64,
     /// Root mean square over the image of the angle between the directions of a pixel, towards
-    /// targets at the range of the first's, rad per axis.
+    /// targets at the first's range, rad per axis.
     pub apart_rad: f64,
     /// The largest of these angles, rad.
     pub most_rad: f64,
-    /// What both say that this may be: the root mean square over the same pixels, rad per axis.
+    /// Its standard deviation as both calibrations state it: the root mean square over the same
+    /// pixels, rad per axis.
     pub said_rad: f64,
-    /// The root mean square of each pixel's angle by what is said of it: one, where both are honest
-    /// and know nothing of each other.
+    /// Root mean square of each pixel's angle divided by its stated deviation: one, where both
+    /// state consistent deviations and are independent of each other.
     pub deviations: f64,
-    /// How many times longer the second's focal length is.
+    /// The second's focal length relative to the first's.
     pub focal_ratio: f64,
-    /// By how much more the second's clock is corrected than the first's, beside what all are, s;
-    /// `None` where one was not calibrated.
+    /// How much more the second's clock is corrected than the first's, beside what all clocks have
+    /// in common, s; `None` where one was not calibrated.
     pub later_s: Option<f64>,
-    /// Pixels over the image, and where the second shows what the first shows there, beside that.
+    /// Pixels over the image, and where the second shows, after the move, what the first shows
+    /// there.
     pub pixels: Vec<(Pixel, Pixel)>,
 }
 
-/// A pixel of a camera in both calibrations.
+/// A pixel of a camera in both calibrations, as a sight line.
 #[derive(Clone, Copy)]
 struct Sight {
     /// The pixel.
     pixel: Pixel,
-    /// Where a target is that it shows by the first.
+    /// A target that the pixel shows by the first calibration.
     target: Point3<f64>,
     /// Where the second has the camera, ...
     from: Point3<f64>,
     /// ... and the pixel's direction.
     direction: Unit<Vector3<f64>>,
-    /// Standard deviation of the angle between the two, rad per axis.
+    /// Stated standard deviation of the angle between the two, rad per axis.
     said_rad: f64,
 }
 
-/// Compares two calibrations. `None` if they have no camera in common, or one whose lens shows
-/// nothing.
+/// Compares two calibrations. `None` if they have no camera in common, or none whose lens shows
+/// anything.
 pub fn compare_sites(first: &SiteCalibration, second: &SiteCalibration) -> Option<SiteComparison> {
     let pairs: Vec<(&CalibratedCamera, &CalibratedCamera)> = first
         .cameras()
@@ -184,7 +191,8 @@ fn sights(one: &CalibratedCamera, other: &CalibratedCamera) -> Vec<Sight> {
 }
 
 /// The similarity that brings the first's targets nearest to the second's lines of sight, in
-/// deviations. A camera that was knocked must not draw at the site: its pixels have one weight, and heavy tails.
+/// deviations. A camera that was knocked must not draw the site after it: its pixels share one
+/// weight, from heavy tails.
 fn site_move(mut moved: SiteMove, cameras: &[Vec<Sight>]) -> Option<SiteMove> {
     for _ in 0..STEPS {
         let mut information =
@@ -196,6 +204,7 @@ fn site_move(mut moved: SiteMove, cameras: &[Vec<Sight>]) -> Option<SiteMove> {
             let weights = sights.iter().map(|sight| sight.said_rad.powi(-2));
             let squares: f64 =
                 misses.iter().zip(weights.clone()).map(|((r, _), w)| r.norm_squared() * w).sum();
+            // Student's t weight by the camera's mean square, per axis.
             let typical = squares / (2 * sights.len()).max(1) as f64;
             let of_camera = (FREEDOM + 1.0) / (FREEDOM + typical);
             for ((residual, by), weight) in misses.iter().zip(weights) {
@@ -223,7 +232,7 @@ fn camera(
     moved: &SiteMove,
     later_s: Option<f64>,
 ) -> CameraComparison {
-    // By the tangent: the cosine knows no angle below 1e-8.
+    // By the tangent: the cosine cannot resolve angles below 1e-8.
     let angle = |sight: &Sight| {
         let before = moved.applied(sight.target) - sight.from;
         before.cross(&sight.direction).norm().atan2(before.dot(&sight.direction))

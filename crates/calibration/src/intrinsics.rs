@@ -23,7 +23,7 @@ pub enum IntrinsicsError {
     /// Axes of the image that are not at right angles.
     #[error("`camera_matrix` has a skew of {0}: only images with square corners are supported")]
     Skew(f64),
-    /// A lens model that we do not have.
+    /// An unsupported lens model.
     #[error("the lens model `{0}` is not known: plumb_bob, radtan, equidistant or fisheye")]
     Model(String),
     /// A file of several cameras, none of which was asked for.
@@ -37,18 +37,18 @@ pub enum IntrinsicsError {
         /// Those that it has.
         known: String,
     },
-    /// Numbers that are no camera's.
+    /// Numbers that describe no camera.
     #[error("the numbers describe no camera")]
     Numbers(#[source] GeometryError),
 }
 
-/// A matrix as both write it.
+/// A matrix as OpenCV and ROS write it.
 #[derive(Debug, Deserialize)]
 struct YamlMatrix {
     data: Vec<f64>,
 }
 
-/// The keys of both that matter; others are left alone.
+/// The keys that matter in files of OpenCV and ROS; others are ignored.
 #[derive(Debug, Deserialize)]
 struct CalibrationFile {
     image_width: u32,
@@ -59,7 +59,7 @@ struct CalibrationFile {
     distortion_coefficients: YamlMatrix,
 }
 
-/// A camera of Kalibr's `camchain.yaml`; where it stands to the others is left alone.
+/// A camera of Kalibr's `camchain.yaml`; its pose relative to the others is ignored.
 #[derive(Debug, Deserialize)]
 struct ChainCamera {
     camera_model: String,
@@ -69,8 +69,8 @@ struct ChainCamera {
     resolution: [u32; 2],
 }
 
-/// Reads the YAML of ROS (`camera_info`), of OpenCV's `FileStorage`, or Kalibr's `camchain.yaml` of one
-/// camera.
+/// Reads the YAML of ROS (`camera_info`), of OpenCV's `FileStorage`, or Kalibr's `camchain.yaml` of
+/// one camera.
 ///
 /// # Errors
 /// [`IntrinsicsError`] naming the key that is wrong.
@@ -81,7 +81,7 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
             _ => Err(IntrinsicsError::Several(names(&chain))),
         };
     }
-    // OpenCV begins with a directive that YAML does not have.
+    // OpenCV begins with a directive that is not valid YAML.
     let text = match text.split_once('\n') {
         Some((first, rest)) if first.starts_with("%YAML:") => rest,
         _ => text,
@@ -94,7 +94,8 @@ pub fn intrinsics_from_yaml(text: &str) -> Result<Intrinsics, IntrinsicsError> {
             wanted: "9",
             found: file.camera_matrix.data.len(),
         })?;
-    // Some programs write the last bits of a fit.
+    // A skew of the size of rounding errors is accepted: some programs write the last bits of a
+    // fit.
     if k[1].abs() > 1e-3 {
         return Err(IntrinsicsError::Skew(k[1]));
     }
@@ -154,7 +155,8 @@ impl ChainCamera {
     }
 }
 
-/// The distortion of a model by the name that it has in these files, with the key and what stands there.
+/// The distortion by a model's name in these files, with the key of the coefficients and their
+/// values.
 fn distortion(
     model: &str,
     (key, coefficients): (&'static str, &[f64]),

@@ -1,21 +1,24 @@
-//! A camera's lens as numbers that can be adjusted: the projection with its derivatives.
+//! A camera's lens as adjustable numbers: the projection with its derivatives.
 
 use crossfix_geometry::{Distortion, Intrinsics, Pixel};
 use nalgebra::{DMatrix, Matrix2, Matrix2x3, Vector2, Vector3};
 
-/// Focal length's logarithm, aspect's logarithm, principal point (2), distortion (up to 5).
+/// Largest number of parameters of a lens: the logarithms of focal length and aspect, principal
+/// point (2), distortion (up to 5).
 pub(crate) const MOST_LENS_NUMBERS: usize = 9;
 
-/// Standard deviations that a lens file is known by: of a checkerboard that was shown from nearby.
-/// Lenses change their focal length when they focus, and video is cropped otherwise than pictures.
+/// Standard deviation of the logarithm of the focal length in a lens file from a checkerboard that
+/// was shown from nearby: lenses change their focal length when they focus, and video is cropped
+/// otherwise than pictures.
 const LOG_FOCAL_SD: f64 = 0.01;
-/// The pixels' sides are the sensor's, which no focusing changes.
+/// Standard deviation of the logarithm of the pixels' aspect: it is the sensor's, which no focusing
+/// changes.
 const LOG_ASPECT_SD: f64 = 0.001;
-/// Of the principal point, as a share of the image's width: 3 of 1920 pixels.
+/// Standard deviation of the principal point, as a share of the image's width: 3 of 1920 pixels.
 const CENTRE_SD: f64 = 3.0 / 1920.0;
-/// Of a coefficient of distortion, as a share of it.
+/// Standard deviation of a distortion coefficient, as a share of its value.
 const DISTORTION_SD: f64 = 1.0 / 3.0;
-/// Where a coefficient is nought it is held.
+/// Standard deviation that keeps a number fixed, as where a coefficient is zero.
 const HELD_SD: f64 = 1e-9;
 
 /// A place in the image with its derivatives.
@@ -24,11 +27,11 @@ pub(crate) struct Projection {
     pub(crate) pixel: Vector2<f64>,
     /// By the point in the camera's frame, pixels per metre.
     pub(crate) by_point: Matrix2x3<f64>,
-    /// By each number of the lens.
+    /// By each parameter of the lens.
     pub(crate) by_lens: [Vector2<f64>; MOST_LENS_NUMBERS],
 }
 
-/// The numbers of a lens that are adjusted.
+/// Number of adjustable parameters of a lens.
 pub(crate) fn numbers(intrinsics: &Intrinsics) -> usize {
     4 + match intrinsics.distortion {
         Distortion::None => 0,
@@ -37,7 +40,7 @@ pub(crate) fn numbers(intrinsics: &Intrinsics) -> usize {
     }
 }
 
-/// Each number as it is held against its prior.
+/// Parameters of a lens, in the form in which they are compared with their prior.
 pub(crate) fn values(intrinsics: &Intrinsics) -> Vec<f64> {
     let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
     let mut values = vec![fx.ln(), (fy / fx).ln(), cx, cy];
@@ -45,10 +48,10 @@ pub(crate) fn values(intrinsics: &Intrinsics) -> Vec<f64> {
     values
 }
 
-/// What of a lens may be otherwise than its file says.
+/// How far a lens may deviate from its file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LensFreedom {
-    /// Nothing: it was calibrated as it is used, at a distance.
+    /// Not at all: it was calibrated as it is used, at a distance.
     Keep,
     /// The focal length (1 %).
     Focal,
@@ -56,21 +59,23 @@ pub enum LensFreedom {
     /// pixels), each coefficient of distortion (a third of itself).
     #[default]
     All,
-    /// All, and widely: the file is a guess, as from a data sheet. Focal length 5 %, aspect 0.3 %, principal
-    /// point 20 of 1920 pixels, distortion as most lenses have it. Only where much of the image is covered.
+    /// All, and widely: the file is a guess, as from a data sheet. Focal length 5 %, aspect 0.3 %,
+    /// principal point 20 of 1920 pixels, distortion as most lenses have it. Only where much of the
+    /// image is covered.
     Guess,
 }
 
-/// Standard deviations of a lens that nobody has measured, in the order and units of a file's above: a data
-/// sheet's focal length, and sensors sit a hundredth of their width beside the axis.
+/// Standard deviations of a lens that nobody has measured, in the order and units of a file's
+/// above: a data sheet's focal length, the aspect, and the principal point, as sensors sit a
+/// hundredth of their width off the axis.
 const GUESSED: [f64; 3] = [0.05, 0.003, 20.0 / 1920.0];
-/// Of Brown and Conrady's coefficients (k1, k2, p1, p2, k3) and of a fisheye's: beyond these a lens for
-/// watching would show straight walls as barrels.
+/// The same for Brown and Conrady's coefficients (k1, k2, p1, p2, k3) and for a fisheye's: beyond
+/// these a lens for surveillance would show straight walls as barrels.
 const GUESSED_BROWN_CONRADY: [f64; 5] = [0.2, 0.2, 0.003, 0.003, 0.1];
 const GUESSED_FISHEYE: [f64; 4] = [0.05; 4];
 
 impl LensFreedom {
-    /// How well a lens file knows each number.
+    /// Standard deviation of each parameter in a lens file.
     pub(crate) fn prior_sd(self, intrinsics: &Intrinsics) -> Vec<f64> {
         let centre = CENTRE_SD * f64::from(intrinsics.size.width);
         let mut deviations = vec![LOG_FOCAL_SD, LOG_ASPECT_SD, centre, centre];
@@ -96,7 +101,7 @@ impl LensFreedom {
     }
 }
 
-/// A lens moved by a step in its numbers.
+/// A lens moved by a step in its parameters.
 pub(crate) fn moved(intrinsics: &Intrinsics, step: &[f64]) -> Intrinsics {
     let mut values = values(intrinsics);
     values.iter_mut().zip(step).for_each(|(value, step)| *value += step);
@@ -119,7 +124,7 @@ fn coefficients(distortion: &Distortion) -> &[f64] {
     }
 }
 
-/// Where a point of the camera's frame is seen; `None` behind the camera.
+/// Projection of a point of the camera's frame; `None` behind the camera.
 pub(crate) fn project(intrinsics: &Intrinsics, point: &Vector3<f64>) -> Option<Projection> {
     let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
     let plane = match &intrinsics.distortion {
@@ -129,6 +134,7 @@ pub(crate) fn project(intrinsics: &Intrinsics, point: &Vector3<f64>) -> Option<P
     };
     let scale = Matrix2::from_diagonal(&Vector2::new(fx, fy));
     let seen = scale * plane.place;
+    // By ln(fx) both axes scale, as fy / fx is a parameter of its own.
     let mut by_lens = [Vector2::zeros(); MOST_LENS_NUMBERS];
     by_lens[0] = seen;
     by_lens[1].y = seen.y;
@@ -144,20 +150,22 @@ pub(crate) fn project(intrinsics: &Intrinsics, point: &Vector3<f64>) -> Option<P
     })
 }
 
-/// What a calibration leaves unknown of a lens: its numbers are the logarithm of the focal length,
-/// that of the pixels' aspect, the principal point (2, pixels) and the distortion's coefficients.
+/// Uncertainty of a lens after a calibration. Its parameters are the logarithm of the focal length,
+/// that of the pixels' aspect, the principal point (2, pixels) and the distortion coefficients.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LensUncertainty {
-    /// Covariance of the numbers.
+    /// Covariance of the parameters.
     pub covariance: DMatrix<f64>,
-    /// How the pose (a small rotation about the camera's axes, rad; the centre, m) follows them:
-    /// where a flight has been seen both together are right, wherever each may be.
+    /// Derivative of the pose (a small rotation about the camera's axes, rad; the centre, m) with
+    /// respect to them: where a flight has been seen, pose and lens together are right, wherever
+    /// each of them may be.
     pub pose_by_lens: DMatrix<f64>,
 }
 
 impl LensUncertainty {
-    /// The covariance that it leaves a pixel, where targets at a range (m) are seen in the camera's
-    /// frame along `direction`, pixels^2: large where the image was not covered.
+    /// Covariance of a pixel due to the lens, with the pose following it, where targets at a range
+    /// (m) are seen in the camera's frame along `direction`, pixels^2: large where the image was
+    /// not covered.
     pub(crate) fn covariance_px2(
         &self,
         intrinsics: &Intrinsics,
@@ -167,13 +175,14 @@ impl LensUncertainty {
         let seen = project(intrinsics, &(direction * place.0))?;
         let count = self.covariance.nrows();
         let by_lens = DMatrix::from_fn(2, count, |axis, number| seen.by_lens[number][axis]);
+        // d(pixel) / d(lens) = direct part + d(pixel) / d(pose) x d(pose) / d(lens)
         let by = by_lens + by_pose(&seen, direction, place) * &self.pose_by_lens;
         let covariance = &by * &self.covariance * by.transpose();
         Some(covariance.fixed_view::<2, 2>(0, 0).into_owned())
     }
 }
 
-/// The covariance that a pose's covariance leaves a pixel, likewise.
+/// Covariance of a pixel due to a pose's covariance, for the same target.
 pub(crate) fn pose_covariance_px2(
     intrinsics: &Intrinsics,
     direction: &Vector3<f64>,
@@ -184,7 +193,7 @@ pub(crate) fn pose_covariance_px2(
     Some(by * covariance * by.transpose())
 }
 
-/// How a pixel follows the camera's rotation about its axes and its centre.
+/// Derivative of a pixel by the camera's rotation about its own axes and by its centre.
 fn by_pose(
     seen: &Projection,
     direction: &Vector3<f64>,
@@ -198,7 +207,7 @@ fn by_pose(
     by_pose
 }
 
-/// The direction in which a pixel is seen: by the geometry crate's model.
+/// The direction in which a pixel is seen, by the geometry crate's model.
 pub(crate) fn direction(intrinsics: &Intrinsics, pixel: Pixel) -> Option<Vector3<f64>> {
     let model = crossfix_geometry::CameraModel::new(*intrinsics).ok()?;
     Some(model.direction(pixel).ok()?.into_inner())
@@ -220,11 +229,13 @@ fn brown_conrady(k: &[f64; 5], point: &Vector3<f64>) -> Option<OnPlane> {
     let (x, y) = (point.x / point.z, point.y / point.z);
     let r2 = x * x + y * y;
     let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    // slope = d(radial) / d(r^2)
     let slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
     let place = Vector2::new(
         x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
     );
+    // d(distorted) / d(x, y) is symmetric: this is its element off the diagonal.
     let across = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
     let by_pinhole = Matrix2::new(
         radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
@@ -232,6 +243,7 @@ fn brown_conrady(k: &[f64; 5], point: &Vector3<f64>) -> Option<OnPlane> {
         across,
         radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
     );
+    // d(x, y) / d(point) for x = X / Z, y = Y / Z
     let pinhole_by_point = Matrix2x3::new(1.0, 0.0, -x, 0.0, 1.0, -y) / point.z;
     let pinhole = Vector2::new(x, y);
     let by_coefficient = [
@@ -244,8 +256,8 @@ fn brown_conrady(k: &[f64; 5], point: &Vector3<f64>) -> Option<OnPlane> {
     Some(OnPlane { place, by_point: by_pinhole * pinhole_by_point, by_coefficient })
 }
 
-/// Kannala-Brandt: the angle from the axis, `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`, is the
-/// distance from the principal point.
+/// Kannala-Brandt: with the angle t from the axis, the distance from the principal point is
+/// `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 fn fisheye(k: &[f64; 4], point: &Vector3<f64>) -> Option<OnPlane> {
     let r2 = point.x * point.x + point.y * point.y;
     let r = r2.sqrt().max(1e-9 * point.norm());
@@ -253,6 +265,7 @@ fn fisheye(k: &[f64; 4], point: &Vector3<f64>) -> Option<OnPlane> {
     if length2 <= 0.0 {
         return None;
     }
+    // bent = the distance at unit focal length, slope = d(bent) / d(angle).
     let angle = r.atan2(point.z);
     let t2 = angle * angle;
     let bent = angle * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
@@ -260,6 +273,7 @@ fn fisheye(k: &[f64; 4], point: &Vector3<f64>) -> Option<OnPlane> {
     let outward = Vector2::new(point.x, point.y) / r;
     let angle_by_point =
         Vector3::new(outward.x * point.z, outward.y * point.z, -r).transpose() / length2;
+    // place = outward x bent: outwards it changes with the angle, and across with bent / r.
     let mut by_point = outward * angle_by_point * slope;
     let turning = (Matrix2::identity() - outward * outward.transpose()) * (bent / r);
     let mut left = by_point.fixed_columns_mut::<2>(0);

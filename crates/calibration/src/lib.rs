@@ -1,6 +1,7 @@
-//! What cameras are: poses, clocks and lenses with their covariance, from the flight of one target
-//! ([`calibrate_flight`]) or from landmarks in a picture ([`calibrate_landmarks`]); the file of a site
-//! that holds them ([`SiteCalibration`]); and intrinsics as OpenCV, ROS and Kalibr write them:
+//! Calibration of cameras: poses, clocks and lenses with their covariance, from the flight of one
+//! target ([`calibrate_flight`]) or from landmarks in a picture ([`calibrate_landmarks`]); the file
+//! of a site that holds them ([`SiteCalibration`]); and intrinsics as OpenCV, ROS and Kalibr write
+//! them:
 //!
 //! ```
 //! use crossfix_calibration::intrinsics_from_yaml;

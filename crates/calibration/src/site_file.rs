@@ -1,4 +1,4 @@
-//! `calibration.toml`: what is known of a site's cameras, as `crossfix calibrate` writes it.
+//! `calibration.toml`: the calibration of a site's cameras, as `crossfix calibrate` writes it.
 
 use crossfix_geometry::{Camera, Distortion, GeometryError, ImageSize, Intrinsics, Pose};
 use crossfix_message::{CameraCalibration, CameraName, Datum, Timestamp};
@@ -10,10 +10,9 @@ use crate::calibrated_camera::{CalibratedCamera, ClockCorrection};
 use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 
-/// No place (m), deviation or square of one in a calibration is larger: beyond it sums and squares
-/// come to no numbers.
+/// Largest place (m), deviation or variance that is accepted: beyond it sums and squares overflow.
 const LARGEST: f64 = 1e12;
-/// The form of the file that this build writes, and the only one that it reads.
+/// Version of the file's form that this build writes, and the only one that it reads.
 const FORM: u32 = 1;
 
 /// What is wrong with a calibration file.
@@ -25,7 +24,7 @@ pub enum SiteFileError {
     /// A file of another form.
     #[error("the file has the form {0}: this build reads form {FORM}")]
     Form(u32),
-    /// Numbers that are no camera's.
+    /// Numbers that describe no camera.
     #[error("the numbers of camera `{camera}` describe no camera")]
     Camera {
         /// The camera.
@@ -37,10 +36,10 @@ pub enum SiteFileError {
     /// Two cameras of one name.
     #[error("camera `{0}` is there twice")]
     Twice(CameraName),
-    /// A datum that cannot be.
+    /// A datum that is impossible.
     #[error("`datum` is impossible")]
     Datum,
-    /// A covariance, a clock or a deviation that cannot be.
+    /// A covariance, a clock or a deviation that is impossible.
     #[error("camera `{camera}`: `{key}` is impossible")]
     Number {
         /// The camera.
@@ -150,25 +149,25 @@ impl SiteCalibration {
         Ok(Self { cameras, datum })
     }
 
-    /// The file's text, without its first lines that say where it is from.
+    /// The file's text, without its first lines, which say where it is from.
     pub fn to_toml(&self) -> String {
         let cameras = self.cameras.iter().map(FileCamera::of).collect();
         let datum = self.datum.as_ref().map(FileDatum::of);
         toml::to_string(&File { form: FORM, datum, cameras }).unwrap_or_default()
     }
 
-    /// A site of these cameras, of which nobody knows what they are off by together.
+    /// A site of these cameras, without a datum: what they are off by together is not stated.
     pub fn of(cameras: Vec<CalibratedCamera>) -> Self {
         Self { cameras, datum: None }
     }
 
-    /// The same with what they are off by together, if that is known.
+    /// The same with a datum, if that is known.
     pub(crate) fn with_datum(cameras: Vec<CalibratedCamera>, datum: Option<Datum>) -> Self {
         Self { cameras, datum }
     }
 
-    /// Takes pose and lens of a camera in: where the site has one of its name, that one's clock and
-    /// noise stay.
+    /// Adds the pose and lens of a camera: where the site has one of its name, that one's clock and
+    /// noise are kept.
     pub fn put(&mut self, camera: CalibratedCamera) {
         match self.cameras.iter_mut().find(|known| known.name == camera.name) {
             Some(known) => {
@@ -184,12 +183,12 @@ impl SiteCalibration {
         &self.cameras
     }
 
-    /// What the site may be off by as a whole, if the file says so.
+    /// What the site may be off by as a whole, if the file states it.
     pub fn datum(&self) -> Option<&Datum> {
         self.datum.as_ref()
     }
 
-    /// What the cameras' channel says of a camera of the file.
+    /// Message for the cameras' channel of a camera of the file.
     pub fn message(&self, camera: &CalibratedCamera, valid_from: Timestamp) -> CameraCalibration {
         let message = camera.message(valid_from);
         self.datum.iter().fold(message, CameraCalibration::with_datum)
@@ -234,7 +233,7 @@ impl FileCamera {
         Self {
             name: camera.name.clone(),
             position_m: pose.position().coords.into(),
-            // nalgebra stores columns first.
+            // nalgebra stores matrices by columns.
             rotation: rotation.transpose().into(),
             pose_covariance: camera.pose_covariance.into(),
             lens: FileLens {
@@ -307,10 +306,10 @@ fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
     matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-/// Whether a matrix may be a covariance. Its numbers have units of their own: each counts by its own
-/// deviation.
+/// Whether a matrix may be a covariance. Its numbers have different units, so it is judged as a
+/// correlation matrix.
 fn is_covariance(matrix: &DMatrix<f64>) -> bool {
-    // Rounding, and a person who has shortened the numbers.
+    // Tolerance for rounding, and for a person who has shortened the numbers.
     const ABOUT: f64 = 1e-4;
     if !matrix.iter().all(|value| value.abs() < LARGEST) || matrix.diagonal().min() < 0.0 {
         return false;
@@ -324,7 +323,7 @@ fn is_covariance(matrix: &DMatrix<f64>) -> bool {
     is_symmetric && correlation.symmetric_eigenvalues().min() >= -ABOUT
 }
 
-/// The matrix of these rows, if they make one of this size and of numbers that can be.
+/// The matrix of these rows, if they have this size and plausible numbers.
 fn matrix(rows: &[Vec<f64>], size: (usize, usize)) -> Option<DMatrix<f64>> {
     let is_whole = rows.len() == size.0 && rows.iter().all(|row| row.len() == size.1);
     let is_number = rows.iter().flatten().all(|value| value.abs() < LARGEST);

@@ -1,5 +1,5 @@
-//! What is known of a site beside what its cameras saw of a target: where cameras stand, how far
-//! apart, and landmarks in their pictures.
+//! What is known of a site apart from its cameras' labels of a target: where cameras stand, how far
+//! apart they are, and landmarks in their pictures.
 
 use crossfix_geometry::Pixel;
 use crossfix_message::{CameraName, Datum};
@@ -8,16 +8,16 @@ use nalgebra::{Point3, Unit, Vector3};
 use crate::calibrated_camera::CalibratedCamera;
 use crate::site_file::SiteCalibration;
 
-/// What is known of a site beside what its cameras saw of a target.
+/// What is known of a site apart from its cameras' labels of a target.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
     /// Places of cameras.
     pub places: Vec<SurveyedPlace>,
     /// Distances between cameras.
     pub distances: Vec<TapedDistance>,
-    /// Things of known places that were clicked in pictures.
+    /// Things at known places that were clicked in pictures.
     pub landmarks: Vec<SurveyedLandmark>,
-    /// An earlier calibration of the site, by [`Survey::with_known`].
+    /// An earlier calibration of the site, set by [`Survey::with_known`].
     pub known: Option<SiteCalibration>,
 }
 
@@ -37,7 +37,7 @@ pub struct SurveyedPlace {
 pub struct TapedDistance {
     /// The cameras.
     pub between: [CameraName; 2],
-    /// m.
+    /// Their distance, m.
     pub metres: f64,
     /// Standard deviation, m.
     pub sd_m: f64,
@@ -46,14 +46,14 @@ pub struct TapedDistance {
 /// Where a landmark is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LandmarkPlace {
-    /// At a place.
+    /// A place.
     Place {
         /// Local ENU, m.
         position: Point3<f64>,
         /// Standard deviation per axis, m.
         sd_m: Vector3<f64>,
     },
-    /// So far away that only its direction counts: the sun, a star.
+    /// A direction only, as it is far away: the sun, a star.
     Direction {
         /// Local ENU.
         direction: Unit<Vector3<f64>>,
@@ -65,11 +65,11 @@ pub enum LandmarkPlace {
 /// A landmark that was clicked in the pictures of some cameras.
 #[derive(Clone, Debug)]
 pub struct SurveyedLandmark {
-    /// What it is called.
+    /// Its name.
     pub name: String,
     /// Where it is.
     pub at: LandmarkPlace,
-    /// Where it is in the pictures, of each camera once.
+    /// Its clicks in the pictures, one per camera.
     pub clicks: Vec<Click>,
 }
 
@@ -84,15 +84,16 @@ pub struct Click {
     pub sd_px: f64,
 }
 
-/// So many landmarks in its picture tell a camera's pose: three are seen alike from up to four places.
+/// Landmarks in a picture that determine its camera's pose: three are seen alike from up to four
+/// places.
 pub(crate) const ENOUGH_FOR_POSE: usize = 4;
-/// So many places say which way is up, and how large a site is whatever sees them.
+/// Places that determine which way is up, and how large a site is whatever sees them.
 pub(crate) const ENOUGH_PLACES: usize = 3;
 
 impl Survey {
-    /// With an earlier calibration of the site as what is known of poses and lenses beforehand, in the
-    /// place of the survey of its cameras. Where the site is as a whole stays what that says, so no log and
-    /// no landmark must say otherwise.
+    /// Adds an earlier calibration of the site as prior knowledge of poses and lenses, in the place
+    /// of the survey of its cameras. The site as a whole stays where that calibration has it, so no
+    /// log and no landmark may contradict it.
     #[must_use]
     pub fn with_known(mut self, site: SiteCalibration) -> Self {
         self.places.retain(|place| site.camera(&place.camera).is_none());
@@ -105,17 +106,17 @@ impl Survey {
         self
     }
 
-    /// What an earlier calibration says of a camera; its lens is begun with.
+    /// A camera in the earlier calibration; its lens is the start of the new one.
     pub(crate) fn known(&self, camera: &CameraName) -> Option<&CalibratedCamera> {
         self.known.as_ref()?.camera(camera)
     }
 
-    /// What a site may be off by as a whole whose cameras are held by an earlier calibration.
+    /// The datum of the earlier calibration: what a site that it places may be off by as a whole.
     pub(crate) fn known_datum(&self) -> Option<&Datum> {
         self.known.as_ref()?.datum()
     }
 
-    /// Whether it tells these cameras how large their site is.
+    /// Whether it determines the size of the site of these cameras.
     pub fn tells_size(&self, cameras: &[&CameraName]) -> bool {
         let stands = |place: &&SurveyedPlace| cameras.contains(&&place.camera);
         let are_there = |distance: &TapedDistance| {
@@ -126,8 +127,8 @@ impl Survey {
             || self.telling_landmarks(cameras) >= ENOUGH_PLACES
     }
 
-    /// How many landmarks tell these cameras where they are: those that two of them see, and those of
-    /// a camera that has enough for its pose.
+    /// Number of landmarks that tell these cameras where they are: those that two of them see, and
+    /// those of a camera that sees enough for its pose.
     pub(crate) fn telling_landmarks(&self, cameras: &[&CameraName]) -> usize {
         let seen = |camera: &CameraName| {
             let in_picture = |landmark: &SurveyedLandmark| {

@@ -7,7 +7,7 @@ use crate::fft::{Size, Spectrum, Transforms};
 use crate::moments::Moments;
 use crate::{Extent, Plane, Reference, Similarity, SpectralWeight};
 
-/// How products are summed.
+/// How the sums of products of a kernel with a gate are computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Route {
     /// Sample by sample.
@@ -16,25 +16,27 @@ pub enum Route {
     Spectral,
 }
 
-/// Nanoseconds of a product and sum on the direct route, and of a sample and doubling of a
-/// transform's size on the spectral one. Measured by `cargo bench -p crossfix-correlation`; only
-/// their ratio counts, and near the crossing either route does.
+/// Cost model of the two routes, ns: `DIRECT_NS` per multiply-add of the direct route,
+/// `SPECTRAL_NS` per `n log2 n` of a transform of `n` samples. Measured by
+/// `cargo bench -p crossfix-correlation`; only their ratio matters, and near the crossing either
+/// route will do.
 const DIRECT_NS: f64 = 0.027;
 const SPECTRAL_NS: f64 = 0.30;
 
-/// Sides of the pieces into which the spectral route cuts a large gate: these transforms stay in
-/// the cache.
+/// Sides, in samples, of the pieces into which the spectral route cuts a large gate: transforms of
+/// this size stay in the processor's cache.
 const PIECE: Size = Size { width: 256, height: 128 };
 
-/// Correlates references with gates; keeps its plans and its memory, so that the statistics of a
-/// second gate of the same size allocate nothing.
+/// Correlates references with gates. Keeps its FFT plans and its buffers, so that the statistics of
+/// a second gate of the same size allocate nothing.
 #[derive(Default)]
 pub struct Correlator {
     route: Option<Route>,
     transforms: Transforms,
     gate_spectrum: Spectrum,
     kernel_spectrum: Spectrum,
-    /// What `kernel_spectrum` is the spectrum of: the same kernel is not transformed twice.
+    /// Size and kernel that `kernel_spectrum` was made from: the same kernel is not transformed
+    /// twice.
     kernel: Option<(Size, Plane)>,
     moments: Moments,
     centred: Plane,
@@ -48,7 +50,8 @@ impl fmt::Debug for Correlator {
     }
 }
 
-/// What the placements of a reference inside a gate are like: the parts of the zero-mean measure.
+/// Covariance and variance at every placement of a reference inside a gate: the parts of the
+/// zero-mean measure.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Statistics {
     /// Weighted covariance of the gate with the reference.
@@ -58,16 +61,16 @@ pub struct Statistics {
 }
 
 impl Correlator {
-    /// One that always takes the same route, where the measure leaves a choice.
+    /// A correlator that always takes the same route, where the measure leaves a choice.
     pub fn with_route(route: Route) -> Self {
         Self { route: Some(route), ..Self::default() }
     }
 
     /// The similarity of a reference with a gate at every placement; larger is more alike.
     ///
-    /// `floor` is the noise's standard deviation, added in square to both variances of the
-    /// zero-mean measure: a flat gate correlates with nothing. What of the reference is larger than
-    /// the gate is cut off.
+    /// `floor` is the noise's standard deviation; its square is added to both variances of the
+    /// zero-mean measure, so that a flat gate correlates with nothing. A reference larger than the
+    /// gate is cropped to the gate's size.
     pub fn similarity(
         &mut self,
         gate: &Plane,
@@ -109,7 +112,7 @@ impl Correlator {
     }
 
     /// The weighted covariance with the reference, and the weighted variance, of the gate at every
-    /// placement inside it. What of the reference is larger than the gate is cut off.
+    /// placement inside it. A reference larger than the gate is cropped to the gate's size.
     pub fn statistics(&mut self, gate: &Plane, reference: &Reference, out: &mut Statistics) {
         let fitting = fitting(gate, reference);
         let reference = fitting.as_ref().unwrap_or(reference);
@@ -122,12 +125,13 @@ impl Correlator {
         let (mean, variance) = (self.moments.mean.samples(), out.variance.samples_mut());
         pulp::Arch::new().dispatch(|| {
             for (variance, mean) in variance.iter_mut().zip(mean) {
+                // Var = E[h^2] - (E h)^2, never below 0 by rounding.
                 *variance = (*variance - mean * mean).max(0.0);
             }
         });
     }
 
-    /// The gate without its mean, which costs the squares fewer digits.
+    /// Writes the gate less its mean to `centred`: the squares then lose fewer digits to rounding.
     fn centre(&mut self, gate: &Plane) {
         self.centred.copy_from(gate);
         let mean = gate.mean();
@@ -163,7 +167,7 @@ impl Correlator {
         }
     }
 
-    /// Which route is the shorter one.
+    /// The route that the cost model expects to be faster.
     fn route(&self, gate: &Plane, kernel: &Plane, extent: Extent) -> Route {
         if let Some(route) = self.route {
             return route;
@@ -175,12 +179,13 @@ impl Correlator {
             ),
             Extent::Circular => (gate.samples().len(), Size::of(gate)),
         };
+        // One multiply-add per placement and kernel sample, against n log2 n of the transforms.
         let direct = DIRECT_NS * (placements * kernel.samples().len()) as f64;
         let spectral = SPECTRAL_NS * size.area() as f64 * (size.area() as f64).log2();
         if direct <= spectral { Route::Direct } else { Route::Spectral }
     }
 
-    /// The sums of products of a kernel with a gate.
+    /// The sums of products of a kernel with a gate at every placement, `K = sum h g`.
     fn products(&mut self, gate: &Plane, kernel: &Plane, extent: Extent, out: &mut Plane) {
         match (self.route(gate, kernel, extent), extent) {
             (Route::Direct, _) => self.slide(Product, gate, kernel, extent, out),
@@ -210,7 +215,8 @@ impl Correlator {
         let (width, height) =
             (gate.width() + 1 - kernel.width(), gate.height() + 1 - kernel.height());
         out.reshape(width, height);
-        // A piece holds at least three kernels: else most of it would be overlap.
+        // A side of a piece is at least four times the kernel's (or all of the gate's): otherwise
+        // most of the piece would be overlap.
         let side = |piece: usize, kernel: usize, gate: usize| piece.max(4 * kernel).min(gate);
         let (wide, tall) = (
             side(PIECE.width, kernel.width(), gate.width()),
@@ -219,7 +225,10 @@ impl Correlator {
         let size = Size::holding(wide, tall);
         self.transform_kernel(kernel, size);
         let transform = self.transforms.of(size);
+        // Placements that a piece gives, and so the distance of the pieces.
         let (step_x, step_y) = (wide + 1 - kernel.width(), tall + 1 - kernel.height());
+        // Neighbouring pieces overlap by the kernel's side less 1: these placements would wrap
+        // round and are computed from the next piece.
         for top in (0..height).step_by(step_y) {
             for left in (0..width).step_by(step_x) {
                 let (part_x, part_y) = (step_x.min(width - left), step_y.min(height - top));
@@ -262,6 +271,7 @@ impl Correlator {
         );
         self.fill_moments(gate, &plain, extent);
         self.products(gate, reference.image(), extent, scores);
+        // R = sum h g / sqrt(sum h^2 sum g^2); `square` is the mean of h^2, hence `count`.
         let count = reference.image().samples().len() as f32;
         let energy: f32 = reference.image().samples().iter().map(|g| g * g).sum();
         for (score, square) in scores.samples_mut().iter_mut().zip(self.moments.square.samples()) {
@@ -283,6 +293,8 @@ impl Correlator {
         self.fill_moments(&centred, reference, extent);
         self.products(&centred, reference.kernel(), extent, scores);
         self.centred = centred;
+        // R = cov(h, g) / sqrt((var g + floor^2) (var h + floor^2)). The products are the
+        // covariance, as the kernel sums to 0.
         let noise = floor * floor;
         let own = (reference.variance() + noise).max(f32::MIN_POSITIVE);
         let (mean, square) = (self.moments.mean.samples(), self.moments.square.samples());
@@ -308,6 +320,7 @@ impl Correlator {
         let transform = self.transforms.of(size);
         transform.forward(&self.centred, &mut self.gate_spectrum);
         self.gate_spectrum.multiply_conjugate(&self.kernel_spectrum);
+        // Inverse transform of q H G* is the similarity map (eq. 3.7).
         weigh(&mut self.gate_spectrum, size, weight);
         let (width, height) = match extent {
             Extent::Circular => (size.width, size.height),
@@ -328,7 +341,8 @@ impl Correlator {
     ) {
         let image = reference.image();
         let (width, height) = (image.width(), image.height());
-        // The same level is taken from both: the squares keep their digits.
+        // The same level is subtracted from gate and reference, which leaves their difference as it
+        // is and costs the squares fewer digits.
         let level = gate.mean();
         self.centre(gate);
         let centred = std::mem::take(&mut self.centred);
@@ -345,7 +359,8 @@ impl Correlator {
     }
 }
 
-/// The reference cut to the gate, if it is larger.
+/// The reference cropped to the gate's size; `None` if it fits. The cropped one has a uniform
+/// window.
 fn fitting(gate: &Plane, reference: &Reference) -> Option<Reference> {
     let image = reference.image();
     let (width, height) = (image.width().min(gate.width()), image.height().min(gate.height()));
@@ -358,8 +373,9 @@ fn fitting(gate: &Plane, reference: &Reference) -> Option<Reference> {
 /// Multiplies a cross-spectrum by a weight (Lytvynets 2020, eq. 3.7).
 fn weigh(spectrum: &mut Spectrum, size: Size, weight: SpectralWeight) {
     let largest = spectrum.0.iter().map(|value| value.norm()).fold(0.0, f32::max);
-    // What is below the rounding of the largest term has no phase.
+    // Below this a term is rounding of the largest one, and its phase means nothing.
     let least = largest * 1e-6;
+    // Frequencies in cycles per sample; the upper half of the indices are the negative frequencies.
     let frequency = |index: usize, side: usize| index.min(side - index) as f32 / side as f32;
     for (x, column) in spectrum.0.chunks_exact_mut(size.height).enumerate() {
         for (y, value) in column.iter_mut().enumerate() {

@@ -1,15 +1,15 @@
-//! Sliding a small kernel over a gate, sample by sample, as many columns at a time as the machine
-//! has lanes. For small kernels this is quicker than any transform.
+//! Sliding a small kernel over a gate, sample by sample, with as many columns at a time as the
+//! machine has SIMD lanes. For small kernels this is faster than any transform.
 
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::Plane;
 
-/// Vectors of columns that are accumulated at once; with two rows each, the accumulators of both
+/// Number of vectors of columns that are accumulated at once; with two rows each, all accumulators
 /// fit the registers of a machine with sixteen of them.
 const MOST_VECTORS: usize = 5;
 
-/// What is accumulated over a kernel: the one difference between the direct measures.
+/// The term that is accumulated over a kernel: the only difference between the direct measures.
 pub(crate) trait Term: Copy {
     /// The accumulator after one more pair of samples.
     fn step<S: Simd>(self, simd: S, sum: S::f32s, kernel: S::f32s, gate: S::f32s) -> S::f32s;
@@ -58,8 +58,8 @@ pub(crate) struct Slide<'a, T> {
 }
 
 impl<T: Term> Slide<'_, T> {
-    /// Fills the output, which takes the size of the placements, with the widest instructions of
-    /// the machine it runs on. The kernel must not be larger than the gate.
+    /// Fills the output, after resizing it to the number of placements, with the widest
+    /// instructions of the machine it runs on. The kernel must not be larger than the gate.
     pub(crate) fn run(self) {
         self.run_on(Arch::new());
     }
@@ -78,9 +78,10 @@ impl<T: Term> WithSimd for Slide<'_, T> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         let (width, height) = (self.out.width(), self.out.height());
-        // Blocks of like size: a last block of one vector would wait for its own sums. The last one
-        // comes first: what of it hangs over its row is written again with the row's first block,
-        // with the next row, or lies in the padding.
+        // Blocks of nearly equal size: a last block of a single vector would wait for the result of
+        // each of its additions. The last block is computed first: where it extends beyond its row,
+        // its values are overwritten by the row's first block or by the next row, or they lie in
+        // the padding.
         let vectors = width.div_ceil(S::F32_LANES);
         let blocks = vectors.div_ceil(MOST_VECTORS);
         for row in (0..height).step_by(2) {
@@ -100,13 +101,13 @@ impl<T: Term> WithSimd for Slide<'_, T> {
 }
 
 impl<T: Term> Slide<'_, T> {
-    /// Two rows of `V` vectors of placements.
+    /// Computes two rows of `V` vectors of placements.
     #[inline(always)]
     fn block<S: Simd, const V: usize>(&mut self, simd: S, column: usize, row: usize) {
         let tall = self.kernel.height();
         let none = [simd.splat_f32s(0.0); V];
-        // Each row of the gate meets row `y` of the kernel for the upper placements, and the one
-        // before it for the lower.
+        // Each row of the gate meets row `y` of the kernel for the upper row of placements, and row
+        // `y - 1` for the lower one.
         let mut upper = self.line(simd, column, row, 0, none);
         if row + 1 == self.out.height() {
             for y in 1..tall {
@@ -124,7 +125,7 @@ impl<T: Term> Slide<'_, T> {
         self.store::<S, V>(column, row + 1, lower);
     }
 
-    /// One row of the gate with row `y` of the kernel.
+    /// Accumulates one row of the gate with row `y` of the kernel.
     #[inline(always)]
     fn line<S: Simd, const V: usize>(
         &self,
@@ -145,8 +146,8 @@ impl<T: Term> Slide<'_, T> {
         sums
     }
 
-    /// One row of the gate with row `y` of the kernel for the upper row of placements, and the row
-    /// before it for the lower.
+    /// Accumulates one row of the gate with row `y` of the kernel for the upper row of placements,
+    /// and with row `y - 1` for the lower one.
     #[inline(always)]
     fn two_lines<S: Simd, const V: usize>(
         &self,

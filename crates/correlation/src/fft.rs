@@ -1,4 +1,4 @@
-//! Two-dimensional real FFTs: rows by realfft, columns by rustfft, memory kept between calls.
+//! Two-dimensional real FFTs: rows by realfft, columns by rustfft; buffers are kept between calls.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,15 +9,16 @@ use rustfft::{Fft, FftPlanner};
 
 use crate::Plane;
 
-/// Rows that are transposed together: a cache line of complex samples.
+/// Number of rows that are transposed together: their samples of one column fill a cache line.
 const ROWS_AT_ONCE: usize = 8;
 
-/// The spectrum of a real plane: `width / 2 + 1` columns of `height`, stored column by column.
+/// The spectrum of a real plane: `width / 2 + 1` columns of `height` (the rest is their conjugate),
+/// stored column by column.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Spectrum(pub(crate) Vec<Complex<f32>>);
 
 impl Spectrum {
-    /// Becomes its product with the conjugate of another: the spectrum of a cross-correlation.
+    /// Multiplies by the conjugate of another spectrum: the spectrum of their cross-correlation.
     pub(crate) fn multiply_conjugate(&mut self, kernel: &Self) {
         for (value, kernel) in self.0.iter_mut().zip(&kernel.0) {
             *value *= kernel.conj();
@@ -33,12 +34,12 @@ pub(crate) struct Size {
 }
 
 impl Size {
-    /// The size of a plane itself: what wraps round, wraps round at its sides.
+    /// The size of a plane itself: correlation then wraps round at the plane's sides.
     pub(crate) fn of(plane: &Plane) -> Self {
         Self { width: plane.width(), height: plane.height() }
     }
 
-    /// The least good size that holds so many columns and rows: multiples of 16 with no prime
+    /// The smallest fast size that holds this many columns and rows: multiples of 16 with no prime
     /// factor above 5 are twice as fast as awkward sides.
     pub(crate) fn holding(width: usize, height: usize) -> Self {
         let good = |side: usize| {
@@ -66,7 +67,7 @@ fn is_smooth(mut number: usize) -> bool {
     number == 1
 }
 
-/// The transform of one size, with its memory.
+/// The transform of one size, with its plans and buffers.
 pub(crate) struct Transform {
     size: Size,
     row_forward: Arc<dyn RealToComplex<f32>>,
@@ -88,13 +89,15 @@ impl Transform {
         let (half, height) = (self.half(), self.size.height);
         spectrum.0.resize(half * height, Complex::default());
         spectrum.0.fill(Complex::default());
+        // Transform some rows, then scatter them into the columns of the spectrum. Rows below the
+        // plane are zero, and so are their transforms.
         for first in (0..plane.height()).step_by(ROWS_AT_ONCE) {
             let count = ROWS_AT_ONCE.min(plane.height() - first);
             for (y, out) in self.rows.chunks_exact_mut(half).take(count).enumerate() {
                 let (used, rest) = self.row.split_at_mut(plane.width());
                 used.copy_from_slice(plane.row(first + y));
                 rest.fill(0.0);
-                // The lengths are the plan's own: it cannot refuse them.
+                // Cannot fail: the buffers have the lengths that the plan asks for.
                 let _ =
                     self.row_forward.process_with_scratch(&mut self.row, out, &mut self.scratch);
             }
@@ -108,7 +111,7 @@ impl Transform {
         self.column_forward.process_with_scratch(&mut spectrum.0, &mut self.scratch);
     }
 
-    /// The top left `width` by `height` of the plane of a spectrum, which is used up.
+    /// The inverse transform's top left `width` by `height` samples; overwrites the spectrum.
     pub(crate) fn inverse(
         &mut self,
         spectrum: &mut Spectrum,
@@ -119,6 +122,7 @@ impl Transform {
         let (half, tall) = (self.half(), self.size.height);
         self.column_inverse.process_with_scratch(&mut spectrum.0, &mut self.scratch);
         plane.reshape(width, height);
+        // Neither library scales its transforms.
         let scale = 1.0 / self.size.area() as f32;
         for first in (0..height).step_by(ROWS_AT_ONCE) {
             let count = ROWS_AT_ONCE.min(height - first);
@@ -129,8 +133,8 @@ impl Transform {
                 }
             }
             for (y, row) in self.rows.chunks_exact_mut(half).take(count).enumerate() {
-                // A real row's first and middle terms are real up to rounding; realfft wants
-                // exactly.
+                // The first and the middle term of a real row are real but for rounding; realfft
+                // wants exactly.
                 row[0].im = 0.0;
                 if self.size.width.is_multiple_of(2) {
                     row[half - 1].im = 0.0;
@@ -145,7 +149,7 @@ impl Transform {
     }
 }
 
-/// Transforms that have been made, by size.
+/// Planned transforms, by size.
 pub(crate) struct Transforms {
     real: RealFftPlanner<f32>,
     complex: FftPlanner<f32>,

@@ -6,16 +6,17 @@ use crate::{Plane, Reference};
 
 /// A step shorter than this ends the fit, px.
 const SETTLED_PX: f64 = 2e-3;
-/// How far a fit may go from its start, px: further off there is another peak.
+/// How far a fit may move from its start along each axis, px: farther off there is another peak.
 const REACH_PX: f64 = 1.5;
-/// Share of the trace that keeps the normal matrix regular where the image tells nothing.
+/// Share of the normal matrix' trace that is added to its diagonal: it stays regular where the
+/// image holds no information.
 const LEAST_SHARE: f64 = 1e-9;
-/// How much better than by the image a contrast is known that is given.
+/// Information on a given contrast over that which the image gives on it.
 const KNOWN: f64 = 1e6;
-/// Planes of a fit: model, its changes by the four freedoms, image.
+/// Number of planes in a fit: model, its derivatives by the four freedoms, image.
 const PLANES: usize = 6;
 
-/// What a fit may change beside contrast and brightness.
+/// Parameters that are fitted, beside contrast and brightness.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Freedom {
     /// The place.
@@ -37,23 +38,23 @@ pub struct Fit {
     pub log_scale: f64,
     /// How far the image is turned from the reference, x towards y, rad; 0 with [`Freedom::Shift`].
     pub turn_rad: f64,
-    /// Variance of what the reference does not explain.
+    /// Variance of the residual: what the fitted reference does not explain of the image.
     pub residual_variance: f64,
     /// Pixels compared.
     pub pixels: usize,
-    /// Inverse of Fisher's information of (x, y, log scale, turn), in noise of variance 1, with
+    /// Inverse of Fisher's information of (x, y, log scale, turn), for noise of variance 1, with
     /// contrast and brightness unknown.
     inverse: Option<Matrix4<f64>>,
 }
 
 impl Fit {
-    /// The covariance of (x, y), px^2, in noise of a variance: the Cramer-Rao bound `sigma^2 J^-1`.
-    /// `None` where the image tells no place.
+    /// The covariance of (x, y), px^2, for this noise variance: the Cramer-Rao bound
+    /// `sigma^2 J^-1`. `None` where the image does not determine the place.
     pub fn covariance(&self, noise_variance: f64) -> Option<Matrix2<f64>> {
         self.inverse.map(|inverse| inverse.fixed_view::<2, 2>(0, 0) * noise_variance)
     }
 
-    /// The variances of log scale and turn in noise of a variance; `None` if they were not fitted.
+    /// The variances of log scale and turn for this noise variance; `None` if they were not fitted.
     pub fn shape_variances(&self, noise_variance: f64) -> Option<[f64; 2]> {
         let inverse = self.inverse?;
         let variances = [inverse[(2, 2)], inverse[(3, 3)]].map(|v| v * noise_variance);
@@ -61,9 +62,9 @@ impl Fit {
     }
 }
 
-/// Fits a reference to an image between the pixels by Gauss and Newton: the image is
-/// `offset + gain * reference(u - place) + white noise`, and the reference, which has the less
-/// noise, is what is interpolated. Keeps its memory.
+/// Fits a reference to an image between the pixels by Gauss-Newton steps. The image is modelled as
+/// `offset + gain * reference(u - place) + white noise`; the reference is the one that is
+/// interpolated, as it has the less noise. Keeps its buffers.
 #[derive(Debug, Default)]
 pub struct Fitter {
     resampler: Resampler,
@@ -73,17 +74,18 @@ pub struct Fitter {
     image: Plane,
 }
 
-/// How a fit is done.
+/// Options of a fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FitOptions {
-    /// Pixels of the reference's border that are not compared: the rest is interpolated from them.
+    /// Width of the reference's border that is not compared, pixels: the pixels inside are
+    /// interpolated from it.
     pub border: usize,
-    /// Most steps.
+    /// At most this many Gauss-Newton steps.
     pub steps: usize,
-    /// What may change.
+    /// The parameters that are fitted.
     pub freedom: Freedom,
-    /// Share of the reference's energy that is added to the information of scale and turn: a prior
-    /// that they have not changed.
+    /// Information added on scale and turn, as a share of the reference's energy: a prior that they
+    /// have not changed.
     pub stiffness: f64,
     /// The image's contrast over the reference's, where it is known; otherwise it is fitted.
     pub contrast: Option<f64>,
@@ -95,7 +97,8 @@ impl Default for FitOptions {
     }
 }
 
-/// Sums and products of the planes' samples; the products are of deviations from the means.
+/// Sums of the planes' samples and of their products (of the deviations from the means, once
+/// centred): the normal equations of a fit.
 #[derive(Clone, Copy, Debug, Default)]
 struct Normal {
     sums: [f64; PLANES],
@@ -103,7 +106,7 @@ struct Normal {
 }
 
 impl Fitter {
-    /// Fits from the placement whose top left sample is at (`column`, `row`) of the image.
+    /// Fits, starting at the placement whose top left sample is at (`column`, `row`) of the image.
     pub fn fit(
         &mut self,
         image: &Plane,
@@ -118,11 +121,12 @@ impl Fitter {
         let whole = [column.round(), row.round()];
         let (left, top) = (whole[0] as isize + bx as isize, whole[1] as isize + by as isize);
         image.crop_into(left, top, width, height, &mut self.image);
+        // Single-precision sums keep more digits without the mean brightness.
         let level = self.image.mean();
         self.image.samples_mut().iter_mut().for_each(|s| *s -= level);
         self.model.value.reshape(width, height);
 
-        // Where the reference is in the crop's own coordinates.
+        // The reference's place relative to the rounded start, px.
         let start = [column - whole[0], row - whole[1]];
         let mut place = start;
         let mut fit = Fit {
@@ -136,6 +140,7 @@ impl Fitter {
             inverse: None,
         };
         for _ in 0..options.steps {
+            // Pixel u of the crop shows the reference at u + border - place.
             let (left, top) = (bx as f64 - place[0], by as f64 - place[1]);
             reference.spline().sample_with_gradient(
                 left,
@@ -146,6 +151,7 @@ impl Fitter {
             let normal = self.normal(options.freedom, place);
             let Some(step) = normal.solve(options, &mut fit) else { break };
             for axis in 0..2 {
+                // At most a pixel per step, and never out of reach of the start.
                 let reached = place[axis] + step[axis].clamp(-1.0, 1.0);
                 place[axis] = reached.clamp(start[axis] - REACH_PX, start[axis] + REACH_PX);
             }
@@ -162,6 +168,7 @@ impl Fitter {
         if freedom == Freedom::ShiftScaleTurn {
             self.by_scale.reshape(width, height);
             self.by_turn.reshape(width, height);
+            // Scale and turn are about the middle of the reference at its present place.
             let centre = [(width, place[0]), (height, place[1])]
                 .map(|(side, at)| ((side as f64 - 1.0) / 2.0 + at) as f32);
             for row in 0..height {
@@ -170,7 +177,8 @@ impl Fitter {
                 let changes = self.by_scale.row_mut(row).iter_mut().zip(self.by_turn.row_mut(row));
                 for (column, ((scale, turn), (by_x, by_y))) in changes.zip(slopes).enumerate() {
                     let x = column as f32 - centre[0];
-                    // d/ds T(s x, s y) and d/dphi T(R(phi) (x, y)) at s = 1, phi = 0.
+                    // d/ds T(s x, s y) = x T_x + y T_y and d/dphi T(R(phi) (x, y)) = x T_y - y T_x,
+                    // at s = 1 and phi = 0.
                     *scale = x * by_x + y * by_y;
                     *turn = x * by_y - y * by_x;
                 }
@@ -186,7 +194,8 @@ impl Fitter {
                 Arch::new().dispatch(Products(planes))
             }
         };
-        // J'J and J'r of the planes without their means: a constant brightness is fitted along.
+        // J'J and J'r of the planes less their means, sum(ab) - sum(a) sum(b) / n: this eliminates
+        // the unknown constant brightness.
         let count = (width * height) as f64;
         for i in 0..PLANES {
             for j in i..PLANES {
@@ -199,7 +208,7 @@ impl Fitter {
     }
 }
 
-/// The sums of the products of planes, one with another.
+/// Sums of the planes' samples and of the products of every pair of planes.
 struct Products<'a, const N: usize>([&'a Plane; N]);
 
 impl<const N: usize> WithSimd for Products<'_, N> {
@@ -220,7 +229,8 @@ impl<const N: usize> WithSimd for Products<'_, N> {
 }
 
 impl Normal {
-    /// The sums of four planes in the places of six: model, slopes, nothing, nothing, image.
+    /// Moves the sums of four planes to their places among six: model, slopes, nothing, nothing,
+    /// image.
     fn spread(self) -> Self {
         let place = [0, 1, 2, 5];
         let mut spread = Self::default();
@@ -233,24 +243,28 @@ impl Normal {
         spread
     }
 
-    /// The step of the place, and what the fit is like before it. `None` if the image tells no
-    /// step.
+    /// Solves the normal equations: returns the step of the place, and writes gain, residual
+    /// variance and covariance before that step to `fit`. `None` if the image determines no step.
     fn solve(&self, options: FitOptions, fit: &mut Fit) -> Option<[f64; 2]> {
         let p = &self.products;
         let energy = p[0][0];
         if energy <= 0.0 || !energy.is_finite() {
             return None;
         }
-        // Image = gain * (model - place * slope - scale * by_scale - turn * by_turn): the model
-        // moves against its slope.
+        // Linear in (gain, gain dx, gain dy, gain ds, gain dphi): image = gain * (model - dx by_x -
+        // dy by_y - ds by_scale - dphi by_turn). The signs are negative because the model moves
+        // against its slope.
         let sign = |i: usize| if i == 0 { 1.0 } else { -1.0 };
         let mut normal = Matrix5::from_fn(|i, j| sign(i) * sign(j) * p[i][j]);
         let mut right = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
+        // Without scale and turn their rows are empty: any information there keeps the matrix
+        // regular.
         let shift_only = options.freedom == Freedom::Shift;
         let stiff = if shift_only { energy } else { options.stiffness * energy };
         for i in 0..5 {
             normal[(i, i)] += LEAST_SHARE * normal.trace() + if i > 2 { stiff } else { 0.0 };
         }
+        // A given contrast enters as a prior measurement of the gain.
         if let Some(contrast) = options.contrast {
             normal[(0, 0)] += KNOWN * energy;
             right[0] += KNOWN * energy * contrast;
@@ -259,6 +273,8 @@ impl Normal {
         let solution = solved.solve(&right);
         let gain = solution[0];
         fit.gain = gain;
+        // Residual sum of squares, r'r - x'J'r with the image r (of x only the gain where the
+        // contrast is given), over the pixels less the fitted parameters.
         let freedoms = if shift_only { 4.0 } else { 6.0 };
         let fitted = Vector5::from_fn(|i, _| sign(i) * p[i][5]);
         let explained =
@@ -268,6 +284,8 @@ impl Normal {
         if gain <= 0.0 || !gain.is_finite() {
             return None;
         }
+        // The block of (J'J)^-1 without the gain's row is what is left with the contrast unknown;
+        // the unknowns are gain times each parameter, hence the gain's square.
         let mut inverse = solved.inverse().fixed_view::<4, 4>(1, 1) / gain.powi(2);
         if shift_only {
             inverse.fill_with_identity();
@@ -278,7 +296,8 @@ impl Normal {
         } else {
             (fit.log_scale, fit.turn_rad) = (solution[3] / gain, solution[4] / gain);
         }
-        // What is no place: a gradient that the contrast explains as well.
+        // A variance that only the regularisation bounds means that the place is undetermined:
+        // contrast explains the gradient along that axis as well.
         let tells = |i: usize| inverse[(i, i)] * gain.powi(2) * LEAST_SHARE * energy < 1e-3;
         fit.inverse = (tells(0) && tells(1)).then_some(inverse);
         let step = [solution[1] / gain, solution[2] / gain];
@@ -286,7 +305,7 @@ impl Normal {
     }
 }
 
-/// The sum of samples, in eight lanes.
+/// The sum of samples, in eight SIMD lanes.
 #[inline(always)]
 fn sum(samples: &[f32]) -> f64 {
     let mut lanes = [0.0_f32; 8];
@@ -299,7 +318,7 @@ fn sum(samples: &[f32]) -> f64 {
     f64::from(lanes.iter().sum::<f32>() + rest.iter().sum::<f32>())
 }
 
-/// The sum of products, in eight lanes.
+/// The sum of products, in eight SIMD lanes.
 #[inline(always)]
 fn dot(one: &[f32], other: &[f32]) -> f64 {
     let mut lanes = [0.0_f32; 8];
@@ -354,8 +373,9 @@ mod tests {
 
     #[test]
     fn the_covariance_is_the_cramer_rao_bound() {
-        // By hand: the inverse of the sum of the gradient's outer products, free of the mean and of
-        // the spot itself, which a symmetric spot's gradient is anyway.
+        // By hand: the inverse of the sum of the gradient's outer products. Mean and spot itself,
+        // which are fitted as well, take nothing away: a symmetric spot's gradient is orthogonal to
+        // both.
         let fit = Fitter::default().fit(
             &spot(40, 40, 20.0, 20.0, 1.0, 0.0),
             &reference(),

@@ -1,15 +1,15 @@
-//! Brightness between the samples: cubic convolution, which passes through the samples and has a
-//! continuous gradient.
+//! Brightness between the samples. Two interpolators, both with a continuous gradient and passing
+//! through the samples: cubic convolution over four samples, and a cubic spline.
 
 use pulp::{Arch, Simd, WithSimd};
 
 use crate::Plane;
 
-/// Samples that a value between samples is made of, an axis.
+/// Samples per axis from which an interpolated value is computed.
 const TAPS: usize = 4;
 
-/// The weights of the four samples about a place that lies `fraction` after the second of them
-/// (Keys' cubic convolution).
+/// The weights of the four samples around a place that lies `fraction` of a sample after the second
+/// of them (Keys' cubic convolution).
 #[inline(always)]
 fn weights(fraction: f32) -> [f32; TAPS] {
     let f = fraction;
@@ -21,7 +21,8 @@ fn weights(fraction: f32) -> [f32; TAPS] {
     ]
 }
 
-/// The weights of the four coefficients of a cubic spline about a place.
+/// The weights of the four coefficients of a cubic spline around a place: the uniform cubic
+/// B-spline.
 #[inline(always)]
 fn spline_weights(fraction: f32) -> [f32; TAPS] {
     let (f, rest) = (fraction, 1.0 - fraction);
@@ -33,17 +34,18 @@ fn spline_weights(fraction: f32) -> [f32; TAPS] {
     ]
 }
 
-/// The derivatives of [`spline_weights`].
+/// The derivatives of [`spline_weights`] by `fraction`.
 #[inline(always)]
 fn spline_slopes(fraction: f32) -> [f32; TAPS] {
     let (f, rest) = (fraction, 1.0 - fraction);
     [-0.5 * rest * rest, (1.5 * f - 2.0) * f, (-1.5 * f + 1.0) * f + 0.5, 0.5 * f * f]
 }
 
-/// How far the filter reaches that makes a spline's coefficients of samples.
+/// Half length, in samples, of the filter that turns samples into spline coefficients.
 const REACH: usize = 5;
 
-/// That filter: `sqrt(3) z^|k|` with `z = sqrt(3) - 2`, cut off and made to sum to 1.
+/// The filter that turns samples into spline coefficients: `sqrt(3) z^|k|` with `z = sqrt(3) - 2`,
+/// cut off at [`REACH`] and normalised to sum to 1.
 fn prefilter() -> [f32; 2 * REACH + 1] {
     let pole = 3.0_f32.sqrt() - 2.0;
     let mut taps = [0.0; 2 * REACH + 1];
@@ -54,13 +56,14 @@ fn prefilter() -> [f32; 2 * REACH + 1] {
     taps.map(|tap| tap / sum)
 }
 
-/// A whole step and what is left of it, from 0 to 1.
+/// The integer part (rounded down) and the fraction, from 0 to 1, of a coordinate.
 fn split(place: f64) -> (isize, f32) {
     let whole = place.floor();
     (whole as isize, (place - whole) as f32)
 }
 
-/// One pass along the rows and one along the columns of what a part is made of.
+/// Separable interpolation: one pass along the rows of the supporting samples, then one along the
+/// columns.
 struct Passes<'a> {
     part: &'a Plane,
     along: [f32; TAPS],
@@ -98,7 +101,7 @@ fn along_columns(from: &Plane, taps: [f32; TAPS], to: &mut Plane) {
     }
 }
 
-/// The weighted sum of rows.
+/// Weighted sum of `N` rows, sample by sample.
 #[inline(always)]
 fn combine<const N: usize>(out: &mut [f32], taps: [f32; N], rows: [&[f32]; N]) {
     let count = out.len();
@@ -112,7 +115,7 @@ fn combine<const N: usize>(out: &mut [f32], taps: [f32; N], rows: [&[f32]; N]) {
     }
 }
 
-/// Takes samples between samples; keeps its memory.
+/// Interpolates planes between their samples; keeps its buffers.
 #[derive(Debug, Default)]
 pub struct Resampler {
     part: Plane,
@@ -120,8 +123,9 @@ pub struct Resampler {
 }
 
 impl Resampler {
-    /// The part whose top left sample is at (`left`, `top`), between the samples of a plane whose
-    /// border goes on beyond it; its size is that of `to`.
+    /// Cuts out the part whose top left sample is at (`left`, `top`), in fractions of samples, by
+    /// cubic convolution. Its size is that of `to`; beyond the plane's border the border samples
+    /// are repeated.
     pub fn sample(&mut self, from: &Plane, left: f64, top: f64, to: &mut Plane) {
         let (fx, fy) = self.support(from, left, top, to);
         self.passes(weights(fx), weights(fy), to);
@@ -137,17 +141,19 @@ impl Resampler {
         });
     }
 
-    /// Cuts the samples out that a part is made of; returns the fractions.
+    /// Copies the samples that support an interpolated part to `self.part`; returns the fractions
+    /// of its place along x and y.
     fn support(&mut self, from: &Plane, left: f64, top: f64, to: &Plane) -> (f32, f32) {
         let ((x, fx), (y, fy)) = (split(left), split(top));
         let (width, height) = (to.width() + TAPS - 1, to.height() + TAPS - 1);
+        // One sample before and two after each place.
         from.crop_into(x - 1, y - 1, width, height, &mut self.part);
         self.lines.reshape(to.width(), height);
         (fx, fy)
     }
 }
 
-/// A part of a plane between its samples, with its gradient.
+/// An interpolated part of a plane, with its gradient.
 #[derive(Debug, Default)]
 pub(crate) struct Sampled {
     pub(crate) value: Plane,
@@ -155,21 +161,22 @@ pub(crate) struct Sampled {
     pub(crate) by_y: Plane,
 }
 
-/// A plane as a cubic spline: it passes through the samples, and its gradient is true to higher
-/// frequencies than that of four samples.
+/// A plane as a cubic spline: it passes through the samples, and its gradient is accurate up to
+/// higher frequencies than that of the four-sample cubic convolution.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Spline {
     padded: Plane,
     lines: Plane,
-    /// Of the samples and `MARGIN` more on each side.
+    /// Coefficients of the samples and of `MARGIN` more on each side.
     coefficients: Plane,
 }
 
-/// Samples beyond the border for which there are coefficients.
+/// Number of samples beyond the border for which there are coefficients.
 const MARGIN: isize = 2;
 
 impl Spline {
-    /// Becomes the spline through a plane's samples; beyond the border, the border goes on.
+    /// Becomes the spline through a plane's samples; beyond the border the border samples are
+    /// repeated.
     pub(crate) fn pass_through(&mut self, plane: &Plane) {
         let (taps, pad) = (prefilter(), MARGIN + REACH as isize);
         let wide = |side: usize, pad: isize| side + 2 * pad as usize;
@@ -187,8 +194,8 @@ impl Spline {
         Arch::new().dispatch(Prefilter { taps, padded, lines, coefficients });
     }
 
-    /// The part whose top left sample is at (`left`, `top`) with its gradient; the size is that of
-    /// `to.value`.
+    /// Cuts out the part whose top left sample is at (`left`, `top`), with its gradient; the size
+    /// is that of `to.value`.
     pub(crate) fn sample_with_gradient(
         &self,
         left: f64,
@@ -207,7 +214,7 @@ impl Spline {
     }
 }
 
-/// The passes of a spline's value and gradient.
+/// The separable passes that give a spline's value and its gradient.
 struct GradientPasses<'a> {
     part: &'a Plane,
     fx: f32,
@@ -222,6 +229,8 @@ impl WithSimd for GradientPasses<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { part, fx, fy, lines, to } = self;
+        // With B the spline weights along an axis and B' their slopes: value = B(x) B(y),
+        // by_y = B(x) B'(y), by_x = B'(x) B(y).
         along_rows(part, spline_weights(fx), lines);
         along_columns(lines, spline_weights(fy), &mut to.value);
         along_columns(lines, spline_slopes(fy), &mut to.by_y);
@@ -230,7 +239,7 @@ impl WithSimd for GradientPasses<'_> {
     }
 }
 
-/// The filter that makes coefficients of samples, along the rows and along the columns.
+/// Turns samples into spline coefficients: the filter along the rows, then along the columns.
 struct Prefilter<'a> {
     taps: [f32; 2 * REACH + 1],
     padded: &'a Plane,
@@ -254,23 +263,24 @@ impl WithSimd for Prefilter<'_> {
     }
 }
 
-/// A place in a plane that is `scale` times as large as another and turned by `turn_rad`, x towards
-/// y: where its middle lies, and how its samples are spaced.
+/// Where another plane is seen in a plane: `scale` times as large, turned by `turn_rad` (x towards
+/// y), and with its middle at (`x`, `y`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     /// Column of the middle.
     pub x: f64,
     /// Row of the middle.
     pub y: f64,
-    /// Distance of neighbouring samples.
+    /// Distance of neighbouring samples of the view, in samples of the plane.
     pub scale: f64,
     /// Direction of the rows.
     pub turn_rad: f64,
 }
 
 impl Resampler {
-    /// A plane as it is seen in a view: `to` keeps its size, and its middle lies at the view's.
-    /// Cubic where the view is only shifted, linear where it is scaled or turned.
+    /// A plane as it is seen in a view: `to` keeps its size, and its middle lies at the view's
+    /// (`x`, `y`). Cubic convolution where the view is only shifted, linear interpolation where it
+    /// is scaled or turned.
     pub fn resample(&mut self, from: &Plane, view: View, to: &mut Plane) {
         let half = [to.width(), to.height()].map(|side| (side as f64 - 1.0) / 2.0);
         if view.scale == 1.0 && view.turn_rad == 0.0 {
@@ -278,11 +288,13 @@ impl Resampler {
             return;
         }
         let (cos, sin) = (view.scale * view.turn_rad.cos(), view.scale * view.turn_rad.sin());
-        // What the view can see, so that no sample lies outside it.
+        // Bounding box of the turned view with a margin of 2 samples, so that every sample of the
+        // view lies inside the crop.
         let reach = [0, 1].map(|i| cos.abs() * half[i] + sin.abs() * half[1 - i] + 2.0);
         let corner = [(view.x - reach[0]).floor(), (view.y - reach[1]).floor()];
         let sides = reach.map(|reach| (2.0 * reach).ceil() as usize + 2);
         from.crop_into(corner[0] as isize, corner[1] as isize, sides[0], sides[1], &mut self.part);
+        // Where sample (0, 0) of the view lies in the crop: middle - scale R(turn) half.
         let start = [
             view.x - corner[0] - cos * half[0] + sin * half[1],
             view.y - corner[1] - sin * half[0] - cos * half[1],
@@ -297,7 +309,7 @@ struct Turned<'a> {
     part: &'a Plane,
     /// Where the first sample lies.
     start: [f32; 2],
-    /// From a sample to the next in the row.
+    /// Step from a sample to the next in the row.
     step: [f32; 2],
     to: &'a mut Plane,
 }

@@ -1,6 +1,6 @@
-//! Similarity of a reference image with a gate of the current image: the
-//! measures of Herasymenko 2021 and Lytvynets 2020 (chapter 3), by planned real FFTs or sample by
-//! sample, and where they peak between the samples, with a covariance.
+//! Similarity of a reference image with a gate (search window) of the current image: the measures
+//! of Herasymenko 2021 and Lytvynets 2020 (chapter 3), computed by planned real FFTs or sample by
+//! sample; and the place of their peak between the samples, with its covariance.
 //!
 //! ```
 //! use crossfix_correlation::{Correlator, Extent, Plane, Reference, Similarity, Window};

@@ -1,11 +1,11 @@
 use crate::Plane;
 
-/// Half the length of the longest filter.
+/// Half the length of the longest filter, in taps.
 const MOST_REACH: usize = 5;
 
-/// A Gaussian low-pass over both axes, the border going on beyond itself: what a noisy reference
-/// needs before it is interpolated, for between the samples its noise is less than at them, and a
-/// fit would go there.
+/// A Gaussian low-pass over both axes; beyond the border the border samples are repeated. A noisy
+/// reference needs it before it is interpolated: interpolation averages noise, so it is lower
+/// between the samples than at them, and a fit would be drawn there.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LowPass {
     deviation: f32,
@@ -15,7 +15,7 @@ pub struct LowPass {
     cross_gradient_gain: f32,
 }
 
-/// Memory for filtering.
+/// Buffers of the filter.
 #[derive(Clone, Debug, Default)]
 pub struct LowPassMemory {
     padded: Plane,
@@ -23,7 +23,7 @@ pub struct LowPassMemory {
 }
 
 impl LowPass {
-    /// A filter of a standard deviation in pixels; 0 changes nothing.
+    /// A filter with this standard deviation in pixels; 0 changes nothing.
     pub fn new(deviation: f32) -> Self {
         let reach = ((3.0 * deviation).ceil() as usize).min(MOST_REACH);
         let mut taps: Vec<f32> = (0..=2 * reach)
@@ -32,14 +32,16 @@ impl LowPass {
                 if distance == 0.0 { 1.0 } else { (-0.5 * (distance / deviation).powi(2)).exp() }
             })
             .collect();
+        // Normalised to sum to 1: constant brightness is kept.
         let sum: f32 = taps.iter().sum();
         taps.iter_mut().for_each(|tap| *tap /= sum);
         let at =
             |k: isize| usize::try_from(k).ok().and_then(|k| taps.get(k)).copied().unwrap_or(0.0);
+        // White noise's variance is multiplied by sum h^2 per axis.
         let squares: f32 = taps.iter().map(|tap| tap * tap).sum();
         let own = taps[reach];
-        // The central difference of one sample's weights with that of the sample: on its axis h(0)
-        // and h(2), across it h(0).
+        // Covariance of (f(1) - f(-1)) / 2 after the filter with the same before it: along the axis
+        // (h(0) - h(2)) / 2, and h(0) across it.
         let cross = 0.5 * (own - at(reach as isize + 2)) * own;
         Self {
             deviation,
@@ -55,18 +57,18 @@ impl LowPass {
         self.deviation
     }
 
-    /// White noise's variance after over before.
+    /// Variance of white noise after the filter over that before it.
     pub fn noise_gain(&self) -> f32 {
         self.noise_gain
     }
 
-    /// The weight of a sample in its own result.
+    /// The weight of a sample in its own filtered value.
     pub fn own_weight(&self) -> f32 {
         self.own_weight
     }
 
-    /// Covariance of white noise's central difference along an axis before and after, over the
-    /// noise's variance.
+    /// Covariance of white noise's central difference along an axis before the filter with that
+    /// after it, over the noise's variance.
     pub fn cross_gradient_gain(&self) -> f32 {
         self.cross_gradient_gain
     }
@@ -127,7 +129,8 @@ mod tests {
             assert!((squares - filter.noise_gain).abs() < 1e-5);
             assert!((out.row(10)[10] - filter.own_weight).abs() < 1e-6);
             let row = out.row(10);
-            // Of the impulse itself: half after it, less half before it.
+            // The impulse weighs +1/2 in the difference of the sample before it, and -1/2 in that
+            // of the sample after it.
             let cross = 0.5 * (row[10] - row[8]) / 2.0 - 0.5 * (row[12] - row[10]) / 2.0;
             assert!((cross - filter.cross_gradient_gain).abs() < 1e-5, "{cross} {filter:?}");
         }

@@ -5,7 +5,7 @@ use pulp::{Arch, Simd, WithSimd};
 use crate::direct::{Product, Slide};
 use crate::{Plane, Window};
 
-/// Memory for the moments, and the moments.
+/// Weighted first and second moments of a gate, with the buffers to compute them.
 #[derive(Debug, Default)]
 pub(crate) struct Moments {
     /// The weighted mean at every placement.
@@ -37,8 +37,8 @@ impl Moments {
     }
 }
 
-/// The mean over a box at every placement, of the samples or of their squares: running sums along
-/// the columns, sums of powers of two along the rows.
+/// The mean over a box at every placement, of the samples or of their squares: running sums down
+/// the columns, then along the row sums whose lengths double.
 struct BoxMeans<'a> {
     gate: &'a Plane,
     squares: bool,
@@ -67,6 +67,7 @@ impl WithSimd for BoxMeans<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { gate, squares, width, height, columns, rows, out } = self;
+        // `columns` holds, for each column, the sum over the `height` newest rows.
         let share = 1.0 / (width * height) as f32;
         for y in 0..gate.height() {
             accumulate(columns, gate.row(y), squares, 1.0);
@@ -80,7 +81,7 @@ impl WithSimd for BoxMeans<'_> {
     }
 }
 
-/// Adds a row, or its squares, to the sums of the columns.
+/// Adds `sign` times a row, or its squares, to the sums of the columns.
 #[inline(always)]
 fn accumulate(columns: &mut [f32], row: &[f32], squares: bool, sign: f32) {
     if squares {
@@ -94,14 +95,15 @@ fn accumulate(columns: &mut [f32], row: &[f32], squares: bool, sign: f32) {
     }
 }
 
-/// Sums of `width` samples from each place on, valid where all samples are there. The rows are
-/// memory.
+/// Sums of `width` samples starting at each place, valid where all of these samples exist. `rows`
+/// are buffers.
 #[inline(always)]
 fn row_sums<'a>(samples: &[f32], rows: &'a mut [Vec<f32>; 2], width: usize) -> &'a [f32] {
     let [from, to] = rows;
     let (mut from, mut to) = (&mut from[..], &mut to[..]);
     from.copy_from_slice(samples);
-    // The bits of the width from the second highest: a sum of n becomes one of 2n or 2n + 1.
+    // Binary expansion of the width, from its second highest bit down: sums of n samples become
+    // sums of 2n, s_2n[x] = s_n[x] + s_n[x + n], or of 2n + 1 with one more sample.
     let mut length = 1;
     for bit in (0..width.ilog2()).rev() {
         let doubled = to.iter_mut().zip(from.iter()).zip(&from[length..]);

@@ -18,7 +18,7 @@ pub struct SubPixelPeak {
     pub x: f64,
     /// Row, with its fraction.
     pub y: f64,
-    /// The sample nearest to it.
+    /// The score of the sample that the peak was refined from.
     pub score: f32,
 }
 
@@ -36,12 +36,14 @@ impl Plane {
     }
 }
 
-/// Offset of the vertex of the parabola through three samples, within half a sample.
+/// Offset of the vertex of the parabola through three neighbouring samples from the middle one, at
+/// most half a sample; 0 where they have no maximum.
 fn vertex(before: f32, here: f32, after: f32) -> f64 {
     let curvature = f64::from(before) - 2.0 * f64::from(here) + f64::from(after);
     if curvature >= -1e-12 {
         return 0.0;
     }
+    // x = (a - c) / (2 (a - 2 b + c)).
     (0.5 * (f64::from(before) - f64::from(after)) / curvature).clamp(-0.5, 0.5)
 }
 
@@ -51,7 +53,8 @@ impl Peak {
         SubPixelPeak { x: self.column as f64, y: self.row as f64, score: self.score }
     }
 
-    /// The peak between the samples of `scores`: a parabola an axis. At the border it stays.
+    /// The peak between the samples of `scores`, by a parabola per axis. At the border it stays at
+    /// its sample.
     pub fn refined(self, scores: &Plane) -> SubPixelPeak {
         let Self { column, row, score } = self;
         let inner_x = column > 0 && column + 1 < scores.width();

@@ -1,13 +1,14 @@
-/// Samples behind the last one that may be read and written without meaning: a vector of columns
-/// then needs no care at the end of a row.
+/// Number of samples behind the last one that may be read and written without meaning: whole
+/// vectors of columns can then be used at the end of a row.
 pub(crate) const PADDING: usize = 16;
 
-/// A plane of samples, row by row: an image's brightness, a reference, a map of scores.
+/// A two-dimensional array of samples, row by row: an image's brightness, a reference, a map of
+/// scores.
 #[derive(Clone, Debug)]
 pub struct Plane {
     width: usize,
     height: usize,
-    /// `width * height` samples, and [`PADDING`].
+    /// `width * height` samples, then [`PADDING`] more.
     samples: Vec<f32>,
 }
 
@@ -19,7 +20,7 @@ impl PartialEq for Plane {
 }
 
 impl Default for Plane {
-    /// No samples, and no memory: a plane to be written into.
+    /// No samples, and no memory: a plane to be written to.
     fn default() -> Self {
         Self { width: 0, height: 0, samples: Vec::new() }
     }
@@ -33,7 +34,7 @@ impl Plane {
         fits.then_some(Self { width, height, samples })
     }
 
-    /// A plane of what a function says of column and row. Sides of zero are taken as one.
+    /// A plane whose samples are a function of column and row. Sides of zero are taken as one.
     pub fn from_fn(
         width: usize,
         height: usize,
@@ -47,7 +48,7 @@ impl Plane {
         plane
     }
 
-    /// Takes another size, keeping its memory; what the samples are then is not said.
+    /// Changes the size, keeping its memory; the samples are unspecified afterwards.
     pub fn reshape(&mut self, width: usize, height: usize) {
         (self.width, self.height) = (width.max(1), height.max(1));
         self.samples.resize(self.width * self.height + PADDING, 0.0);
@@ -59,12 +60,12 @@ impl Plane {
         self.samples_mut().copy_from_slice(other.samples());
     }
 
-    /// Columns.
+    /// Number of columns.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn height(&self) -> usize {
         self.height
     }
@@ -74,17 +75,17 @@ impl Plane {
         &self.samples[..self.width * self.height]
     }
 
-    /// All samples, to be changed.
+    /// All samples, mutable.
     pub fn samples_mut(&mut self) -> &mut [f32] {
         &mut self.samples[..self.width * self.height]
     }
 
-    /// The samples from a place on, and the padding.
+    /// The samples from a place to the end, with the padding.
     pub(crate) fn padded_from(&self, column: usize, row: usize) -> &[f32] {
         &self.samples[row * self.width + column..]
     }
 
-    /// The samples from a place on, and the padding, to be changed.
+    /// The samples from a place to the end, with the padding, mutable.
     pub(crate) fn padded_from_mut(&mut self, column: usize, row: usize) -> &mut [f32] {
         &mut self.samples[row * self.width + column..]
     }
@@ -94,7 +95,7 @@ impl Plane {
         &self.samples[row * self.width..(row + 1) * self.width]
     }
 
-    /// One row, to be changed.
+    /// One row, mutable.
     pub fn row_mut(&mut self, row: usize) -> &mut [f32] {
         &mut self.samples[row * self.width..(row + 1) * self.width]
     }
@@ -106,14 +107,15 @@ impl Plane {
         self.samples[row * self.width + column]
     }
 
-    /// The part whose top left sample is at (`left`, `top`); beyond the border, the border goes on.
+    /// The part whose top left sample is at (`left`, `top`); beyond the border the border samples
+    /// are repeated.
     pub fn crop(&self, left: isize, top: isize, width: usize, height: usize) -> Self {
         let mut part = Self::default();
         self.crop_into(left, top, width, height, &mut part);
         part
     }
 
-    /// As [`crop`](Self::crop), into a plane that is there already.
+    /// As [`crop`](Self::crop), into an existing plane.
     pub fn crop_into(&self, left: isize, top: isize, width: usize, height: usize, part: &mut Self) {
         part.reshape(width, height);
         let inside = left >= 0 && left as usize + part.width <= self.width;
@@ -133,7 +135,7 @@ impl Plane {
 
     /// The mean of all samples.
     pub fn mean(&self) -> f32 {
-        // Lanes of single precision a row, double precision over the rows.
+        // Single-precision lanes within a row, double precision over the rows.
         let mut sum = 0.0_f64;
         for row in self.samples().chunks(self.width.max(1)) {
             let mut lanes = [0.0_f32; 8];

@@ -1,8 +1,8 @@
 use crate::Plane;
 use crate::interpolation::Spline;
 
-/// How much each pixel of a reference counts: the product of a weight of its column and one of its
-/// row. The weights of an axis sum to 1.
+/// Weight of each pixel of a reference: the product of a weight of its column and one of its row.
+/// The weights along each axis sum to 1.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Window {
     columns: Plane,
@@ -11,15 +11,15 @@ pub struct Window {
 }
 
 impl Window {
-    /// Every pixel alike: the plain zero-mean normalised cross-correlation.
+    /// Equal weights: the plain zero-mean normalised cross-correlation.
     pub fn uniform(width: usize, height: usize) -> Self {
         let columns = normalised(Plane::from_fn(width, 1, |_, _| 1.0));
         let rows = normalised(Plane::from_fn(1, height, |_, _| 1.0));
         Self { columns, rows, uniform: true }
     }
 
-    /// A Gaussian about the middle, with a standard deviation of a share of each side: the target
-    /// in the middle counts, the background at the border little.
+    /// A Gaussian around the middle, with a standard deviation of this share of each side: the
+    /// target in the middle counts, the background at the border little.
     pub fn gaussian(width: usize, height: usize, share: f64) -> Self {
         let weight = |index: usize, side: usize| {
             let distance = (index as f64 - (side as f64 - 1.0) / 2.0) / (share * side as f64);
@@ -30,17 +30,17 @@ impl Window {
         Self { columns, rows, uniform: false }
     }
 
-    /// Columns.
+    /// Number of columns.
     pub fn width(&self) -> usize {
         self.columns.width()
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn height(&self) -> usize {
         self.rows.height()
     }
 
-    /// Whether every pixel counts alike.
+    /// Whether all weights are equal.
     pub fn is_uniform(&self) -> bool {
         self.uniform
     }
@@ -74,8 +74,8 @@ fn normalised(mut plane: Plane) -> Plane {
     plane
 }
 
-/// A reference image, ready to be correlated: its window, and its weighted deviation from its
-/// weighted mean.
+/// A reference image, prepared for correlation: with its window, and its weighted deviation from
+/// its weighted mean.
 ///
 /// ```
 /// use crossfix_correlation::{Plane, Reference, Window};
@@ -111,12 +111,14 @@ impl Reference {
         let Self { image, window, kernel, spline, variance } = self;
         spline.pass_through(image);
         let (columns, rows) = (window.columns.samples(), window.rows.samples());
+        // Weighted mean m = sum w g, the weight w being a column's times a row's.
         let mut mean = 0.0;
         for (y, &across) in rows.iter().enumerate() {
             let line: f32 =
                 image.row(y).iter().zip(columns).map(|(sample, along)| sample * along).sum();
             mean += across * line;
         }
+        // Kernel w (g - m), and weighted variance sum w (g - m)^2.
         let mut sum = 0.0;
         for (y, &across) in rows.iter().enumerate() {
             let line = kernel.row_mut(y).iter_mut().zip(image.row(y)).zip(columns);
@@ -129,8 +131,8 @@ impl Reference {
         *variance = sum;
     }
 
-    /// Changes the image in place and prepares it anew; one that changes its size has a uniform
-    /// window from then on.
+    /// Changes the image in place and prepares it again; if its size changes, its window is uniform
+    /// from then on.
     pub fn update(&mut self, change: impl FnOnce(&mut Plane)) {
         change(&mut self.image);
         let (width, height) = (self.image.width(), self.image.height());
@@ -156,7 +158,7 @@ impl Reference {
         self.variance
     }
 
-    /// The image between its samples.
+    /// The spline through the image.
     pub(crate) fn spline(&self) -> &Spline {
         &self.spline
     }

@@ -1,4 +1,4 @@
-//! What a camera saw, as its site's calibration file has it: lens, pose and clock.
+//! One camera as its site's calibration file describes it: lens, pose and clock.
 
 use std::path::Path;
 
@@ -27,7 +27,7 @@ pub struct Calibrated {
 }
 
 impl Calibrated {
-    /// The camera of this name.
+    /// Reads the site's file and picks the camera of this name.
     pub fn load(path: &Path, name: &CameraName) -> anyhow::Result<Self> {
         let site = load(path)?;
         let camera = site.camera(name).cloned().with_context(|| {
@@ -41,7 +41,7 @@ impl Calibrated {
         Ok(Self { site, camera })
     }
 
-    /// All that the site's file says of it.
+    /// All that the site's file says of the camera.
     #[cfg(feature = "centre")]
     pub fn calibrated_camera(&self) -> &CalibratedCamera {
         &self.camera
@@ -52,42 +52,44 @@ impl Calibrated {
         &self.camera.camera
     }
 
-    /// The message that describes the camera from a common time on.
+    /// The message that describes the camera from a time (common time) on.
     pub fn message(&self, from: Timestamp) -> CameraCalibration {
-        /// A row may be read out before its frame's time, s.
+        /// A row may be read out this long before its frame's time, s.
         const EARLIER_S: f64 = 1.0;
         self.site.message(&self.camera, from.plus_seconds(-EARLIER_S))
     }
 
-    /// The common time of one of another camera's of the site; its own, if the site has it not.
+    /// Common time of an instant by another camera's clock; `own` unchanged if the site lacks that
+    /// camera.
     pub fn common_of(&self, camera: &CameraName, own: Timestamp) -> Timestamp {
         self.site.camera(camera).map_or(own, |camera| middle_time(camera, own.nanos()).0)
     }
 
-    /// The common time of one of the camera's.
+    /// Common time of an instant by this camera's clock.
     pub fn common(&self, own: Timestamp) -> Timestamp {
         middle_time(&self.camera, own.nanos()).0
     }
 
-    /// As [`recalibrate`].
+    /// [`recalibrate`] with this camera.
     pub fn apply(&self, frame: &mut BearingFrame) -> u64 {
         recalibrate(frame, &self.camera)
     }
 
-    /// Gives a picture the common time.
+    /// Sets a preview picture's time to the common time.
     pub fn apply_to_preview(&self, preview: &mut Preview) {
         preview.capture_time_ns = middle_time(&self.camera, preview.capture_time_ns).0.nanos();
     }
 }
 
-/// The common time of a frame's middle row, and its deviation.
+/// Common time at which a frame's middle row was read out, and its standard deviation, s.
 pub fn middle_time(camera: &CalibratedCamera, own_ns: i64) -> (Timestamp, f64) {
     let height = f64::from(camera.camera.model().intrinsics().size.height);
     camera.common_time(Timestamp::from_nanos(own_ns), height / 2.0)
 }
 
-/// Makes a frame's bearings anew from its pixels, and its time the common one: that at which the
-/// rows of its targets were read out, in the mean. Returns how many bearings had to be left out.
+/// Computes a frame's bearings again from their pixels, and sets its time to the common time: that
+/// at which the rows of its targets were read out, on average. Returns how many bearings had to be
+/// left out.
 pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
     let row = middle_row(frame, camera);
     let (time, sd_s) = camera.common_time(Timestamp::from_nanos(frame.capture_time_ns), row);
@@ -107,7 +109,7 @@ pub fn recalibrate(frame: &mut BearingFrame, camera: &CalibratedCamera) -> u64 {
     (before - frame.tracks.len()) as u64
 }
 
-/// The row whose read-out gives a frame its time: that of its targets, in the mean.
+/// The image row whose read-out time is taken as the frame's time: the mean row of its targets.
 fn middle_row(frame: &BearingFrame, camera: &CalibratedCamera) -> f64 {
     let height = f64::from(camera.camera.model().intrinsics().size.height);
     let is_seen =
@@ -116,12 +118,12 @@ fn middle_row(frame: &BearingFrame, camera: &CalibratedCamera) -> f64 {
     if rows.is_empty() { height / 2.0 } else { rows.iter().sum::<f64>() / rows.len() as f64 }
 }
 
-/// The time that the camera's own clock showed when a frame was taken that [`recalibrate`] has given the
-/// common one.
+/// Time that the camera's own clock showed when a frame was taken: the inverse of [`recalibrate`],
+/// which has set the frame to common time.
 #[cfg(feature = "centre")]
 pub fn own_time(frame: &BearingFrame, camera: &CalibratedCamera) -> Timestamp {
-    /// What a clock is ahead by changes by less than a hundredth of what its time does: each step leaves
-    /// as much of the error.
+    /// Fixed-point steps: the clock's offset changes by less than a hundredth of the change of its
+    /// time, so each step leaves less than a hundredth of the error.
     const STEPS: usize = 6;
     let common = Timestamp::from_nanos(frame.capture_time_ns);
     let row = middle_row(frame, camera);
@@ -137,7 +139,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// A camera that looks along its z axis, whose clock is half a minute behind, with a read-out of
+    /// A camera that looks along its z axis, whose clock is half a minute slow, with a read-out of
     /// 20 ms.
     pub(crate) const SITE: &str = r#"
         form = 1

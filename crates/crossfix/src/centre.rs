@@ -1,5 +1,5 @@
-//! The fusion as its two shells need it, live and offline: what comes in is read, refused, counted
-//! and said in one way.
+//! The fusion as its two shells, live and offline, need it: messages are read, refused, counted and
+//! reported in one way.
 
 use std::collections::BTreeSet;
 use std::time::Instant;
@@ -13,21 +13,21 @@ use crossfix_message::{
 use crate::pose_watch::PoseWatch;
 use crate::repeats::Repeats;
 
-/// The fusion with its doorkeeper.
+/// The fusion, with the checks that a message must pass before it gets there.
 pub struct Centre {
     fusion: Fusion,
-    /// Whom it listens to; `None`: to everybody.
+    /// Cameras that are listened to; `None` means all.
     cameras: Option<Vec<CameraName>>,
     refused: Refusals,
     repeats: Repeats,
     frames: u64,
     poses: PoseWatch,
     scene_begins: Timestamp,
-    /// Cameras that have said that no more will come of them.
+    /// Cameras that have announced that they send no more.
     ended: BTreeSet<CameraName>,
 }
 
-/// What was turned away before it came to the fusion.
+/// Counts of what was turned away before it reached the fusion.
 #[derive(Debug, Default)]
 struct Refusals {
     malformed: u64,
@@ -38,7 +38,7 @@ struct Refusals {
     bad_calibrations: u64,
 }
 
-/// A message that names the camera that it is of.
+/// A message that names the camera it comes from.
 trait OfCamera: Payload {
     fn camera(&self) -> &str;
 }
@@ -70,8 +70,8 @@ enum Unread {
     Mismatched { message: String },
 }
 
-/// Reads a message that came under a camera's key: what a transport lets a camera send is of that
-/// camera and of no other.
+/// Reads a message that came under a camera's key. The transport permits a camera only its own key,
+/// so the message must name that camera and no other.
 fn read_of<M: OfCamera>(camera: &CameraName, data: &[u8]) -> Result<M, Unread> {
     let message: M = decode(data).map_err(Unread::Decode)?;
     if message.camera() == camera.as_str() {
@@ -98,13 +98,13 @@ impl Centre {
         })
     }
 
-    /// Whether it listens to a camera.
+    /// Whether messages of a camera are used.
     pub fn listens_to(&self, camera: &CameraName) -> bool {
         self.cameras.as_ref().is_none_or(|cameras| cameras.contains(camera))
     }
 
-    /// Takes a message in and returns what follows from it. `sender` is for the warning, where
-    /// there is something to warn of.
+    /// Takes a message in and returns the fusion's outputs. `sender` is named in warnings, if there
+    /// are any.
     pub fn take(&mut self, channel: &Channel, data: &[u8], sender: &str) -> Vec<Output> {
         let Some(camera) = channel.camera() else {
             return Vec::new();
@@ -147,8 +147,8 @@ impl Centre {
         self.follow(outputs)
     }
 
-    /// Takes a calibration in. An impossible one is counted, and what was known of the camera
-    /// stays.
+    /// Takes a calibration in. An impossible one is counted, and the camera's earlier calibration
+    /// stays in use.
     fn calibrate(&mut self, camera: &CameraName, data: &[u8], sender: &str) {
         let read = read_of::<CameraCalibration>(camera, data);
         let Some(message) = self.used(camera, read, sender) else {
@@ -176,7 +176,7 @@ impl Centre {
         }
     }
 
-    /// A message that was read, or `None` and why not is counted.
+    /// The message if it could be read; otherwise counts why not and returns `None`.
     fn used<M>(&mut self, camera: &CameraName, read: Result<M, Unread>, sender: &str) -> Option<M> {
         match read {
             Ok(message) => return Some(message),
@@ -199,7 +199,7 @@ impl Centre {
         None
     }
 
-    /// Counts what cannot be read, and warns of it; `sender` is for the warning.
+    /// Counts a message that cannot be read, and warns of it; `sender` is named in the warning.
     pub fn refuse(&mut self, what: &str, sender: &str, error: &DecodeError) {
         let (counter, kind) = match error {
             DecodeError::Malformed { .. } => (&mut self.refused.malformed, "malformed"),
@@ -212,7 +212,7 @@ impl Centre {
         });
     }
 
-    /// Handles everything that still waits.
+    /// Handles all that is still queued in the fusion.
     pub fn flush(&mut self) -> Vec<Output> {
         let outputs = self.fusion.flush();
         self.poses.finish(&self.fusion);
@@ -221,7 +221,7 @@ impl Centre {
         outputs
     }
 
-    /// Keeps count of what the fusion says, and says to people what is theirs.
+    /// Counts the fusion's outputs, and logs those that are meant for people.
     fn follow(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         for output in &outputs {
             match output {
@@ -237,44 +237,44 @@ impl Centre {
         outputs
     }
 
-    /// Whether cameras still stand as they were calibrated.
+    /// The watch over whether cameras still stand as they were calibrated.
     pub fn poses(&self) -> &PoseWatch {
         &self.poses
     }
 
-    /// Whether a camera has said that no more will come of it.
+    /// Whether a camera has announced that it sends no more.
     pub fn has_ended(&self, camera: &CameraName) -> bool {
         self.ended.contains(camera)
     }
 
-    /// The cameras that are left out.
+    /// The cameras that the fusion leaves out.
     pub fn left_out(&self) -> Vec<CameraName> {
         let reports = self.fusion.cameras();
         let left_out = reports.filter(|report| report.standing == CameraStanding::Excluded);
         left_out.map(|report| report.camera).collect()
     }
 
-    /// What its warnings still have to say.
+    /// Logs the counts of repeated warnings that are due.
     pub fn remind(&mut self, now: Instant) {
         self.repeats.remind(now);
     }
 
-    /// What it was asked to warn of.
+    /// Warns by request of the shell; repeats of a kind are counted instead of logged.
     pub fn warn(&mut self, kind: &str, text: impl FnOnce() -> String) {
         self.repeats.warn(kind, Instant::now(), text);
     }
 
-    /// Track frames so far.
+    /// Number of track frames so far.
     pub fn frames(&self) -> u64 {
         self.frames
     }
 
-    /// What time it is in the data: the epoch before there are any.
+    /// Current data time; the epoch before there are any data.
     pub fn now(&self) -> Timestamp {
         self.fusion.now().unwrap_or_default()
     }
 
-    /// What it says of itself; the shell adds what the transport has counted, in `counted`.
+    /// The component's health; the shell adds what the transport has counted, in `counted`.
     pub fn health(&self, counted: &[(&'static str, u64)]) -> Health {
         let refused = &self.refused;
         let own = [
@@ -308,7 +308,7 @@ impl Centre {
     }
 }
 
-/// Says that a camera is left out, or used again.
+/// Logs that a camera is left out, or used again.
 fn report_camera(camera: &CameraName, standing: CameraStanding) {
     if standing == CameraStanding::Excluded {
         tracing::warn!(
@@ -319,7 +319,7 @@ fn report_camera(camera: &CameraName, standing: CameraStanding) {
     }
 }
 
-/// A camera's report as it goes over the wire.
+/// A camera's report as a wire message.
 fn camera_health(report: &CameraReport) -> CameraHealth {
     let standing = match report.standing {
         CameraStanding::Good => crossfix_message::CameraStanding::Good,

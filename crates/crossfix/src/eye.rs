@@ -1,5 +1,5 @@
-//! From a camera's frame to the message that says what it saw: the agent's
-//! pure part, shared by `agent` and `track`.
+//! From a camera's frame to the message with its bearings: the agent's pure part, shared by `agent`
+//! and `track`.
 
 use crossfix_correlation::Plane;
 use crossfix_geometry::{Camera, GeometryError, Pixel, PixelCovariance};
@@ -14,12 +14,12 @@ use nalgebra::{Matrix2, Vector2};
 /// Quality of preview pictures, 1 to 100.
 const JPEG_QUALITY: u8 = 60;
 
-/// The brightness of a frame as the tracker takes it; `None` for a frame without pixels.
+/// Brightness of a frame as the tracker takes it; `None` for a frame without pixels.
 pub fn brightness(frame: &Frame) -> Option<Plane> {
     Plane::new(frame.width, frame.height, frame.brightness())
 }
 
-/// What a camera says of itself in each message.
+/// What a camera states about itself in each message.
 pub struct CameraIdentity {
     pub name: CameraName,
     pub camera: Camera,
@@ -27,7 +27,7 @@ pub struct CameraIdentity {
 }
 
 impl CameraIdentity {
-    /// The message of one exposure, and how many tracks are not in it, as the lens shows no
+    /// The message of one exposure, and the number of tracks left out of it because the lens has no
     /// direction at their pixels.
     pub fn bearing_frame(
         &self,
@@ -50,9 +50,9 @@ impl CameraIdentity {
         (frame, unseen)
     }
 
-    /// A track as it goes over the wire: the measurement where there is one, else the prediction
-    /// with its own covariance, marked as such. The fusion wants measurements that are independent
-    /// of each other, so it gets the place in this image and not the image filter's estimate.
+    /// A track as a wire message: the measured place if there is one, else the predicted place with
+    /// its own covariance, marked as predicted. The fusion needs independent measurements, so it
+    /// gets the place in this image, not the image filter's estimate.
     fn bearing_track(&self, track: &ImageTrack) -> Result<BearingTrack, GeometryError> {
         let Measurement { place, covariance } = track.measured.unwrap_or_else(|| predicted(track));
         let pixel = Pixel::new(place.x, place.y);
@@ -106,8 +106,8 @@ impl CameraIdentity {
     }
 }
 
-/// Where a track that this image did not show is believed to be, and how well that is known: to a
-/// pixel where the tracker does not say.
+/// Predicted place of a track that was not measured in this image, with its covariance: one pixel
+/// of SD per axis where the tracker states none.
 fn predicted(track: &ImageTrack) -> Measurement {
     let covariance = track.covariances.map_or_else(Matrix2::identity, |[x, y]| {
         Matrix2::from_diagonal(&Vector2::new(x.m11, y.m11))

@@ -1,4 +1,4 @@
-//! How a component says, every second, how it does: to the site, to Prometheus, and to systemd.
+//! A component's health report, published every second: to the site, to Prometheus, and to systemd.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant, SystemTime};
@@ -10,7 +10,7 @@ use crate::host::HostWatch;
 use crate::metrics::MetricsPage;
 use crate::network;
 
-/// How often a component says how it does.
+/// Interval of health reports.
 pub const PERIOD: Duration = Duration::from_secs(1);
 
 /// Where a component's health can be seen beside the site's network.
@@ -21,19 +21,19 @@ pub struct HealthArgs {
     metrics: Option<SocketAddr>,
 }
 
-/// Says how a component does.
+/// Publishes a component's health.
 #[derive(Debug)]
 pub struct HealthReporter {
     publisher: LinkPublisher,
     run: u64,
     host: HostWatch,
     page: Option<MetricsPage>,
-    /// When it reported last, and what had been handled then.
+    /// Time of the last report, and the number handled by then.
     before: Option<(Instant, u64)>,
     certificate: Option<WatchedCertificate>,
 }
 
-/// A component's certificate, looked at now and then; what is wrong with it is said when it begins.
+/// A component's certificate, read again now and then; a problem is logged when it first appears.
 #[derive(Debug)]
 pub struct WatchedCertificate {
     own: OwnCertificate,
@@ -57,7 +57,7 @@ impl WatchedCertificate {
         self.problem = problem;
     }
 
-    /// What is wrong with it.
+    /// The certificate's current problem, if any.
     pub fn problem(&mut self) -> Option<String> {
         if self.looked_at.elapsed() >= CERTIFICATE_PERIOD {
             self.look();
@@ -66,14 +66,14 @@ impl WatchedCertificate {
     }
 }
 
-/// How often a component looks whether its certificate is to be renewed.
+/// How often a component checks whether its certificate needs renewal.
 const CERTIFICATE_PERIOD: Duration = Duration::from_secs(60);
 
 impl HealthReporter {
-    /// Of the component whose health goes out on a channel.
+    /// A reporter for the component whose health is published on `channel`.
     ///
     /// # Errors
-    /// If the channel cannot be published on, or the metrics' address not be listened on.
+    /// If the channel cannot be published on, or the metrics' address cannot be listened on.
     pub fn new(
         args: &HealthArgs,
         link: &Link,
@@ -90,7 +90,7 @@ impl HealthReporter {
         })
     }
 
-    /// What a component says of itself, with what is known of its run, process and host.
+    /// A component's health report, completed with its run, process and host.
     pub fn completed(&mut self, health: Health) -> Health {
         let now = Instant::now();
         let rate_hz = self.before.map_or(0.0, |(at, handled)| {
@@ -104,7 +104,7 @@ impl HealthReporter {
         Health { run, host, rate_hz, load: self.host.look(), problems, ..health }
     }
 
-    /// Says it.
+    /// Publishes a report.
     ///
     /// # Errors
     /// If the session is closed.

@@ -1,28 +1,28 @@
-//! How busy this process and its host are, and how good the host's clock is.
+//! Load of this process and its host, and the accuracy of the host's clock.
 
 use std::time::{Duration, Instant};
 
 use crossfix_message::HostLoad;
 use sysinfo::{Components, Pid, ProcessRefreshKind, ProcessesToUpdate, System};
 
-/// Looks at this process and its host once a second.
+/// Measures the load of this process and its host once a second.
 #[derive(Debug, Default)]
 pub struct HostWatch {
-    /// None where the system does not tell.
+    /// `None` where the system does not tell.
     system: Option<System>,
     parts: Option<Components>,
-    /// When it looked last, and the processor time that the process had had by then.
+    /// When it was measured last, and the process's processor time (CPU time) by then.
     before: Option<(Instant, Duration)>,
 }
 
 impl HostWatch {
-    /// Begins to look: what is in use is told from the second look on.
+    /// Starts measuring; the load is available from the second look on.
     pub fn start() -> Self {
         let parts = Components::new_with_refreshed_list();
         Self { system: System::new().ok(), parts: parts.ok(), before: None }
     }
 
-    /// How it is since the look before; `None` where the system does not tell.
+    /// Load since the previous look; `None` where the system does not tell.
     pub fn look(&mut self) -> Option<HostLoad> {
         let system = self.system.as_mut()?;
         let own = Pid::from_u32(std::process::id());
@@ -55,13 +55,14 @@ fn hottest(parts: &mut Components) -> Option<f64> {
     read.filter(|celsius| celsius.is_finite()).map(f64::from).max_by(f64::total_cmp)
 }
 
-/// How far off the host's clock may be, by what the program that keeps it has told the kernel; `None`
-/// where nothing keeps it. Such programs tell it every few seconds to minutes; in between the kernel
-/// adds half a millisecond a second, and says that nothing keeps it once that has come to 16 s.
+/// How far off the host's clock may be, as the program that disciplines the clock has told the
+/// kernel; `None` where no program does. Such programs tell the kernel every few seconds to
+/// minutes; in between the kernel adds half a millisecond per second, and reports the clock as
+/// unsynchronised once that has come to 16 s.
 #[cfg(target_os = "linux")]
 #[expect(unsafe_code, reason = "no crate that is kept has this call without setting the clock")]
 pub fn kernel_clock_bound() -> Option<Duration> {
-    // SAFETY: the structure is numbers alone, for which zeros are valid; with `modes` nought the call
+    // SAFETY: `timex` is made of numbers only, for which zeros are valid; with `modes` 0 the call
     // writes into it and sets nothing.
     let (state, answer) = unsafe {
         let mut answer: libc::timex = std::mem::zeroed();
@@ -71,7 +72,7 @@ pub fn kernel_clock_bound() -> Option<Duration> {
     is_kept.then(|| Duration::from_micros(answer.maxerror.max(0).unsigned_abs()))
 }
 
-/// As on Linux, but that the kernel is not asked.
+/// As on Linux, except that no kernel can be asked: always `None`.
 #[cfg(not(target_os = "linux"))]
 pub fn kernel_clock_bound() -> Option<Duration> {
     None
@@ -89,7 +90,7 @@ mod tests {
         let until = Instant::now() + Duration::from_millis(500);
         while Instant::now() < until {}
         let load = watch.look().unwrap();
-        // Other tests of this process may work beside.
+        // Other tests of this process may run at the same time.
         assert!(load.process_cores > 0.3, "{load:?}");
         assert!((0.0..=1.0).contains(&load.cores_in_use), "{load:?}");
         // Nobody's clock is off by the age of the universe, however it is kept.

@@ -1,4 +1,4 @@
-//! Pages that this program serves itself: requests answered on a thread of their own.
+//! Pages that this program serves itself: requests are answered on a thread of their own.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
@@ -14,16 +14,17 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::time::{sleep, timeout};
 
-/// Who may ask at the same time; the next wait. Each takes a file descriptor, of which the camera and
-/// the network need some, too.
+/// Most requests served at the same time; further ones wait. Each takes a file descriptor, and the
+/// camera and the network need some, too.
 pub const ASKING: usize = 16;
-/// How long a question may take to come.
+/// How long a request may take to arrive.
 const ASKED_WITHIN: Duration = Duration::from_secs(1);
-/// The pause after a connection could not be taken, as descriptors are short.
+/// Pause after a connection could not be accepted because descriptors are short.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Answers everybody who asks at an address, until the process ends. From the first byte of a question to
-/// the last of its answer it may take `within`: who takes it slower must not keep a connection.
+/// Answers all requests at an address until the process ends. From the first byte of a request to
+/// the last of its answer at most `within` may pass, so that a slow client cannot keep a
+/// connection.
 ///
 /// # Errors
 /// If the address cannot be listened on.
@@ -68,7 +69,7 @@ where
             Ok((stream, _)) => {
                 let answer = Arc::clone(answer);
                 tokio::spawn(async move {
-                    // What goes wrong with one who asks is theirs.
+                    // A failure of one client's connection concerns nobody else.
                     let _ = timeout(within, answer_one(stream, &*answer)).await;
                     drop(place);
                 });

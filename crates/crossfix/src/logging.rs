@@ -47,11 +47,13 @@ pub fn start(args: &LoggingArgs) {
         (_, 1) => "info,crossfix=debug",
         _ => "debug",
     };
-    // Zenoh warns about what we chose on purpose (no gossip) and about peers that are not up yet.
+    // Zenoh warns about what is configured on purpose (no gossip) and about peers that are not up
+    // yet.
     let filter = format!("{level},zenoh=error,zenoh_transport=error,zenoh_link_tcp=error");
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(filter));
-    // What the reader of streams says of cameras that do as they please is in its errors, and what it
-    // says in detail may hold how one logs in to them, whoever asks for it.
+    // What the stream reader (retina) warns of in cameras that break the standard is in its errors
+    // already, and its detailed logs may contain login data; so it stays at `error` whatever level
+    // is asked for.
     let quiet = Directive::from(LevelFilter::ERROR);
     let filter = filter.add_directive("retina=error".parse().unwrap_or(quiet));
     let builder = |filter| {
@@ -69,15 +71,15 @@ pub fn start(args: &LoggingArgs) {
     }
 }
 
-/// The system's journal, where stderr goes there: then lines have their level and where in the code they
-/// come from as fields (`journalctl -p warning -t crossfix`).
+/// The system's journal, if stderr goes there: log lines then carry their level and code location
+/// as fields (`journalctl -p warning -t crossfix`).
 #[cfg(target_os = "linux")]
 fn journal() -> Option<tracing_journald::Layer> {
     use std::os::fd::AsFd;
     use std::os::linux::fs::MetadataExt;
 
-    // systemd says which of its sockets that is (systemd.exec(5), `JOURNAL_STREAM`): somebody may have
-    // sent stderr elsewhere since.
+    // systemd says which socket is the journal's (systemd.exec(5), `JOURNAL_STREAM`); stderr may
+    // have been redirected since, so the two are compared.
     let said = std::env::var("JOURNAL_STREAM").ok()?;
     let stderr = std::io::stderr().as_fd().try_clone_to_owned().ok()?;
     let stderr = std::fs::File::from(stderr).metadata().ok()?;
@@ -86,7 +88,7 @@ fn journal() -> Option<tracing_journald::Layer> {
     Some(layer.with_syslog_identifier("crossfix".to_owned()))
 }
 
-/// Elsewhere there is none.
+/// Other systems have no journal.
 #[cfg(not(target_os = "linux"))]
 fn journal() -> Option<tracing_subscriber::layer::Identity> {
     None

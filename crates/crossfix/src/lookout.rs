@@ -1,29 +1,30 @@
-//! Who is there, and a word on who is not.
+//! Which of the needed components are present, and log lines about those that are not.
 
 use std::time::{Duration, Instant};
 
 use crossfix_message::{CameraName, Channel, Key};
 use crossfix_transport::{Link, NetworkConfig, OwnCertificate, Presence};
 
-/// How long somebody may be missing before that is said, and how often it is said again that nobody
-/// is there.
+/// How long a component may be missing before that is logged, and how often it is repeated while
+/// none is present.
 const PATIENCE: Duration = Duration::from_secs(3);
 const PERIOD: Duration = Duration::from_secs(60);
-/// Names in a line; the rest is a number.
+/// Most names in a line; the rest is given as a number.
 const NAMED: usize = 8;
 
-/// Looks who of those that a component needs is there, and says who comes, who goes, and who is
-/// missing.
+/// Watches which of the components that this one needs are present, and logs who comes, who goes,
+/// and who is missing.
 pub struct Lookout {
     presence: Presence,
     site: String,
     others: Vec<Other>,
     absence: Absence,
-    /// What is shown those who are missing, where there are certificates.
+    /// Certificate to test the connection to missing components with, where the network has
+    /// certificates.
     certificate: Option<OwnCertificate>,
 }
 
-/// When it is time to say who is missing.
+/// Decides when to log who is missing.
 #[derive(Debug, Default)]
 struct Absence {
     since: Option<Instant>,
@@ -31,8 +32,8 @@ struct Absence {
 }
 
 impl Absence {
-    /// Whether it is now, where so many of so many are there; `changed` if one of them has just come
-    /// or gone, of which others may be about to follow.
+    /// Whether to log now, with `here` of `of` components present. `changed`: one of them has just
+    /// come or gone, so others may be about to follow.
     fn is_due(&mut self, here: usize, of: usize, changed: bool, now: Instant) -> bool {
         if changed || here == of {
             *self = Self::default();
@@ -41,7 +42,8 @@ impl Absence {
             return false;
         }
         let since = *self.since.get_or_insert(now);
-        // That nobody is there is said again; that one of several is not may be meant.
+        // A complete absence is repeated; one of several missing may be intended and is logged
+        // once.
         let again = |said: Instant| here == 0 && now.saturating_duration_since(said) >= PERIOD;
         let is_due =
             now.saturating_duration_since(since) >= PATIENCE && self.said.is_none_or(again);
@@ -57,9 +59,9 @@ struct Other {
     endpoint: String,
     key: Key,
     is_here: bool,
-    /// Whether it was there at the look before, too.
+    /// Whether it was present at the previous look, too.
     was_here: bool,
-    /// Whether it ever was.
+    /// Whether it was ever present.
     has_been_here: bool,
 }
 
@@ -70,7 +72,7 @@ impl Other {
 }
 
 impl Lookout {
-    /// For those who need cameras.
+    /// Watches the cameras that a component needs.
     pub fn for_cameras(
         link: &Link,
         network: &NetworkConfig,
@@ -84,7 +86,7 @@ impl Lookout {
         Self::new(link, others.collect())
     }
 
-    /// For those who need the fusion centres of a camera.
+    /// Watches the fusion centres that a camera needs.
     pub fn for_centres_of(
         link: &Link,
         network: &NetworkConfig,
@@ -109,7 +111,7 @@ impl Lookout {
         Ok(Self { presence, site, others, absence: Absence::default(), certificate })
     }
 
-    /// Looks again; to be called about once a second.
+    /// Checks again who is present; to be called about once a second.
     pub fn look(&mut self, now: Instant) {
         let mut changed = false;
         for other in &mut self.others {
@@ -130,8 +132,8 @@ impl Lookout {
         }
     }
 
-    /// Says of those that are missing whether it is for a certificate, which Zenoh does not: on a thread
-    /// of its own, as they may be slow to answer.
+    /// Logs of each missing component whether its certificate is the reason, which Zenoh does not
+    /// tell. On a thread of its own, as they may answer slowly.
     fn ask_why(&self) {
         let Some(certificate) = self.certificate.clone() else { return };
         let missing: Vec<(String, String)> = self
@@ -150,29 +152,29 @@ impl Lookout {
         });
     }
 
-    /// Whether all of them are there.
+    /// Whether all watched components are present.
     pub fn all_are_here(&self) -> bool {
         self.others.iter().all(|other| self.presence.is_alive(&other.key))
     }
 
-    /// Whether one of them is there.
+    /// Whether at least one watched component is present.
     pub fn any_is_here(&self) -> bool {
         self.others.iter().any(|other| self.presence.is_alive(&other.key))
     }
 
-    /// Whether a component is there, whoever is looked out for.
+    /// Whether a component is present, be it watched or not.
     pub fn is_here(&self, key: &Key) -> bool {
         self.presence.is_alive(key)
     }
 
-    /// The cameras of them that were there at the last two looks, by name: by the second, they hear
-    /// what is said of them.
+    /// The watched cameras that were present at the last two looks, by name: by the second look
+    /// they receive what is published for them.
     pub fn cameras_here(&self) -> Vec<String> {
         let here = self.others.iter().filter(|other| other.is_here && other.was_here);
         here.filter_map(|other| other.key.channel.camera()).map(ToString::to_string).collect()
     }
 
-    /// The cameras of them that were there and are not now.
+    /// The watched cameras that were present earlier and are not now.
     pub fn cameras_gone(&self) -> impl Iterator<Item = &CameraName> {
         let gone = self.others.iter().filter(|other| other.has_been_here && !other.is_here);
         gone.filter_map(|other| other.key.channel.camera())

@@ -63,7 +63,7 @@ struct Cli {
 
 fn main() -> ExitCode {
     network::give_zenoh_threads();
-    // Misuse ends in clap, with exit code 2.
+    // clap handles wrong arguments itself, with exit code 2.
     let cli = Cli::parse();
     logging::start(&cli.logging);
     match shutdown::supervise(move || cli.command.run()) {

@@ -1,4 +1,4 @@
-//! A component's health for Prometheus: `GET /metrics` on an address of its own.
+//! A component's health for Prometheus: `GET /metrics` on a separate address.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, PoisonError, RwLock};
@@ -13,19 +13,19 @@ use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
 
 use crate::http;
 
-/// How long somebody who asks may take, from the first byte to the last: who asks slower, or nothing, must
-/// not keep a connection.
+/// How long an exchange may take, from the first byte of the request to the last of the answer, so
+/// that a slow or silent client cannot keep a connection.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
-/// A page that is older is of a component that does not say any more how it does.
+/// A report older than this means that the component no longer reports its health.
 const STALE: Duration = Duration::from_secs(5);
 
-/// The page; it is gone when the process ends.
+/// The metrics page; it disappears when the process ends.
 #[derive(Debug)]
 pub struct MetricsPage {
     shown: Arc<RwLock<Shown>>,
 }
 
-/// What the page says, and since when.
+/// The page's text, and when it was set.
 #[derive(Debug)]
 struct Shown {
     text: String,
@@ -45,7 +45,7 @@ impl MetricsPage {
         Ok(page)
     }
 
-    /// Shows a report from now on.
+    /// Serves a report from now on.
     pub fn show(&self, health: &Health) {
         match exposition(health) {
             Ok(text) => {
@@ -74,7 +74,7 @@ fn answer<B>(request: &Request<B>, shown: &RwLock<Shown>) -> Response<Full<Bytes
     response
 }
 
-/// Metrics of one report.
+/// The metrics made of one report.
 struct Metrics {
     registry: Registry,
     component: String,
@@ -94,7 +94,7 @@ impl Metrics {
         self.registry.register(Box::new(gauge))
     }
 
-    /// One value of each camera that the fusion centre knows.
+    /// A gauge with one value for each camera that the fusion centre knows.
     fn gauges(
         &self,
         name: &str,
@@ -110,7 +110,7 @@ impl Metrics {
     }
 }
 
-/// A report in Prometheus' text format, base units.
+/// A report in Prometheus' text format, in base units.
 fn exposition(health: &Health) -> prometheus::Result<String> {
     let metrics = Metrics { registry: Registry::new(), component: health.component.clone() };
     let handled = "Frames or messages handled since the start.";
@@ -131,7 +131,7 @@ fn exposition(health: &Health) -> prometheus::Result<String> {
     TextEncoder::new().encode_to_string(&metrics.registry.gather())
 }
 
-/// A counter of a report, or what is called so and is a time of the last second.
+/// A counter of a report; one whose name ends in a unit is instead a time of the last second.
 fn counted(metrics: &Metrics, name: &str, value: u64) -> prometheus::Result<()> {
     let words = name.replace('_', " ");
     let now = |words: &str| format!("{words}, in the last second.");
@@ -234,7 +234,7 @@ mod tests {
         let address = free_address();
         let page = MetricsPage::serve(address).unwrap();
         page.show(&Health { component: "north".to_owned(), ..Health::default() });
-        // Twice as many as may ask at the same time say nothing.
+        // Twice as many clients as may be served at the same time connect and say nothing.
         let silent: Vec<_> =
             (0..2 * ASKING).map(|_| std::net::TcpStream::connect(address).unwrap()).collect();
         let answer = ask(address, "GET /metrics HTTP/1.1\r\nHost: a\r\n\r\n");

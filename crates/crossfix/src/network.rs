@@ -1,4 +1,4 @@
-//! Going onto a site's network.
+//! Joining a site's network.
 
 use std::time::{Duration, Instant};
 
@@ -6,26 +6,28 @@ use crossfix_transport::{Link, NetworkConfig, Role, RunId};
 
 use crate::shutdown::Shutdown;
 
-/// How long a router may be silent before that is said, and how often it is said again.
+/// How long a router may be silent before that is logged, and how often it is repeated.
 const PATIENCE: Duration = Duration::from_secs(2);
 const PERIOD: Duration = Duration::from_secs(60);
 
-/// The threads of Zenoh's pools, if whoever starts the program does not say otherwise. Zenoh closes
-/// the connection to a receiver that is lost on a thread that receives for all, and there the system
-/// waits for up to ten seconds for what had not gone out yet (eclipse-zenoh issue 1101). Of its own
-/// accord Zenoh receives on two: a switch that died with two recorders behind it stopped a site for
-/// ten seconds. With half of these, one with a dozen would.
+/// Number of threads of Zenoh's pools, unless the environment sets it. Zenoh closes the connection
+/// to a lost receiver on a thread that receives for all, and there the system waits for up to ten
+/// seconds for data not yet sent (eclipse-zenoh issue 1101). By default Zenoh receives on two
+/// threads: a switch that died with two recorders behind it stopped a site for ten seconds. With
+/// half of these threads, one with a dozen recorders would.
 const ZENOH_THREADS: &str = "(rx: (worker_threads: 32), tx: (worker_threads: 4), \
                              acc: (worker_threads: 4), net: (worker_threads: 4))";
-/// Where Zenoh reads that, once a process, when its first thread is started.
+/// Environment variable from which Zenoh reads this, once per process, when its first thread
+/// starts.
 const ZENOH_THREADS_VARIABLE: &str = "ZENOH_RUNTIME";
 
-/// Gives Zenoh threads enough that lost receivers hold nobody up. Only at the very beginning, while
-/// the program has no other thread.
+/// Gives Zenoh enough threads that lost receivers delay nobody else. Only to be called at the very
+/// beginning, while the program has no other thread.
 #[expect(unsafe_code, reason = "Zenoh takes this from its environment alone")]
 pub fn give_zenoh_threads() {
     if std::env::var_os(ZENOH_THREADS_VARIABLE).is_none() {
-        // SAFETY: the main thread is the only one yet, so none reads the environment meanwhile.
+        // SAFETY: the main thread is the only one so far, so no other reads the environment
+        // meanwhile.
         unsafe { std::env::set_var(ZENOH_THREADS_VARIABLE, ZENOH_THREADS) };
     }
 }
@@ -55,7 +57,7 @@ pub fn open(
     }
 }
 
-/// Says at the start who may join the site's network.
+/// Logs at the start who may join the site's network.
 fn say_how_secure(network: &NetworkConfig, role: &Role) {
     if network.security.is_some() {
         return;
@@ -73,12 +75,12 @@ fn say_how_secure(network: &NetworkConfig, role: &Role) {
     }
 }
 
-/// This host and process, as people look for them: `camera-host-2:4711`.
+/// This host and process, in a form that people can look up: `camera-host-2:4711`.
 pub fn host() -> String {
     format!("{}:{}", gethostname::gethostname().to_string_lossy(), std::process::id())
 }
 
-/// Names two runs that publish on one key.
+/// The warning that two runs publish on one key.
 pub fn rivalry(key: &crossfix_message::Key, runs: [RunId; 2]) -> String {
     let [one, other] = runs;
     format!("two programs publish on `{key}`: the runs {one} and {other}; is one started twice?")

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Serialize;
 
-/// Writes a line of the result. A reader that went away (`| head`) is no error.
+/// Writes a line of the result. A reader that has gone away (`| head`) is not an error.
 pub fn line(text: impl std::fmt::Display) {
     let _ = writeln!(io::stdout().lock(), "{text}");
 }
@@ -17,7 +17,7 @@ pub fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Says why the command failed: the error and what it comes from, a line each.
+/// Prints why the command failed: the error and its causes, a line each.
 pub fn error(error: &anyhow::Error) {
     let mut stderr = io::stderr().lock();
     let _ = writeln!(stderr, "error: {error}");
@@ -26,18 +26,17 @@ pub fn error(error: &anyhow::Error) {
     }
 }
 
-/// A file that is being written. It has a name of its own until it is whole, so that what stood
-/// under the name that was asked for stays until then, and nobody takes half a file for a whole
-/// one.
+/// A file that is being written. It has a temporary name until it is complete, so that an existing
+/// file of the wanted name stays until then, and nobody takes half a file for a whole one.
 #[derive(Debug)]
 pub struct Draft {
     path: PathBuf,
-    /// `None`: written in place, as a pipe or a device can only be.
+    /// Temporary path. `None`: written in place, as pipes and devices must be.
     part: Option<PathBuf>,
 }
 
 impl Draft {
-    /// A draft of a file that is made from others.
+    /// A draft of a file that is made from `inputs`, none of which it may overwrite.
     pub fn new(path: &Path, inputs: &[&Path]) -> anyhow::Result<Self> {
         for input in inputs {
             ensure!(
@@ -48,19 +47,19 @@ impl Draft {
         }
         let in_place = path.exists() && !path.is_file();
         ensure!(!path.is_dir(), "cannot write {}: it is a folder", path.display());
-        // What a link names is replaced, and not the link.
+        // If the path is a link, the file it points to is replaced, not the link.
         let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         let mut part = path.clone().into_os_string();
         part.push(format!(".{}.part", std::process::id()));
         Ok(Self { path, part: (!in_place).then(|| part.into()) })
     }
 
-    /// Where to write.
+    /// The path to write to.
     pub fn path(&self) -> &Path {
         self.part.as_deref().unwrap_or(&self.path)
     }
 
-    /// The file is whole: it gets its name.
+    /// Moves the completed file to its final name.
     pub fn keep(mut self) -> anyhow::Result<()> {
         if let Some(part) = self.part.take() {
             std::fs::rename(&part, &self.path)
@@ -78,11 +77,10 @@ impl Drop for Draft {
     }
 }
 
-/// Names that are tried for a file whose own is taken.
+/// Most names that are tried for a file whose name is taken.
 const MOST_NAMES: u32 = 10_000;
 
-/// The name that was asked for, and those that are tried where it is taken: `today-2.mcap`,
-/// `today-3.mcap` ..
+/// The wanted name, and those tried where it is taken: `today-2.mcap`, `today-3.mcap` ..
 pub fn names(asked: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let extension =
@@ -92,7 +90,7 @@ pub fn names(asked: &Path) -> impl Iterator<Item = PathBuf> + '_ {
     std::iter::once(asked.to_owned()).chain(others)
 }
 
-/// Says that a file is written under another name than was asked for.
+/// Logs that a file is written under another name than was asked for.
 pub fn say_other_name(asked: &Path, path: &Path) {
     if path != asked {
         tracing::warn!(
@@ -103,7 +101,7 @@ pub fn say_other_name(asked: &Path, path: &Path) {
     }
 }
 
-/// Writes a whole file.
+/// Writes a complete file.
 pub fn write_file(path: &Path, inputs: &[&Path], bytes: &[u8]) -> anyhow::Result<()> {
     let draft = Draft::new(path, inputs)?;
     std::fs::write(draft.path(), bytes)

@@ -1,4 +1,4 @@
-//! Playing data in the time of the wall.
+//! Playing data at the speed of the wall clock.
 
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -10,12 +10,12 @@ pub fn wall_seconds() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
 
-/// How often a wait looks whether it is to stop.
+/// How often a wait checks whether to stop.
 const POLL: Duration = Duration::from_millis(50);
-/// Waits longer than this are one of this length: a hundred years.
+/// Longer waits are cut to this length: about a hundred years, s.
 const LONGEST_S: f64 = 3e9;
 
-/// When to handle what: data time runs `speed` times as fast as a clock that nobody sets, from
+/// When to handle which data: data time runs `speed` times as fast as a monotonic clock, from
 /// `start` on; with a speed of 0 nothing waits.
 #[derive(Clone, Copy, Debug)]
 pub struct Pace {
@@ -24,21 +24,20 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// Data that begin at a time of the wall's clock, seconds since the Unix epoch. The clock is
-    /// read once: what is done to it later changes nothing.
+    /// Pace of data that begin at a wall clock time, seconds since the Unix epoch. The clock is
+    /// read once, so later changes of it have no effect.
     pub fn beginning_at(wall_s: f64, speed: f64) -> Self {
         Self::beginning_in(wall_s - wall_seconds(), speed)
     }
 
-    /// Data that begin in so many seconds, or began that long ago if it is negative.
+    /// Pace of data that begin in `seconds`, or began that long ago if it is negative.
     pub fn beginning_in(seconds: f64, speed: f64) -> Self {
         let (now, by) = (Instant::now(), duration(seconds.abs()));
         let start = if seconds < 0.0 { now.checked_sub(by) } else { now.checked_add(by) };
         Self { start: start.unwrap_or(now), speed }
     }
 
-    /// Waits until it is time for what lies `data_s` after the data's beginning. Says whether to go
-    /// on.
+    /// Waits until it is time for the data `data_s` after the beginning. Returns whether to go on.
     pub fn wait(&self, data_s: f64, shutdown: &Shutdown) -> bool {
         if let Some(due) = self.due(data_s) {
             while !shutdown.requested() {
@@ -53,7 +52,7 @@ impl Pace {
         !shutdown.requested()
     }
 
-    /// How long ago what lies `data_s` after the data's beginning should have been handled.
+    /// How late the data `data_s` after the beginning are by now.
     pub fn behind(&self, data_s: f64) -> Duration {
         self.due(data_s).map_or(Duration::ZERO, |due| Instant::now().saturating_duration_since(due))
     }
@@ -64,7 +63,7 @@ impl Pace {
 }
 
 fn duration(seconds: f64) -> Duration {
-    // NaN is no time at all.
+    // NaN becomes zero.
     Duration::from_secs_f64(seconds.clamp(0.0, LONGEST_S).max(0.0))
 }
 

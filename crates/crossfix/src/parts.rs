@@ -1,12 +1,12 @@
-//! What this build leaves out, said to whoever asks for it.
+//! Parts that this build leaves out, and the messages about them.
 
-/// The parts of the program that a build may leave out, with the feature that brings each.
+/// Parts of the program that a build may leave out, with the feature that includes each.
 const PARTS: [(&str, &str, bool); 2] = [
     ("the fusion centre's commands", "centre", cfg!(feature = "centre")),
     ("pictures for Rerun", "viewer", cfg!(feature = "viewer")),
 ];
 
-/// The end of the help: where to start, or what is left out and how to have it.
+/// End of the help text: where to start, or what is left out and how to include it.
 pub fn closing_words() -> String {
     let lines: Vec<String> = PARTS
         .iter()
@@ -16,13 +16,13 @@ pub fn closing_words() -> String {
     if lines.is_empty() { "Start with `crossfix demo`.".to_owned() } else { lines.join("\n") }
 }
 
-/// What a build without the viewer says to whoever asks for a picture.
+/// The error of a build without the viewer when a picture is asked for.
 #[cfg(not(feature = "viewer"))]
 pub fn no_pictures() -> anyhow::Error {
     is_left_out("pictures for Rerun", "viewer")
 }
 
-/// The error of asking for a part that is left out.
+/// The error when a part that is left out is asked for.
 #[cfg(not(all(feature = "centre", feature = "viewer", feature = "onvif")))]
 pub fn is_left_out(part: &str, feature: &str) -> anyhow::Error {
     anyhow::anyhow!("this build leaves out {part}: build it with `--features {feature}`")

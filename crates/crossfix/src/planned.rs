@@ -1,4 +1,4 @@
-//! What a camera's accuracy is reckoned by, from its file or its calibration.
+//! A camera's accuracy for planning, from its file or its calibration.
 
 use std::path::Path;
 
@@ -9,12 +9,12 @@ use nalgebra::Matrix6;
 
 use crate::config::CameraFile;
 
-/// Frames a second of a camera whose file does not say.
+/// Frames per second of a camera whose file does not say.
 const DEFAULT_RATE_HZ: f64 = 30.0;
-/// What an image tracker's place of a target errs by where nobody has said, pixels per axis.
+/// Standard deviation of an image tracker's target position where none is given, pixels per axis.
 const DEFAULT_PIXEL_SD_PX: f64 = 0.5;
 
-/// A camera by its file, and by the calibration that the file names.
+/// A camera described by its file and by the calibration that the file names.
 pub fn of_file(
     file: &CameraFile,
     path: &Path,
@@ -44,7 +44,8 @@ pub fn of_file(
     })
 }
 
-/// A camera by its calibration; its clock is off by the calibration's deviation and by its own, s.
+/// A camera described by its calibration; its clock error is the calibration's deviation and
+/// `clock_sd_s` (s) together.
 pub fn of_calibrated(camera: &CalibratedCamera, clock_sd_s: f64) -> PlannedCamera {
     let found_s = camera.clock.knots_s.get(camera.clock.knots_s.len() / 2).map_or(0.0, |k| k[2]);
     PlannedCamera {
@@ -59,7 +60,8 @@ pub fn of_calibrated(camera: &CalibratedCamera, clock_sd_s: f64) -> PlannedCamer
     }
 }
 
-/// Makes a pose's rotation (from 0) or position (from 3) independent of all else, of one deviation.
+/// Makes the rotation (`first` 0) or position (`first` 3) of a pose uncorrelated with the rest,
+/// with one deviation on each axis.
 pub fn hold(pose_covariance: &mut Matrix6<f64>, first: usize, sd: f64) {
     pose_covariance.fixed_rows_mut::<3>(first).fill(0.0);
     pose_covariance.fixed_columns_mut::<3>(first).fill(0.0);

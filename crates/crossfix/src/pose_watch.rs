@@ -1,4 +1,4 @@
-//! Whether cameras still stand as they were calibrated, asked of the fusion now and then.
+//! Checks now and then, by asking the fusion, whether cameras still stand as they were calibrated.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,33 +6,33 @@ use std::fmt;
 use crossfix_fusion::{Fusion, PoseFinding};
 use crossfix_message::{CameraName, Timestamp};
 
-/// The fusion is asked this often, s of data time: what it tells is of the last minute, and of 64
-/// cameras it costs 0.1 s.
+/// Interval between checks, s of data time: a finding covers the last minute, and for 64 cameras it
+/// costs 0.1 s.
 const ASKED_EVERY_S: f64 = 10.0;
 
-/// What is found within so long is of one knock, s: the fusion's memory is of 100 s with targets, and
-/// there are some without.
+/// Findings within this time are ascribed to one knock, s: the fusion remembers 100 s with targets,
+/// and there are periods without any.
 const SAME_KNOCK_S: f64 = 300.0;
 
-/// What has been found of each camera that has been watched beside others.
+/// Findings of each camera that has been watched together with others.
 #[derive(Debug, Default)]
 pub struct PoseWatch {
     asked: Option<Timestamp>,
     cameras: BTreeMap<CameraName, CameraWatch>,
 }
 
-/// What has been found of a camera.
+/// Findings of one camera.
 #[derive(Clone, Debug)]
 pub struct CameraWatch {
-    /// At last; `None` if nothing has told since it was calibrated anew.
+    /// The newest finding; `None` if there has been none since the camera was last calibrated.
     pub now: Option<PoseFinding>,
-    /// When most spoke for its having been moved, ...
+    /// The finding with the strongest evidence that the camera has been moved, ...
     pub worst: PoseFinding,
-    /// ... and when that was.
+    /// ... and its time.
     worst_at: Timestamp,
-    /// When it was first sure that it had.
+    /// When it was first certain that the camera had been moved.
     pub moved_at: Option<Timestamp>,
-    /// The longest that it was watched within the fusion's memory, s.
+    /// The longest time that the camera was watched within the fusion's memory, s.
     pub watched_s: f64,
 }
 
@@ -45,8 +45,8 @@ impl CameraWatch {
         if found.is_moved {
             self.moved_at.get_or_insert(time);
         }
-        // What is sure is worse than what is not, and what this camera alone explains than what another
-        // might have, however much spoke for that.
+        // Certain findings come before uncertain ones, and findings that only this camera explains
+        // before those that another might explain, however strong the evidence there.
         let rank = |finding: &PoseFinding| {
             (finding.is_moved, finding.or_else.is_empty(), finding.log_odds)
         };
@@ -59,7 +59,7 @@ impl CameraWatch {
 }
 
 impl PoseWatch {
-    /// Asks the fusion if it is time; returns whether it was.
+    /// Asks the fusion if a check is due; returns whether it was.
     pub fn look(&mut self, fusion: &Fusion) -> bool {
         let Some(now) = fusion.now() else { return false };
         let asked = *self.asked.get_or_insert(now);
@@ -70,7 +70,7 @@ impl PoseWatch {
         is_due
     }
 
-    /// Asks the fusion at its end.
+    /// Asks the fusion once more at its end.
     pub fn finish(&mut self, fusion: &Fusion) {
         if let Some(now) = fusion.now() {
             self.ask(fusion, now);
@@ -87,8 +87,8 @@ impl PoseWatch {
         }
     }
 
-    /// Whether a camera has been moved, by all that has been found: not one that for a moment might have
-    /// been in the place of another, which about then was found to have been alone.
+    /// Whether a camera has been moved, by all findings. Not if the finding might also have been
+    /// due to another camera that at about that time was found to be the only one moved.
     pub fn has_moved(&self, name: &CameraName) -> bool {
         self.cameras.get(name).is_some_and(|camera| {
             let took_its_place = |other: &CameraName| {
@@ -101,12 +101,12 @@ impl PoseWatch {
         })
     }
 
-    /// What has been found of each camera, by name.
+    /// Findings of each camera, by name.
     pub fn cameras(&self) -> &BTreeMap<CameraName, CameraWatch> {
         &self.cameras
     }
 
-    /// What is to be said of the cameras that have been moved.
+    /// Messages about the cameras that have been moved.
     pub fn problems(&self) -> impl Iterator<Item = (&CameraName, String)> {
         let moved = |camera: &'_ CameraWatch| camera.now.clone().filter(|now| now.is_moved);
         self.cameras.iter().filter_map(move |(name, camera)| {
@@ -117,7 +117,7 @@ impl PoseWatch {
     }
 }
 
-/// By how much a camera has been turned.
+/// Text of how far a camera has been turned.
 pub struct Turn<'a>(pub &'a PoseFinding);
 
 impl fmt::Display for Turn<'_> {
@@ -135,7 +135,7 @@ impl fmt::Display for Turn<'_> {
 mod tests {
     use super::*;
 
-    /// What is found at so many seconds of a camera for which the odds are sure.
+    /// Adds a certain finding of a camera at a time, s.
     fn found(watch: &mut PoseWatch, name: &str, at_s: f64, or_else: &[&str]) {
         let finding = PoseFinding {
             watched_s: 60.0,

@@ -1,4 +1,4 @@
-//! A recording read with another calibration: times, lenses and poses as that has them.
+//! A recording read with another calibration, which replaces its times, lenses and poses.
 
 use std::cell::Cell;
 use std::cmp::Reverse;
@@ -13,11 +13,11 @@ use crossfix_recording::Entry;
 
 use crate::calibrated::{self, middle_time, recalibrate};
 
-/// A calibration file to be put in the place of what was recorded.
+/// A calibration file that replaces what was recorded.
 #[derive(Clone, Debug)]
 pub struct Recalibration {
     site: SiteCalibration,
-    /// Bearings that the calibration has no direction for.
+    /// Number of bearings for which the calibration has no direction.
     left_out: Cell<u64>,
 }
 
@@ -27,13 +27,13 @@ impl Recalibration {
         calibrated::load(path).map(Self::of)
     }
 
-    /// By a calibration that is in no file yet.
+    /// From a calibration that is in no file yet.
     pub fn of(site: SiteCalibration) -> Self {
         Self { site, left_out: Cell::new(0) }
     }
 
-    /// The entry as it would have been recorded with this calibration. What cannot be read stays
-    /// as it is; what is of no camera of the file, too.
+    /// The entry as it would have been recorded with this calibration. Entries that cannot be read
+    /// or that belong to no camera of the file stay as they are.
     pub fn applied(&self, entry: Entry) -> Entry {
         self.changed(&entry).unwrap_or(entry)
     }
@@ -43,8 +43,8 @@ impl Recalibration {
             Channel::Calibration(name) => {
                 let camera = self.site.camera(name)?;
                 let message = self.site.message(camera, Timestamp::EPOCH);
-                // The file knows no mounts: its pose is that at rest.
-                // What cannot be read, which may have been on one, stays as it is.
+                // The file knows no mounts: its pose is that at rest. A recorded calibration that
+                // cannot be read may have had a mount, so it stays as it is.
                 let recorded = decode::<CameraCalibration>(&entry.data).ok()?;
                 let mount = recorded.parse().ok().map(|known| known.mount);
                 let message = match mount.or(recorded.mount.is_none().then_some(None))? {
@@ -69,12 +69,12 @@ impl Recalibration {
             }
             _ => return None,
         };
-        // It arrived as long after its capture as it did.
+        // The delay from capture to arrival stays as recorded.
         let arrival = entry.arrival.plus_seconds(data_time.seconds_since(entry.data_time));
         Some(Entry { key: entry.key.clone(), data_time, arrival, data })
     }
 
-    /// Says what was left out.
+    /// Logs how many bearings were left out.
     fn say(&self) {
         if self.left_out.get() > 0 {
             tracing::warn!(
@@ -85,7 +85,7 @@ impl Recalibration {
         }
     }
 
-    /// By how much the cameras' times move apart at most, s.
+    /// Most by which the cameras' times can move apart, s.
     fn spread_s(&self) -> f64 {
         let ahead = |camera: &CalibratedCamera| {
             camera.clock.knots_s.iter().map(|knot| knot[1]).collect::<Vec<_>>()
@@ -93,15 +93,15 @@ impl Recalibration {
         let all: Vec<f64> = self.site.cameras().iter().flat_map(ahead).chain([0.0]).collect();
         let least = all.iter().copied().fold(f64::INFINITY, f64::min);
         let most = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        // Rates go on behind the last knot.
+        // Clocks go on at their rate after the last knot.
         most - least + SPARE_S
     }
 }
 
-/// What a clock may gain behind its calibration, s.
+/// Allowance for the drift of a clock after its last knot, s.
 const SPARE_S: f64 = 5.0;
 
-/// Entries put into the order of their new times: each waits until nothing older can come.
+/// Entries in the order of their new times: each waits until no older one can come.
 #[derive(Debug)]
 pub struct Reordered {
     recalibration: Recalibration,
@@ -112,9 +112,9 @@ pub struct Reordered {
 }
 
 impl Reordered {
-    /// None waits yet.
+    /// Starts with no entry waiting.
     pub fn new(recalibration: Recalibration) -> Self {
-        // What was looked through for a range is not counted twice.
+        // Entries that were read to find a range must not be counted twice.
         recalibration.left_out.set(0);
         let spread_s = recalibration.spread_s();
         Self {
@@ -126,7 +126,7 @@ impl Reordered {
         }
     }
 
-    /// Takes an entry in, in the order of the recording; hands on what is not waited for any more.
+    /// Takes the recording's next entry; hands on those for which the wait is over.
     pub fn take(
         &mut self,
         entry: Entry,
@@ -140,7 +140,7 @@ impl Reordered {
         self.release(own.plus_seconds(-self.spread_s), &mut handle)
     }
 
-    /// Hands on what still waits.
+    /// Hands on all entries that still wait.
     pub fn finish(
         &mut self,
         mut handle: impl FnMut(Entry) -> anyhow::Result<()>,
@@ -175,7 +175,7 @@ mod tests {
     use super::*;
     use crate::calibrated::tests::SITE;
 
-    /// Whether a camera takes cues, and its mount's reach, are its agent's to say.
+    /// Cues and the mount's range come from the recorded message, not from the calibration.
     #[test]
     fn a_camera_on_a_mount_stays_on_it_and_its_rest_is_the_new_pose() {
         let site = SiteCalibration::from_toml(SITE).unwrap();

@@ -1,4 +1,4 @@
-//! Going through recordings, with a word for what they lack.
+//! Reading recordings, and reporting what is missing in them.
 
 use std::path::Path;
 
@@ -9,19 +9,19 @@ use serde::Serialize;
 
 use crate::shutdown::Shutdown;
 
-/// What could not be had from a recording.
+/// What could not be read from a recording.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Lacks {
     /// Parts of the file that cannot be read.
     pub damage: Option<Damage>,
-    /// Messages that were asked for and could not be read.
+    /// Number of wanted messages that could not be read.
     pub unreadable: u64,
-    /// Why the first of them could not.
+    /// Why the first of them could not be read.
     pub first_unreadable: Option<String>,
 }
 
 impl Lacks {
-    /// Reads a message, or counts that it cannot be read.
+    /// Decodes a message, or counts that it cannot be read.
     pub fn read<M: Payload>(&mut self, data: &[u8]) -> Option<M> {
         match decode(data) {
             Ok(message) => Some(message),
@@ -38,7 +38,7 @@ impl Lacks {
         self.first_unreadable.get_or_insert_with(|| error.to_string());
     }
 
-    /// Says what is lacking, as a warning.
+    /// Logs a warning of what is missing.
     pub fn say(&self, path: &Path) {
         if let Some(damage) = &self.damage {
             tracing::warn!("{} is damaged {damage}; everything else was read", path.display());
@@ -52,7 +52,7 @@ impl Lacks {
         }
     }
 
-    /// An error that says what was not found, and what may be why.
+    /// An error that says what was not found and the likely reason, unless it was found.
     pub fn ensure_found(&self, found: bool, what: &str, path: &Path) -> anyhow::Result<()> {
         let why = match (&self.first_unreadable, &self.damage) {
             (Some(first), _) => format!(": {} messages cannot be read ({first})", self.unreadable),
@@ -64,7 +64,7 @@ impl Lacks {
     }
 }
 
-/// Hands every message of a recording on, and adds to `lacks` what is damaged.
+/// Passes every message of a recording to `handle`, and adds damage to `lacks`.
 pub fn for_each(
     path: &Path,
     lacks: &mut Lacks,
@@ -82,8 +82,8 @@ pub fn for_each(
     }
 }
 
-/// Hands messages of a recording on until it is asked to stop: a long file is not read to its end
-/// then.
+/// Passes the messages of a recording to `handle` until the program is asked to stop, which ends
+/// the reading of a long file early.
 pub fn for_each_until(
     path: &Path,
     lacks: &mut Lacks,
@@ -99,7 +99,7 @@ pub fn for_each_until(
     if is_stopped { Ok(()) } else { read }
 }
 
-/// The first message of a recording for which there is an answer.
+/// The first answer that is not `None`, over the messages of a recording.
 pub fn find<T>(
     path: &Path,
     mut answer: impl FnMut(Entry) -> Option<T>,
@@ -115,7 +115,7 @@ pub fn find<T>(
     }
 }
 
-/// That no more is wanted: the rest need not be read.
+/// Signals that the search is over, so the rest need not be read.
 #[derive(Debug, thiserror::Error)]
 #[error("found")]
 struct Found;

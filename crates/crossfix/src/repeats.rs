@@ -1,15 +1,15 @@
-//! Warnings that would come again and again.
+//! Limits warnings that would be repeated endlessly.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// A warning of one kind is said at once, then this often with how many there were.
+/// A warning of one kind is logged at once, then at this interval with the number of repeats.
 const PERIOD: Duration = Duration::from_secs(60);
-/// Kinds that are told apart: names in them come from outside.
+/// Most kinds that are told apart: the names in them come from outside.
 const MAX_KINDS: usize = 1000;
 
-/// Says the first warning of a kind at once, and then how many more there were, once a minute:
-/// whoever can cause a warning must not be able to fill a disk with it.
+/// Logs the first warning of a kind at once, and after that once a minute how many more there were,
+/// so that whoever can cause a warning cannot fill a disk with it.
 #[derive(Debug, Default)]
 pub struct Repeats {
     kinds: BTreeMap<String, Kind>,
@@ -18,20 +18,20 @@ pub struct Repeats {
 #[derive(Debug)]
 struct Kind {
     said: Instant,
-    /// How many since, and the first of them.
+    /// Number of warnings since, and the text of the first of them.
     more: u64,
     first: String,
 }
 
 impl Repeats {
-    /// A warning of a kind. Its text is made only where it is said.
+    /// Adds a warning of a kind. Its text is only made when it is logged.
     pub fn warn(&mut self, kind: &str, now: Instant, text: impl FnOnce() -> String) {
         if let Some(line) = self.line(kind, now, text) {
             tracing::warn!("{line}");
         }
     }
 
-    /// Says what is due of warnings that have stopped coming.
+    /// Logs the due counts of warnings that have stopped coming.
     pub fn remind(&mut self, now: Instant) {
         for kind in self.kinds.values_mut() {
             if let Some(line) = kind.due(now) {
@@ -40,7 +40,7 @@ impl Repeats {
         }
     }
 
-    /// Says all that still waits to be said: nothing comes after it.
+    /// Logs all counts that have not been logged yet, at the end.
     pub fn end(&mut self) {
         self.kinds.values_mut().filter_map(Kind::rest).for_each(|line| tracing::warn!("{line}"));
     }
@@ -71,7 +71,7 @@ impl Kind {
         Some(line)
     }
 
-    /// What has not been said of it.
+    /// The line for the warnings of this kind that have not been logged yet.
     fn rest(&mut self) -> Option<String> {
         let more = std::mem::take(&mut self.more);
         (more > 0).then(|| format!("{} ({more} times since this was said last)", self.first))

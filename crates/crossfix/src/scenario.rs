@@ -14,36 +14,36 @@ pub struct ExposureRow {
     pub t: f64,
     pub cam: u32,
     pub scan: u64,
-    /// How many bearings it has; not needed to read it.
+    /// Number of its bearings; not needed for reading.
     #[serde(default)]
     pub n: usize,
 }
 
-/// A bearing.
+/// A bearing of one exposure.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct DetectionRow {
-    /// Capture time, s; that of its exposure counts.
+    /// Capture time, s; the exposure's own time takes precedence.
     #[serde(default)]
     pub t: f64,
     pub cam: u32,
     pub scan: u64,
-    /// Its number in the exposure.
+    /// The bearing's number within the exposure.
     pub det: u64,
     /// Unit vector in the format's camera axes.
     pub ux: f64,
     pub uy: f64,
     pub uz: f64,
-    /// Standard deviation along each tangent.
+    /// Standard deviation along each tangent, rad.
     pub sigma_rad: f64,
-    /// The target; -1 is clutter. Whoever fuses must not look at it.
+    /// The target's number; -1 is clutter. A fusion must not use it.
     #[serde(default)]
     pub truth_id: i64,
 }
 
-/// Where a target is (m) and how fast (m/s).
+/// Position (m) and velocity (m/s) of a target.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct TruthRow {
-    /// s
+    /// Time, s.
     pub t: f64,
     pub id: u64,
     pub x: f64,
@@ -54,8 +54,8 @@ pub struct TruthRow {
     pub vz: f64,
 }
 
-/// From the format's camera axes, x left, y up, z forward, to ours, x right, y down, z forward; and
-/// back.
+/// Converts between the format's camera axes (x left, y up, z forward) and ours (x right, y down, z
+/// forward); its own inverse.
 pub fn turned(v: Vector3<f64>) -> Vector3<f64> {
     Vector3::new(-v.x, -v.y, v.z)
 }

@@ -1,10 +1,11 @@
-//! A camera that looks for what the fusion centre tells it to look for: where it should point, and
-//! which of the tracks in its image is the target.
+//! A camera that looks for the targets that the fusion centre's cues name: where it should point,
+//! and which of the tracks in its image is the target.
 //!
 //! The wide cameras hand a target over, the narrow one turns there, searches, and locks (Klochko's
-//! first paper, chapter 2). A track is the target if it is where the cue has it, by both covariances
-//! together (equation 4.8 there). The head stares and does not chase: what stands still against the
-//! sky is the sky, and a detector that sees the sky go by finds nothing.
+//! first paper, chapter 2). A track is the target if it lies where the cue predicts, in the sum of
+//! both covariances (equation 4.8 there). The head stares and does not chase: the detector takes
+//! what is still in the image for background, and while the background moves through the image it
+//! finds nothing.
 
 mod place;
 
@@ -18,87 +19,89 @@ use nalgebra::{Matrix2, Rotation3, Unit, Vector3};
 
 use self::place::{Place, long_axis, place_at, squared_distance};
 
-/// Cues hold for so long after the last one came, s of data time: as far as they look ahead.
+/// Validity of a cue after it came, s of data time: as far as cues look ahead.
 const VALID_S: f64 = 2.0;
-/// A track may be the target if it lies within this of where the cue has it, squared in the
-/// deviations of both: P = 0.999 of two degrees of freedom.
+/// Gate on the squared Mahalanobis distance of a track from the cue's prediction, with the sum of
+/// both covariances: P = 0.999 with two degrees of freedom.
 const GATE: f64 = 13.8;
-/// It is the target if it has been the likeliest for so many images: one is chance, as a bird passes
-/// through.
+/// A track is the target once it has been the likeliest for this many images: one could be chance,
+/// as a bird passes through.
 const IMAGES: u32 = 3;
-/// Another must be so much less likely, squared in the deviations: twenty times.
+/// The second-best track's squared distance must be larger by this much: its likelihood is then
+/// twenty times smaller.
 const RUNNER_UP: f64 = 6.0;
-/// The target may leave the middle by so much of the way to the image's border before the head
-/// turns again. With more of it a target that turns has left the image before the head has; with
-/// less it turns all the time.
+/// How far the target may be from the image centre, as a fraction of the half view, before the head
+/// turns again. With more of it a target that changes course leaves the image before the head has
+/// turned; with less the head turns all the time.
 const OFF_MIDDLE: f64 = 0.6;
-/// A turn by less than this of half the view shows nothing new.
+/// A turn by less than this fraction of half the view shows nothing new.
 const LEAST_TURN: f64 = 0.1;
-/// The head aims so far ahead at most, s: targets turn.
+/// The head aims at most this far ahead, s: targets change course.
 const LONGEST_LEAD_S: f64 = 1.5;
-/// How long a head stares where a target may be, s, before it looks at the next place of a stripe, from
-/// when it stands there: a detector takes half a second to find what moves.
+/// How long a head stares at each view of a search, s, counted from when it stands there: a
+/// detector takes half a second to find what moves.
 const STARE_S: f64 = 1.5;
-/// Views of a stripe lie so close together, as a share of the view.
+/// Spacing of the views of a search along the cue's error ellipse, as a fraction of the view.
 const STEP: f64 = 0.8;
-/// A stripe is looked along to so many deviations on both sides: 19 of 20 targets are there.
+/// The search reaches this many SDs to both sides along the ellipse's long axis: 19 of 20 targets
+/// are there.
 const SEARCHED_SDS: f64 = 2.0;
-/// A stripe of more views than this has its nearest ones looked at.
+/// Of a search that would need more views than this, only the nearest are looked at.
 const MOST_VIEWS: i32 = 40;
-/// What has not been seen for so long is seen no more, s: a detector misses one now and then.
+/// A track not seen for this long is no longer a candidate, s: a detector misses one now and then.
 const MISSED_S: f64 = 0.5;
-/// What was found so lately is still what it looks for, s, though a surer target is told of: a turn and
-/// a stare.
+/// A target found within this time is kept even if there is a cue of a surer target, s: time for a
+/// turn and a stare.
 const FOUND_S: f64 = 4.0;
-/// More cues, or more times of one, than a fusion centre tells are of none.
+/// Most cues, and most times per cue, that are accepted: a fusion centre sends no more.
 const MOST_CUES: usize = 64;
 const MOST_TIMES: usize = 16;
 
-/// Where a camera pointed in an image.
+/// Where a camera pointed when an image was taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pointed {
-    /// Where it always does: nothing turns it.
+    /// Always the same way: it has no mount.
     Fixed,
-    /// Nobody knows: its mount says nothing.
+    /// Unknown: its mount reports nothing.
     Unknown,
-    /// Where its mount says, which turns it.
+    /// Where its mount reports, while turning.
     Turning(ScanAngles),
-    /// Where its mount says, which stood still.
+    /// Where its mount reports, having stood still.
     Settled(ScanAngles),
 }
 
-/// What turns a camera, as an agent sees it.
+/// A camera's mount, as an agent uses it.
 pub trait Mount: Send {
-    /// Tells it to turn to where it says that these angles are.
+    /// Tells the mount to turn to these angles, in the mount's own readings.
     fn aim(&mut self, angles: ScanAngles);
 
-    /// Where it pointed in the newest image.
+    /// Where the camera pointed in the newest image.
     fn pointed(&mut self) -> Pointed;
 
-    /// Whether it turns where it is told at present.
+    /// Whether the mount currently obeys orders to turn.
     fn obeys(&self) -> bool {
         true
     }
 }
 
-/// What a camera should do, by what it has seen.
+/// Orders to a camera, given what it has seen.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Orders {
-    /// Where its mount should point from now on.
+    /// Where the mount should point from now on.
     pub aim: Option<ScanAngles>,
-    /// Which of its tracks is what it was told to look for.
+    /// The camera's track that is the target it was told to look for.
     pub taken_over: Option<TakenOver>,
 }
 
-/// The view along a stripe that is looked at.
+/// Progress of a search: the view along the error ellipse that is looked at.
 #[derive(Clone, Copy, Debug)]
 struct Search {
     view: i32,
-    /// Since when the head has stood there; `None` on its way.
+    /// Since when the head has stood there; `None` while it turns there.
     since: Option<Timestamp>,
 }
 
-/// A track that may be the target.
+/// A track that may be the target, and the number of images for which it has been.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Candidate {
     image_track: u64,
@@ -106,30 +109,30 @@ struct Candidate {
     seen: Timestamp,
 }
 
-/// Looks for what it is told to look for.
+/// Chooses a cue, points the camera at its target, and recognises the target's track.
 #[derive(Debug)]
 pub struct Seeker {
     mount: Option<PanTilt>,
-    /// What each angle that the mount says is off by, rad.
+    /// Standard deviation of each angle that the mount reports, rad.
     angle_sd_rad: f64,
-    /// Half of the shorter side of the view, and of its diagonal, rad.
+    /// Half of the view's shorter side, and half of its diagonal, rad.
     half_view: f64,
     half_diagonal: f64,
     cues: CueFrame,
-    /// What it is on, and where that was last, in the frame at rest.
+    /// The target looked for, and its last expected direction, in the frame at rest.
     of: Option<Cued>,
     last: Option<Unit<Vector3<f64>>>,
     candidate: Option<Candidate>,
-    /// When it was found last, in this view or in one before.
+    /// When the target was last recognised, in this view or an earlier one.
     found: Option<Timestamp>,
     search: Option<Search>,
     holds: bool,
-    /// Where its mount was told to point last.
+    /// Where the mount was last told to point.
     ordered: Option<ScanAngles>,
 }
 
 impl Seeker {
-    /// For a camera that a mount turns, or that stands still.
+    /// A seeker for a camera on a mount, or for one that stands still.
     pub fn new(model: &CameraModel, mount: Option<PanTilt>, angle_sd_rad: f64) -> Self {
         let lens = model.intrinsics();
         let half_view = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
@@ -153,7 +156,7 @@ impl Seeker {
         }
     }
 
-    /// Takes in what the fusion centre says; what it never would is no cue.
+    /// Takes in the fusion centre's cues; those beyond the limits are dropped or cut.
     pub fn hear(&mut self, cues: CueFrame) {
         self.cues = cues;
         self.cues.cues.truncate(MOST_CUES);
@@ -164,13 +167,14 @@ impl Seeker {
         });
     }
 
-    /// Its mount does not turn at present: it sees on where it is.
+    /// Sets whether the mount cannot turn at present; the camera then goes on observing where it
+    /// points.
     pub fn hold(&mut self, holds: bool) {
         self.holds = holds;
     }
 
-    /// What to do, by the tracks of an image that was taken at a time by the camera's clock, and where
-    /// it pointed then.
+    /// Orders for the camera, given the tracks of an image, its time by the camera's clock, and
+    /// where it pointed then.
     pub fn look(&mut self, time: Timestamp, pointed: Pointed, tracks: &[BearingTrack]) -> Orders {
         let Some((cue, now)) = self.choose(time) else { return Orders::default() };
         self.last = Some(now.direction);
@@ -188,7 +192,7 @@ impl Seeker {
         let mount = self.mount.filter(|_| !self.holds);
         let aim = mount.and_then(|mount| self.aim(&mount, pointed, &cue, &now, time));
         if aim.is_some() {
-            // Of another view nothing is known.
+            // Nothing is known about tracks in another view.
             (self.candidate, self.ordered) = (None, aim);
         }
         let taken_over =
@@ -196,8 +200,9 @@ impl Seeker {
         Orders { aim, taken_over }
     }
 
-    /// The cue of what it is on, and where that is; if there is none any more, or it is a poor one that
-    /// nothing was found of, of what is best looked for.
+    /// The cue to follow, and the predicted place of its target: that of the present target; if
+    /// that is gone, or its cue is of no track and has led to nothing while surer ones exist, the
+    /// best other cue.
     fn choose(&mut self, time: Timestamp) -> Option<(Cue, Place)> {
         let is_sure = |cue: &Cue| cue.of.as_ref().is_some_and(|of| of.track_id != 0);
         let is_found = self.found.is_some_and(|found| is_lately(found, time, FOUND_S));
@@ -211,7 +216,8 @@ impl Seeker {
         let sure = || reached.iter().filter(|(cue, _)| is_sure(cue));
         let same = reached.iter().find(|(cue, _)| cue.of == self.of);
         let same = same.filter(|(cue, _)| is_sure(cue) || is_found || sure().next().is_none());
-        // What one camera saw becomes a track, and what it is on has another name: it is where it was.
+        // When a single camera's target becomes a track its cue changes its name: the track nearest
+        // to the last direction is taken for it.
         let away = |place: &Place| self.last.map_or(TAU, |last| last.angle(&place.direction));
         let beside = sure().min_by(|a, b| away(&a.1).total_cmp(&away(&b.1)));
         let beside = beside.filter(|(_, place)| away(place) < self.half_view);
@@ -224,7 +230,7 @@ impl Seeker {
         Some((cue, place))
     }
 
-    /// Whether a place can be brought into view.
+    /// Whether a predicted place, within its uncertainty, can be brought into view.
     fn reaches(&self, place: &Place) -> bool {
         let (_, long_sd) = long_axis(place);
         let (nearest, view) = match &self.mount {
@@ -234,7 +240,7 @@ impl Seeker {
         nearest.angle(&place.direction) < view + SEARCHED_SDS * long_sd
     }
 
-    /// The track that is where the cue has the target, if it has been for some images.
+    /// The track that has matched the cue's prediction for long enough, if any.
     fn recognise(
         &mut self,
         now: &Place,
@@ -254,7 +260,7 @@ impl Seeker {
             .filter(|(squared, _)| *squared <= GATE)
             .collect();
         near.sort_by(|one, other| one.0.total_cmp(&other.0));
-        // What it has recognised before stays the target while it is there.
+        // A track that has been recognised before stays the target while it is in the gate.
         let known = self.candidate.filter(|candidate| {
             candidate.images >= IMAGES && near.iter().any(|(_, id)| *id == candidate.image_track)
         });
@@ -264,7 +270,7 @@ impl Seeker {
             _ => None,
         };
         let Some(image_track) = known.map_or(clear, |candidate| Some(candidate.image_track)) else {
-            // A detector misses one now and then.
+            // A detector misses a target now and then, so the candidate is kept for a while.
             self.candidate = self.candidate.filter(|before| is_lately(before.seen, time, MISSED_S));
             return None;
         };
@@ -274,7 +280,7 @@ impl Seeker {
         (images >= IMAGES).then_some(image_track)
     }
 
-    /// Where to point from now on, if that is elsewhere than where it does or soon will.
+    /// Where to point from now on, if that differs from where it points or is about to.
     fn aim(
         &mut self,
         mount: &PanTilt,
@@ -285,13 +291,13 @@ impl Seeker {
     ) -> Option<ScanAngles> {
         let (angles, is_settled) = match pointed {
             Pointed::Settled(angles) => (angles, true),
-            // While it turns, what counts is where it will stand.
+            // While it turns, what counts is where it will stop.
             Pointed::Turning(angles) => (self.ordered.unwrap_or(angles), false),
             Pointed::Fixed | Pointed::Unknown => return None,
         };
         let (long_axis, long_sd) = long_axis(now);
         if long_sd * SEARCHED_SDS > self.half_view {
-            // A view along a stripe is looked at once the head is there.
+            // A view of the search begins once the head stands there.
             let stripe = Some((long_axis, long_sd)).filter(|_| is_settled);
             return stripe.and_then(|stripe| self.search(mount, angles, now, stripe, time));
         }
@@ -302,14 +308,15 @@ impl Seeker {
         if now.direction.angle(&axis(mount, angles)) < may_be_off {
             return None;
         }
-        // It comes in on one side and leaves on the other.
+        // Aim ahead of the target by the time it takes to cross the permitted part of half the
+        // view, so that it enters on one side and leaves on the other.
         let lead_s = (OFF_MIDDLE * self.half_view / rate.max(1e-6)).min(LONGEST_LEAD_S);
         let there = place_at(cue, time.plus_seconds(lead_s))?;
         self.worth_turning(mount, angles, mount.aim(&there.direction))
     }
 
-    /// An aim, if it shows something else; where a target is as near as the mount brings it already, none
-    /// does.
+    /// An aim, if it changes the view enough. If the target is out of the mount's range and the
+    /// head is already as near as it gets, there is none.
     fn worth_turning(
         &self,
         mount: &PanTilt,
@@ -320,7 +327,8 @@ impl Seeker {
         (turn > LEAST_TURN * self.half_view).then_some(aim)
     }
 
-    /// The next view along a stripe, from the middle to both ends and again.
+    /// The next view of a search along the ellipse's long axis, from the middle outwards to both
+    /// ends, and then again.
     fn search(
         &mut self,
         mount: &PanTilt,
@@ -329,7 +337,7 @@ impl Seeker {
         (axis, long_sd): (Vector3<f64>, f64),
         time: Timestamp,
     ) -> Option<ScanAngles> {
-        // What is recognised is stared at: two cameras together will soon know where it is.
+        // A recognised target is stared at: with a second camera its position will soon be known.
         if self.candidate.is_some() || self.found.is_some_and(|f| is_lately(f, time, STARE_S)) {
             return None;
         }
@@ -346,31 +354,32 @@ impl Seeker {
             }
         };
         self.search = Some(Search { view, since: None });
-        // 0, 1, -1, 2, -2, ...
+        // Offsets in views: 0, 1, -1, 2, -2, ...
         let side = if view % 2 == 1 { 1.0 } else { -1.0 };
         let offset = side * f64::from((view + 1) / 2) * step;
+        // Turning about direction x axis moves the view along the long axis.
         let turn = Rotation3::new(now.direction.cross(&axis) * offset);
         self.worth_turning(mount, angles, mount.aim(&(turn * now.direction)))
     }
 }
 
-/// Where the camera looks along with its mount at angles, in its frame at rest.
+/// Optical axis with the mount at these angles, in the camera's frame at rest.
 fn axis(mount: &PanTilt, angles: ScanAngles) -> Vector3<f64> {
     turn_of(mount, angles) * Vector3::z()
 }
 
-/// Whether a time lies no more than so many seconds back.
+/// Whether `then` lies at most `seconds` before `now`.
 fn is_lately(then: Timestamp, now: Timestamp, seconds: f64) -> bool {
     (0.0..=seconds).contains(&now.seconds_since(then))
 }
 
-/// Whether a cue is of about now.
+/// Whether a cue's first time lies within [`VALID_S`] of a time.
 fn is_valid(cue: &Cue, time: Timestamp) -> bool {
     let said = cue.ahead.first().map(|first| Timestamp::from_nanos(first.time_ns));
     said.is_some_and(|said| time.seconds_since(said).abs() <= VALID_S)
 }
 
-/// From the camera's frame as it is turned to that at rest.
+/// Rotation from the camera's frame as turned to its frame at rest.
 fn turn_of(mount: &PanTilt, angles: ScanAngles) -> Rotation3<f64> {
     mount.rest().rotation().inverse() * mount.pose(angles).rotation()
 }

@@ -1,19 +1,20 @@
-//! What systemd is told, where it started the program (`Type=notify`, `WatchdogSec`); elsewhere
+//! Notifications to systemd, if it started the program (`Type=notify`, `WatchdogSec`); elsewhere
 //! nobody listens, and that is no error.
 
 use sd_notify::NotifyState;
 
-/// The program is up and does what it is for, or waits for those whom it needs.
+/// The program is up and does its work, or waits for the components it needs.
 pub fn ready(status: &str) {
     tell(&[NotifyState::Ready, NotifyState::Status(status)]);
 }
 
-/// Its main loop goes round. Said every second; one that hangs does not say it, and is started again.
+/// Reports that the main loop runs. To be sent every second; systemd restarts a program that hangs
+/// and does not send it.
 pub fn alive() {
     tell(&[NotifyState::Watchdog]);
 }
 
-/// It reads its configuration again; [`ready`] says that it has.
+/// Reports that the configuration is being read again; [`ready`] reports that it has been.
 pub fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => tell(&[NotifyState::Reloading, now]),
@@ -21,7 +22,7 @@ pub fn reloading() {
     }
 }
 
-/// It has been asked to stop, and does.
+/// Reports that the program is stopping.
 pub fn stopping() {
     tell(&[NotifyState::Stopping]);
 }

@@ -1,5 +1,5 @@
-//! Stopping: Ctrl-C, SIGTERM, or, for children of `demo`, the end of stdin. And SIGHUP, on which those who
-//! serve read their configuration again.
+//! Stopping: Ctrl-C, SIGTERM, or, for children of `demo`, the end of stdin. Also SIGHUP, on which
+//! long-running commands read their configuration again.
 
 use std::io::{IsTerminal, Read};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,41 +11,41 @@ use anyhow::{Context, bail};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
-/// How long a command may take to end after it has been asked to: people wait for it. What it does
-/// then of its own accord takes [`LAST_WORDS`] and half a second to take its leave of the network.
+/// How long a command may take to end after it was asked to stop: people wait for it. By itself it
+/// takes [`LAST_WORDS`] plus half a second to leave the network.
 const GRACE: Duration = Duration::from_millis(1800);
-/// How long a command that was asked to stop still takes in what is on its way to it.
+/// How long after the request to stop a command still accepts messages that are on their way.
 pub const LAST_WORDS: Duration = Duration::from_millis(700);
-/// How long after it was asked to stop it still handles what has come; the rest is counted.
+/// How long after the request to stop it still handles accepted messages; the rest is counted.
 pub const LAST_WORK: Duration = Duration::from_millis(1100);
-/// How long it takes its leave of peers that do not listen.
+/// How long it tries to take leave of peers that do not answer.
 pub const LEAVE: Duration = Duration::from_millis(500);
-/// The same of a command that has come to its end by itself: nothing is to be lost.
+/// As [`LEAVE`], for a command that has come to its end by itself: nothing may be lost.
 pub const LONG_LEAVE: Duration = Duration::from_secs(10);
-/// How often is looked whether the time is up.
+/// How often it is checked whether the time is up.
 const POLL: Duration = Duration::from_millis(20);
 /// The commands run on a thread of their own, with the stack of a main thread.
 const STACK_BYTES: usize = 8 << 20;
 
-/// The system has one handler a process; it holds what the program was asked for.
+/// The signal state: the system has one handler per process.
 static ASKED: OnceLock<Arc<Asked>> = OnceLock::new();
 
-/// What a program was asked for.
+/// Requests that the program has received.
 #[derive(Debug, Default)]
 struct Asked {
-    /// To stop, and when.
+    /// Request to stop, and when it came.
     stop: OnceLock<Instant>,
-    /// To read its configuration again, and whether it can.
+    /// Request to read the configuration again, and whether the command can do that.
     reload: AtomicBool,
     can_reload: AtomicBool,
 }
 
-/// Whether the program has been asked to stop, or to read its configuration again.
+/// Tells whether the program has been asked to stop, or to read its configuration again.
 #[derive(Clone, Debug)]
 pub struct Shutdown(Arc<Asked>);
 
 impl Shutdown {
-    /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second one ends the program at once.
+    /// Listens for Ctrl-C, SIGTERM and SIGHUP; a second signal ends the program at once.
     pub fn listen() -> Self {
         let asked = ASKED.get_or_init(|| {
             let asked = Arc::new(Asked::default());
@@ -63,19 +63,19 @@ impl Shutdown {
         Self(Arc::clone(asked))
     }
 
-    /// Takes SIGHUP, but on a terminal, where it says that the terminal is gone, for the wish that the
-    /// configuration is read again.
+    /// Makes SIGHUP mean that the configuration is to be read again. Not on a terminal, where it
+    /// means that the terminal is gone.
     pub fn with_reload(self) -> Self {
         self.0.can_reload.store(!std::io::stdin().is_terminal(), Ordering::SeqCst);
         self
     }
 
-    /// Whether the configuration is to be read again; once for each time that it was asked for.
+    /// Whether the configuration is to be read again; true once per request.
     pub fn take_reload(&self) -> bool {
         self.0.reload.swap(false, Ordering::SeqCst)
     }
 
-    /// Stops as well when stdin ends: when the parent closes it, or dies.
+    /// Also stops when stdin ends, that is, when the parent closes it or dies.
     pub fn with_stdin(self, wanted: bool) -> Self {
         if wanted {
             let asked = Arc::clone(&self.0);
@@ -93,13 +93,14 @@ impl Shutdown {
         self.0.stop.get().is_some()
     }
 
-    /// Whether to stop without looking at what still comes: it was asked for longer ago than this.
+    /// Whether the request to stop came longer ago than `patience`, so that pending messages are to
+    /// be dropped.
     pub fn overdue(&self, patience: Duration) -> bool {
         self.0.stop.get().is_some_and(|asked| asked.elapsed() > patience)
     }
 }
 
-/// Notes what signals ask for.
+/// Records what signals ask for.
 fn heed(mut signals: Signals, asked: &Asked) {
     let mut is_second = false;
     for signal in &mut signals {
@@ -114,8 +115,8 @@ fn heed(mut signals: Signals, asked: &Asked) {
     }
 }
 
-/// Runs a command, and leaves it behind if it does not end in time after it has been asked to: a
-/// disk that hangs, or a step that computes for long, must not make it immortal.
+/// Runs a command, and abandons it if it does not end in time after a request to stop, so that a
+/// hanging disk or a long computation cannot keep the process alive.
 pub fn supervise(
     command: impl FnOnce() -> anyhow::Result<()> + Send + 'static,
 ) -> anyhow::Result<()> {

@@ -6,15 +6,16 @@ use nalgebra::{Matrix6, Vector6};
 
 use crate::Estimate;
 
-/// A camera has a part in a track if it has given it a bearing within this before the answer, s.
+/// A camera takes part in a track if it has given it a bearing within this time before the answer,
+/// s.
 const LATELY_S: f64 = 1.0;
 
-/// What a run's `TrackFrame`s said when: the causal answer to "where was each track at time t".
+/// Record of a run's `TrackFrame`s: the causal answer to "where was each track at time t".
 ///
-/// A frame holds the tracks that an exposure has changed; the others go on as they were said last.
+/// A frame has the tracks that an exposure has changed; the others continue as last stated.
 #[derive(Clone, Debug, Default)]
 pub struct TrackHistory {
-    /// What was said of each track.
+    /// Statements on each track, by time.
     tracks: BTreeMap<u64, BTreeMap<Timestamp, Said>>,
     times: BTreeSet<Timestamp>,
 }
@@ -28,7 +29,7 @@ struct Said {
     time_sd_s: f64,
 }
 
-/// A track's state, if the message holds one that makes sense.
+/// A track's state, if the message has one that is finite.
 fn state(track: &Track) -> Option<KinematicState> {
     let (p, v) = (track.position?, track.velocity?);
     let mean = Vector6::new(p.x, p.y, p.z, v.x, v.y, v.z);
@@ -38,7 +39,7 @@ fn state(track: &Track) -> Option<KinematicState> {
 }
 
 impl TrackHistory {
-    /// Takes a frame in, in any order.
+    /// Adds a frame, in any order.
     pub fn add(&mut self, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
         self.times.insert(time);
@@ -51,8 +52,9 @@ impl TrackHistory {
         }
     }
 
-    /// The confirmed tracks at `time`, ordered by id: as last said at or before it, extrapolated
-    /// with their velocities. Their covariances grow with the velocity's alone.
+    /// The confirmed tracks at `time`, ordered by id: as last stated at or before it, extrapolated
+    /// with their velocities. Their covariances grow only by the velocity's covariance, without
+    /// process noise.
     pub fn at(&self, time: Timestamp) -> Vec<Estimate> {
         let mut estimates = self.all_at(time);
         estimates
@@ -60,8 +62,8 @@ impl TrackHistory {
         estimates
     }
 
-    /// The same with the tracks that are not sure, and those that one camera alone follows: a
-    /// direction whose range is a guess.
+    /// The same with tentative tracks, and those that a single camera follows: a direction whose
+    /// range is a guess.
     pub fn all_at(&self, time: Timestamp) -> Vec<Estimate> {
         let said = self.tracks.iter().filter_map(|(&id, said)| {
             let (&then, said) = said.range(..=time).next_back()?;
@@ -73,7 +75,7 @@ impl TrackHistory {
         said.filter(|said| said.status != TrackState::Lost).collect()
     }
 
-    /// Every frame's time, in order.
+    /// The times of all frames, in order.
     pub fn times(&self) -> impl Iterator<Item = Timestamp> + '_ {
         self.times.iter().copied()
     }

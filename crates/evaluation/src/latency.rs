@@ -3,7 +3,8 @@ use std::collections::BTreeMap;
 use crossfix_message::Timestamp;
 use serde::Serialize;
 
-/// Latency from a bearing to the tracks that followed from it, as the recorder saw both arrive.
+/// Latency from a bearing to the tracks that followed from it, by the times at which the recorder
+/// received both.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Latency {
     /// Median, milliseconds.
@@ -15,24 +16,25 @@ pub struct Latency {
 /// Pairs bearing frames with the track frames that name them.
 #[derive(Clone, Debug, Default)]
 pub struct LatencyRecorder {
-    /// A camera that was started again counts its frames anew: then there are several of a number.
+    /// Arrivals by camera and frame number; several for one number if the camera was restarted and
+    /// counts from the start again.
     bearings: BTreeMap<(String, u64), Vec<Timestamp>>,
     tracks: Vec<((String, u64), Timestamp)>,
 }
 
 impl LatencyRecorder {
-    /// A bearing frame arrived.
+    /// Adds the arrival of a bearing frame.
     pub fn bearing(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
         self.bearings.entry((camera.to_owned(), sequence)).or_default().push(arrival);
     }
 
-    /// A track frame arrived that followed from a camera's frame. The order in which both arrive
-    /// does not matter.
+    /// Adds the arrival of a track frame that followed from a camera's frame. The order in which
+    /// both arrive does not matter.
     pub fn tracks(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
         self.tracks.push(((camera.to_owned(), sequence), arrival));
     }
 
-    /// The latency, if any pair has been seen.
+    /// The latency, if there is any pair.
     pub fn latency(&self) -> Option<Latency> {
         let pairs = self.tracks.iter().filter_map(|(key, arrival)| {
             Some(arrival.seconds_since(self.cause(key, *arrival)?) * 1e3)
@@ -43,8 +45,8 @@ impl LatencyRecorder {
         let quantile = |q: f64| milliseconds[(q * last as f64).round() as usize];
         Some(Latency { p50_ms: quantile(0.5), p99_ms: quantile(0.99) })
     }
-    /// When the frame arrived from which tracks followed that arrived at a time: the last one
-    /// before it, or where they overtook it, the first.
+    /// Arrival of the frame that caused tracks which arrived at a time: the last arrival before
+    /// that time, or the first where the tracks overtook the frame.
     fn cause(&self, key: &(String, u64), tracks: Timestamp) -> Option<Timestamp> {
         let arrivals = self.bearings.get(key)?;
         arrivals

@@ -1,6 +1,6 @@
-//! Tracks held against truth: root mean squared errors, NEES, OSPA and GOSPA,
-//! completeness, false tracks, changes of identity, latency. And before anything
-//! flies: how well a site's cameras can do at best ([`bound`]).
+//! Comparison of tracks with the truth: root mean squared errors, NEES, OSPA and GOSPA,
+//! completeness, false tracks, changes of identity, latency. And, before anything flies: how well a
+//! site's cameras can do at best ([`bound`]).
 //!
 //! ```
 //! use crossfix_evaluation::{Estimate, Evaluator, TrueTarget};

@@ -8,12 +8,11 @@ use serde::Serialize;
 
 use crate::stretches::{Delays, Stretches, quantile};
 
-/// Costs are quantised for the assignment: a millionth of the cut-off.
+/// Costs are quantised to integers for the assignment, in millionths of the squared cut-off.
 const COST_SCALE: f64 = 1e6;
-/// An answer farther than this from every target is far off for most uses, m.
+/// Beyond this distance from every target an answer is too far off for most uses, m.
 const FAR_OFF_M: f64 = 1.0;
-/// An answer farther off than this many of its own deviations has said that it was surer than it
-/// was.
+/// An answer farther off than this many of its own standard deviations was overconfident.
 const SIGMAS: f64 = 4.0;
 
 /// Where a target really is.
@@ -23,22 +22,22 @@ pub struct TrueTarget {
     pub id: u64,
     /// Metres, world.
     pub position: Point3<f64>,
-    /// Metres a second, world.
+    /// Metres per second, world.
     pub velocity: Vector3<f64>,
 }
 
-/// Where a track says that a target is.
+/// A track's estimate of a target at an instant.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimate {
     /// The track's number.
     pub id: u64,
-    /// What the track said that it was.
+    /// The track's state as its message stated it.
     pub status: TrackState,
-    /// How many cameras had given it a bearing within the second before.
+    /// Number of cameras that had given it a bearing within the second before.
     pub cameras: usize,
-    /// Its state.
+    /// Its position and velocity with their covariance.
     pub state: KinematicState,
-    /// Standard deviation of the time at which it was there, s: 0 if the track does not say.
+    /// Standard deviation of the time that the estimate is of, s: 0 if the track does not state it.
     pub time_sd_s: f64,
 }
 
@@ -49,14 +48,15 @@ impl Estimate {
     }
 }
 
-/// How large errors are against what the tracks said of them: errors squared by the stated
-/// covariance. The mean of honest ones is the number of their degrees of freedom; one instant of
-/// great confidence and great error spoils it, which the median does not show.
+/// Normalised estimation error squared: squared errors relative to the covariance that the tracks
+/// stated. For consistent tracks the mean is the number of degrees of freedom; a single instant
+/// with great confidence and a great error spoils the mean, which the median does not show.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Nees {
     /// Mean over the instants.
     pub mean: Option<f64>,
-    /// Median over the instants: honest is 5.35 of six degrees of freedom, 2.37 of three.
+    /// Median over the instants: for consistent tracks 5.35 with six degrees of freedom, 2.37 with
+    /// three.
     pub median: Option<f64>,
 }
 
@@ -69,7 +69,7 @@ impl Nees {
     }
 }
 
-/// One target's figures.
+/// Figures of one target.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TargetReport {
     /// The target.
@@ -82,17 +82,17 @@ pub struct TargetReport {
     pub position_rmse_m: Option<f64>,
     /// Root mean squared velocity error, m/s.
     pub velocity_rmse_mps: Option<f64>,
-    /// Normalised estimation error squared of position and velocity; 6 is honest.
+    /// NEES of position and velocity; 6 if the tracks are consistent.
     pub nees: Nees,
-    /// Of the position alone; 3 is honest.
+    /// NEES of the position alone; 3 if consistent.
     pub position_nees: Nees,
-    /// Of the velocity alone; 3 is honest.
+    /// NEES of the velocity alone; 3 if consistent.
     pub velocity_nees: Nees,
-    /// How often another track took it over.
+    /// How often the track paired with it changed.
     pub id_switches: u64,
 }
 
-/// All figures of a run.
+/// Figures of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
     /// Instants compared.
@@ -103,20 +103,20 @@ pub struct Report {
     pub position_rmse_m: Option<f64>,
     /// Root mean squared velocity error of the pairs, m/s.
     pub velocity_rmse_mps: Option<f64>,
-    /// Normalised estimation error squared of position and velocity of the pairs; 6 is honest.
+    /// NEES of position and velocity of the pairs; 6 if the tracks are consistent.
     pub nees: Nees,
-    /// Of the position alone; 3 is honest.
+    /// NEES of the position alone; 3 if consistent.
     pub position_nees: Nees,
-    /// Of the velocity alone; 3 is honest.
+    /// NEES of the velocity alone; 3 if consistent.
     pub velocity_nees: Nees,
-    /// What the tracks said at all instants together: one answer a track and instant.
+    /// Number of answers: one per track and instant.
     pub answers: u64,
-    /// Answers that lay farther than the cut-off from every target.
+    /// Answers farther than the cut-off from every target.
     pub false_answers: u64,
     /// Share of the answers that lay more than 1 m from the nearest target, however far.
     pub share_off_by_1_m: Option<f64>,
-    /// Share of the answers that lay farther from the nearest target than four times what they said
-    /// themselves (the root of the sum of the position's variances).
+    /// Share of the answers that lay farther from the nearest target than four times their own
+    /// stated deviation (the root of the sum of the position's variances).
     pub share_beyond_4_sd: Option<f64>,
     /// How long the targets waited for an answer.
     pub delays: Delays,
@@ -124,9 +124,9 @@ pub struct Report {
     pub completeness: f64,
     /// Mean number of tracks without a target.
     pub false_tracks_per_instant: f64,
-    /// Tracks that were never any target's.
+    /// Number of tracks that were never paired with a target.
     pub false_tracks: u64,
-    /// How often a target was taken over by another track.
+    /// How often the track paired with a target changed.
     pub id_switches: u64,
     /// Mean OSPA distance (order 2), m.
     pub ospa_m: f64,
@@ -140,7 +140,7 @@ pub struct Report {
 struct Sums {
     position: f64,
     velocity: f64,
-    /// Of both, of the position and of the velocity, an entry a pair.
+    /// NEES of both together, of the position and of the velocity, one entry per pair.
     nees: [Vec<f64>; 3],
     pairs: u64,
 }
@@ -152,7 +152,7 @@ impl Sums {
         self.position += position.norm_squared();
         self.velocity += velocity.norm_squared();
         let error = Vector6::from_iterator(position.iter().chain(velocity.iter()).copied());
-        // A covariance that cannot be inverted is not honest at any error.
+        // A covariance that cannot be inverted is consistent with no error.
         let both =
             state.covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error)));
         let part = |from: usize, error: &Vector3<f64>| {
@@ -184,7 +184,8 @@ struct Target {
     switches: u64,
 }
 
-/// How far from the nearest target the answers lay, at instants with any target.
+/// Counts of answers by their distance from the nearest target; `judged` are those at instants with
+/// any target.
 #[derive(Clone, Copy, Debug, Default)]
 struct Answers {
     all: u64,
@@ -213,7 +214,7 @@ impl Answers {
     }
 }
 
-/// Holds tracks against truth, instant by instant.
+/// Compares tracks with the truth, instant by instant.
 #[derive(Clone, Debug)]
 pub struct Evaluator {
     cutoff: f64,
@@ -230,7 +231,8 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// Pairs farther apart than `cutoff_m` are no pairs; it is also OSPA's and GOSPA's c.
+    /// An evaluator in which tracks and targets `cutoff_m` or more apart are not paired; this is
+    /// also the c of OSPA and GOSPA.
     pub fn new(cutoff_m: f64) -> Self {
         Self {
             cutoff: cutoff_m,
@@ -247,7 +249,7 @@ impl Evaluator {
         }
     }
 
-    /// Compares one instant; instants come in order of time.
+    /// Adds one instant; instants come in order of time.
     pub fn add(&mut self, time: Timestamp, truth: &[TrueTarget], estimates: &[Estimate]) {
         self.instants += 1;
         estimates.iter().for_each(|estimate| self.answers.add(truth, estimate, self.cutoff));
@@ -274,16 +276,18 @@ impl Evaluator {
         let (missed, false_ones) = (truth.len() - paired, estimates.len() - paired);
         self.false_instants += false_ones as u64;
         let c2 = self.cutoff.powi(2);
+        // GOSPA with p = 2 and alpha = 2: each missed target and each false track adds c^2 / 2.
         self.gospa += (squares + c2 / 2.0 * (missed + false_ones) as f64).sqrt();
         let larger = truth.len().max(estimates.len());
         if larger > 0 {
-            // Unpaired targets cost the cut-off, be it that there is no track or none near enough.
+            // OSPA with p = 2: whatever is unpaired adds c^2, whether there is no track or none
+            // near enough.
             let unpaired = (larger - paired) as f64;
             self.ospa += ((squares + c2 * unpaired) / larger as f64).sqrt();
         }
     }
 
-    /// The estimate of each target, least total squared distance first.
+    /// The index of each target's estimate: the assignment of least total squared distance.
     fn pair(&self, truth: &[TrueTarget], estimates: &[Estimate]) -> Vec<Option<usize>> {
         if truth.is_empty() {
             return Vec::new();
@@ -291,6 +295,7 @@ impl Evaluator {
         let distance = |row: usize, column: usize| {
             (estimates[column].state.position() - truth[row].position).norm()
         };
+        // One extra column per target, at the cut-off's cost, leaves the target unpaired.
         let columns = estimates.len() + truth.len();
         let weights = Matrix::from_fn(truth.len(), columns, |(row, column)| {
             let relative =
@@ -304,7 +309,7 @@ impl Evaluator {
         column_of.into_iter().enumerate().map(near).collect()
     }
 
-    /// The figures of all instants so far.
+    /// Figures of all instants so far.
     pub fn report(&self) -> Report {
         let target_instants: u64 = self.targets.values().map(|target| target.instants).sum();
         let instants = self.instants.max(1) as f64;

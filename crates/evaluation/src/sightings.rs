@@ -2,11 +2,12 @@ use std::collections::BTreeMap;
 
 use crossfix_message::{BearingFrame, ImageTrackState, Timestamp};
 
-/// Frames this many times farther apart than a camera's usually are have others missing between.
+/// Two frames this many times farther apart than usual for their camera have missing frames between
+/// them.
 const GAP_INTERVALS: f64 = 1.7;
 
-/// Which cameras saw something when. A track is no better than what was seen: real data are held
-/// against truth where enough cameras saw the target.
+/// Records which cameras saw something when. A track cannot be better than what was seen: real data
+/// are compared with the truth at instants when enough cameras saw the target.
 #[derive(Clone, Debug, Default)]
 pub struct Sightings {
     /// Whether each frame of a camera has a measured bearing.
@@ -14,15 +15,15 @@ pub struct Sightings {
 }
 
 impl Sightings {
-    /// Takes a frame in, in any order.
+    /// Adds a frame, in any order.
     pub fn add(&mut self, frame: &BearingFrame) {
         let seen = frame.tracks.iter().any(|track| track.state() == ImageTrackState::Tracking);
         let time = Timestamp::from_nanos(frame.capture_time_ns);
         self.cameras.entry(frame.camera.clone()).or_default().insert(time, seen);
     }
 
-    /// How many cameras saw something, whatever it was, at each of some times: in the frame just
-    /// before and in that just after, with none missing between.
+    /// Number of cameras that saw something, whatever it was, at each of some times: in the frame
+    /// just before and in the one just after, with none missing between.
     pub fn cameras_at(&self, times: &[Timestamp]) -> Vec<usize> {
         let mut counts = vec![0; times.len()];
         for frames in self.cameras.values() {
@@ -44,7 +45,7 @@ impl Sightings {
     }
 }
 
-/// The median time between a camera's frames, s; `None` of a single frame.
+/// The median time between a camera's frames, s; `None` for a single frame.
 fn usual_interval_s(frames: &BTreeMap<Timestamp, bool>) -> Option<f64> {
     let mut intervals: Vec<f64> = frames
         .keys()

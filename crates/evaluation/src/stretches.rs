@@ -5,27 +5,27 @@ use std::collections::BTreeMap;
 use crossfix_message::Timestamp;
 use serde::Serialize;
 
-/// Instants of a target that lie farther apart than this belong to two stretches, s.
+/// Two instants of a target that are farther apart than this belong to different stretches, s.
 const GAP_S: f64 = 1.0;
-/// A stretch shorter than this is not held against anybody who gave no answer in it, s.
+/// A stretch that is shorter than this and without an answer does not count, s.
 const LEAST_S: f64 = 1.0;
 
-/// How long it took until a target was answered for, from the beginning of each stretch of instants
-/// that were asked for.
+/// Times until a target was answered for, from the beginning of each stretch of instants at which
+/// it was asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Delays {
-    /// From a target's first instant to its first answer, the longest of all targets, s; absent if
-    /// one was never answered for.
+    /// Time from a target's first instant to its first answer, the longest of all targets, s;
+    /// absent if one was never answered for.
     pub first_s: Option<f64>,
-    /// Stretches after a target's first one: it has gone out of what was asked for for more than a
-    /// second, and come back. Those of less than a second that got no answer do not count.
+    /// Number of stretches after a target's first one: it was not asked for during more than a
+    /// second, and then again. Stretches of up to a second without an answer do not count.
     pub returns: u64,
-    /// From a return to the next answer, the median, s; absent without a return, or if more than
+    /// Median time from a return to the next answer, s; absent without a return, or if more than
     /// half got no answer.
     pub next_median_s: Option<f64>,
-    /// The same, for nine returns of ten, s.
+    /// The same time, within which nine of ten returns are answered, s.
     pub next_p90_s: Option<f64>,
-    /// Stretches (of more than a second) without any answer.
+    /// Number of stretches (of more than a second) without any answer.
     pub unanswered: u64,
 }
 
@@ -36,12 +36,12 @@ struct Stretch {
     answered: Option<Timestamp>,
 }
 
-/// The stretches of every target.
+/// The stretches of all targets.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Stretches(BTreeMap<u64, Vec<Stretch>>);
 
 impl Stretches {
-    /// Notes an instant of a target, in order of time.
+    /// Adds an instant of a target, in order of time.
     pub(crate) fn add(&mut self, target: u64, time: Timestamp, answered: bool) {
         let stretches = self.0.entry(target).or_default();
         let goes_on = stretches.last().is_some_and(|last| time.seconds_since(last.to) <= GAP_S);
@@ -84,7 +84,7 @@ impl Stretches {
     }
 }
 
-/// A quantile of ascending values, the next one that there is; `None` if that is not finite.
+/// A quantile of ascending values, rounded up to the next value; `None` if that is not finite.
 pub(crate) fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     let place = (share * sorted.len() as f64).ceil() as usize;
     sorted.get(place.saturating_sub(1)).copied().filter(|value| value.is_finite())
@@ -101,12 +101,12 @@ mod tests {
         for (time, answered) in [(0.0, false), (0.5, false), (1.0, true), (1.5, true)] {
             stretches.add(7, at(time), answered);
         }
-        // Back after ten seconds, answered for at once; and once more, never.
+        // It returns after ten seconds, answered for at once; and once more, never answered for.
         stretches.add(7, at(11.5), true);
         for k in 0..4 {
             stretches.add(7, at(20.0 + 0.5 * f64::from(k)), false);
         }
-        // Too short to be missed.
+        // Too short to count as missed.
         stretches.add(7, at(30.0), false);
         let delays = stretches.delays();
         assert_eq!(delays.first_s, Some(1.0));

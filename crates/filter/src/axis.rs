@@ -9,24 +9,26 @@ pub struct AxisMeasurement {
     pub variance: f64,
 }
 
-/// The difference of a measurement from its prediction, with its variance.
+/// Innovation: a measurement less its prediction, with its variance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Innovation {
     /// Measured less predicted.
     pub value: f64,
-    /// H P H' + R.
+    /// Innovation variance `S = H P H' + R`.
     pub variance: f64,
 }
 
 impl Innovation {
-    /// The normalised innovation squared: chi-square with one degree of freedom if all is well.
+    /// The normalised innovation squared `v^2 / S`: chi-square with one degree of freedom if the
+    /// filter is consistent.
     pub fn normalised_squared(&self) -> f64 {
         self.value * self.value / self.variance
     }
 }
 
-/// Position and velocity on one axis: the second-order Kalman filter into which the fourth-order
-/// one of Herasymenko 2021, eqs. 2-12 falls apart when the axes' errors are taken as independent.
+/// Kalman filter of position and velocity on one axis: the fourth-order filter of Herasymenko 2021,
+/// eqs. 2-12, splits into two of these when the errors of the image's axes are taken as
+/// independent.
 ///
 /// The motion is constant velocity driven by white acceleration of standard deviation `sigma_a`
 /// that is constant between two updates: `G = [T^2/2, T]'`, `Q = sigma_a^2` (erratum: the papers
@@ -45,7 +47,7 @@ impl Innovation {
 pub struct AxisFilter {
     position: f64,
     velocity: f64,
-    /// The covariance, P11, P12 and P22.
+    /// The covariance: P11 here, then P12 and P22.
     position_variance: f64,
     cross: f64,
     velocity_variance: f64,
@@ -55,7 +57,7 @@ pub struct AxisFilter {
 
 impl AxisFilter {
     /// Starts from two measurements `interval` seconds apart (Herasymenko 2021, eqs. 13-14;
-    /// erratum: the velocity's variance has `sigma_a^2 T^2 / 4`).
+    /// erratum: the velocity's variance contains `sigma_a^2 T^2 / 4`).
     pub fn start(
         first: AxisMeasurement,
         second: AxisMeasurement,
@@ -97,7 +99,7 @@ impl AxisFilter {
         self.velocity_variance += noise;
     }
 
-    /// What a measurement would be off by.
+    /// The innovation that a measurement would have; the filter stays as it is.
     #[inline]
     pub fn innovation(&self, measurement: AxisMeasurement) -> Innovation {
         Innovation {
@@ -106,37 +108,42 @@ impl AxisFilter {
         }
     }
 
-    /// Takes a measurement in (Herasymenko 2021, eqs. 9, 11 and 12) and returns its innovation.
+    /// Updates with a measurement (Herasymenko 2021, eqs. 9, 11 and 12) and returns its innovation.
     #[inline]
     pub fn measurement_update(&mut self, measurement: AxisMeasurement) -> Innovation {
         let innovation = self.innovation(measurement);
+        // K = P H' S^-1, with H = [1 0]: K_1 = P11 / S and K_2 = P12 / S.
         let share = 1.0 / innovation.variance;
         let (gain, velocity_gain) = (self.position_variance * share, self.cross * share);
         self.position += gain * innovation.value;
         self.velocity += velocity_gain * innovation.value;
-        // (I - K H) P with 1 - K_1 = R / S: no difference of nearly equal numbers on the position.
+        // P+ = (I - K H) P with 1 - K_1 = R / S, so that P11+ = K_1 R and P12+ = K_2 R: no
+        // difference of nearly equal numbers in the position's variance.
         self.velocity_variance -= velocity_gain * self.cross;
         self.position_variance = gain * measurement.variance;
         self.cross = velocity_gain * measurement.variance;
         innovation
     }
 
-    /// Replaces what is known of the position by `posterior`; the velocity follows by regression,
-    /// `x+ = x + P_xp / P_pp (m - p)`, `P+ = P - P_xp P_px / P_pp^2 (P_pp - c)`.
+    /// Replaces the distribution of the position by `posterior`, with mean m and variance c; the
+    /// velocity follows by regression on the position, `x+ = x + P_xp / P_pp (m - p)`,
+    /// `P+ = P - P_xp P_px / P_pp^2 (P_pp - c)`.
     ///
-    /// A measurement's update (Herasymenko 2021, eqs. 9-12) is this with the product of prior and
-    /// likelihood.
+    /// A measurement update (Herasymenko 2021, eqs. 9-12) is the special case where `posterior` is
+    /// the product of prior and likelihood.
     pub fn condition(&mut self, posterior: AxisMeasurement) {
+        // b = P_vp / P_pp: regression of the velocity on the position.
         let slope = self.cross / self.position_variance;
         self.velocity += slope * (posterior.position - self.position);
         self.position = posterior.position;
+        // Velocity variance that the position does not explain: P_vv - b P_vp.
         let rest = (self.velocity_variance - slope * self.cross).max(0.0);
         self.position_variance = posterior.variance;
         self.cross = slope * posterior.variance;
         self.velocity_variance = rest + slope * self.cross;
     }
 
-    /// Multiplies the covariance: less is known than the filter believes.
+    /// Multiplies the covariance by `factor`, where less is known than the filter believes.
     pub fn inflate(&mut self, factor: f64) {
         self.position_variance *= factor;
         self.cross *= factor;
@@ -148,7 +155,7 @@ impl AxisFilter {
         self.position
     }
 
-    /// Velocity, unit a second.
+    /// Velocity, units per second.
     pub fn velocity(&self) -> f64 {
         self.velocity
     }
@@ -163,13 +170,13 @@ impl AxisFilter {
         Matrix2::new(self.position_variance, self.cross, self.cross, self.velocity_variance)
     }
 
-    /// Moves the origin of the axis: what was at a position is at that plus `by`, and all else
-    /// stays.
+    /// Moves the origin of the axis: every position becomes itself plus `by`; velocity and
+    /// covariance stay.
     pub fn move_by(&mut self, by: f64) {
         self.position += by;
     }
 
-    /// Puts the state at rest at a position, keeping its covariance.
+    /// Sets position and zero velocity, keeping the covariance.
     pub fn hold_at(&mut self, position: f64) {
         (self.position, self.velocity) = (position, 0.0);
     }
@@ -192,7 +199,7 @@ mod tests {
         assert_eq!(filter.covariance(), Matrix2::new(1.0, 2.0, 2.0, 20.0 + 0.25));
     }
 
-    /// Mean NEES of `runs` runs of 20 steps of the model itself.
+    /// Mean NEES over `runs` runs of 20 steps, simulated by the filter's own motion model.
     fn mean_nees(sigma_a: f64, runs: u32) -> f64 {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };

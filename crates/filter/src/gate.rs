@@ -13,7 +13,7 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// The gate of two dimensions that holds a true measurement with probability `p`:
+    /// The gate in two dimensions that contains a true measurement with probability `p`:
     /// `l^2 = -2 ln(1 - p)`. `p` is clamped to [0, 1 - 1e-12].
     pub fn with_probability(p: f64) -> Self {
         Self { threshold: -2.0 * (1.0 - p.clamp(0.0, 1.0 - 1e-12)).ln() }
@@ -29,12 +29,12 @@ impl Gate {
         self.threshold
     }
 
-    /// The probability with which the gate holds a true measurement of two dimensions.
+    /// The probability with which the gate contains a true measurement of two dimensions.
     pub fn probability(&self) -> f64 {
         1.0 - (-self.threshold / 2.0).exp()
     }
 
-    /// Whether a squared Mahalanobis distance lies inside; a NaN does not.
+    /// Whether a squared Mahalanobis distance lies inside the gate; a NaN does not.
     pub fn holds(&self, normalised_squared: f64) -> bool {
         normalised_squared <= self.threshold
     }

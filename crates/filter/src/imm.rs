@@ -7,12 +7,12 @@ use crate::models::{MAX_MODELS, ModelWeights, MotionModels, Restlessness};
 /// weighted by how well each predicts (Solonar 2023, eqs. 10-17, with the errata; there for the
 /// brightness of a pixel, here for position and velocity).
 ///
-/// How often a target leaves its calm is learnt of each: one that has flown straight for minutes is
-/// expected to go on, and one that turns every few seconds to turn again before its bearings can
-/// show it.
+/// The rate at which a target leaves calm flight is learnt for each: one that has flown straight
+/// for minutes is expected to go on, and one that turns every few seconds is expected to turn again
+/// before its bearings can show it.
 ///
-/// All models share the transition of constant velocity. So the moments of the prediction follow
-/// from those of the combined state in closed form, and a gate needs no mixing: see
+/// All models share the constant-velocity transition matrix. So the moments of the prediction
+/// follow from those of the combined state in closed form, and a gate needs no mixing: see
 /// [`Self::predicted`].
 ///
 /// ```
@@ -43,14 +43,14 @@ pub struct Imm {
     probabilities: ModelWeights,
     combined: KinematicState,
     restlessness: Restlessness,
-    /// How probable calm can be, at most, since an axis of the motion is not seen: what it was
-    /// before, and what the transitions have made of it since. Measurements of the other axes may
-    /// find less, and no more.
+    /// Upper limit on the probability of calm flight while an axis of the motion is not observed:
+    /// the probability before, carried on by the transitions since. Measurements of the other axes
+    /// may make calm less probable than this, but not more. `None` while all axes are observed.
     calm_most: Option<f64>,
 }
 
 impl Imm {
-    /// All models at one state, with the shares as probabilities.
+    /// A filter with all models at the same state, and their shares as probabilities.
     pub fn new(state: KinematicState, models: &MotionModels) -> Self {
         let mut probabilities = [0.0; MAX_MODELS];
         for (probability, model) in probabilities.iter_mut().zip(models.models()) {
@@ -83,6 +83,7 @@ impl Imm {
 
     fn probabilities_after(&self, transitions: &[ModelWeights; MAX_MODELS]) -> ModelWeights {
         let mut predicted = [0.0; MAX_MODELS];
+        // c_j = sum_i p_ij mu_i.
         for (row, now) in transitions.iter().zip(self.probabilities()) {
             for (p, transition) in predicted.iter_mut().zip(row) {
                 *p += transition * now;
@@ -93,10 +94,12 @@ impl Imm {
 
     /// Mean and covariance of the prediction over `interval` seconds.
     ///
-    /// Mixing leaves the moments of the whole as they are, and the models' transition is the same:
-    /// so these are the moments that mixing, predicting and combining would give.
+    /// Mixing leaves the moments of the whole mixture unchanged, and all models have the same
+    /// transition matrix, so these are the moments that mixing, predicting and combining would
+    /// give.
     pub fn predicted(&self, interval: f64, models: &MotionModels) -> KinematicState {
         let weights = self.predicted_probabilities(interval, models);
+        // Process noise is linear in the density, so the mixture's is that of the mean density.
         let density =
             models.models().iter().zip(weights).map(|(model, weight)| model.density * weight).sum();
         self.combined.predicted(interval, density)
@@ -106,7 +109,7 @@ impl Imm {
     /// returns the updated state with the logarithm of the measurement's likelihood.
     ///
     /// Returns the logarithm of the likelihood over all models; `None`, with everything left as it
-    /// was, if `update` has failed for all of them or the numbers have.
+    /// was, if `update` has failed or has given numbers that are not finite for all of them.
     pub fn update(
         &mut self,
         interval: f64,
@@ -126,12 +129,14 @@ impl Imm {
                 update(&predicted).filter(|(state, log)| log.is_finite() && state.is_finite());
             *next = Some(match updated {
                 Some((state, logarithm)) => {
+                    // ln(c_j L_j), the model's unnormalised posterior probability.
                     logarithms[j] = logarithm + weights[j].ln();
                     state
                 }
                 None => predicted,
             });
         }
+        // Normalised relative to the largest, so that the exponentials do not all underflow.
         let largest = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         if !largest.is_finite() {
             return None;
@@ -144,17 +149,18 @@ impl Imm {
             *state = next;
         }
         self.combined = combined(&self.states, &self.probabilities);
-        // Where an axis is not seen the measurements do not tell how often it does.
+        // While an axis is not observed, the measurements do not tell how often the target leaves
+        // calm.
         if !models.is_partial {
             self.restlessness.see(models.calm_probability(self.probabilities()), interval);
         }
         Some(largest + sum.ln())
     }
 
-    /// Takes in that for the last `interval` seconds what the target did along an axis was not
-    /// seen: it may have moved by the models of `since` in place of those of `before`, and no
-    /// measurement would have shown it.
-    pub fn relive(
+    /// Accounts for an axis `along` which the target was not observed during the last `interval`
+    /// seconds: its motion may have followed the models of `since` in place of those of `before`,
+    /// and no measurement would have shown it.
+    pub fn widen_along(
         &mut self,
         interval: f64,
         along: &Unit<Vector3<f64>>,
@@ -168,8 +174,8 @@ impl Imm {
         self.states = states;
         let axis = along.into_inner() * along.transpose();
         for ((state, old), new) in self.states.iter_mut().zip(before.models()).zip(since.models()) {
-            // White acceleration of density q over T: q [T^3/3 T^2/2; T^2/2 T], here along one axis
-            // and for as much as the livelier model has more.
+            // White acceleration of density q over T: Q = q [T^3/3 T^2/2; T^2/2 T], here along one
+            // axis (a a') and for the density by which the livelier model exceeds the old one.
             let more = axis * (new.density - old.density).max(0.0);
             for (row, column, share) in [
                 (0, 0, interval.powi(3) / 3.0),
@@ -184,9 +190,9 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Widens every model's knowledge to at least these standard deviations and forgets what ties
-    /// velocity to position: the covariance re-initialisation of Kalinov 2019 (equation 8), per
-    /// block.
+    /// Widens every model's covariance to at least these standard deviations and drops the
+    /// correlation of velocity with position: the covariance re-initialisation of Kalinov 2019
+    /// (equation 8), per block.
     pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
         for state in &mut self.states {
             state.reinitialise(position_sd, velocity_sd);
@@ -194,8 +200,9 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Adds to every model's covariance, or takes from it, for what is learnt of errors that all
-    /// models share. What would leave a model less than nothing is not taken from it.
+    /// Adds `change`, which may be negative, to every model's covariance: for what is learnt of
+    /// errors that all models share. A model whose covariance would no longer be positive definite
+    /// stays as it is.
     pub fn add_covariance(&mut self, change: &Matrix6<f64>) {
         for state in &mut self.states {
             let next = state.covariance + change;
@@ -206,17 +213,17 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// Makes no model's covariance less than a part of it that all share: what is short of it grows
-    /// by the smallest share of the part that does. The growth is continuous, so that rounding
-    /// decides nothing.
-    pub fn exceed(&mut self, part: &Matrix6<f64>) {
+    /// Makes every model's covariance P at least `part` (P - part has no negative eigenvalue), a
+    /// part that all models share: a covariance that falls short grows by the smallest multiple of
+    /// `part` that is enough. The growth is continuous, so that rounding decides nothing.
+    pub fn raise_to(&mut self, part: &Matrix6<f64>) {
         let mut grown = false;
         for state in &mut self.states {
             if (state.covariance - part).cholesky().is_some() {
                 continue;
             }
-            // P + a Q >= Q where (1 - a) m <= 1, m being the largest eigenvalue of L^-1 Q L^-T with
-            // P = L L'.
+            // With Q the part: P + a Q >= Q where (1 - a) m <= 1, m being the largest eigenvalue of
+            // L^-1 Q L^-T with P = L L'. So a = 1 - 1/m.
             let largest = state.covariance.cholesky().and_then(|factor| {
                 let half = factor.l().solve_lower_triangular(part)?;
                 let whole = factor.l().solve_lower_triangular(&half.transpose())?;
@@ -230,7 +237,7 @@ impl Imm {
         }
     }
 
-    /// Moves every model's mean: for what is learnt of an error that all models share.
+    /// Adds `change` to every model's mean: for what is learnt of an error that all models share.
     pub fn shift(&mut self, change: &Vector6<f64>) {
         for state in &mut self.states {
             state.mean += change;
@@ -238,8 +245,8 @@ impl Imm {
         self.combined = combined(&self.states, &self.probabilities);
     }
 
-    /// What model `j` starts its step from: the states weighted by the probability of each having
-    /// been the mode, given that `j` is the mode now.
+    /// The state from which model `j` starts its step (IMM mixing): all states, weighted by the
+    /// probability of each model having been the mode, given that `j` is the mode now.
     fn mixed(&self, j: usize, transitions: &[ModelWeights; MAX_MODELS]) -> KinematicState {
         if self.states.len() == 1 {
             return self.states[0].clone();
@@ -249,19 +256,20 @@ impl Imm {
         for ((weight, row), probability) in
             weights.iter_mut().zip(transitions).zip(self.probabilities())
         {
+            // mu_ij = p_ij mu_i / c_j, with c_j the total.
             *weight = row[j] * probability;
             total += *weight;
         }
         if total <= 0.0 {
-            // Ruled out, and no time in which it could have come up again: its state counts for
-            // nothing.
+            // The model has probability 0, and over an interval of 0 no other changes to it: its
+            // state counts for nothing.
             return self.combined.clone();
         }
         combined(&self.states, &weights.map(|weight| weight / total))
     }
 }
 
-/// Mean and covariance of a mixture.
+/// Mean and covariance of a mixture: `m = sum w_i m_i`, `P = sum w_i (P_i + (m_i - m) (m_i - m)')`.
 fn combined(states: &[KinematicState], weights: &ModelWeights) -> KinematicState {
     if let [only] = states {
         return only.clone();

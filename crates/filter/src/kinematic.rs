@@ -46,9 +46,11 @@ impl KinematicState {
     /// Moves the state `interval` seconds on: constant velocity driven by continuous white
     /// acceleration of power spectral density `density`, m^2/s^3.
     ///
-    /// Continuous, so that the noise of a second does not depend on how many updates cut it.
+    /// Continuous, so that the process noise of a second does not depend on the number of updates
+    /// in it.
     pub fn time_update(&mut self, interval: f64, density: f64) {
-        // F = [I, I dt; 0, I], so F x and F P F' are sums of blocks.
+        // F = [I, I dt; 0, I], so F x and F P F' are sums of blocks. With P_pp, P_pv and P_vv the
+        // blocks of P: P_pp + (P_pv + P_vp) dt + P_vv dt^2 for positions, P_pv + P_vv dt across.
         let velocity = self.velocity();
         let mut position = self.mean.fixed_rows_mut::<3>(0);
         position += velocity * interval;
@@ -60,6 +62,7 @@ impl KinematicState {
         let tied = ties + speeds * interval;
         self.covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&tied);
         self.covariance.fixed_view_mut::<3, 3>(3, 0).copy_from(&tied.transpose());
+        // Q = q [T^3/3 T^2/2; T^2/2 T] per axis; going back in time it grows as well, by |T|.
         let noise = density * interval.abs();
         for axis in 0..3 {
             self.covariance[(axis, axis)] += noise * interval.powi(2) / 3.0;
@@ -69,10 +72,10 @@ impl KinematicState {
         }
     }
 
-    /// The state after a measurement of its position, with the logarithm of the measurement's
-    /// likelihood: a plain Kalman update, covariance in metres^2 (Kalinov 2019, eqs. 6 and 9;
-    /// erratum: the update is `(I - K H) P`). `None` if the innovation's covariance is not positive
-    /// definite.
+    /// The state after a measurement of its position (covariance `noise`, metres^2), with the
+    /// logarithm of the measurement's likelihood: a plain Kalman update (Kalinov 2019, eqs. 6 and
+    /// 9; erratum: the update is `(I - K H) P`). `None` if the innovation's covariance is not
+    /// positive definite.
     pub fn position_updated(
         &self,
         measured: Point3<f64>,
@@ -88,16 +91,18 @@ impl KinematicState {
         let covariance = self.covariance - gain * across.transpose();
         let state = Self {
             mean: self.mean + gain * innovation,
+            // Symmetric in spite of rounding.
             covariance: (covariance + covariance.transpose()) / 2.0,
         };
-        // -2 ln N(v; 0, S) = nis + 3 ln 2 pi + ln |S|, and |S| is the square of |L|.
+        // -2 ln N(v; 0, S) = nis + 3 ln 2 pi + ln |S|, with ln |S| = 2 sum ln L_ii for S = L L'.
         let normaliser = 3.0 * (2.0 * std::f64::consts::PI).ln()
             + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         Some((state, -(nis + normaliser) / 2.0))
     }
 
-    /// Forgets: position and velocity become independent, and no axis of either is known better
-    /// than the standard deviations given (Kalinov 2019, eq. 8).
+    /// Forgets: position and velocity become independent, and the variances given are added to
+    /// those of each axis, so that neither is known better than by these standard deviations
+    /// (Kalinov 2019, eq. 8).
     pub fn reinitialise(&mut self, position_sd: f64, velocity_sd: f64) {
         let mut covariance = Matrix6::zeros();
         for (block, sd) in [(0, position_sd), (3, velocity_sd)] {

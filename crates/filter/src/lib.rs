@@ -1,11 +1,11 @@
-//! Small linear filters and gates: what tracks a point, whatever the point is.
+//! Small linear filters and gates for tracking a point, independent of what the point is.
 //!
-//! [`AxisFilter`] is one axis of an image (Herasymenko 2021 and Lytvynets 2020);
-//! [`KinematicState`] is position and velocity in space, [`Imm`] a bank of them
-//! that differ in how hard the target accelerates; [`SmoothedResidual`] and
-//! [`NormalisedInnovation`] tell when one filter is left behind (Kalinov 2019);
-//! [`Gate`] decides whether a measurement can belong to a track, [`normal_score`] says how
-//! much one surprises where several were expected.
+//! [`AxisFilter`] tracks along one axis of an image (Herasymenko 2021 and Lytvynets 2020);
+//! [`KinematicState`] holds position and velocity in space; [`Imm`] is a bank of these that differ
+//! in how hard the target accelerates; [`SmoothedResidual`] and [`NormalisedInnovation`] detect
+//! that a single filter is left behind by a manoeuvre (Kalinov 2019); [`Gate`] decides whether a
+//! measurement can belong to a track; [`normal_score`] says how surprising a measurement is when a
+//! mixture of normal distributions was expected.
 //!
 //! A target that moves by 2 px from image to image, measured to half a pixel:
 //!

@@ -1,13 +1,13 @@
-//! Detectors of manoeuvres: what tells that a filter of constant velocity is being left behind.
+//! Detectors of manoeuvres: they tell when a constant-velocity filter is left behind by its target.
 
 use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-/// Kalinov's detector, mended: the running mean of the residuals against a multiple of the
+/// Kalinov's detector, corrected: compares the running mean of the residuals with a multiple of the
 /// measurement's standard deviation, axis by axis (equations 6-7, with the absolute value that the
-/// text has and the equation lacks).
+/// paper's text has and its equation lacks).
 ///
 /// ```
 /// use crossfix_filter::SmoothedResidual;
@@ -26,15 +26,15 @@ pub struct SmoothedResidual {
 }
 
 impl SmoothedResidual {
-    /// Over a window of this many residuals (at least 1), with the threshold in standard deviations
-    /// of one measurement; Kalinov 2019 has 0.81, which keeps false alarms few for windows of 8 and
-    /// more.
+    /// A detector over a window of this many residuals (at least 1), with the threshold `scale` in
+    /// standard deviations of one measurement. Kalinov 2019 uses 0.81, which keeps false alarms few
+    /// for windows of 8 and more.
     pub fn new(window: usize, scale: f64) -> Self {
         Self { window: window.max(1), scale, residuals: VecDeque::new() }
     }
 
-    /// Takes a residual in, each axis in standard deviations of the measurement, and says whether
-    /// the target manoeuvres. After an alarm the window starts anew.
+    /// Takes a residual, each axis in standard deviations of the measurement, and returns whether
+    /// the target manoeuvres. After an alarm the window starts empty again.
     pub fn see(&mut self, residual: Vector3<f64>) -> bool {
         self.residuals.push_back(residual);
         if self.residuals.len() > self.window {
@@ -67,13 +67,14 @@ pub struct NormalisedInnovation {
 }
 
 impl NormalisedInnovation {
-    /// Over a window of this many innovations (at least 1), with a probability of false alarm.
+    /// A detector over a window of this many innovations (at least 1), with this probability of a
+    /// false alarm.
     pub fn new(window: usize, false_alarm: f64) -> Self {
         Self { window: window.max(1), false_alarm, innovations: VecDeque::new() }
     }
 
-    /// Takes the NIS of a measurement of `dimensions` in, and says whether the target manoeuvres.
-    /// After an alarm the window starts anew.
+    /// Takes the NIS of a measurement of `dimensions` and returns whether the target manoeuvres.
+    /// After an alarm the window starts empty again.
     pub fn see(&mut self, nis: f64, dimensions: usize) -> bool {
         self.innovations.push_back((nis, dimensions));
         if self.innovations.len() > self.window {
@@ -81,6 +82,8 @@ impl NormalisedInnovation {
         }
         let sum: f64 = self.innovations.iter().map(|(nis, _)| nis).sum();
         let freedom: usize = self.innovations.iter().map(|(_, dimensions)| dimensions).sum();
+        // The sum of independent chi-square variables is chi-square with the sum of their degrees
+        // of freedom.
         let threshold = ChiSquared::new(freedom.max(1) as f64)
             .map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(1.0 - self.false_alarm));
         let alarm = self.innovations.len() == self.window && sum > threshold;
@@ -107,7 +110,8 @@ mod tests {
         let runs = 20_000;
         let alarms =
             (0..runs).filter(|_| detector.see(normal().powi(2) + normal().powi(2), 2)).count();
-        // Sums over a window of two overlap and start anew after an alarm: slightly under 1 %.
+        // Sums over a window of two overlap, and the window starts empty after an alarm: slightly
+        // under 1 %.
         let share = alarms as f64 / f64::from(runs);
         assert!((0.006..0.012).contains(&share), "{share}");
     }

@@ -2,12 +2,13 @@ use statrs::function::erf::{erfc, erfc_inv};
 
 use crate::AxisMeasurement;
 
-/// What a standard normal variable would have to be to surprise as much as `value` does where a
-/// mixture of normal distributions, given as weights and moments, was expected.
+/// The value of a standard normal variable that is as surprising as `value` is where a mixture of
+/// normal distributions, given as weights and moments, was expected.
 ///
-/// Of one distribution it is the normalised innovation; of several its square is chi-square with
-/// one degree of freedom if the mixture holds, which the squared innovation over the mixture's
-/// variance is not: a small weight on a wide part widens the variance, and hardly what is usual.
+/// For a single distribution it is the normalised innovation. For several, its square is chi-square
+/// with one degree of freedom if the mixture is right. The squared innovation over the mixture's
+/// variance is not: a wide part of small weight makes that variance much larger without changing
+/// much what usually occurs.
 ///
 /// ```
 /// use crossfix_filter::{AxisMeasurement, normal_score};
@@ -21,6 +22,7 @@ use crate::AxisMeasurement;
 pub fn normal_score<const N: usize>(value: f64, parts: [(f64, AxisMeasurement); N]) -> f64 {
     let total: f64 = parts.iter().map(|(weight, _)| weight).sum();
     let beyond = |sign: f64| -> f64 {
+        // P(X > value) for sign +1 and P(X < value) for -1: sum of w_i erfc(z_i / sqrt 2) / 2.
         let tail = |(weight, part): &(f64, AxisMeasurement)| {
             let off = sign * (value - part.position) / part.variance.sqrt();
             weight * 0.5 * erfc(off / std::f64::consts::SQRT_2)
@@ -28,8 +30,8 @@ pub fn normal_score<const N: usize>(value: f64, parts: [(f64, AxisMeasurement); 
         parts.iter().map(tail).sum::<f64>() / total
     };
     let (above, below) = (beyond(1.0), beyond(-1.0));
-    // The smaller tail is the one with the digits. Beyond the smallest number all surprises are
-    // alike.
+    // The inverse normal distribution of the smaller tail, which has kept its digits. Tails below
+    // the smallest positive number give the same score.
     let score =
         std::f64::consts::SQRT_2 * erfc_inv((2.0 * above.min(below)).clamp(f64::MIN_POSITIVE, 1.0));
     if above < below { score } else { -score }

@@ -1,60 +1,64 @@
-//! How targets fly, and how they go over from one way of flying to another.
+//! Motion models of targets, and the rates of change between them. "Calm" models are those in which
+//! targets fly for long; each time a target leaves them is an "upset".
 
-/// More models than this say nothing that fewer do not.
+/// Greatest number of models: more say nothing that fewer do not.
 pub const MAX_MODELS: usize = 4;
 
-/// A target has left its calm when calm is less likely than this (a probability): when it is
-/// likelier that it has. Of half of it only hard manoeuvres would count, ...
+/// A target counts as having left calm flight when the probability of calm is below this: when it
+/// is more likely not calm. At half of this value only hard manoeuvres would count, ...
 const UPSET: f64 = 0.5;
-/// ... and it has come to it again when calm is likelier than this. Well above the other, so that
-/// one manoeuvre in which the probability goes to and fro counts once.
+/// ... and it counts as calm again when the probability of calm is above this. Well above the
+/// other, so that one manoeuvre during which the probability goes up and down counts once.
 const CALM: f64 = 0.9;
 
-/// How often a target counts as having left its calm, beside what has been seen, where an axis of
-/// its motion is not seen: Jeffreys' prior of a rate. The mean over all targets is right in the
-/// mean alone, and there nothing shows in time that it was wrong of this one.
+/// Number of upsets added to those seen, where an axis of the target's motion is not observed:
+/// Jeffreys' prior of a rate. The mean rate over all targets is right only on average, and where an
+/// axis is not observed nothing shows in time that it was wrong for this target.
 const UNSEEN_UPSETS: f64 = 0.5;
 
-/// One way of flying: constant velocity driven by white acceleration.
+/// A motion model: constant velocity driven by white acceleration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionModel {
     /// Power spectral density of the white acceleration, m^2/s^3.
     pub density: f64,
-    /// Share of the time that targets fly like this, before anything is known of one.
+    /// Share of the time that targets fly by this model: the prior for a target of which nothing is
+    /// known.
     pub share: f64,
-    /// Whether targets fly like this for long: each leaves its calm at a rate of its own.
+    /// Whether targets fly by this model for long: each target leaves its calm models at a rate of
+    /// its own.
     pub calm: bool,
 }
 
-/// How often targets go over from one way of flying to another.
+/// Rates at which targets change from one motion model to another.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModeRates {
-    /// From one model to another of the same kind, calm or not, 1/s: it is drawn anew from their
-    /// shares.
+    /// Rate of change between models of the same kind, calm or not, 1/s: the model is drawn again
+    /// by their shares.
     pub switching_per_s: f64,
-    /// How often a target that is not calm comes to its calm, 1/s; by the shares this says how
-    /// often it leaves it in the mean over all targets.
+    /// Rate at which a target that is not calm becomes calm, 1/s. With the shares it determines the
+    /// mean rate, over all targets, of leaving calm.
     pub calming_per_s: f64,
-    /// What is believed of how often one target leaves its calm is worth so much calm flight, s.
+    /// Weight of the prior rate of leaving calm of one target, as seconds of calm flight.
     pub prior_s: f64,
 }
 
-/// The ways in which targets fly, and how often they change from one to another.
+/// Motion models with the rates of change between them.
 ///
 /// Whether a target is calm is a Markov chain of two states in continuous time, and so is its model
-/// while it stays in one of them. So the transition over an interval is the same however it is cut.
-/// The rate at which a target leaves its calm is its own and is learnt: see [`crate::Imm`].
+/// while it stays in one of them. So the transition over an interval is the same into however many
+/// pieces it is cut. The rate of leaving calm is the target's own and is learnt: see
+/// [`crate::Imm`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionModels {
     models: Vec<MotionModel>,
     rates: ModeRates,
     /// Share of the time that targets are calm.
     calm_share: f64,
-    /// Whether an axis of the motion is not seen.
+    /// Whether an axis of the motion is not observed.
     pub(crate) is_partial: bool,
 }
 
-/// Weights of the models, in their order; what lies beyond the last model is 0.
+/// Weights of the models, in their order; entries beyond the last model are 0.
 pub type ModelWeights = [f64; MAX_MODELS];
 
 impl MotionModels {
@@ -91,8 +95,9 @@ impl MotionModels {
         &self.models
     }
 
-    /// The same where an axis of the motion is not seen: what is not calm may be as lively along it
-    /// as the liveliest, and that a target flies evenly across it is no evidence that it is calm.
+    /// The same models where an axis of the motion is not observed: along it every model that is
+    /// not calm may be as lively as the liveliest, and even flight across it is no evidence of
+    /// calm.
     #[must_use]
     pub fn partial(&self) -> Self {
         let widest = self.widest();
@@ -102,11 +107,13 @@ impl MotionModels {
         Self { models, is_partial: true, ..*self }
     }
 
-    /// The probability of calm after an interval, by its transitions, of a target that is calm with
-    /// some probability.
+    /// The probability of calm after an interval with these `transitions`, from the probability
+    /// `calm` before it.
     pub(crate) fn calm_after(&self, calm: f64, transitions: &[ModelWeights; MAX_MODELS]) -> f64 {
         let mut after = 0.0;
         for (is_calm, probability) in [(true, calm), (false, 1.0 - calm)] {
+            // All models of a kind have the same probability of being calm afterwards: one row
+            // does.
             let rows = transitions.iter().zip(&self.models);
             let row = rows.filter(|(_, model)| model.calm == is_calm).map(|(row, _)| row).next();
             after += row.map_or(0.0, |row| self.calm_probability(row)) * probability;
@@ -114,7 +121,7 @@ impl MotionModels {
         after
     }
 
-    /// Weights of which no more than `most` are calm.
+    /// Rescales weights so that those of the calm models sum to at most `most`.
     pub(crate) fn no_calmer(&self, most: f64, weights: ModelWeights) -> ModelWeights {
         let calm = self.calm_probability(&weights);
         if calm <= most || calm >= 1.0 {
@@ -133,8 +140,8 @@ impl MotionModels {
         self.models.iter().map(|m| m.density).fold(0.0, f64::max)
     }
 
-    /// Probability of each model (columns) an interval of seconds after each (rows), for a target
-    /// of some restlessness.
+    /// Transition matrix: probability of each model (columns) `interval` seconds after each (rows),
+    /// for a target of this restlessness.
     pub(crate) fn transitions(
         &self,
         interval: f64,
@@ -144,13 +151,17 @@ impl MotionModels {
         let (calm, lively) = (self.calm_share, 1.0 - self.calm_share);
         let of_two = calm > 0.0 && lively > 0.0;
         let calming = if of_two { self.rates.calming_per_s } else { 0.0 };
+        // Stationary shares balance: calm * usual = lively * calming.
         let usual = if of_two { calming * lively / calm } else { 0.0 };
         let unseen = if self.is_partial { UNSEEN_UPSETS } else { 0.0 };
         let leaving =
             if of_two { restlessness.rate(usual, self.rates.prior_s, unseen) } else { 0.0 };
-        // What is left of the difference between the two states after the interval.
+        // Two-state chain: a deviation from the stationary probabilities decays by this over the
+        // interval.
         let kept = (-(leaving + calming) * interval).exp();
         let unswitched = (-self.rates.switching_per_s * interval).exp();
+        // Probability that the target has neither changed its kind (calm, lively) nor drawn its
+        // model again.
         let never =
             [(-leaving * interval).exp(), (-calming * interval).exp()].map(|out| out * unswitched);
         let mut transitions = [[0.0; MAX_MODELS]; MAX_MODELS];
@@ -158,9 +169,12 @@ impl MotionModels {
             let (out, back, share) =
                 if from.calm { (leaving, calming, calm) } else { (calming, leaving, lively) };
             let total = out + back;
+            // P(same kind after T) = (back + out exp(-(out + back) T)) / (out + back).
             let stays = if total > 0.0 { (back + out * kept) / total } else { 1.0 };
             let untouched = never[usize::from(!from.calm)];
             for (j, (probability, to)) in row.iter_mut().zip(&self.models).enumerate() {
+                // Same kind: the model has stayed, or has been drawn again by the kind's shares.
+                // Other kind: drawn by the shares of that one.
                 *probability = if to.calm == from.calm {
                     let same = if i == j { untouched } else { 0.0 };
                     same + (stays - untouched) * to.share / share
@@ -172,33 +186,33 @@ impl MotionModels {
         transitions
     }
 
-    /// The probability of being calm.
+    /// The probability of calm: the sum over the calm models.
     pub(crate) fn calm_probability(&self, probabilities: &[f64]) -> f64 {
         self.models.iter().zip(probabilities).filter(|(model, _)| model.calm).map(|(_, p)| p).sum()
     }
 }
 
-/// How often a target leaves its calm: the mean of a gamma distribution of the rate, which each
-/// time that it does and each second that it does not sharpens.
+/// Rate at which one target leaves calm, 1/s: the mean of a gamma distribution, which each upset
+/// and each second of calm sharpens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Restlessness {
     is_calm: bool,
-    /// How often it has been seen to leave its calm, ...
+    /// How often the target has been seen to leave calm, ...
     upsets: f64,
-    /// ... and for how long it has been calm, s.
+    /// ... and how long it has been calm, s.
     calm_s: f64,
 }
 
 impl Restlessness {
     pub(crate) const UNKNOWN: Self = Self { is_calm: true, upsets: 0.0, calm_s: 0.0 };
 
-    /// The rate, 1/s, had it left its calm so many times more than has been seen; `usual` is the
-    /// mean over all targets, worth `prior_s` seconds of one.
+    /// The rate, 1/s, with `more` upsets than have been seen; `usual` is the mean rate over all
+    /// targets, which counts as much as `prior_s` seconds of this one.
     fn rate(&self, usual: f64, prior_s: f64, more: f64) -> f64 {
         (usual * prior_s + self.upsets + more) / (prior_s + self.calm_s)
     }
 
-    /// The target has been calm with this probability for an interval of seconds.
+    /// Notes that the target was calm with probability `calm` for `interval` seconds.
     pub(crate) fn see(&mut self, calm: f64, interval: f64) {
         self.calm_s += calm * interval.abs();
         if self.is_calm && calm < UPSET {
@@ -281,7 +295,7 @@ mod tests {
         let mut calm = Restlessness::UNKNOWN;
         calm.see(1.0, 60.0);
         let usual = 1e-3;
-        // Ten times in a minute beside twenty seconds in which it was not known.
+        // Ten upsets in a minute, beside the prior's twenty seconds.
         assert!((restless.rate(usual, 20.0, 0.0) - 10.02 / 80.0).abs() < 1e-12);
         assert!((calm.rate(usual, 20.0, 0.0) - 0.02 / 80.0).abs() < 1e-12);
     }

@@ -1,15 +1,16 @@
-//! Who gets what: the assignment of greatest total gain.
+//! Assignment of rows to columns with the greatest total gain.
 
 use std::collections::BTreeMap;
 
 use pathfinding::prelude::{Matrix, kuhn_munkres};
 
-/// Gains are quantised, as the solver wants an order: steps of a millionth.
+/// Gains are quantised, as the solver needs totally ordered numbers: steps of a millionth.
 const STEPS: f64 = 1e6;
-/// A cluster of more pairs than this (all rows times all columns) is cut greedily: time is bounded.
+/// Most pairs (all rows times all columns) of a cluster that is solved as a whole; a larger one is
+/// cut greedily: time is bounded.
 const MAX_KNOT: usize = 40_000;
 
-/// A row and a column that may be paired, and what that is worth more than leaving both alone.
+/// A row and a column that may be paired, and the gain of that over leaving both alone.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Candidate {
     pub(crate) row: usize,
@@ -69,7 +70,7 @@ fn solve(cluster: &[Candidate]) -> Vec<(usize, usize)> {
     if rows.len() * (columns.len() + rows.len()) > MAX_KNOT {
         return greedy(cluster);
     }
-    // Each row has a column of its own where it gains nothing: it may stay alone.
+    // Each row also has a column of its own where it gains nothing, so that it may stay alone.
     let mut gains = Matrix::new(rows.len(), columns.len() + rows.len(), 0i64);
     for candidate in cluster {
         let place = (rows.binary_search(&candidate.row), columns.binary_search(&candidate.column));

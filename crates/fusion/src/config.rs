@@ -19,7 +19,7 @@ pub struct FusionConfig {
 }
 
 impl FusionConfig {
-    /// The same with such a [`Tracking::smoothing_s`], if there is one.
+    /// The configuration with this [`Tracking::smoothing_s`], if one is given.
     #[must_use]
     pub fn smoothed(mut self, smoothing_s: Option<f64>) -> Self {
         self.tracking.smoothing_s = smoothing_s.unwrap_or(self.tracking.smoothing_s);
@@ -27,12 +27,12 @@ impl FusionConfig {
     }
 }
 
-/// How the cameras' clocks are estimated from the tracks. A clock's offset begins as its frames'
-/// standard deviation of the capture time says.
+/// How the cameras' clocks are estimated from the tracks. The initial standard deviation of a
+/// clock's offset is that which its frames report of their capture time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Clocks {
-    /// Whether they are. Default true.
+    /// Whether they are estimated. Default true.
     pub estimate: bool,
     /// Cameras whose clock is right by definition. Default none.
     pub trusted: Vec<CameraName>,
@@ -54,13 +54,13 @@ impl Default for Clocks {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EventTime {
-    /// How long to wait for a camera that is behind the others, or for a frame that a newer one of
-    /// its camera has overtaken where that has happened within the last 20 times this, s of capture
-    /// time. 0.001 to 60. Default 0.5: longer than any network hiccup that a track would not
+    /// How long to wait for a camera that is behind the others, s of capture time; and for a frame
+    /// that a newer one of its camera has overtaken, where that has happened within the last 20
+    /// times this. 0.001 to 60. Default 0.5: longer than any network hiccup that a track would not
     /// survive anyway.
     pub lateness_s: f64,
-    /// A frame this far ahead of what the cameras say together (the second newest, and what half of
-    /// them have reached) is from the future and refused, s. 0.001 to 3600. Default 10.
+    /// A frame this far ahead of the cameras' common time (the second newest, and what half of them
+    /// have reached) is from the future and refused, s. 0.001 to 3600. Default 10.
     pub max_ahead_s: f64,
 }
 
@@ -70,7 +70,7 @@ impl Default for EventTime {
     }
 }
 
-/// Whose covariance counts.
+/// Which covariance a bearing is weighted by.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Weighting {
@@ -140,9 +140,9 @@ pub struct Initiation {
     /// `map` (default), `stacked`, `triple` or `pair`, for `grouping`.
     pub solver: SpatialSolver,
     /// The shortest observation period, s; a period lasts until every camera that is heard has
-    /// given an exposure, and these lie as close together as they do. 0.0001 to 60. Default 0.05.
+    /// given an exposure, and these lie closest together. 0.0001 to 60. Default 0.05.
     pub period_s: f64,
-    /// How many periods may make a group of fixes. 2 to 20, default 4; the papers have 5.
+    /// How many periods a group of fixes may span. 2 to 20, default 4; the papers have 5.
     pub periods: usize,
     /// Fixes that a group needs to start a track. 1 to `periods`, default 2.
     pub fixes: usize,
@@ -159,7 +159,8 @@ pub struct Initiation {
     /// The spatial gate of `pair`, `J <= beta`, m^2 (Klochko 2020, below equation 9). 1e-9 to 1e9.
     /// Default 16.
     pub pair_gate_m2: f64,
-    /// The temporal gate of the papers, m. 1e-6 to 1000000. Absent (default): from the covariances.
+    /// The temporal gate of the papers, m. 1e-6 to 1000000. Absent (default): the gate follows from
+    /// the covariances.
     pub temporal_gate_m: Option<f64>,
     /// How many sight lines two groups may share and both start a track. 0 to 64. Default 0.
     pub shared_lines: usize,
@@ -185,7 +186,7 @@ impl Default for Initiation {
     }
 }
 
-/// What keeps a track with a target that turns.
+/// How a track stays with a target that turns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Manoeuvres {
@@ -201,17 +202,17 @@ pub enum Manoeuvres {
     None,
 }
 
-/// One way of flying.
+/// One motion model: a way of flying.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlightModel {
     /// Power spectral density of the white acceleration, m^2/s^3: its root is the change of
     /// velocity in a second, m/s. 0 to 1000000.
     pub acceleration_density: f64,
-    /// Share of the time that targets fly like this.
+    /// Share of the time for which targets fly like this.
     pub share: f64,
-    /// Whether targets fly like this for long. How often one leaves its calm is learnt of each.
-    /// Default false.
+    /// Whether targets fly like this for long. The rate at which a target leaves its calm is learnt
+    /// for each target. Default false.
     #[serde(default)]
     pub calm: bool,
 }
@@ -228,29 +229,29 @@ pub struct Tracking {
     /// How often a target that is not calm changes its way of flying, 1/s. 1e-9 to 100. Default
     /// 0.3.
     pub switching_rate_per_s: f64,
-    /// How often a target that is not calm comes to its calm, 1/s. 1e-9 to 100. Default 0.02; by
-    /// the shares targets leave it every forty minutes in the mean.
+    /// How often a target that is not calm comes to its calm, 1/s. 1e-9 to 100. Default 0.02; with
+    /// the default shares targets leave it every forty minutes in the mean.
     pub calming_rate_per_s: f64,
-    /// What this says of how often one target leaves its calm is worth so much of its flight, s.
-    /// 0.001 to 1000000. Default 20: one that has turned once is expected to turn again within so
-    /// many seconds. With half of it the track of a target that flies straight after one turn is
-    /// noisier than it need be.
+    /// Weight of the prior rate at which a target leaves its calm, in seconds of the target's own
+    /// flight. 0.001 to 1000000. Default 20: a target that has turned once is expected to turn
+    /// again within so many seconds. With half of it the track of a target that flies straight
+    /// after one turn is noisier than it need be.
     pub restlessness_prior_s: f64,
     /// Power spectral density of the white acceleration where there is one model, m^2/s^3. 1e-12 to
     /// 1000000. Default 3, for UAVs that turn and stop (1.7 m/s of change in a second); 0.02 for
     /// what flies straight.
     pub acceleration_density: f64,
-    /// Residuals that `smoothed-residual` takes the mean of. 1 to 1000. Default 8.
+    /// Number of residuals that `smoothed-residual` averages. 1 to 1000. Default 8.
     pub residual_window: usize,
     /// Its threshold in standard deviations of a bearing. 0.001 to 1000. Default 0.81, as in
     /// Kalinov 2019.
     pub residual_scale: f64,
-    /// Innovations that `innovation` sums. 1 to 1000. Default 2.
+    /// Number of innovations that `innovation` sums. 1 to 1000. Default 2.
     pub innovation_window: usize,
     /// Probability of its false alarm. Default 0.0001.
     pub innovation_false_alarm: f64,
     /// Probability with which a true bearing passes a track's gate. Default 0.999999: a target that
-    /// begins to turn must still be in it when the likelihoods have noticed.
+    /// begins to turn must still be inside the gate when the likelihoods have noticed.
     pub gate_probability: f64,
     /// Probability that a camera reports a target in its field of view. Default 0.9.
     pub detection_probability: f64,
@@ -260,18 +261,18 @@ pub struct Tracking {
     /// 25.
     pub confirm_score: f64,
     /// A confirmed track not updated for this long is coasting, and a camera that has not seen a
-    /// target for this long does not hold its track in place any more, s. 0.001 to 3600. Default
-    /// 1.5.
+    /// target for this long no longer counts as holding (supporting) its track, s. 0.001 to 3600.
+    /// Default 1.5.
     pub coasting_after_s: f64,
     /// A track not updated for this long is lost, s. 0.001 to 3600. Default 4.
     pub lost_after_s: f64,
-    /// A track whose position is worse than this along any axis is lost, m. 0.001 to 100000.
-    /// Default 20.
+    /// A track whose position has a larger standard deviation than this along any axis is lost, m.
+    /// 0.001 to 100000. Default 20.
     pub max_position_sd_m: f64,
-    /// How long a track's state waits for later bearings that tell of it, s: it goes out at once,
-    /// and again when they have (`replay --fuse` writes those alone). 0 to 2. Default 0: it does not.
-    /// Half a second halves the error of the velocity, more tells little more; the cost of each bearing
-    /// grows with it.
+    /// How long a track's state waits to be smoothed by later bearings, s: it goes out at once, and
+    /// again when these are in (`replay --fuse` writes only the smoothed ones). 0 to 2. Default 0:
+    /// no smoothing. Half a second halves the error of the velocity, more tells little more; the
+    /// cost of each bearing grows with it.
     pub smoothing_s: f64,
 }
 

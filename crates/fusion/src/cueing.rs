@@ -1,10 +1,10 @@
-//! What cameras that look where they are told should look for.
+//! Cues: where cameras that are turned on request should look for targets.
 //!
-//! One camera hands angles over, the other turns there, searches, and locks (Klochko's first paper,
+//! One camera hands angles over; the other turns there, searches, and locks (Klochko's first paper,
 //! chapter 2; for a scanning thermal receiver Klochko 2020, eq. 3). Here all cameras together hand
-//! over, so that it is a place in space that is looked for, seen from where the other camera stands.
-//! Where one camera alone sees a target its range is unknown, and the cue is a stripe: the other
-//! camera's view of the first one's sight line.
+//! over, so a cue is a position in space as seen from the other camera. If one camera alone sees a
+//! target, the range is unknown, and the cue is a stripe: the first camera's sight line as the
+//! other one sees it.
 
 use std::collections::BTreeMap;
 
@@ -19,16 +19,17 @@ use crate::cameras::KnownCamera;
 use crate::range_chart::Chart;
 use crate::uncertainty::{CameraUncertainty, SharedTies};
 
-/// A camera is told this often, s of data time: a target at 100 m that flies at 20 m/s has gone on
-/// by 20 mrad.
+/// Interval between the cues for a camera, s of data time: in that time a target at 100 m that
+/// flies at 20 m/s moves by 20 mrad.
 const EVERY_S: f64 = 0.1;
-/// For so long ahead it is told where the target should be, s: a head that turns for a second, and
-/// one that is not told anew for another, still knows.
+/// Times ahead for which a cue predicts the bearing, s: far enough for a head that turns for a
+/// second and gets no new cue for another.
 const AHEAD_S: [f64; 5] = [0.0, 0.25, 0.5, 1.0, 2.0];
-/// So many targets at most: one camera looks for one at a time, and what it is on must be among them.
+/// Most targets in one cue message: a camera looks for one at a time, and the one that it is on
+/// must be among them.
 const MOST_CUES: usize = 32;
-/// Places and weights by which a normal variable's mean and variance are formed of five (Gauss and
-/// Hermite): exact up to the ninth power.
+/// Nodes and weights of the five-point Gauss-Hermite rule for the mean and variance of a function
+/// of a standard normal variable: exact for polynomials up to the ninth power.
 const NODES: [(f64, f64); 5] = [
     (0.0, 8.0 / 15.0),
     (1.355_626_179_974_266, 0.222_075_922_005_612_6),
@@ -37,19 +38,19 @@ const NODES: [(f64, f64); 5] = [
     (-2.856_970_013_872_806, 0.011_257_411_327_720_69),
 ];
 
-/// A target as far as it is known, as of a time.
+/// A target's predicted states for cueing, at one time.
 #[derive(Clone, Debug)]
 pub(crate) struct Known {
-    /// Which.
+    /// Its identity.
     pub(crate) of: Cued,
-    /// Where it is and how it moves, now and ahead.
+    /// Position and velocity now and at each time ahead.
     pub(crate) ahead: [KinematicState; AHEAD_S.len()],
-    /// Where the camera stands that alone sees it; `None` if several do.
+    /// Position of the camera that alone sees it; `None` if several do.
     pub(crate) seen_from: Option<Point3<f64>>,
 }
 
 impl Known {
-    /// A target by what is expected of it at times from `now` on.
+    /// A target whose state at any time from `now` on is given by `expected`.
     pub(crate) fn new(
         of: Cued,
         now: Timestamp,
@@ -60,17 +61,17 @@ impl Known {
     }
 }
 
-/// When each camera was told last.
+/// When each camera was last sent a cue.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Cueing {
     told: BTreeMap<CameraName, Timestamp>,
 }
 
 impl Cueing {
-    /// Whether it is time to tell a camera.
+    /// Whether a camera's next cue is due; if so, notes that it is sent.
     pub(crate) fn is_due(&mut self, camera: &CameraName, now: Timestamp) -> bool {
         let told = self.told.get(camera);
-        // Where time has gone back, it is time as well.
+        // It is due as well if time has gone back.
         let due = told.is_none_or(|told| !(0.0..EVERY_S).contains(&now.seconds_since(*told)));
         if due {
             self.told.insert(camera.clone(), now);
@@ -79,16 +80,17 @@ impl Cueing {
     }
 }
 
-/// A camera's clock, as far as it is known.
+/// The estimate of a camera's clock.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct OwnClock {
-    /// What it is ahead by, s.
+    /// By how much it is ahead, s.
     pub(crate) ahead_s: f64,
-    /// The standard deviation of that against the other cameras' clocks, s.
+    /// Standard deviation of `ahead_s` relative to the other cameras' clocks, s.
     pub(crate) sd_s: f64,
 }
 
-/// What a camera should look for: tracks, and then what one other camera alone sees; the nearest first.
+/// The cue message for a camera: tracks first, then targets that one other camera alone sees; each
+/// group by range, the nearest first.
 pub(crate) fn cues(
     camera: &CameraName,
     known: &KnownCamera,
@@ -98,7 +100,7 @@ pub(crate) fn cues(
 ) -> CueFrame {
     let own_now = now.plus_seconds(clock.ahead_s);
     let uncertainty = CameraUncertainty { time_sd_s: clock.sd_s, ..known.uncertainty() };
-    // What it alone sees it need not be told.
+    // A camera needs no cue for what it alone sees itself.
     let others = targets.iter().filter(|target| target.of.camera != camera.as_str());
     let mut cues: Vec<Cue> = others
         .filter_map(|target| cue((known, &uncertainty), own_now, target))
@@ -115,7 +117,8 @@ pub(crate) fn cues(
     frame.stamped()
 }
 
-/// `None` if it lies at the camera itself, or may lie anywhere.
+/// The cue of one target for one camera; `None` if the target lies at the camera itself, or may lie
+/// anywhere.
 fn cue(
     camera: (&KnownCamera, &CameraUncertainty),
     own_now: Timestamp,
@@ -125,6 +128,7 @@ fn cue(
     let here = &target.ahead[0];
     let away = here.position() - origin;
     let range_m = away.norm();
+    // sd(ln r) = sqrt(a' P a) / r^2 with a = p - c, of length r.
     let along = away.dot(&(here.position_covariance() * away)).max(0.0);
     let ahead = target.ahead.iter().zip(AHEAD_S).map(|(state, ahead_s)| {
         expected(camera, state, target.seen_from, own_now.plus_seconds(ahead_s))
@@ -137,7 +141,8 @@ fn cue(
     })
 }
 
-/// Where the camera should see a state, in its own frame.
+/// The predicted bearing of a state in the camera's own frame; `None` if it is too uncertain for a
+/// bearing.
 fn expected(
     (known, uncertainty): (&KnownCamera, &CameraUncertainty),
     state: &KinematicState,
@@ -150,7 +155,7 @@ fn expected(
     let shared = uncertainty.shared(&model, state.velocity());
     let to_world: &Rotation3<f64> = known.camera.pose().rotation();
     let own = to_world.inverse() * direction;
-    // Both have tangents of their own at the direction.
+    // World frame and camera frame have different tangents at the direction: turn the covariance.
     let turn = (to_world.matrix() * tangent_basis(&own)).transpose() * model.basis;
     let covariance = turn * (covariance + shared) * turn.transpose();
     if covariance.diagonal().max() > Bearing::WIDEST_RAD.powi(2) {
@@ -166,8 +171,8 @@ fn expected(
 }
 
 /// Mean direction and covariance (rad^2, along the direction's tangents) in which a state is seen
-/// from `origin`. Where one camera alone sees the target, at `seen_from`, what is unknown is the
-/// logarithm of its range from there, and the moments are those over that.
+/// from `origin`. If one camera alone sees the target, from `seen_from`, the logarithm of its range
+/// from there is unknown, and the moments are taken over that.
 fn seen(
     state: &KinematicState,
     origin: Point3<f64>,
@@ -189,7 +194,9 @@ fn seen(
     let tangents = tangent_basis(&direction).transpose();
     let mut covariance = Matrix2::zeros();
     for (weight, model, spread) in models {
-        // Along great circles: a stripe may be longer than a tangent plane is flat.
+        // Offsets are measured along great circles: a stripe may be longer than a tangent plane is
+        // flat. Covariance = sum of weight * (spread between the places + spread H P H' of each
+        // place).
         let turn = turn_between(&model.direction, &direction)?;
         let aside = tangents * turn_vector(&turn).cross(&-direction.into_inner());
         let by = tangents * (turn.matrix() * model.basis) * model.by_position();
@@ -198,7 +205,8 @@ fn seen(
     Some((direction, covariance))
 }
 
-/// Places along a range that is not known, with their weights, and what is unknown of each beside.
+/// Positions along an uncertain range, with their weights and the remaining covariance of each
+/// position once the range is given.
 fn along_range(chart: &Chart, state: &KinematicState) -> Vec<(f64, Point3<f64>, Matrix3<f64>)> {
     let (covariance, _) = chart.expressed(&state.covariance, &SharedTies::zeros());
     let variance = covariance.m33;
@@ -206,6 +214,8 @@ fn along_range(chart: &Chart, state: &KinematicState) -> Vec<(f64, Point3<f64>, 
         return vec![(1.0, state.position(), state.position_covariance())];
     }
     let tied: Vector6<f64> = covariance.column(2).into_owned();
+    // Given the log range: mean c x / sqrt(v) at node x, covariance P - c c' / v, where c is the
+    // column of the log range in P and v its variance.
     let left = covariance - tied * tied.transpose() / variance;
     let place = |(node, weight): (f64, f64)| {
         let point = chart.point(&(tied * (node / variance.sqrt())));
@@ -249,7 +259,8 @@ mod tests {
         assert!((by_axis[(2, 2)] - 0.25e-4).abs() < 1e-9, "{by_axis}");
     }
 
-    /// What one camera alone sees is a stripe for another: as long as drawn ranges make it.
+    /// For another camera, a target of unknown range is a stripe: its length is checked against
+    /// many ranges.
     #[test]
     fn an_unknown_range_is_a_stripe_along_the_others_sight_line() {
         let (one, other) = (Point3::origin(), Point3::new(100.0, 0.0, 0.0));
@@ -258,7 +269,7 @@ mod tests {
         let spread = Matrix3::from_diagonal(&[0.09, (300.0 * log_sd).powi(2), 0.09].into());
         let target = state(Point3::new(0.0, 300.0, 0.0), spread);
         let (direction, covariance) = seen(&target, other, Some(one)).unwrap();
-        // By a thousand ranges of even probability.
+        // A thousand ranges of equal probability.
         let angles: Vec<f64> = (0..1000)
             .map(|k| {
                 let share = (f64::from(k) + 0.5) / 1000.0;
@@ -274,12 +285,12 @@ mod tests {
         let (long, short) = (axes.eigenvalues.max().sqrt(), axes.eigenvalues.min().sqrt());
         assert!((long / variance.sqrt() - 1.0).abs() < 0.1, "{long} {}", variance.sqrt());
         assert!(short < 0.002, "{short}");
-        // For the camera that sees it, it is no stripe.
+        // For the camera that sees the target it is no stripe.
         let (_, covariance) = seen(&target, one, None).unwrap();
         assert!(covariance.trace().sqrt() < 0.002);
     }
 
-    /// Of a normal variable, by summing its density.
+    /// Quantile of a standard normal variable, by summing its density.
     fn normal_quantile(share: f64) -> f64 {
         let (mut x, mut below) = (-6.0, 0.0);
         while below < share {

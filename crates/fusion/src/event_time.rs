@@ -1,5 +1,5 @@
-//! Event time with a bounded wait: frames go in as they arrive and come out in the order of their
-//! capture times, so that the order of arrival changes nothing.
+//! Event time with a bounded wait: frames are taken in as they arrive and released in the order of
+//! their capture times, so that the order of arrival changes nothing.
 
 mod queue;
 mod stream;
@@ -13,15 +13,15 @@ use stream::Stream;
 
 pub(crate) use queue::ReorderQueue;
 
-/// More exposures than this are not remembered of those that came out: memory is bounded.
+/// Most exposures that are remembered of those that were released: memory is bounded.
 const MAX_TAKEN: usize = 20_000;
 
-/// A camera that has been silent for so many times the lateness is not waited for.
+/// A camera that has been silent for this many times the lateness is not waited for.
 const PATIENCES: f64 = 4.0;
 
-/// Of what one camera's clock alone says has gone by, this share is believed. With all of it a clock
-/// that races makes all others look silent between two of their frames; with half of it the last
-/// camera of a site is not followed for ten seconds.
+/// Of the time that one camera's clock alone says has gone by, this share is believed. With all of
+/// it a clock that races makes all others look silent between two of their frames; with half of it
+/// the last camera of a site is not followed for ten seconds.
 const ALONE: f64 = 0.4;
 
 /// How an exposure arrived.
@@ -29,11 +29,11 @@ const ALONE: f64 = 0.4;
 pub(crate) enum Arrival {
     /// After all others of its camera.
     InOrder,
-    /// After a newer one of its camera, in time all the same.
+    /// After a newer one of its camera, but still in time.
     OutOfOrder,
 }
 
-/// A camera that should be heard: its frames, once it has been, and whether it has come to its end.
+/// A camera that should be heard: its stream once it has been, and whether it has come to its end.
 #[derive(Clone, Copy, Debug, Default)]
 struct Source {
     stream: Option<Stream>,
@@ -42,57 +42,58 @@ struct Source {
 
 /// The buffer that puts exposures into order.
 ///
-/// The time up to which exposures are released follows the reference: the second newest of the live
-/// cameras, and no more than half of them must be beyond what the others have reached. So a
-/// minority of wrong clocks cannot drag the others into the past. It is the time of the slowest
-/// camera that is still heard, or `lateness_s` behind the reference, whichever is later.
+/// The reference is the time of the second newest of the live cameras, and no more than half of
+/// them may be beyond what the others have reached. So a minority of wrong clocks cannot drag the
+/// others into the past. Exposures are released up to the time of the slowest camera that is still
+/// heard, or up to `lateness_s` behind the reference, whichever is later.
 ///
 /// Frames that are refused count for the reference too: where most cameras jump, time has jumped.
-/// If most of them have been behind what was released for a while, that was the mistake, and the
-/// order is taken up anew from their time.
+/// If most of them have been behind what was released for a while, the release was the mistake, and
+/// the order starts again from their time.
 ///
 /// A camera is live until time has gone on by [`PATIENCES`] times the lateness since it was heard.
-/// There is no other clock here than the cameras': time goes on as the second quickest of them does,
-/// jumps left out, and by a share of what the quickest alone is ahead ([`ALONE`]). What a camera says
-/// all at once of a time that the others have been through, as its host stood still or its link was
-/// cut, is no progress.
+/// There is no other clock here than the cameras': time goes on as the second quickest of them
+/// does, without jumps, and by a share of what the quickest alone is ahead ([`ALONE`]). What a
+/// camera says all at once of a time that the others have been through, because its host stood
+/// still or its link was cut, is no progress.
 ///
-/// A camera that has been further behind than anybody waits, for as long, is not waited for: its
-/// frames come too late all the same.
+/// A camera that has been further behind than the lateness, for [`PATIENCES`] times as long, is not
+/// waited for: its frames come too late all the same.
 ///
 /// A camera's newest frame is its word that nothing older comes, so that nobody waits for an order
 /// that transports keep anyway. A camera whose word has cost a frame is taken, for a while, to be
 /// as far behind its newest frame as that one was.
 ///
-/// What is late is not measured by that word but by what has been worked on: an exposure that can
-/// still be taken in order is taken.
+/// Whether a frame is late is decided not by that word but by what has been worked on: an exposure
+/// that can still be taken in order is taken.
 #[derive(Debug)]
 pub(crate) struct EventBuffer {
     config: EventTime,
-    /// Each with whether its time has been compared with another camera's.
+    /// The waiting exposures, each with whether its time has been compared with another camera's.
     waiting: ReorderQueue<bool>,
-    /// What came out within the last `lateness_s`, to tell what comes twice from what comes late.
+    /// What was released within the last `lateness_s`, to tell what comes twice from what comes
+    /// late.
     taken: BTreeSet<(Timestamp, CameraName)>,
     sources: BTreeMap<CameraName, Source>,
     /// How far time has gone on, s.
     run_s: f64,
     /// The time that the live cameras agree on, and how many they were, when a frame last came.
     reference: Option<Reference>,
-    /// [`Self::run_s`] since when most live cameras have been behind what was released.
+    /// [`Self::run_s`] since which most live cameras have been behind what was released.
     behind_since_s: Option<f64>,
-    /// What was held when the order was taken up anew.
+    /// Exposures that were waiting when the order started again.
     dropped: Vec<Rejection>,
-    /// Where the order was taken up anew, until somebody asks.
+    /// Where the order started again, until somebody asks.
     restarted: Option<Timestamp>,
     /// The oldest time heard.
     first: Option<Timestamp>,
-    /// The newest time that came out.
+    /// The newest time that was released.
     released: Timestamp,
-    /// The newest time, less the clock's offset, that has been worked on.
+    /// The newest time, with the clock's offset taken off, that has been worked on.
     passed: Timestamp,
 }
 
-/// What the live cameras say the time is.
+/// Common time of the live cameras, and how many there are.
 #[derive(Clone, Copy, Debug)]
 struct Reference {
     time: Timestamp,
@@ -117,13 +118,13 @@ impl EventBuffer {
         }
     }
 
-    /// Says that a camera should be heard soon: in the beginning it is waited for as for the
+    /// Announces a camera that should be heard soon: in the beginning it is waited for like the
     /// others.
     pub(crate) fn expect(&mut self, camera: &CameraName) {
         self.sources.entry(camera.clone()).or_default();
     }
 
-    /// Takes an exposure in; nothing comes out before [`Self::release`] says so.
+    /// Takes an exposure in; nothing is released before [`Self::release`] says so.
     pub(crate) fn insert(&mut self, exposure: Exposure) -> Result<Arrival, RejectionReason> {
         let (time, max_ahead_s) = (exposure.time, self.config.max_ahead_s);
         if let Some(source) = self.sources.get_mut(&exposure.camera) {
@@ -163,19 +164,20 @@ impl EventBuffer {
         self.sources.values().filter_map(|source| Some((source.stream.as_ref()?, source.ended)))
     }
 
-    /// Those that have not come to their end.
+    /// The streams that have not come to their end.
     fn going_on(&self) -> impl Iterator<Item = &Stream> {
         self.streams().filter(|(_, ended)| !ended).map(|(stream, _)| stream)
     }
 
-    /// Takes note of an exposure's time, whatever becomes of it.
+    /// Notes an exposure's time, whatever becomes of the exposure.
     fn hear(&mut self, exposure: &Exposure) -> Arrival {
         let (time, lateness_s) = (exposure.time, self.config.lateness_s);
         let late_s = self.late_s(exposure);
         let source = self.sources.entry(exposure.camera.clone()).or_default();
         let stream = source.stream.get_or_insert(Stream::beginning(time));
         let arrival = if time < stream.newest { Arrival::OutOfOrder } else { Arrival::InOrder };
-        // A clock that races makes nobody else look silent, nor does one that makes up for lost time.
+        // A clock that races makes nobody else look silent, nor does one that catches up on lost
+        // time.
         let reached = self.reference.map(|reference| reference.time.plus_seconds(-lateness_s));
         let keeps_up = reached.is_none_or(|reached| time > reached);
         let step_s = time.seconds_since(stream.newest).clamp(0.0, lateness_s);
@@ -199,12 +201,12 @@ impl EventBuffer {
             second_s = second_s.max(stream.gone_s.min(first_s));
             first_s = first_s.max(stream.gone_s);
         }
-        // Where there is one camera, nobody else can look silent.
+        // Where there is only one camera, nobody else can look silent.
         let share = if self.streams().count() > 1 { ALONE } else { 1.0 };
         self.run_s = self.run_s.max(second_s + share * (first_s - second_s));
     }
 
-    /// Takes note of the cameras that are further behind than anybody waits.
+    /// Notes the cameras that are further behind than anybody waits.
     fn note_who_is_behind(&mut self) {
         let Some(Reference { time, .. }) = self.reference else { return };
         let (patience, run_s) = (time.plus_seconds(-self.config.lateness_s), self.run_s);
@@ -219,7 +221,7 @@ impl EventBuffer {
         self.reference.map(|reference| reference.time)
     }
 
-    /// Asks the live cameras for the time.
+    /// Computes the reference from the live cameras.
     fn refer(&mut self) {
         let patience_s = PATIENCES * self.config.lateness_s;
         let is_live = |stream: &&Stream| self.run_s - stream.heard_s <= patience_s;
@@ -229,7 +231,7 @@ impl EventBuffer {
             times
         };
         let newest = newest_first(live.iter().map(|stream| stream.newest).collect());
-        // What a camera has reached: its next frame is not due before.
+        // The time that a camera has reached: its next frame is not due before.
         let reached = newest_first(live.iter().map(|s| s.newest.plus_seconds(s.step_s)).collect());
         let half = live.len() / 2;
         let time = match (newest.as_slice(), reached.get(half)) {
@@ -250,7 +252,7 @@ impl EventBuffer {
         }
     }
 
-    /// Takes the order up anew from a time before what was released.
+    /// Starts the order again from a time before what was released.
     fn restart(&mut self, time: Timestamp) {
         while let Some((exposure, _)) = self.waiting.pop() {
             let by_s = exposure.time.seconds_since(time);
@@ -264,7 +266,7 @@ impl EventBuffer {
         self.restarted = Some(time);
     }
 
-    /// Forgets all times: the clocks of all cameras have stepped. Nothing is held.
+    /// Forgets all times, as the clocks of all cameras have stepped. Nothing is kept waiting.
     pub(crate) fn begin_anew(&mut self) {
         let mut sources = std::mem::take(&mut self.sources);
         sources.retain(|_, source| source.ended || source.stream.is_some());
@@ -272,27 +274,27 @@ impl EventBuffer {
         *self = Self { sources, ..Self::new(self.config.clone()) };
     }
 
-    /// The time at which the order was taken up anew with the last frame, if it was: what has been
-    /// made of later times is to be forgotten.
+    /// The time at which the order started again with the last frame, if it did: what has been made
+    /// of later times is to be forgotten.
     pub(crate) fn take_restart(&mut self) -> Option<Timestamp> {
         self.restarted.take()
     }
 
-    /// By how much an exposure comes too late, s: what follows it has been worked on. What came out
-    /// may still wait for other clocks to be sure (its time is less the clock's offset then).
+    /// By how much an exposure comes too late, s: what follows it has been worked on. What was
+    /// released may still wait until other clocks are sure (by its time less the clock's offset).
     fn late_s(&self, exposure: &Exposure) -> Option<f64> {
         let corrected = exposure.time.plus_seconds(-exposure.correction_s);
         let is_late = exposure.time < self.released && corrected < self.passed;
         is_late.then(|| self.released.seconds_since(exposure.time))
     }
 
-    /// Says that an exposure of this time, less the clock's offset, is being worked on.
+    /// Notes that an exposure of this time, less the clock's offset, is being worked on.
     pub(crate) fn pass(&mut self, corrected: Timestamp) {
         self.passed = self.passed.max(corrected);
     }
 
-    /// By how much a time, less the clock's offset, lies before what has been worked on, s: more
-    /// than the lateness, or `None`.
+    /// By how much a time, less the clock's offset, lies before what has been worked on, s; `None`
+    /// unless that is more than the lateness.
     pub(crate) fn passed_by_s(&self, corrected: Timestamp) -> Option<f64> {
         Some(self.passed.seconds_since(corrected)).filter(|by_s| *by_s > self.config.lateness_s)
     }
@@ -344,7 +346,7 @@ impl EventBuffer {
         }
     }
 
-    /// Nothing before this time comes any more.
+    /// The time before which nothing comes any more.
     fn watermark(&self) -> Option<Timestamp> {
         let heard = self.streams().count();
         if heard > 1 && self.going_on().next().is_none() {

@@ -25,38 +25,39 @@ use crate::uncertainty::{LastingNoise, pose_covariance_of_careful_survey};
 use crate::unmet::{Unmet, WhyNothing};
 use crate::{ConfigError, Counters, FusionConfig};
 
-/// What comes out of the fusion centre.
+/// A result of the fusion centre.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Output {
     /// The tracks that an exposure has changed.
     Tracks(TrackFrame),
-    /// The same after a while, as the bearings since have told: see
+    /// The same tracks after a lag, smoothed by the bearings since: see
     /// [`crate::Tracking::smoothing_s`].
     Smoothed(TrackFrame),
     /// Something happened to a track.
     Event(TrackEvent),
-    /// What a camera that looks where it is told should look for.
+    /// Where a camera that takes cues should look.
     Cues(CueFrame),
-    /// Something was not used.
+    /// A frame, or a part of one, was not used.
     Rejected(Rejection),
-    /// A camera is left out, or used again.
+    /// A camera is excluded, or used again.
     Camera(CameraName, CameraStanding),
 }
 
-/// What the fusion centre thinks of a camera.
+/// The fusion centre's judgement of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraReport {
     /// The camera.
     pub camera: CameraName,
-    /// Whether it is believed.
+    /// How far its bearings are believed.
     pub standing: CameraStanding,
-    /// How many times its reported covariances count.
+    /// Factor by which its reported covariances are multiplied.
     pub noise_factor: f64,
-    /// Its clock; `None` as long as it has not been heard.
+    /// Its clock; `None` until the camera has been heard.
     pub clock: Option<ClockEstimate>,
 }
 
-/// The fusion centre as a state machine: frames in, tracks out; no clock, no thread, no socket.
+/// The fusion centre as a state machine: frames in, tracks out; without clock, thread or socket of
+/// its own.
 #[derive(Debug)]
 pub struct Fusion {
     config: FusionConfig,
@@ -67,17 +68,18 @@ pub struct Fusion {
     clocks: ClockEstimator,
     unmet: Unmet,
     site_time: SiteTime,
-    /// Exposures in the order of their times less what their clocks are ahead.
+    /// Exposures ordered by capture time less the estimated offset of their camera's clock.
     corrected: ReorderQueue<()>,
     smoothing: Smoothing,
     cueing: Cueing,
     counters: Counters,
     sequence: u64,
+    /// Capture time of the exposure that was handled last.
     now: Option<Timestamp>,
 }
 
 impl Fusion {
-    /// A fusion centre that knows no camera yet.
+    /// A fusion centre that does not know any camera yet.
     ///
     /// # Errors
     /// [`ConfigError`] if a number of the configuration makes no sense.
@@ -102,11 +104,11 @@ impl Fusion {
         })
     }
 
-    /// Makes a camera known, or replaces what is known of it for the frames that it captures from
-    /// the calibration's `valid_from_ns` on.
+    /// Registers a camera, or replaces its calibration for the frames that it captures from the
+    /// calibration's `valid_from_ns` on.
     ///
     /// # Errors
-    /// [`CalibrationError`] if the message describes no camera; what was known stays.
+    /// [`CalibrationError`] if the message describes no camera; the old calibration then stays.
     pub fn calibrate(&mut self, message: &CameraCalibration) -> Result<(), CalibrationError> {
         let calibration = message.parse()?;
         self.buffer.expect(&calibration.name);
@@ -131,7 +133,8 @@ impl Fusion {
         Ok(())
     }
 
-    /// Takes a frame in and returns all that follows from it and from what it had to wait for.
+    /// Handles a frame, and returns all that follows from it and from the frames that were waiting
+    /// for it.
     pub fn ingest(&mut self, frame: &BearingFrame) -> Vec<Output> {
         self.counters.count("frames");
         let mut outputs = Vec::new();
@@ -157,7 +160,8 @@ impl Fusion {
                 for reason in left_out {
                     self.refuse(refused(frame, reason), outputs);
                 }
-                // As far as is known by now: it is settled when the exposure's turn comes.
+                // A preliminary value: the final clock offset is set when the exposure's turn
+                // comes.
                 exposure.correction_s =
                     self.clock(&exposure.camera).map_or(0.0, |clock| clock.offset_s);
                 let (camera, time) = (exposure.camera.clone(), exposure.time);
@@ -166,8 +170,8 @@ impl Fusion {
                     arrival,
                     Err(RejectionReason::Late { .. } | RejectionReason::Future { .. })
                 );
-                // By the site's time: ten seconds of frames that come all at once are not ten
-                // seconds of a clock that is wrong.
+                // The site's time is used here: ten seconds of frames that arrive in one burst are
+                // not evidence of a clock that is wrong for ten seconds.
                 let now = self.buffer.agreed_time().unwrap_or(time);
                 self.note_time(&camera, now, in_time, outputs);
                 if let Some(time) = self.buffer.take_restart() {
@@ -183,7 +187,7 @@ impl Fusion {
         }
     }
 
-    /// Says that a camera has come to its end, so that nothing waits for it.
+    /// Notes that a camera has ended, so that nothing waits for it any longer.
     pub fn camera_ended(&mut self, camera: &CameraName) -> Vec<Output> {
         let mut outputs = Vec::new();
         self.site_time.forget(camera);
@@ -193,7 +197,7 @@ impl Fusion {
         outputs
     }
 
-    /// Handles everything that still waits: the end of a recording.
+    /// Handles everything that still waits, at the end of a recording.
     pub fn flush(&mut self) -> Vec<Output> {
         let mut outputs = Vec::new();
         self.site_time.end().iter().for_each(|frame| self.take(frame, &mut outputs));
@@ -202,7 +206,7 @@ impl Fusion {
         outputs
     }
 
-    /// What is thought of each camera, ordered by name.
+    /// The judgement of each camera, ordered by name.
     pub fn cameras(&self) -> impl Iterator<Item = CameraReport> + '_ {
         self.cameras.iter().map(|(name, camera)| CameraReport {
             camera: name.clone(),
@@ -215,8 +219,9 @@ impl Fusion {
         })
     }
 
-    /// Whether cameras have been moved since they were calibrated: of each that has been watched
-    /// beside others. It costs the third power of their number: 0.1 s of 64.
+    /// Whether cameras have been moved since they were calibrated: one finding for each camera that
+    /// has been compared with others. The cost grows with the third power of the number of cameras:
+    /// 0.1 s for 64.
     pub fn pose_findings(&self) -> BTreeMap<CameraName, PoseFinding> {
         self.cameras.pose_findings()
     }
@@ -226,17 +231,17 @@ impl Fusion {
         self.now
     }
 
-    /// Why no target is found, where two cameras see something at the same time.
+    /// Why no target is found although two cameras see something at the same time.
     pub fn why_nothing(&self) -> Option<&WhyNothing> {
         self.unmet.why()
     }
 
-    /// What has been handled and refused so far.
+    /// Counts of what has been handled and refused so far.
     pub fn counters(&self) -> &Counters {
         &self.counters
     }
 
-    /// All tracks as of the newest exposure handled, ordered by id.
+    /// All tracks after the newest exposure handled, ordered by id.
     pub fn tracks(&self) -> impl Iterator<Item = &Track> {
         self.tracker.tracks()
     }
@@ -269,9 +274,9 @@ impl Fusion {
         outputs.push(Output::Rejected(rejection));
     }
 
-    /// Takes the clock's offset off an exposure's time. Corrected times may be in another order, so
-    /// an exposure waits until no camera's clock can be far enough ahead for an earlier one to
-    /// come.
+    /// Subtracts the clock's estimated offset from an exposure's time. The corrected times may come
+    /// in another order, so an exposure waits until no camera's clock can be far enough ahead for
+    /// an earlier exposure still to come.
     fn correct(&mut self, mut exposure: Exposure, outputs: &mut Vec<Output>) {
         self.clocks.see(&exposure.camera, &exposure.uncertainty);
         let Some(clock) = self.clock(&exposure.camera) else {
@@ -301,12 +306,12 @@ impl Fusion {
         clock.map_or(exposure.uncertainty.time_sd_s, |clock| clock.sd_s)
     }
 
-    /// What is known of a camera's clock, if clocks are in doubt.
+    /// The estimate of a camera's clock, if there is one and clocks are in doubt at all.
     fn clock(&self, camera: &CameraName) -> Option<ClockEstimate> {
         if self.clocks.is_needed() { self.clocks.estimate(camera) } else { None }
     }
 
-    /// One exposure, in the order of capture times.
+    /// Handles one exposure; they come in the order of capture times.
     fn process(&mut self, exposure: &Exposure, outputs: &mut Vec<Output>) {
         self.buffer.pass(exposure.time);
         self.now = Some(exposure.time);
@@ -336,7 +341,8 @@ impl Fusion {
             self.follow(&exposure, &mut changes)
         };
         for samples in self.tracker.draws() {
-            // What a mount's angles are off by is another error after each turn.
+            // The error of a mount's angles is a new one after each turn: cameras on mounts are
+            // left out.
             let is_fixed = |sample: &Sample| !self.cameras.is_on_mount(&sample.camera);
             let samples: Vec<Sample> = samples.into_iter().filter(is_fixed).collect();
             if samples.len() < 2 {
@@ -353,8 +359,9 @@ impl Fusion {
         self.cue(exposure.time, outputs);
     }
 
-    /// Gives an exposure to the tracks, and what these leave to the search for new ones; returns
-    /// how it fits the tracks, and which has used which of its sightings (by index).
+    /// Updates the tracks with an exposure, and gives what they leave over to the search for new
+    /// tracks; returns how the exposure fits the tracks, and which track has used which sighting
+    /// (by index).
     fn follow(
         &mut self,
         exposure: &Exposure,
@@ -378,14 +385,14 @@ impl Fusion {
         for start in initiator.hand_over(exposure, &step.used, known, tracker.motion()) {
             changes.extend(tracker.adopt(start, cameras));
         }
-        let seen = (step.third_differences.as_slice(), step.strangers);
+        let seen = (step.third_differences.as_slice(), step.unassigned);
         if let Some(camera) = cameras.get_mut(&exposure.camera) {
             camera.learn_noise(exposure.time, seen, tracker.motion().holding_s);
         }
         (step.fittings, step.used)
     }
 
-    /// Learns from the bearings of tracks what they say of the camera's clock.
+    /// Updates the estimate of the camera's clock with its bearings of tracks.
     fn compare_clocks(&mut self, exposure: &Exposure, used: &[(usize, TrackId)]) {
         if !self.clocks.is_needed() {
             return;
@@ -400,7 +407,7 @@ impl Fusion {
         }
     }
 
-    /// Learns from an exposure how far its camera can be believed.
+    /// Updates the standing of an exposure's camera by how the exposure fits the tracks.
     fn assess_camera(
         &mut self,
         exposure: &Exposure,
@@ -409,7 +416,7 @@ impl Fusion {
     ) {
         let judgement = self.cameras.judge(&exposure.camera, exposure.time, fittings);
         if judgement.suspects_clock {
-            // Bearings compared and not used can tell.
+            // Bearings that are compared but not used can show this too.
             self.clocks.suspect(&exposure.camera);
         }
         if let Some(standing) = judgement.standing {
@@ -421,7 +428,7 @@ impl Fusion {
         }
     }
 
-    /// Takes in whether a frame of a camera came in time.
+    /// Notes whether a camera's frame came in time.
     fn note_time(
         &mut self,
         camera: &CameraName,
@@ -443,7 +450,7 @@ impl Fusion {
     }
 }
 
-/// A frame is not used, or a part of it, and why.
+/// The rejection of a frame, or of a part of it, with the reason.
 fn refused(frame: &BearingFrame, reason: RejectionReason) -> Rejection {
     Rejection { camera: frame.camera.clone(), sequence: frame.sequence, reason }
 }

@@ -1,4 +1,5 @@
-//! From the wire to what the fusion works on: what comes out of here is possible.
+//! Reads bearing frames from the wire into exposures; every exposure that comes out is physically
+//! possible.
 
 use std::fmt;
 
@@ -10,7 +11,7 @@ use crate::cameras::{KnownCamera, Pointed, Rooted};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Bearings, Counters, Weighting};
 
-/// Bearings of one frame that are read: more is no picture, and memory is bounded.
+/// Most bearings that are read of one frame: no image has more, and memory is bounded.
 const MAX_BEARINGS: usize = 10_000;
 
 /// One measured target in one exposure.
@@ -18,9 +19,9 @@ const MAX_BEARINGS: usize = 10_000;
 pub struct Sighting {
     /// The 2D track that measured it.
     pub image_track: u64,
-    /// Where it is seen.
+    /// Its sight line.
     pub line: SightLine,
-    /// Whether it is of something that stands in the camera's view for good.
+    /// Whether it is of something fixed in the camera's view (a tree, the horizon, a light).
     pub(crate) rooted: Rooted,
 }
 
@@ -33,20 +34,20 @@ pub struct Exposure {
     pub sequence: u64,
     /// Capture time.
     pub time: Timestamp,
-    /// What is uncertain of the camera as a whole.
+    /// The uncertainty that all its bearings share.
     pub(crate) uncertainty: CameraUncertainty,
     /// Where its mount pointed, if it has one.
     pub(crate) pointed: Option<Pointed>,
-    /// Density of the camera's false bearings, 1/sr.
+    /// Density of the camera's false bearings (clutter), 1/sr.
     pub(crate) clutter_per_sr: f64,
-    /// What has been taken off the reported time for the clock's offset, s.
+    /// The clock's offset that has been subtracted from the reported time, s.
     pub(crate) correction_s: f64,
     /// The targets, in the frame's order.
     pub sightings: Vec<Sighting>,
 }
 
 impl Exposure {
-    /// It is not used, and why.
+    /// The rejection of this exposure for a reason.
     pub(crate) fn refused(&self, reason: RejectionReason) -> Rejection {
         Rejection { camera: self.camera.to_string(), sequence: self.sequence, reason }
     }
@@ -55,28 +56,28 @@ impl Exposure {
 /// Why a frame or a part of it was not used.
 #[derive(Clone, Debug, PartialEq)]
 pub enum RejectionReason {
-    /// No calibration is known for the camera.
+    /// The camera has no calibration.
     UnknownCamera,
-    /// Its time lies before what has been handled already.
+    /// Its capture time lies before exposures that have been handled already.
     Late {
         /// By how much, s.
         by_s: f64,
     },
-    /// Its time lies too far ahead of the other cameras.
+    /// Its capture time lies too far ahead of the other cameras.
     Future {
         /// By how much, s.
         by_s: f64,
     },
-    /// A frame of this camera and time has been handled.
+    /// A frame of this camera with this capture time has been handled before.
     Duplicate,
     /// The frame's time or its standard deviation is impossible.
     Time,
-    /// The camera is on a mount, and the frame does not say where that pointed, or says what is
-    /// impossible.
+    /// The camera is on a mount, and the frame does not say where the mount pointed, or the angles
+    /// are impossible.
     Pointing,
     /// One bearing is impossible; the others of the frame are used.
     Bearing(GeometryError),
-    /// The frame has more bearings than a picture can have; the first ones are used.
+    /// The frame has more bearings than an image can have; the first ones are used.
     Crowded {
         /// How many are left out.
         left_out: usize,
@@ -84,7 +85,7 @@ pub enum RejectionReason {
 }
 
 impl RejectionReason {
-    /// The name under which it is counted.
+    /// The name of its counter.
     pub fn counter(&self) -> &'static str {
         match self {
             Self::UnknownCamera => "rejected_unknown_camera",
@@ -99,7 +100,7 @@ impl RejectionReason {
     }
 }
 
-/// Something that was not used, with its source.
+/// A frame, or a part of one, that was not used, with its source.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rejection {
     /// The camera as the frame names it.
@@ -159,7 +160,7 @@ fn sighting(
     })
 }
 
-/// Where the mount of a frame's camera pointed, if it has one.
+/// The direction in which the mount of a frame's camera pointed; `None` without a mount.
 fn pointed(frame: &BearingFrame, known: &KnownCamera) -> Result<Option<Pointed>, RejectionReason> {
     if known.mount.is_none() {
         return Ok(None);
@@ -168,7 +169,7 @@ fn pointed(frame: &BearingFrame, known: &KnownCamera) -> Result<Option<Pointed>,
     said.map(Some).ok_or(RejectionReason::Pointing)
 }
 
-/// Reads a frame: what was measured, and what of it had to be left out.
+/// Reads a frame: returns its measurements, and the reasons for which parts of it were left out.
 pub(crate) fn read(
     frame: &BearingFrame,
     name: &CameraName,

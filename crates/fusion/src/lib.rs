@@ -1,4 +1,4 @@
-//! The fusion centre: time-stamped bearings of three and more unsynchronised
+//! The fusion centre: time-stamped bearings of three or more unsynchronised
 //! cameras in, 3D tracks with velocity and covariance out.
 //!
 //! [`Fusion`] is a pure state machine. It takes [`BearingFrame`]s in any order
@@ -8,11 +8,11 @@
 //! Inside: bearings that belong to known tracks update them one exposure at a
 //! time ([`Track`], interacting models of iterated extended Kalman filters);
 //! the others are gathered into observation periods, in which sets of them
-//! begin hypotheses that are followed until one reading of the bearings is by
-//! far the best. The papers' way can be chosen in its place ([`papers`]).
+//! start hypotheses that are followed until one explanation of the bearings is
+//! by far the best. The papers' method can be chosen instead ([`papers`]).
 //!
-//! Three cameras look at a place over which a target flies; two seconds of their bearings, no two
-//! of them of one time, are a track:
+//! Three cameras look at a place over which a target flies; from two seconds of their bearings, no
+//! two of them taken at the same time, comes a track:
 //!
 //! ```
 //! use crossfix_fusion::{Fusion, FusionConfig};

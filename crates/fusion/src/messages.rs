@@ -1,4 +1,4 @@
-//! What the fusion centre says, in the words of the wire.
+//! Conversion of the fusion centre's results to messages.
 
 use crossfix_filter::KinematicState;
 use crossfix_message::{CameraResidual, Payload, Timestamp, TrackEvent, TrackState};
@@ -8,7 +8,7 @@ use crate::spatial::Quantity;
 use crate::track::{Track, TrackStatus};
 use crate::tracker::TrackChange;
 
-/// Something that happened to a track.
+/// The message of an event of a track.
 pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
     TrackEvent {
         time_ns: time.nanos(),
@@ -20,7 +20,7 @@ pub(crate) fn event(change: TrackChange, time: Timestamp) -> TrackEvent {
     .stamped()
 }
 
-/// A track as of `time`.
+/// The message of a track, with its state predicted to `time`.
 pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix_message::Track {
     let now = track.predicted(time, motion);
     let state = match track.status {
@@ -57,10 +57,10 @@ pub(crate) fn track(track: &Track, time: Timestamp, motion: &Motion) -> crossfix
     told
 }
 
-/// Says where a track is and how it moves.
+/// Sets a message's position, velocity and covariance.
 pub(crate) fn set_state(told: &mut crossfix_message::Track, state: &KinematicState) {
     told.position = Some(state.position().into());
     told.velocity = Some(state.velocity().into());
-    // Symmetric, so columns are rows.
+    // Symmetric, so column-major is row-major.
     told.covariance = state.covariance.as_slice().to_vec();
 }

@@ -6,20 +6,20 @@ use crossfix_filter::{
 
 use crate::{ConfigError, Manoeuvres, Tracking};
 
-/// What a track's velocity may have become after a manoeuvre that a detector saw, m/s per axis.
+/// Standard deviation of a track's velocity after a manoeuvre that a detector saw, m/s per axis.
 pub(crate) const REINITIALISED_VELOCITY_SD: f64 = 15.0;
-/// How far the position may be off by then, m per axis.
+/// Standard deviation of its position by then, m per axis.
 pub(crate) const REINITIALISED_POSITION_SD: f64 = 1.0;
 
 /// The motion models of all tracks, and the detector that a new track gets.
 #[derive(Clone, Debug)]
 pub(crate) struct Motion {
-    /// Of tracks that several cameras see.
+    /// For tracks that several cameras see.
     models: MotionModels,
-    /// Of tracks that one camera alone sees: what the target does along its sight line nobody
-    /// sees, so every model that is not calm is as uncertain as the liveliest.
+    /// For tracks that one camera alone sees: the motion along its sight line cannot be observed,
+    /// so every model that is not calm is as uncertain as the liveliest.
     unranged: MotionModels,
-    /// A camera's bearing holds a track for so long, s.
+    /// How long after its bearing a camera counts as one that holds (supports) a track, s.
     pub(crate) holding_s: f64,
     detector: Option<Detector>,
 }
@@ -27,7 +27,7 @@ pub(crate) struct Motion {
 /// A detector of manoeuvres (Kalinov 2019).
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Detector {
-    /// The paper's.
+    /// The paper's, on the smoothed residual.
     Residual(SmoothedResidual),
     /// On the normalised innovation squared.
     Innovation(NormalisedInnovation),
@@ -73,13 +73,13 @@ impl Motion {
         Ok(Self { models, unranged, holding_s: config.coasting_after_s, detector })
     }
 
-    /// The models of a track that two cameras see, or of one whose motion along the one sight line
-    /// that is left nobody sees.
+    /// The models of a track that two cameras see (`ranged`), or of one whose motion along its only
+    /// sight line cannot be observed.
     pub(crate) fn models(&self, ranged: bool) -> &MotionModels {
         if ranged { &self.models } else { &self.unranged }
     }
 
-    /// Density of acceleration over all models of a track that is held, m^2/s^3.
+    /// Mean density of the acceleration over all models of a track that is held, m^2/s^3.
     pub(crate) fn density(&self, probabilities: &[f64]) -> f64 {
         self.models.models().iter().zip(probabilities).map(|(model, p)| model.density * p).sum()
     }

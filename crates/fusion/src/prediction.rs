@@ -1,5 +1,5 @@
-//! A track's prediction as one camera sees it: computed once an exposure, compared with every
-//! bearing of it.
+//! A track's predicted bearing for one camera: computed once per exposure, and compared with every
+//! bearing of the exposure.
 
 use std::f64::consts::PI;
 
@@ -9,77 +9,82 @@ use nalgebra::{Matrix2, Matrix3x2, Point3, Vector2};
 
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
-/// Where a camera should see a target, and how surely.
+/// The predicted bearing of a target for one camera, with its covariance.
 #[derive(Clone, Debug)]
 pub(crate) struct BearingPrediction {
     model: BearingModel,
+    /// Factor on the covariances that the camera reports.
     factor: f64,
-    /// By what is known of the camera's errors.
+    /// The spread given what is known of the camera's errors.
     known: Spread,
-    /// The same where those that last have been drawn anew, and the probability of that.
+    /// The spread if the camera's lasting errors have been drawn again (a label or an image tracker
+    /// has jumped), and the probability of that.
     renewed: Option<(Spread, f64)>,
-    /// What each model's process noise adds along both tangents, rad^2, and its probability.
+    /// Variance that each model's process noise adds along both tangents, rad^2, and the models'
+    /// probabilities.
     added: ModelWeights,
     weights: ModelWeights,
+    /// The largest of these variances, rad^2: the gate's.
     widest: f64,
 }
 
-/// How far a bearing may lie from the direction that is expected, along the tangents.
+/// Mean and covariance of a bearing about the expected direction, along the tangents.
 #[derive(Clone, Copy, Debug)]
 struct Spread {
-    /// What the camera's errors are thought to shift the bearing by, rad.
+    /// Shift of the bearing by the estimated errors of the camera, rad.
     shifted: Vector2<f64>,
-    /// Covariance of the direction without the process noise of this step, with what pose and clock
-    /// of the camera add, rad^2.
+    /// Covariance of the direction, rad^2: of the state without this step's process noise, and of
+    /// the camera's pose and clock; the bearing's own noise comes on top.
     steady: Matrix2<f64>,
-    /// What poses and clocks of the camera shift all its bearings by, rad^2, and how that goes with
-    /// the track's error.
+    /// Covariance of the shift that the camera's shared errors give to all its bearings, rad^2, and
+    /// its covariance with the track's own error of direction.
     shift: Matrix2<f64>,
     cross: Matrix2<f64>,
 }
 
-/// A line of which a track has been made, along the tangents.
+/// One of the lines that a track was started from, compared with that track; along the tangents.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Beginning {
-    /// What of it the track leaves, rad.
+    /// The line less the track's direction: the residual, rad.
     pub(crate) left: Vector2<f64>,
-    /// Covariances of the camera's shift, of the line's noise, and of the track's place as seen
-    /// from there, rad^2.
+    /// Covariances of the camera's shift, of the line's noise, and of the track's position as seen
+    /// from this camera, rad^2.
     pub(crate) shift: Matrix2<f64>,
     pub(crate) noise: Matrix2<f64>,
     pub(crate) placed: Matrix2<f64>,
 }
 
-/// A bearing against a prediction, with what its camera shifts all of its bearings by apart, along
-/// the tangents.
+/// Decomposition of a bearing's deviation from its prediction into the camera's shift (the same for
+/// all its bearings) and the rest; along the tangents.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GivenShift {
     /// Covariance of the shift, rad^2.
     pub(crate) shift: Matrix2<f64>,
-    /// What of a shift the bearing is off by: the track has taken the rest of it in.
+    /// L: with a shift s the bearing is expected to be off by L s, as the track has already
+    /// absorbed the rest of s.
     pub(crate) left: Matrix2<f64>,
-    /// Covariance of the rest, rad^2.
+    /// Covariance of the deviation that remains once the shift is known, rad^2.
     pub(crate) spread: Matrix2<f64>,
 }
 
-/// How a bearing fits a prediction.
+/// How well a bearing fits a prediction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Fit {
-    /// Squared Mahalanobis distance under the liveliest of the models: what the gate looks at.
+    /// Squared Mahalanobis distance with the process noise of the liveliest model: the gate's test.
     pub(crate) gate_distance: f64,
-    /// Logarithm of the bearing's density over all models, 1/sr.
+    /// Logarithm of the bearing's probability density over all models, 1/sr.
     pub(crate) log_density: f64,
 }
 
 impl Fit {
-    /// Log-likelihood ratio of the bearing being a target's that is seen with a probability against being
-    /// one of so many false ones, 1/sr.
+    /// Log-likelihood ratio of two explanations of the bearing: a target that is detected with
+    /// probability `detection`, or clutter of density `clutter_per_sr` (1/sr).
     pub(crate) fn log_ratio(&self, detection: f64, clutter_per_sr: f64) -> f64 {
         detection.ln() + self.log_density - clutter_per_sr.ln()
     }
 
-    /// The likelier of two readings of a bearing, by what was known of its camera's errors or as
-    /// those that last have been drawn anew, which is of a probability.
+    /// The likelier of two explanations of a bearing: that the camera's errors are as known, or
+    /// that the lasting ones have been drawn again, which has the given probability.
     pub(crate) fn likelier(
         known: Option<Self>,
         renewed: Option<Self>,
@@ -106,20 +111,23 @@ impl BearingPrediction {
         uncertainty: &CameraUncertainty,
         errors: &SharedErrors,
     ) -> Option<Self> {
-        // Process noise is the same along all axes: what it adds to a direction is a multiple of
-        // the identity, and only what the models share has to be projected.
+        // Process noise is isotropic: along the tangents it adds a multiple of the identity, so
+        // only the part of the state that all models share has to be projected.
         let state: KinematicState = imm.combined().predicted(interval, 0.0);
         let model = BearingModel::new(origin, state.position())?;
         let by = model.by_position();
         let shifts = uncertainty.shifts(&model, state.velocity());
         let noise = uncertainty.noise(&model, state.velocity(), &Matrix2::zeros());
+        // H P H', with H = E' / r.
         let placed = by * state.position_covariance() * by.transpose();
         let spread = |errors: &SharedErrors| {
             let shift = errors.spread(&shifts);
+            // H X J', with X the track's covariance with the shared errors.
             let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
             let steady = placed + cross + cross.transpose() + shift + noise;
             Spread { shifted: shifts * errors.mean, steady, shift, cross }
         };
+        // White acceleration of density q moves a position by a variance of q t^3 / 3.
         let moved = interval.abs().powi(3) / 3.0 / model.range.powi(2);
         let mut added = [0.0; MAX_MODELS];
         for (variance, model) in added.iter_mut().zip(models.models()) {
@@ -136,9 +144,9 @@ impl BearingPrediction {
         })
     }
 
-    /// Where a camera at `origin` should see a target of a state, as of the state's time; the
-    /// target may have moved by `moved` (m, standard deviation per axis) between that time and the
-    /// exposure.
+    /// The predicted bearing of a state, at the state's time, for a camera at `origin`; between
+    /// that time and the exposure the target may have moved by `moved` (m, standard deviation per
+    /// axis).
     pub(crate) fn of_state(
         state: &KinematicState,
         origin: Point3<f64>,
@@ -161,19 +169,20 @@ impl BearingPrediction {
         self.model.range
     }
 
-    /// The tangents at the predicted direction, in which its covariances are expressed, world.
+    /// The tangents at the predicted direction on which its covariances are expressed, world frame.
     pub(crate) fn basis(&self) -> &Matrix3x2<f64> {
         &self.model.basis
     }
 
-    /// What a bearing is expected to be off by, where what the camera shifts all of its own by is
-    /// known.
+    /// The expected deviation of a bearing given the shift that its camera adds to all its
+    /// bearings. The line's covariance counts at least `least_factor` times.
     pub(crate) fn given_shift(&self, line: &SightLine, least_factor: f64) -> GivenShift {
+        // Mean process noise over the models.
         let added: f64 =
             self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
         let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
-        // Of the shift s the track has taken C V^-1 s in, with C the covariance of the two and V
-        // the shift's.
+        // With V the covariance of the shift s and C its covariance with the track's error, the
+        // track has absorbed C V^-1 s: L = I + C V^-1, and the rest has the covariance S - L V L'.
         let Spread { steady, shift, cross, .. } = self.known;
         let taken = shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| cross * inverse);
         let left = Matrix2::identity() + taken;
@@ -181,7 +190,8 @@ impl BearingPrediction {
         GivenShift { shift, left, spread: spread + noise + Matrix2::identity() * added }
     }
 
-    /// What is left of a line of which the track has been made.
+    /// The residual of a line that the track was started from, with its covariances; `None` if the
+    /// line points to the other side.
     pub(crate) fn beginning(&self, line: &SightLine) -> Option<Beginning> {
         let noise = self.model.covariance_of(line) * self.factor;
         let Spread { steady, shift, cross, .. } = self.known;
@@ -189,8 +199,8 @@ impl BearingPrediction {
         Some(Beginning { left: self.model.offset(line)?, shift, noise, placed })
     }
 
-    /// How a bearing fits; `None` if it lies outside the gate. What is likelier of the camera's
-    /// errors that last, that they went on or were drawn anew, is taken for true.
+    /// How well a bearing fits; `None` if it lies outside the gate. Of the two cases, that the
+    /// camera's lasting errors went on or that they were drawn again, the likelier is used.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
         let offset = self.model.offset(line)?;
         let known = self.fit_by(&self.known, offset, line, gate);
@@ -206,16 +216,18 @@ impl BearingPrediction {
         gate: Gate,
     ) -> Option<Fit> {
         let innovation = offset - by.shifted;
-        // No axis of the covariance is longer than its trace: most bearings need no more than this.
+        // A variance along any axis is at most the trace: this cheap test rejects most bearings.
         let longest = by.steady.trace() + 2.0 * self.widest + line.covariance.trace() * self.factor;
         if innovation.norm_squared() > gate.threshold() * longest {
             return None;
         }
+        // S without the process noise, which each model adds in its turn.
         let spread = by.steady + self.model.covariance_of(line) * self.factor;
         let gate_distance = distance(&spread, self.widest, innovation)?.0;
         if !gate.holds(gate_distance) {
             return None;
         }
+        // Mixture over the models: sum of w_i N(z; 0, S + q_i I).
         let mut density = 0.0;
         for (&added, &weight) in self.added.iter().zip(&self.weights) {
             if weight > 0.0 {
@@ -227,20 +239,22 @@ impl BearingPrediction {
     }
 }
 
-/// Logarithm of a normal density of mean 0.
+/// Logarithm of a two-dimensional normal density of mean 0.
 pub(crate) fn log_density(covariance: &Matrix2<f64>, vector: Vector2<f64>) -> Option<f64> {
     let (squared, determinant) = distance(covariance, 0.0, vector)?;
     Some(-squared / 2.0 - (2.0 * PI).ln() - determinant.ln() / 2.0)
 }
 
-/// Squared Mahalanobis distance of a vector, and the determinant, for `covariance + I added`.
+/// Squared Mahalanobis distance of a vector for `covariance + I added`, and the determinant of
+/// that.
 fn distance(covariance: &Matrix2<f64>, added: f64, vector: Vector2<f64>) -> Option<(f64, f64)> {
     let [xx, xy, yy] = [covariance.m11 + added, covariance.m12, covariance.m22 + added];
     let determinant = xx * yy - xy * xy;
     let squared = (yy * vector.x * vector.x - 2.0 * xy * vector.x * vector.y
         + xx * vector.y * vector.y)
         / determinant;
-    // Of a matrix that is less than nothing the determinant is positive too.
+    // A negative definite matrix has a positive determinant too, so the first element is tested as
+    // well.
     (determinant > 0.0 && xx > 0.0 && squared.is_finite()).then_some((squared, determinant))
 }
 

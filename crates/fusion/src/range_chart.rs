@@ -1,11 +1,12 @@
-//! The coordinates in which one camera's bearings leave the range alone.
+//! Coordinates in which the bearings of one camera do not change the range.
 //!
 //! Seen from a camera that stands still, a target at twice the distance and twice the speed gives
-//! the same bearings for ever. In Cartesian coordinates that direction of the state turns with
-//! every update, and a linearised filter takes the difference for knowledge: within seconds it is
-//! sure of a range that no bearing holds. In the direction, the logarithm of the range, and the
-//! velocity as a share of the range, it is one axis that never turns, a bearing is a linear
-//! measurement of the two others, and an uncertain range is nearly Gaussian.
+//! the same bearings for ever: this direction of the state is unobservable. In Cartesian
+//! coordinates it turns with every update, and a linearised filter takes the difference for
+//! information: within seconds it is sure of a range that no bearing contains. In the coordinates
+//! direction, logarithm of the range, and velocity divided by the range, the unobservable direction
+//! is one axis that never turns, a bearing is a linear measurement of the direction alone, and an
+//! uncertain range is nearly Gaussian.
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::passing_ranges;
@@ -15,26 +16,26 @@ use nalgebra::{
 
 use crate::uncertainty::SharedTies;
 
-/// Coordinates of a target's state about one state.
+/// Coordinates of a target's state, as differences from one given state.
 // Made and used in one update: never stored, so the size of the larger variant costs nothing.
 #[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
 pub(crate) enum Chart {
-    /// Position and velocity: where several cameras hold the target in its place.
+    /// Position and velocity: for targets that several cameras place.
     Cartesian(KinematicState),
-    /// Where one camera alone follows it.
+    /// Direction, range and velocity by range: for targets that one camera alone follows.
     ByRange(RangeChart),
 }
 
-/// Direction (two tangents, rad), logarithm of the range, and velocity by range (1/s, world's
-/// axes), as differences from those of one state, seen from one place.
+/// Direction (along two tangents, rad), logarithm of the range, and velocity divided by the range
+/// (1/s, world axes), as differences from those of one state, seen from one place.
 #[derive(Clone, Debug)]
 pub(crate) struct RangeChart {
     origin: Point3<f64>,
     direction: Unit<Vector3<f64>>,
     tangents: Matrix3x2<f64>,
     range: f64,
-    /// Velocity by range, 1/s.
+    /// Velocity divided by the range, 1/s.
     share: Vector3<f64>,
 }
 
@@ -43,25 +44,25 @@ pub(crate) struct RangeChart {
 pub(crate) struct ChartPoint {
     pub(crate) place: Point3<f64>,
     pub(crate) velocity: Vector3<f64>,
-    /// How the place changes with the first three coordinates.
+    /// Derivative of the position by the first three coordinates.
     pub(crate) place_by: Matrix3<f64>,
-    /// How position and velocity change with the coordinates.
+    /// Derivative of position and velocity by the coordinates.
     pub(crate) state_by: Matrix6<f64>,
 }
 
 impl Chart {
-    /// Of a state that several cameras hold.
+    /// The Cartesian chart about a state, for a target that several cameras place.
     pub(crate) fn cartesian(state: &KinematicState) -> Self {
         Self::Cartesian(state.clone())
     }
 
-    /// About a state, as seen from `origin`; `None` if the state lies there.
+    /// The range chart about a state as seen from `origin`; `None` if the state lies there.
     pub(crate) fn by_range(origin: Point3<f64>, state: &KinematicState) -> Option<Self> {
         RangeChart::new(origin, state).map(Self::ByRange)
     }
 
-    /// A covariance of position and velocity, and theirs with some errors, in the chart's
-    /// coordinates.
+    /// The covariance of position and velocity, and their cross-covariance with some errors, both
+    /// in the chart's coordinates.
     pub(crate) fn expressed(
         &self,
         covariance: &Matrix6<f64>,
@@ -76,7 +77,7 @@ impl Chart {
         }
     }
 
-    /// How the first three coordinates follow position and velocity.
+    /// Derivative of the first three coordinates by position and velocity.
     pub(crate) fn place_by_state(&self) -> Matrix3x6<f64> {
         match self {
             Self::Cartesian(_) => Matrix3x6::identity(),
@@ -84,9 +85,10 @@ impl Chart {
         }
     }
 
-    /// Back from the chart at a point of it, after an update by a measurement of the place (`by`,
-    /// on the first three coordinates) with a gain: the covariance, what becomes of the state's
-    /// covariance with any error, and the gain, all of position and velocity.
+    /// Transforms the result of an update back from the chart at one of its points. The update
+    /// measured the position with the Jacobian `by` (on the first three coordinates) and the gain
+    /// K. Returns the covariance, the factor I - K H that is applied to the state's covariance with
+    /// any other error, and K, all for position and velocity.
     pub(crate) fn from(
         &self,
         point: &ChartPoint,
@@ -94,6 +96,7 @@ impl Chart {
         by: &Matrix2x3<f64>,
         gain: Matrix6x2<f64>,
     ) -> (Matrix6<f64>, Matrix6<f64>, Matrix6x2<f64>) {
+        // I - K H, where H = [by, 0].
         let mut left = Matrix6::identity();
         let mut of_place = left.fixed_columns_mut::<3>(0);
         of_place -= gain * by;
@@ -107,7 +110,7 @@ impl Chart {
         }
     }
 
-    /// The point of some coordinates.
+    /// The point with these coordinates.
     pub(crate) fn point(&self, coordinates: &Vector6<f64>) -> ChartPoint {
         match self {
             Self::Cartesian(state) => ChartPoint {
@@ -120,8 +123,9 @@ impl Chart {
         }
     }
 
-    /// The coordinate along the sight line at which this passes nearest to a line; `None` if that
-    /// lies behind either camera, or there is no such coordinate.
+    /// The logarithmic range coordinate at which the chart's sight line passes nearest to `line`;
+    /// `None` if that lies behind either camera, or in the Cartesian chart, which has no such
+    /// coordinate.
     pub(crate) fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
         match self {
             Self::Cartesian(_) => None,
@@ -137,8 +141,10 @@ impl RangeChart {
         Some(Self { origin, direction, tangents, range, share: state.velocity() / range })
     }
 
+    /// Derivative of the coordinates by position and velocity, at the chart's own state.
     fn by_state(&self) -> Matrix6<f64> {
         let mut by = Matrix6::zeros();
+        // Rows: da = T' dp / r, d(ln r) = u' dp / r, d(v/r) = dv / r - (v/r) d(ln r).
         let along = self.direction.transpose() / self.range;
         by.fixed_view_mut::<2, 3>(0, 0).copy_from(&(self.tangents.transpose() / self.range));
         by.fixed_view_mut::<1, 3>(2, 0).copy_from(&along);
@@ -149,6 +155,7 @@ impl RangeChart {
     }
 
     fn point(&self, coordinates: &Vector6<f64>) -> ChartPoint {
+        // u = (u0 + T a) / |u0 + T a| and r = r0 exp(c).
         let aside = self.direction.into_inner() + self.tangents * coordinates.fixed_rows::<2>(0);
         let (direction, length) = Unit::new_and_get(aside);
         let range = self.range * coordinates[2].exp();
@@ -159,8 +166,9 @@ impl RangeChart {
         let mut place_by = Matrix3::zeros();
         place_by.fixed_view_mut::<3, 2>(0, 0).copy_from(&(across * range));
         place_by.set_column(2, &(direction.into_inner() * range));
-        // Velocity is kept in ranges per second, so that it scales with the unknown range.
+        // v = (v0/r0 + w) r: velocity in ranges per second scales with the unknown range.
         let velocity = (self.share + coordinates.fixed_rows::<3>(3)) * range;
+        // dp/d(a, c) as above, dv/dc = v, dv/dw = r I.
         let mut state_by = Matrix6::zeros();
         state_by.fixed_view_mut::<3, 3>(0, 0).copy_from(&place_by);
         state_by.fixed_view_mut::<3, 1>(3, 2).copy_from(&velocity);
@@ -174,7 +182,7 @@ impl RangeChart {
         }
     }
 
-    /// The logarithm of the range against the chart's own.
+    /// The coordinate ln(r / r0) at which the sight line passes nearest to `line`.
     fn nearest_to(&self, line: &crossfix_geometry::SightLine) -> Option<f64> {
         let [here, there] =
             passing_ranges((self.origin, &self.direction), (line.origin, &line.direction));

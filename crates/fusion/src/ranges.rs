@@ -1,12 +1,13 @@
-//! What each number of the configuration may be: wide enough for anything that flies, narrow enough
-//! that no number makes the fusion slow, or its sums too large or too small to be told apart.
+//! Admissible range of each number of the configuration: wide enough for anything that flies,
+//! narrow enough that no number makes the fusion slow, or its sums too large or too small to be
+//! told apart.
 
 use crate::motion::Motion;
 use crate::{
     ConfigError, FlightModel, FusionConfig, InitiationMethod, Manoeuvres, SpatialSolver, Weighting,
 };
 
-/// A number of the configuration, and from where to where it makes sense.
+/// A number of the configuration, with the range in which it makes sense.
 struct Range {
     key: &'static str,
     value: f64,
@@ -21,7 +22,7 @@ const fn range(key: &'static str, value: f64, least: f64, most: f64) -> Range {
 /// A key and its number.
 type Key = (&'static str, fn(&FusionConfig) -> f64);
 
-// What each method alone uses.
+// Keys that one method alone uses.
 const OF_EQUAL_WEIGHTS: &[Key] = &[("bearings.equal_sd_rad", |c| c.bearings.equal_sd_rad)];
 const OF_PAIRS: &[Key] = &[("initiation.pair_gate_m2", |c| c.initiation.pair_gate_m2)];
 const OF_GROUPING: &[Key] =
@@ -49,7 +50,7 @@ const OF_INNOVATION: &[Key] = &[
 impl Range {
     fn check(&self) -> Result<(), ConfigError> {
         let &Self { key, value, least, most } = self;
-        // Not a number is in no range.
+        // NaN is in no range.
         if (least..=most).contains(&value) {
             return Ok(());
         }
@@ -79,8 +80,8 @@ impl FusionConfig {
         self.unused().map_or(Ok(()), Err)
     }
 
-    /// A number that says something else than the default and that nothing uses with the methods
-    /// chosen: whoever has set it thinks that it does something.
+    /// Finds a number that differs from the default although none of the chosen methods uses it:
+    /// whoever has set it thinks that it does something.
     fn unused(&self) -> Option<ConfigError> {
         let Self { bearings, initiation, tracking, .. } = self;
         let usual = Self::default();
@@ -187,7 +188,7 @@ impl FusionConfig {
 mod tests {
     use super::*;
 
-    /// What a configuration with one change is refused for.
+    /// The message with which a configuration with one change is refused.
     fn refused(change: impl FnOnce(&mut FusionConfig)) -> String {
         let mut config = FusionConfig::default();
         change(&mut config);

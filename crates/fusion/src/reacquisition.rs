@@ -1,5 +1,8 @@
-//! Tracks that one camera alone follows, seen by a second one again: every bearing that crosses the
-//! sight line may be the target's, so each is followed as a leaf of its own until one is sure.
+//! Re-acquisition: a second camera sees the target of a track that one camera alone follows. Any of
+//! its bearings that crosses the sight line may be the target's, so each is followed as a
+//! hypothesis of its own (a leaf) until one is sure.
+//!
+//! "Strangers" are bearings of other objects or of nothing: clutter.
 
 use std::collections::BTreeMap;
 
@@ -11,18 +14,18 @@ use crate::track::{Track, TrackId};
 use crate::visibility::log_missed;
 use crate::{Exposure, Tracking};
 
-/// A leaf is the track when the bearings are so many times (logarithm) likelier the target's than
-/// strangers: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on a
-/// stranger.
+/// A leaf replaces the track when its bearings are likelier the target's than strangers by this
+/// log-likelihood ratio: a chance of 1 in 3000. Half of it would settle one re-acquisition in 50 on
+/// a stranger.
 pub(crate) const FOUND_AGAIN_MARGIN: f64 = 8.0;
-/// A leaf less likely than this (logarithm) is given up.
+/// A leaf whose log-likelihood ratio falls to this is given up.
 const GIVEN_UP: f64 = -3.0;
-/// Leaves of one track that are followed at a time, the best ones: strangers cannot fill the
-/// memory.
+/// Most leaves of one track at a time, the best ones: memory is bounded however many strangers
+/// there are.
 const MAX_LEAVES: usize = 4;
 
-/// A track with bearings of a second camera taken in, and how much likelier (logarithm) it is that
-/// these are the target's.
+/// A copy of the track that has used bearings of a second camera, with the log-likelihood ratio of
+/// these being the target's against being strangers.
 #[derive(Clone, Debug)]
 struct Leaf {
     track: Track,
@@ -35,7 +38,7 @@ pub(crate) struct Reacquisition {
     leaves: BTreeMap<TrackId, Vec<Leaf>>,
 }
 
-/// What an exposure is compared with.
+/// An exposure with what it is compared by.
 pub(crate) struct Context<'a> {
     pub(crate) exposure: &'a Exposure,
     pub(crate) known: &'a KnownCamera,
@@ -43,12 +46,12 @@ pub(crate) struct Context<'a> {
     pub(crate) config: &'a Tracking,
     pub(crate) gate: Gate,
     pub(crate) max_range_m: f64,
-    /// Which sightings belong to which tracks.
+    /// The track that each sighting belongs to, if any.
     pub(crate) owners: &'a [Option<TrackId>],
 }
 
 impl Context<'_> {
-    /// The sightings (by index) that may be a track's, with their log-likelihood ratios against
+    /// The sightings (by index) in a track's gate, with their log-likelihood ratios against
     /// strangers, the best first.
     fn fits(&self, track: &Track, owner: TrackId) -> Vec<(f64, usize)> {
         let Self { exposure, known, motion, config, .. } = self;
@@ -71,11 +74,12 @@ impl Context<'_> {
         fits
     }
 
+    /// Whether the camera should see the track's target.
     fn expects(&self, track: &Track) -> bool {
         self.known.expects(track.position_at(self.exposure.time), self.max_range_m)
     }
 
-    /// A track with a sighting taken in.
+    /// A copy of a track, updated with a sighting; `None` if the numbers fail.
     fn taken(&self, track: &Track, index: usize) -> Option<Track> {
         let Exposure { camera, time, uncertainty, sightings, .. } = self.exposure;
         let mut track = track.clone();
@@ -89,14 +93,16 @@ impl Context<'_> {
         Some(track)
     }
 
-    /// A leaf after the exposure.
+    /// A leaf after the exposure, with the sighting (by index) that it has used; `None` if it is
+    /// given up.
     fn advanced(&self, mut leaf: Leaf, owner: TrackId) -> Option<(Leaf, Option<usize>)> {
         let Exposure { camera, time, .. } = self.exposure;
         let best = self.fits(&leaf.track, owner).first().copied();
         if let Some((ratio, index)) = best
             && let Some(track) = self.taken(&leaf.track, index)
         {
-            // What the track itself has taken says nothing for or against its leaves.
+            // A sighting that the track itself has used is evidence neither for nor against its
+            // leaves.
             let gained = if self.owners[index].is_some() { 0.0 } else { ratio };
             return Some((Leaf { track, log_ratio: leaf.log_ratio + gained }, Some(index)));
         }
@@ -109,7 +115,7 @@ impl Context<'_> {
         (leaf.log_ratio > GIVEN_UP).then_some((leaf, None))
     }
 
-    /// The leaves that begin with the exposure's bearings.
+    /// New leaves, one for each of the exposure's best free sightings.
     fn begun(&self, track: &Track) -> Vec<(Leaf, Option<usize>)> {
         if !track.is_lost_sight_of_by(&self.exposure.camera, self.motion) {
             return Vec::new();
@@ -125,8 +131,8 @@ impl Context<'_> {
 }
 
 impl Reacquisition {
-    /// Goes on with the leaves of the tracks that one camera alone follows; returns those that are
-    /// found again, with the sighting (by index) that has settled it.
+    /// Continues the leaves of all tracks that one camera alone follows; returns the tracks that
+    /// are found again, with the sighting (by index) that has settled it.
     pub(crate) fn advance(
         &mut self,
         tracks: &BTreeMap<TrackId, Track>,

@@ -1,26 +1,27 @@
 //! Steps of the cameras' clocks.
 //!
 //! A camera's frames are numbered and come in a rhythm. Where the numbers go on and the time does
-//! not go on with them, its clock has stepped, or it has stood still. Where all cameras that are
-//! heard do so by as much, within the time for which late frames are waited for anyway, it is the
-//! site's time: agents of one host, or hosts that follow one source. Until that is clear the frames
-//! of those that have stepped wait; where it does not become clear each clock has stepped for
-//! itself: its step is taken off its times from then on, so that it goes on as if nothing had been.
-//! The site's time is what most clocks say: once most have made the same step, it has, and those
-//! that have not are held to be off.
+//! not go on with them, the camera's clock has stepped, or the camera has stood still. If all
+//! cameras that are heard step by the same amount, within the time for which late frames are waited
+//! for anyway, it is the site's time that has stepped: agents of one host, or hosts that follow one
+//! source. Until that is clear the frames of the cameras that have stepped wait. If it does not
+//! become clear, each clock has stepped for itself: its step is taken off its times from then on,
+//! so that it goes on as if nothing had been. The site's time is what most clocks say: once most
+//! have made the same step, the site's time has made it, and the clocks that have not are taken to
+//! be off.
 //!
-//! A clock that goes back while the frames go on has stepped. One that goes forward may have stood
-//! still: then the other cameras have gone on meanwhile.
+//! A clock that goes back while the frames go on has stepped. Where a clock goes forward its camera
+//! may have stood still: then the other cameras have gone on meanwhile.
 
 use std::collections::BTreeMap;
 
 use crossfix_message::{BearingFrame, CameraName, Timestamp};
 
-/// A frame that is off its camera's rhythm by less than this has only been late, s. With half of it
-/// the frames of phones, which have no rate, are held up.
+/// A frame that is off its camera's rhythm by less than this is only late, s. With half of it the
+/// frames of phones, which have no rate, are held up.
 const LEAST_STEP_S: f64 = 0.25;
-/// The same in its periods. With half of it a frame or two that were numbered and not sent are a
-/// step.
+/// The same in periods of the camera. With half of it a frame or two that were numbered and not
+/// sent count as a step.
 const LEAST_STEP_PERIODS: f64 = 4.0;
 /// Frames after which a camera's rhythm is known. With half of it two frames close together make a
 /// rhythm.
@@ -28,42 +29,42 @@ const KNOWN_RHYTHM: u32 = 5;
 /// The share of a frame in the running mean of its camera's period. With half of it a new rate is
 /// learnt in a second.
 const PERIOD_SHARE: f64 = 0.1;
-/// Cameras that were silent for longer than this are not asked, and after a longer gap a rhythm
-/// says nothing, s. With half of it cameras of 1 Hz are asked by chance.
+/// Cameras that have been silent for longer than this are not asked, and after a longer gap a
+/// rhythm says nothing, s. With half of it cameras of 1 Hz are asked by chance.
 const LIVE_S: f64 = 2.0;
-/// The share of the time for which late frames are waited for that a decision may take. With half
-/// of it hosts whose frames are a tenth of a second apart on their way do not step together; with
-/// all of it what waits is late.
+/// Share of the lateness (the time for which late frames are waited for) that a decision may take.
+/// With half of it hosts whose frames are a tenth of a second apart on their way do not step
+/// together; with all of it the frames that wait are late.
 const SHARE_OF_LATENESS: f64 = 0.5;
-/// A camera whose clock has gone forward stood still where the others have gone on by this share of it.
-/// Anything between none of it and all of it serves.
+/// A camera whose clock has gone forward has stood still if the others have gone on by this share
+/// of the step. Any share between none and all of the step serves.
 const SHARE_OF_STEP: f64 = 0.5;
-/// No more frames than this wait, of no more bearings: memory is bounded.
+/// Most frames that wait, and most bearings in them: memory is bounded.
 const MOST_WAITING: usize = 200;
 const MOST_BEARINGS_WAITING: usize = 20_000;
 
-/// A frame by a clock that is ahead of its camera's.
+/// A frame as stamped by a clock that is `ahead_s` ahead of its camera's.
 pub(crate) fn moved(frame: &BearingFrame, ahead_s: f64) -> BearingFrame {
     let time = Timestamp::from_nanos(frame.capture_time_ns).plus_seconds(ahead_s);
     BearingFrame { capture_time_ns: time.nanos(), ..frame.clone() }
 }
 
-/// One camera's frames so far.
+/// Rhythm of one camera's frames so far.
 #[derive(Clone, Copy, Debug)]
 struct Rhythm {
     sequence: u64,
     time: Timestamp,
     period_s: f64,
     frames: u32,
-    /// How far it has gone on by its own clock, s, steps left out, ...
+    /// How far the camera has gone on by its own clock, s, steps left out.
     gone_s: f64,
-    /// ... and all cameras together, when it was heard last.
+    /// How far all cameras together had gone on when this one was heard last, s.
     heard_s: f64,
-    /// What its clock has stepped by for itself, s.
+    /// Sum of the steps that its clock has made for itself, s.
     ahead_s: f64,
     /// Whether the newest frame was off the rhythm.
     has_stepped: bool,
-    /// The newest time of another camera when it was heard last.
+    /// The newest time of another camera when this one was heard last.
     others: Option<Timestamp>,
 }
 
@@ -82,13 +83,13 @@ impl Rhythm {
         }
     }
 
-    /// Its newest time without the steps of its own.
+    /// The newest time with the clock's own steps taken off.
     fn settled(&self) -> Timestamp {
         self.time.plus_seconds(-self.ahead_s)
     }
 
-    /// By how much the next frame's time is off the rhythm, s, where that is no matter of frames
-    /// that were late.
+    /// By how much the next frame's time is off the rhythm, s; `None` where late frames may explain
+    /// it.
     fn step(&self, sequence: u64, time: Timestamp) -> Option<f64> {
         let numbers = sequence
             .checked_sub(self.sequence)
@@ -102,15 +103,15 @@ impl Rhythm {
             .then_some(step)
     }
 
-    /// Takes the next frame in; returns how far the camera has gone on with it, s.
+    /// Takes the next frame in; returns how far the camera has gone on with that frame, s.
     fn go_on(&mut self, sequence: u64, time: Timestamp, step: Option<f64>) -> f64 {
         let numbers = sequence.saturating_sub(self.sequence);
         let since_s = time.seconds_since(self.time) - step.unwrap_or(0.0);
         let is_another_rate = step.is_some() && self.has_stepped;
         self.has_stepped = step.is_some();
         if numbers == 0 || is_another_rate || since_s <= 0.0 && step.is_none() {
-            // Numbered anew, out of order, or at another rate from now on: the rhythm has to show
-            // again.
+            // Numbered from the start, out of order, or at another rate from now on: the rhythm has
+            // to show again.
             (self.period_s, self.frames) = (0.0, 0);
         } else if step.is_none() {
             let share = PERIOD_SHARE.max(f64::from(self.frames + 1).recip());
@@ -124,19 +125,19 @@ impl Rhythm {
     }
 }
 
-/// A clock that has stepped.
+/// The step of a clock.
 #[derive(Clone, Copy, Debug)]
 struct Step {
     step_s: f64,
-    /// Its camera before.
+    /// The camera's rhythm before the step.
     before: Rhythm,
     /// How far the others have gone on meanwhile, s.
     others_s: f64,
 }
 
 impl Step {
-    /// Whether a clock has stepped that by now is like this, and not a camera that stood still, nor a
-    /// single frame with a wrong time.
+    /// Whether the clock has stepped, by its camera's rhythm now: it is neither a camera that stood
+    /// still, nor a single frame with a wrong time.
     fn is_of_clock(&self, now: &Rhythm) -> bool {
         let numbers = now.sequence.saturating_sub(self.before.sequence);
         let off_s =
@@ -146,38 +147,38 @@ impl Step {
     }
 }
 
-/// Cameras that have stepped, until it is clear whether all have.
+/// Frames that wait, and steps, until it is clear whether all cameras have stepped.
 #[derive(Debug, Default)]
 struct Pending {
     frames: Vec<BearingFrame>,
     steps: BTreeMap<CameraName, Step>,
-    /// How far the cameras had gone on then, s.
+    /// How far each camera had gone on at the first of these steps, s.
     gone_s: BTreeMap<CameraName, f64>,
 }
 
-/// What becomes of a frame.
+/// Decision on a frame.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Turn {
-    /// It is taken at once.
+    /// The frame is taken at once.
     Now,
-    /// It waits.
+    /// The frame waits.
     Waits,
-    /// What waited is taken, and it after that: all clocks have stepped by so much, s.
+    /// The waiting frames are taken, and then this one: all clocks have stepped by this much, s.
     Together(Vec<BearingFrame>, f64),
-    /// The same, where each has stepped for itself.
+    /// The same, where each clock has stepped for itself.
     Apart(Vec<BearingFrame>, Apart),
 }
 
 /// Clocks that have stepped for themselves.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Apart {
-    /// Whose steps are taken off.
+    /// Cameras whose steps are taken off.
     pub(crate) cameras: Vec<CameraName>,
     /// By how much most clocks have stepped by now, s: so has the site's time.
     pub(crate) site_s: Option<f64>,
 }
 
-/// Watches the cameras' times for steps that all make.
+/// Watches the cameras' times for steps that all of them make.
 #[derive(Debug)]
 pub(crate) struct SiteTime {
     longest_s: f64,
@@ -188,7 +189,7 @@ pub(crate) struct SiteTime {
 }
 
 impl SiteTime {
-    /// Of a site where late frames are waited for so long.
+    /// For a site where late frames are waited for by `lateness_s`.
     pub(crate) fn new(lateness_s: f64) -> Self {
         let longest_s = SHARE_OF_LATENESS * lateness_s;
         Self { longest_s, rhythms: BTreeMap::new(), gone_s: 0.0, pending: None }
@@ -203,7 +204,7 @@ impl SiteTime {
         if sequence < rhythm.sequence
             && let Some(others) = others
         {
-            // Its agent has been started again, perhaps by another clock.
+            // The camera's agent has been started again, perhaps with another clock.
             let off_s = |ahead_s: f64| time.plus_seconds(-ahead_s).seconds_since(others).abs();
             if off_s(0.0) < off_s(rhythm.ahead_s) {
                 rhythm.ahead_s = 0.0;
@@ -217,7 +218,7 @@ impl SiteTime {
         };
         self.gone_s += rhythm.go_on(sequence, time, step);
         rhythm.heard_s = self.gone_s;
-        // A clock that was none of the site's steps for itself.
+        // A clock that was not on the site's time steps for itself.
         if let Some(step_s) = step.filter(|_| self.is_of_site(camera, before.settled())) {
             let gone_s = || {
                 self.rhythms.iter().map(|(name, rhythm)| (name.clone(), rhythm.gone_s)).collect()
@@ -248,12 +249,13 @@ impl SiteTime {
         }
     }
 
-    /// What a camera's clock has stepped by for itself, s.
+    /// Sum of the steps that a camera's clock has made for itself, s.
     pub(crate) fn ahead_s(&self, camera: &CameraName) -> f64 {
         self.rhythms.get(camera).map_or(0.0, |rhythm| rhythm.ahead_s)
     }
 
-    /// A camera does not keep the site's time with the steps of its clock taken off: they were none.
+    /// Handles a camera that does not keep the site's time with its clock's steps taken off: they
+    /// were none.
     pub(crate) fn doubt(&mut self, camera: &CameraName) {
         if let Some(rhythm) = self.rhythms.get_mut(camera) {
             rhythm.ahead_s = 0.0;
@@ -276,7 +278,7 @@ impl SiteTime {
         }
         let mut ahead: Vec<f64> = self.live().map(|(_, rhythm)| rhythm.ahead_s).collect();
         ahead.sort_unstable_by(f64::total_cmp);
-        // Where as many have as have not, those that have not.
+        // The median; where as many have stepped as have not, that of the clocks that have not.
         let middle = [ahead[(ahead.len() - 1) / 2], ahead[ahead.len() / 2]];
         let of_most = if middle[0].abs() < middle[1].abs() { middle[0] } else { middle[1] };
         if of_most.abs() > LEAST_STEP_S {
@@ -286,12 +288,12 @@ impl SiteTime {
         apart
     }
 
-    /// Says that a camera has come to its end: nobody asks it any more.
+    /// Notes that a camera has come to its end: nobody asks it any more.
     pub(crate) fn forget(&mut self, camera: &CameraName) {
         self.rhythms.remove(camera);
     }
 
-    /// Gives out what waits: no more frames come.
+    /// Gives out the frames that wait: no more come.
     pub(crate) fn end(&mut self) -> Vec<BearingFrame> {
         self.pending.take().map_or_else(Vec::new, |pending| pending.frames)
     }
@@ -301,7 +303,7 @@ impl SiteTime {
         self.rhythms.iter().filter(move |(_, rhythm)| self.gone_s - rhythm.heard_s <= longest_s)
     }
 
-    /// Whether a camera's time is what most others have that have not stepped.
+    /// Whether a camera's time agrees with that of most others that have not stepped.
     fn is_of_site(&self, camera: &CameraName, time: Timestamp) -> bool {
         let has_stepped =
             |name| self.pending.as_ref().is_some_and(|pending| pending.steps.contains_key(name));
@@ -311,13 +313,15 @@ impl SiteTime {
         times.get(times.len() / 2).is_none_or(|others| time.seconds_since(*others).abs() < LIVE_S)
     }
 
-    /// The newest time of the other cameras: one of them that goes on is enough to show that time has.
+    /// The newest time of the other cameras: one of them that goes on is enough to show that time
+    /// does.
     fn newest_of_others(&self, camera: &CameraName) -> Option<Timestamp> {
         let others = self.live().filter(|(name, _)| *name != camera);
         others.map(|(_, rhythm)| rhythm.settled()).max()
     }
 
-    /// By how much all clocks have stepped, s, or that each has for itself, if either is clear.
+    /// By how much all clocks have stepped, s, or `Some(None)` if each has for itself; `None` while
+    /// neither is clear.
     fn decide(&self) -> Option<Option<f64>> {
         let pending = self.pending.as_ref()?;
         let mut steps: Vec<f64> = pending.steps.values().map(|step| step.step_s).collect();

@@ -25,18 +25,21 @@ use learnt::Learnt;
 use past::Past;
 use ties::Ties;
 
-/// Two cameras alone must place a target at least this well (root of the sum over the axes, as a
-/// share of the range): nearly parallel lines of two targets cross too.
+/// A target that just two cameras see counts as placed if its position is known to this share of
+/// the range (root of the summed variances of the axes): nearly parallel lines of two different
+/// targets cross too.
 const MAX_PAIR_SHARE: f64 = 0.03;
-/// What the bearings tell apart is looked at this often, s: eigenvalues cost more than an update.
+/// How often a track's observability is computed again, s: the eigenvalues cost more than an
+/// update.
 const OBSERVABILITY_INTERVAL_S: f64 = 1.0;
-/// The information of bearings counts for this long, s.
+/// Time constant with which the Fisher information of past bearings fades, s.
 const INFORMATION_S: f64 = 1.0;
-/// A position is observable if it is known better than this, m.
+/// Prior scale of the position in the observability test, m: a position counts as observable if it
+/// is known better than this.
 const POSITION_SCALE_M: f64 = 20.0;
 
-/// Identity of a 3D track, unique over restarts: see [`crossfix_message::track_id`]. Shown as its
-/// number within its run.
+/// Identity of a 3D track, unique across restarts: see [`crossfix_message::track_id`]. Displayed as
+/// the track's number within its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TrackId(pub u64);
 
@@ -46,89 +49,92 @@ impl fmt::Display for TrackId {
     }
 }
 
-/// The life of a track.
+/// The stage of life that a track is in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrackStatus {
-    /// Begun, and not yet sure.
+    /// May still be clutter.
     Tentative,
-    /// Sure.
+    /// Taken for a target.
     Confirmed,
-    /// Sure, but not seen of late.
+    /// A target that no camera has seen lately.
     Coasting,
-    /// Sure, but one camera alone follows it: a direction with an unknown range.
+    /// A target that only one camera follows: its direction is known, its range is not.
     OneCamera,
-    /// Given up.
+    /// Ended.
     Lost,
 }
 
-/// How well a bearing fitted the track before it was used.
+/// Residual of a bearing against the track's prediction, before the update.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeasurementResidual {
     /// Capture time of the bearing.
     pub time: Timestamp,
     /// Angle between bearing and prediction, rad.
     pub angle: f64,
-    /// Squared Mahalanobis distance, two degrees of freedom.
+    /// Normalised innovation squared, two degrees of freedom.
     pub nis: f64,
 }
 
-/// A bearing that a track has taken in.
+/// What an update with a bearing has shown beside the new state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Taken {
-    /// Whether a detector has seen the target begin to manoeuvre.
+    /// Whether a manoeuvre detector has fired.
     pub(crate) manoeuvre: bool,
-    /// Squared third difference of the camera's last four bearings, by the noise reported.
+    /// Squared third difference of the camera's last four bearings, in units of the reported noise.
     pub(crate) third_difference: Option<f64>,
 }
 
-/// A target in space, kept up from single bearings of single cameras.
+/// A 3D track of one target, updated by single bearings of single cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
     /// Its number.
     pub id: TrackId,
-    /// The life it leads.
+    /// Its stage of life.
     pub status: TrackStatus,
     /// Capture time of the newest bearing used: the time of [`Self::state`].
     pub updated: Timestamp,
-    /// Log-likelihood ratio of being a target against being clutter.
+    /// Log-likelihood ratio of target against clutter.
     pub score: f64,
-    /// Newest contribution of each camera.
+    /// Residual of each camera's newest bearing.
     pub residuals: BTreeMap<CameraName, MeasurementResidual>,
-    /// What made the newest update.
+    /// The solver that made the newest update.
     pub solver: Solver,
-    /// What the bearings of late tell apart; renewed about once a second.
+    /// Which directions of position and velocity the recent bearings determine; computed again
+    /// about once a second.
     pub observability: Observability,
+    /// When [`Self::observability`] was computed last.
     observed: Timestamp,
+    /// Whether two cameras have seen it lately, so that its range is known: see [`Self::is_held`].
     held: bool,
-    /// Whether two cameras see it now, so that of how it moves nothing is unseen.
+    /// Whether two cameras see it now, so that its motion is observed along every axis.
     ranged: bool,
-    /// When it began.
+    /// When the track began.
     pub(crate) born: Timestamp,
-    /// Whether a detector has been found to report two ends of the target.
+    /// Whether a detector has been found to report two ends of this target as two objects.
     pub(crate) has_ends: bool,
-    /// How often it has been compared with the tracks that were there before it.
+    /// How often it has been compared with the older tracks.
     pub(crate) comparisons: u32,
-    /// Where the camera stands that gave the newest bearing.
+    /// Position of the camera that gave the newest bearing.
     follower: Option<Point3<f64>>,
-    /// When the last draw was.
+    /// When [`Self::draw`] last compared the cameras' bearings.
     drawn: Timestamp,
-    /// When its state went out, and as what.
+    /// When its state was last published, and with which status.
     pub(crate) published: Option<(Timestamp, TrackStatus)>,
     imm: Imm,
-    /// What ties it to the shared errors of each camera that has seen it.
+    /// Cross-covariance of the track with the shared errors of each camera that has seen it.
     ties: BTreeMap<CameraName, Ties>,
-    /// Whose errors that last it learns.
+    /// The lasting errors of cameras that it estimates, and their estimates.
     learnt: Learnt,
-    /// Where it was of late, where that is asked for; the oldest first.
+    /// Earlier states that later bearings still smooth, where that is asked for; the oldest first.
     past: VecDeque<Past>,
-    /// Fisher information of the bearings of late, for position and velocity.
+    /// Fisher information of the recent bearings on position and velocity.
     information: Matrix6<f64>,
     detector: Option<Detector>,
 }
 
 impl Track {
-    /// A tentative track at a fix of these lines, each with what is uncertain of its camera; the
-    /// lines' covariances hold that already.
+    /// A tentative track at a fix of these lines, each with the uncertainty of its camera; the
+    /// lines' covariances already include that uncertainty.
     pub(crate) fn start<'a>(
         fix: &Fix,
         lines: impl IntoIterator<Item = (&'a CameraName, &'a TimedLine, CameraUncertainty)>,
@@ -161,12 +167,13 @@ impl Track {
         for (camera, timed, uncertainty) in lines {
             track.note_start(fix, camera, timed, &uncertainty);
         }
-        // Not each solver holds all that poses and clocks can have done to its fix.
+        // Not every solver includes in the fix's covariance all that poses and clocks can have done
+        // to the fix.
         track.keep_ties_possible();
         track
     }
 
-    /// A tentative track of what one camera alone has followed: see [`Self::start`].
+    /// A tentative track of a target that one camera alone has followed: see [`Self::start`].
     pub(crate) fn start_alone(
         fix: &Fix,
         (camera, line, uncertainty): (&CameraName, &TimedLine, CameraUncertainty),
@@ -174,12 +181,14 @@ impl Track {
     ) -> Self {
         let mut track = Self::start(fix, [(camera, line, uncertainty)], motion);
         (track.held, track.ranged, track.follower) = (false, false, Some(line.line.origin));
-        // A pose that is off turns no direction faster.
+        // A wrong pose does not change how fast the direction turns: the velocity is not tied to
+        // it.
         track.ties.values_mut().for_each(Ties::forget_velocity);
         track
     }
 
-    /// Notes a line of the fix that the track starts with.
+    /// Takes over one line of the fix that the track starts with: its residual, its
+    /// cross-covariance with the camera's errors, and its information.
     fn note_start(
         &mut self,
         fix: &Fix,
@@ -192,18 +201,22 @@ impl Track {
         let model = BearingModel::new(line.origin, here.position())?;
         let offset = model.offset(line)?;
         let shifts = uncertainty.shifts(&model, here.velocity());
+        // `moved`: variance by which an uncertain time and origin displace the line, m^2.
         let moved = (here.velocity().norm() * time_sd_s).powi(2) + origin_sd_m.powi(2);
         let noise = model.covariance_of(line) + Matrix2::identity() * (moved / model.range.powi(2));
-        // By its root: a sum of squares is not negative, however nearly singular the noise is.
+        // NIS = |L^-1 z|^2 with R = L L': a sum of squares cannot become negative, however nearly
+        // singular the noise is.
         let factor = noise.cholesky()?;
         let nis = factor.l().solve_lower_triangular(&offset)?.norm_squared();
         let inverse = factor.inverse();
         self.residuals
             .insert(camera.clone(), MeasurementResidual { time: *time, angle: offset.norm(), nis });
+        // The line is taken dt after the fix: H = H_p [I, dt I].
         let mut by = Matrix2x6::zeros();
         by.fixed_view_mut::<2, 3>(0, 0).copy_from(&model.by_position());
         by.fixed_view_mut::<2, 3>(0, 3).copy_from(&(model.by_position() * dt));
-        // The least-squares solution errs by -P H' R^-1 times the error of the line.
+        // An error J s of the line (s: the camera's shared errors) moves the least-squares
+        // solution; the cross-covariance with s is X = -P H' R^-1 J.
         let covariance = -(fix.state.covariance * by.transpose() * inverse * shifts);
         self.ties.insert(camera.clone(), Ties::begun(*time, covariance, uncertainty.lasting));
         self.information += by.transpose() * inverse * by;
@@ -215,14 +228,16 @@ impl Track {
         self.imm.combined()
     }
 
-    /// Root of the sum of the position's variances, m: not less than the deviation along any axis.
+    /// Root of the summed variances of the position, m: at least the standard deviation along any
+    /// axis.
     pub(crate) fn position_sd(&self) -> f64 {
         self.state().covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()
     }
 
-    /// Whether the bearings' own noise leaves the place in no doubt; what poses and clocks shift
-    /// the whole track by is left out.
+    /// Whether the bearings' own noise leaves the place well determined; the part of the covariance
+    /// that poses and clocks shift the whole track by is left out.
     pub(crate) fn is_placed(&self) -> bool {
+        // The position's part of the sum of X X' over the cameras.
         let shared: f64 =
             self.ties.values().map(|t| t.covariance.fixed_rows::<3>(0).norm_squared()).sum();
         let sd = (self.position_sd().powi(2) - shared).max(0.0).sqrt();
@@ -246,7 +261,7 @@ impl Track {
         state.position() + state.velocity() * time.seconds_since(self.updated)
     }
 
-    /// What is known of it now and for the seconds ahead.
+    /// The track's state now and for the seconds ahead, for cueing.
     pub(crate) fn known(&self, now: Timestamp, motion: &Motion) -> Known {
         let of = Cued { track_id: self.id.0, ..Default::default() };
         let seen_from = self.follower.filter(|_| !self.held);
@@ -271,34 +286,36 @@ impl Track {
             .is_some_and(|ties| ties.has_seen_lately(self.updated, motion.holding_s))
     }
 
-    /// Whether the track is too uncertain for a camera that has not been following it: any line
-    /// that crosses another camera's sight line would pass for its target.
+    /// Whether the track is too uncertain to be associated directly with a camera that has not been
+    /// following it: any line that crosses the other camera's sight line would pass for its target.
     pub(crate) fn is_lost_sight_of_by(&self, camera: &CameraName, motion: &Motion) -> bool {
         !self.held
             && !self.is_followed_by(camera, motion)
             && self.position_sd() > MAX_PAIR_SHARE * self.range()
     }
 
-    /// Whether the range is unknown as one camera alone has lately followed the target.
+    /// Whether the track is only a direction: one camera alone has lately followed the target, and
+    /// the range is unknown.
     pub(crate) fn is_a_direction(&self, time: Timestamp, motion: &Motion) -> bool {
         let vague =
             |origin| log_range_sd(&self.predicted(time, motion), origin) > VAGUE_LOG_RANGE_SD;
         !self.held && self.follower.is_some_and(vague)
     }
 
-    /// Probability that a camera can see the target at a time, by what it has seen so far.
+    /// Probability that the target is visible to a camera at a time, given what that camera has
+    /// seen so far.
     pub(crate) fn visible_to(&self, camera: &CameraName, time: Timestamp, motion: &Motion) -> f64 {
         let visibility = |ties: &Ties| ties.visibility.at(time, motion.holding_s);
         self.ties.get(camera).map_or(Visibility::UNKNOWN, visibility)
     }
 
-    /// Whether another camera has seen the target since this one looked for it last. Where nobody
-    /// has, what hides it hides it from all, and one camera's miss says no more than another's.
+    /// Whether another camera has seen the target since this one last looked for it. If nobody has,
+    /// whatever hides the target hides it from all cameras, and further misses are no new evidence.
     pub(crate) fn is_seen_since_look_of(&self, camera: &CameraName) -> bool {
         self.ties.get(camera).is_none_or(|ties| self.updated > ties.visibility.last_look())
     }
 
-    /// Takes note of whether a camera that should see the target has reported it.
+    /// Notes whether a camera that should see the target has reported it.
     pub(crate) fn look(
         &mut self,
         camera: &CameraName,
@@ -313,15 +330,15 @@ impl Track {
         }
     }
 
-    /// Takes evidence (a log-likelihood ratio) for or against the track in; its score is at most
-    /// `most`.
+    /// Adds evidence (a log-likelihood ratio) for or against the track to its score, which is
+    /// capped at `most`.
     pub(crate) fn judge(&mut self, change: f64, most: f64) {
         self.score = (self.score + change).min(most);
     }
 
-    /// Takes a bearing in, and tells whether the target has begun to manoeuvre. `None` if the
-    /// numbers fail: then no bearing is taken in, though a detector may have widened the
-    /// covariance.
+    /// Updates the track with a bearing, and tells whether the target has begun to manoeuvre.
+    /// `None` if the numbers fail: then the bearing is not used, though a detector may have widened
+    /// the covariance.
     pub(crate) fn measurement_update(
         &mut self,
         camera: &CameraName,
@@ -338,9 +355,12 @@ impl Track {
             self.settle_past();
             self.keep_ties_possible();
         }
+        // The iterated update works in range coordinates about the camera that follows alone.
         let seen_from = self.follower.filter(|_| !self.held);
         let known = self.errors_of(camera, interval);
         let bearing = (line, &known);
+        // A lasting error may have been drawn again since (a label that jumps): take the likelier
+        // case.
         let anew = self.renewed(&innovation, interval, bearing, uncertainty, motion);
         let errors = anew.unwrap_or(known);
         let measured = Measured { line, camera: uncertainty, errors: &errors };
@@ -374,24 +394,26 @@ impl Track {
         Some(Taken { manoeuvre, third_difference })
     }
 
-    /// Looks whether two cameras still see the target. If not, one alone has for a while, as shows
-    /// by now, and it may have moved along that one's sight line meanwhile.
+    /// Checks whether two cameras still see the target. When that ends, one camera alone has been
+    /// seeing it for some time already, and the target may have moved along that camera's sight
+    /// line unseen: this motion is added for the time since.
     fn range_again(&mut self, line: &SightLine, motion: &Motion) {
         let sees = |ties: &&Ties| ties.sees(self.updated, motion.holding_s);
         let is_ranged = self.ties.values().filter(sees).count() >= 2;
         if std::mem::replace(&mut self.ranged, is_ranged) && !is_ranged {
             let silent = self.ties.values().filter_map(|ties| ties.silent_s(self.updated));
-            // The camera of this bearing is the one that is not silent.
+            // The camera of this bearing is silent for 0 s; the shortest silence of the others is
+            // the time to make up for.
             let silent_s = silent.filter(|silent_s| *silent_s > 0.0).fold(f64::INFINITY, f64::min);
             if silent_s.is_finite() {
                 let models = (motion.models(true), motion.models(false));
-                self.imm.relive(silent_s, &line.direction, models);
+                self.imm.widen_along(silent_s, &line.direction, models);
             }
         }
     }
 
-    /// Adds what a bearing says of position and velocity to what those of the last second have
-    /// said.
+    /// Adds a bearing's Fisher information to that of the recent bearings, which is carried to the
+    /// new time and faded with [`INFORMATION_S`].
     fn gather_information(
         &mut self,
         interval: f64,
@@ -401,6 +423,7 @@ impl Track {
         let old = &self.information;
         let block = |row: usize, column: usize| old.fixed_view::<3, 3>(row, column).into_owned();
         let (places, ties, speeds) = (block(0, 0), block(0, 3), block(3, 3));
+        // Information to the new time: I <- F^-T I F^-1 with F^-1 = [1, -dt; 0, 1].
         let tied = ties - places * interval;
         let moved = speeds - (ties + ties.transpose()) * interval + places * interval.powi(2);
         let mut next = Matrix6::zeros();
@@ -417,13 +440,13 @@ impl Track {
             if next.iter().all(|value| value.is_finite()) { next } else { Matrix6::zeros() };
     }
 
-    /// Whether two cameras have lately seen the target. One alone tells nothing of the range, and
-    /// the track may run along its sight lines.
+    /// Whether two cameras have lately seen the target. With only one the range is unobserved, and
+    /// the track may drift along its sight line.
     pub fn is_held(&self) -> bool {
         self.held
     }
 
-    /// All clocks have stepped by so much, s.
+    /// Moves all times of the track: all clocks have stepped by `step_s` seconds.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         let residuals = self.residuals.values_mut().map(|residual| &mut residual.time);
         let own = [&mut self.updated, &mut self.observed, &mut self.born, &mut self.drawn];
@@ -434,21 +457,21 @@ impl Track {
         self.ties.values_mut().for_each(|ties| ties.step_time(step_s));
     }
 
-    /// Looks at what the bearings tell apart if that was a second ago.
+    /// Computes the observability again if that was last done [`OBSERVABILITY_INTERVAL_S`] ago.
     pub(crate) fn observe_again(&mut self) {
         if self.updated.seconds_since(self.observed) >= OBSERVABILITY_INTERVAL_S {
             self.observe();
         }
     }
 
-    /// Looks at what the bearings tell apart.
+    /// Computes which directions of position and velocity the recent bearings determine.
     pub(crate) fn observe(&mut self) {
         self.observed = self.updated;
         self.observability =
             Observability::of_information(&self.information, POSITION_SCALE_M, VAGUE_VELOCITY_SD);
     }
 
-    /// Whether it was confirmed once and is not lost.
+    /// Whether it has been confirmed and is not lost.
     pub fn is_confirmed(&self) -> bool {
         matches!(
             self.status,
@@ -457,13 +480,13 @@ impl Track {
     }
 }
 
-/// Standard deviation of the logarithm of a state's range from a place.
+/// Standard deviation of the logarithm of a state's range from a place: sd(r) / r.
 fn log_range_sd(state: &KinematicState, origin: Point3<f64>) -> f64 {
     let away = state.position() - origin;
     (away.dot(&(state.position_covariance() * away))).max(0.0).sqrt() / away.norm_squared()
 }
 
-/// Fisher information of a bearing for the position.
+/// Fisher information of a bearing on the position: H' R^-1 H.
 fn told_of_position(
     place: Point3<f64>,
     line: &SightLine,

@@ -1,5 +1,5 @@
-//! The life of tracks: association of an exposure's bearings, confirmation,
-//! coasting, loss and merging.
+//! The tracks of the site: association of an exposure's bearings, confirmation, coasting, loss and
+//! merging.
 
 mod association;
 mod life;
@@ -19,10 +19,10 @@ use association::fitting;
 
 use crate::{Exposure, Sighting, Tracking};
 
-/// Two positions that differ by less than this (squared Mahalanobis, three degrees of freedom,
-/// P = 0.99) are one target if one of the tracks is coasting.
+/// Gate for merging: two positions closer than this (squared Mahalanobis distance, three degrees of
+/// freedom, P = 0.99) are one target if one of the tracks is coasting.
 const MERGE_GATE: f64 = 11.34;
-/// Every track's state goes out at least this often, s.
+/// Every track's state is published at least this often, s.
 const PUBLISHED_EVERY_S: f64 = 0.5;
 /// Something that happened to a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,14 +47,14 @@ pub(crate) struct Tracker {
     /// Beyond this range no camera is expected to see a target, m.
     max_range_m: f64,
     tracks: BTreeMap<TrackId, Track>,
-    /// When the first exposure of the run was.
+    /// Time of the first exposure of the run.
     began: Option<Timestamp>,
-    /// Of the next track in this run.
+    /// Number of the next track in this run.
     next_number: u64,
     reacquisition: Reacquisition,
 }
 
-/// What is noted while an exposure's bearings are given to the tracks.
+/// What is gathered while an exposure's bearings are assigned to the tracks.
 #[derive(Debug, Default)]
 struct Noted {
     changes: Vec<TrackChange>,
@@ -62,21 +62,22 @@ struct Noted {
     third_differences: Vec<f64>,
 }
 
-/// What an exposure has done.
+/// Result of an exposure.
 #[derive(Debug)]
 pub(crate) struct Step {
-    /// The sightings that belong to no track, or to one that cannot hold its place alone.
+    /// The sightings that belong to no track, or to a track that only one camera supports.
     pub(crate) free: Vec<Sighting>,
-    /// Which of them (by index) such a track has used.
+    /// Which of them (by index) such a weakly supported track has used.
     pub(crate) claims: Vec<(usize, TrackId)>,
-    /// Which sighting (by index) each track has taken in.
+    /// Which sighting (by index) updated which track.
     pub(crate) used: Vec<(usize, TrackId)>,
-    /// How the exposure fits the sure targets that other cameras see.
+    /// How the exposure fits the confirmed targets that other cameras see.
     pub(crate) fittings: Fittings,
-    /// Squared third differences of the camera's bearings of tracks, by the noise that it reports.
+    /// Squared third differences of the camera's bearings of tracks, in units of the noise that it
+    /// reports.
     pub(crate) third_differences: Vec<f64>,
-    /// How many of its sightings no track has taken.
-    pub(crate) strangers: usize,
+    /// Number of its sightings that no track has taken.
+    pub(crate) unassigned: usize,
     pub(crate) changes: Vec<TrackChange>,
 }
 
@@ -95,19 +96,19 @@ impl Tracker {
         }
     }
 
-    /// Says when the run begins: at the first exposure that it handles. The tracks' identities
-    /// count from there.
+    /// Sets the start of the run: the time of the first exposure handled, from which the tracks'
+    /// identities count.
     pub(crate) fn begin(&mut self, time: Timestamp) {
         self.began.get_or_insert(time);
     }
 
-    /// All tracks, ordered by id; those lost in this step are there once more, as lost.
+    /// All tracks, ordered by id; those lost in this step are included one last time, as lost.
     pub(crate) fn tracks(&self) -> impl Iterator<Item = &Track> {
         self.tracks.values()
     }
 
-    /// The tracks whose state should go out now, ordered by id: those just updated, those whose
-    /// status has changed, and each at least every half second.
+    /// The tracks whose state should be published now, ordered by id: those just updated, those
+    /// whose status has changed, and every track at least each half second.
     pub(crate) fn due(&mut self, now: Timestamp) -> Vec<TrackId> {
         let mut due = Vec::new();
         for track in self.tracks.values_mut() {
@@ -123,7 +124,7 @@ impl Tracker {
         due
     }
 
-    /// Keeps where these tracks are now, so that later bearings tell of it.
+    /// Stores the present state of these tracks, so that later bearings can smooth it.
     pub(crate) fn remember(&mut self, tracks: &[TrackId], now: Timestamp) {
         for id in tracks {
             if let Some(track) = self.tracks.get_mut(id) {
@@ -132,18 +133,18 @@ impl Tracker {
         }
     }
 
-    /// Keeps nothing of where tracks were until a time.
+    /// Drops the stored states up to a time.
     pub(crate) fn forget_until(&mut self, time: Timestamp) {
         self.tracks.values_mut().for_each(|track| track.forget_until(time));
     }
 
-    /// All sure targets, as far as they are known now.
+    /// All confirmed targets with their predicted states, for cueing.
     pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
         let sure = self.tracks.values().filter(|track| track.is_confirmed());
         sure.map(|track| track.known(now, &self.motion)).collect()
     }
 
-    /// Whether any target is followed for sure.
+    /// Whether any track is confirmed.
     pub(crate) fn has_sure(&self) -> bool {
         self.tracks.values().any(Track::is_confirmed)
     }
@@ -153,8 +154,8 @@ impl Tracker {
         self.tracks.get(&id)
     }
 
-    /// Compares an exposure of a camera that is left out with the sure tracks that others see, and
-    /// updates none: what [`Step::fittings`] and [`Step::used`] would be.
+    /// Compares an exposure of an excluded camera with the confirmed tracks that others see,
+    /// without updating any: returns what [`Step::fittings`] and [`Step::used`] would be.
     pub(crate) fn compare(
         &self,
         exposure: &Exposure,
@@ -190,7 +191,7 @@ impl Tracker {
         &self.motion
     }
 
-    /// Goes back to a time: gives up the tracks that bearings of later times have updated.
+    /// Goes back to a time: ends the tracks that bearings of later times have updated.
     pub(crate) fn restart(&mut self, time: Timestamp) -> Vec<TrackChange> {
         let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
@@ -203,14 +204,14 @@ impl Tracker {
         changes
     }
 
-    /// All clocks have stepped by so much, s.
+    /// Moves all tracks' times: all clocks have stepped by `step_s` seconds.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.reacquisition = Reacquisition::default();
         self.tracks.values_mut().for_each(|track| track.step_time(step_s));
     }
 
-    /// How well an exposure fits the sure tracks: the log-likelihood ratio of its bearings being
-    /// theirs against being nobody's, each track's best.
+    /// How well an exposure fits the confirmed tracks: the sum over the tracks of the best
+    /// log-likelihood ratio, of a bearing being this track's against being clutter.
     pub(crate) fn fit(&self, exposure: &Exposure, known: &KnownCamera) -> f64 {
         let camera = (&exposure.camera, known.camera.pose().position());
         let best = |track: &Track| {
@@ -222,7 +223,7 @@ impl Tracker {
         self.tracks.values().filter(|track| track.is_confirmed()).filter_map(best).sum()
     }
 
-    /// Takes in one exposure: what of it belongs to tracks updates them.
+    /// Handles one exposure: bearings that belong to tracks update them.
     pub(crate) fn step(
         &mut self,
         exposure: &Exposure,
@@ -231,8 +232,8 @@ impl Tracker {
     ) -> Step {
         self.tracks.retain(|_, track| track.status != TrackStatus::Lost);
         let mut owners: Vec<Option<TrackId>> = vec![None; exposure.sightings.len()];
-        // Where all cameras were silent for long, nothing has told the tracks yet that they are
-        // lost.
+        // If all cameras were silent for long, the tracks are overdue for a review and may be lost
+        // already.
         let mut noted = Noted { changes: self.review(exposure.time), ..Noted::default() };
         for ids in self.in_order_of_choice() {
             self.associate(exposure, known, &ids, &mut owners, &mut noted);
@@ -241,11 +242,11 @@ impl Tracker {
         self.reacquire(exposure, known, &mut owners);
         let used =
             owners.iter().enumerate().filter_map(|(i, owner)| Some((i, (*owner)?))).collect();
-        let strangers = owners.iter().filter(|owner| owner.is_none()).count();
+        let unassigned = owners.iter().filter(|owner| owner.is_none()).count();
         let (mut free, mut claims) = (Vec::new(), Vec::new());
         for (sighting, owner) in exposure.sightings.iter().zip(owners) {
-            // What one camera alone follows is offered as if it were nobody's: if the others see
-            // the target elsewhere, it must be found again.
+            // Bearings of tracks that one camera alone follows are offered to the initiation as
+            // free: if the other cameras see the target elsewhere, it must be found again.
             let weak = owner.filter(|id| self.tracks.get(id).is_some_and(|track| !track.is_held()));
             if owner.is_none() || weak.is_some() {
                 claims.extend(weak.map(|id| (free.len(), id)));
@@ -255,31 +256,33 @@ impl Tracker {
         changes.extend(self.review(exposure.time));
         changes.extend(self.merge(exposure.time));
         changes.extend(self.prove(exposure.time, cameras));
-        Step { free, claims, used, fittings, third_differences, strangers, changes }
+        Step { free, claims, used, fittings, third_differences, unassigned, changes }
     }
 
-    /// What the cameras have seen of sure targets, by target, where it is time to compare them.
+    /// The cameras' mean offsets from confirmed targets, by target, for those whose comparison is
+    /// due.
     pub(crate) fn draws(&mut self) -> Vec<Vec<Sample>> {
         let sure = self.tracks.values_mut().filter(|track| track.is_confirmed() && track.is_held());
         sure.map(Track::draw).filter(|samples| samples.len() >= 2).collect()
     }
 
-    /// A camera's pose errors have been found to be larger or smaller (ratio of the variances).
+    /// Passes on that a camera's pose error variance was found to be `ratio` times what was
+    /// assumed.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
         self.tracks.values_mut().for_each(|track| track.rescale_pose(camera, ratio));
     }
 
-    /// A camera's mount has turned it: see [`Track::turn_camera`].
+    /// Passes on that a camera's mount has turned it: see [`Track::turn_camera`].
     pub(crate) fn turn_camera(&mut self, camera: &CameraName) {
         self.tracks.values_mut().for_each(|track| track.turn_camera(camera));
     }
 
-    /// A camera's clock is known otherwise: see [`Track::set_clock`].
+    /// Passes on what has been learnt of a camera's clock: see [`Track::set_clock`].
     pub(crate) fn set_clock(&mut self, camera: &CameraName, change: ClockChange) {
         self.tracks.values_mut().for_each(|track| track.set_clock(camera, change));
     }
 
-    /// Takes up what a second camera sees of the tracks that one alone follows.
+    /// Looks for a second camera's bearings of the tracks that one camera alone follows.
     fn reacquire(
         &mut self,
         exposure: &Exposure,
@@ -308,14 +311,14 @@ impl Tracker {
     }
 }
 
-/// Squared Mahalanobis distance of two states' positions, three degrees of freedom.
+/// Squared Mahalanobis distance between two states' positions, three degrees of freedom.
 fn mahalanobis_squared(one: &KinematicState, other: &KinematicState) -> Option<f64> {
     let difference = one.position() - other.position();
     let spread = one.position_covariance() + other.position_covariance();
     spread.cholesky().map(|c| difference.dot(&c.solve(&difference)))
 }
 
-/// Whether two states of one time may be one target's.
+/// Whether two states of the same time may belong to one target.
 pub(crate) fn same_target(one: &KinematicState, other: &KinematicState) -> bool {
     mahalanobis_squared(one, other).is_some_and(|distance| distance < MERGE_GATE)
 }

@@ -1,51 +1,53 @@
-//! What is uncertain of a camera as a whole, beside the noise of each bearing.
+//! Uncertainty of a camera as a whole, beside the noise of each bearing.
 
 use crossfix_geometry::{BearingModel, tangent_basis};
 use crossfix_message::ClockSource;
 use nalgebra::{Matrix2, Matrix6, Rotation3, SMatrix, SVector, Unit, Vector2, Vector3};
 
-/// Variances that differ by less than this share of them are one: what turning them leaves is far
-/// less.
+/// Variances whose relative difference is less than this are equal: what rotating them leaves is
+/// far less.
 const ROUNDING: f64 = 1e-9;
 
-/// Errors that bearings of a camera share: two of its pose, one of its clock, and two that last from
-/// one bearing of a target to the next.
+/// Number of errors that bearings of a camera share: two of its pose, one of its clock, and two
+/// that last from one bearing of a target to the next.
 pub(crate) const SHARED: usize = 5;
-/// How many are of its pose.
+/// How many of them are of its pose.
 pub(crate) const OF_POSE: usize = 2;
-/// Where the clock's is among them.
+/// Index of the clock's error among them.
 pub(crate) const OF_CLOCK: usize = OF_POSE;
-/// Where those are that last, ...
+/// Index of the first of those that last.
 pub(crate) const LASTING: usize = 3;
-/// ... after so many that one target's bearings tell nothing of: they are considered.
+/// Number of the errors before these. One target's bearings tell nothing of them: they are
+/// considered (Schmidt) and not estimated.
 pub(crate) const CONSIDERED: usize = LASTING;
 
-/// What a deviation of each shared error does to a bearing, rad.
+/// Shift of a bearing by one standard deviation of each shared error, rad.
 pub(crate) type Shifts = SMatrix<f64, 2, SHARED>;
 
-/// Covariance of position and velocity with the shared errors, each in its own deviations.
+/// Covariance of position and velocity with the shared errors, each in units of its own deviation.
 pub(crate) type SharedTies = SMatrix<f64, 6, SHARED>;
 
-/// Covariance of shared errors, each in its own deviations.
+/// Covariance of shared errors, each in units of its own deviation.
 pub(crate) type SharedCovariance = SMatrix<f64, SHARED, SHARED>;
 
-/// What a track knows of the errors that all bearings of a camera share, each in its own deviations.
+/// What a track knows of the errors that all bearings of a camera share, each in units of its own
+/// deviation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SharedErrors {
-    /// Covariance of the state with them.
+    /// Covariance of the state with the errors.
     pub(crate) ties: SharedTies,
-    /// What they are thought to be: not zero for those that last alone.
+    /// Mean of the errors: only of those that last it is not zero.
     pub(crate) mean: SVector<f64, SHARED>,
-    /// Their own covariance.
+    /// Covariance of the errors themselves.
     pub(crate) covariance: SharedCovariance,
-    /// Where something is known of those that last, the probability that they have been drawn anew
-    /// since the camera's last bearing. Somebody's hand or a tracker moves on from where it was at
-    /// once as well as slowly.
+    /// Where something is known of the errors that last, the probability that they have been drawn
+    /// again since the camera's last bearing. Somebody's hand or a tracker moves on from where it
+    /// was at once as well as slowly.
     pub(crate) renewal: Option<f64>,
 }
 
 impl SharedErrors {
-    /// Nothing but their deviations.
+    /// The prior: nothing is known of the errors but their deviations.
     pub(crate) fn unknown() -> Self {
         Self {
             ties: SharedTies::zeros(),
@@ -55,9 +57,9 @@ impl SharedErrors {
         }
     }
 
-    /// Covariance of what they shift a bearing by, rad^2.
+    /// Covariance of the shift of a bearing by the errors, rad^2.
     pub(crate) fn spread(&self, shifts: &Shifts) -> Matrix2<f64> {
-        // Most often each is as wide as it says and goes with no other.
+        // Usually each error has unit variance and is correlated with no other: J C J' = J J'.
         if self.renewal.is_some() {
             shifts * self.covariance * shifts.transpose()
         } else {
@@ -65,8 +67,8 @@ impl SharedErrors {
         }
     }
 
-    /// The same where those that last have been drawn anew, and the probability of that; `None` if
-    /// nothing was known of them.
+    /// The same where the errors that last have been drawn again, and the probability of that;
+    /// `None` if nothing was known of them.
     pub(crate) fn renewed(&self) -> Option<(Self, f64)> {
         let probability = self.renewal?;
         let mut ties = self.ties;
@@ -75,23 +77,24 @@ impl SharedErrors {
     }
 }
 
-/// The part of a bearing's noise that the next bearing of the same target has, too: a tracker that
+/// The part of a bearing's noise that the next bearing of the same target shares: a tracker that
 /// sits beside the target's middle does so for a while.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct LastingNoise {
     /// Standard deviation per tangent, rad.
     pub(crate) sd_rad: f64,
-    /// Time after which e^-1 of it is left, s.
+    /// Correlation time, s: e^-1 of the noise is left after it.
     pub(crate) time_s: f64,
 }
 
 impl LastingNoise {
-    /// None: each bearing errs anew.
+    /// None: the errors of successive bearings are independent.
     pub(crate) const NONE: Self = Self { sd_rad: 0.0, time_s: 1.0 };
 
-    /// The variance of white noise of bearings `interval_s` apart that averages out as slowly, rad^2.
+    /// Variance of white noise that averages out as slowly over bearings `interval_s` apart, rad^2.
     pub(crate) fn as_white(&self, interval_s: f64) -> f64 {
         let kept = (-interval_s.max(1e-3) / self.time_s).exp();
+        // The sum of rho^|k| over all k is (1 + rho) / (1 - rho).
         self.variance() * (1.0 + kept) / (1.0 - kept)
     }
 
@@ -106,8 +109,9 @@ impl LastingNoise {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PoseUncertainty {
     covariance: Matrix6<f64>,
-    /// The variances of rotation and position where all axes are alike and nothing is tied, as most
-    /// poses are declared: then all bearings are shifted alike, and no matrices need be multiplied.
+    /// Variances of rotation and position where all axes are alike and nothing is correlated, as
+    /// most poses are declared: then all bearings are shifted alike, and no matrices need be
+    /// multiplied.
     alike: Option<[f64; 2]>,
 }
 
@@ -115,7 +119,7 @@ impl PoseUncertainty {
     pub(crate) fn new(covariance: Matrix6<f64>) -> Self {
         let [rotation, position] = [covariance.m11, covariance.m44];
         let alike = Self::diagonal(rotation, position);
-        // A covariance that was turned into the world's axes has rounding beside its diagonal.
+        // A covariance that was rotated into the world's axes has rounding off its diagonal.
         let [turns, moves] = [(0, rotation), (3, position)].map(|(from, variance)| {
             let off = (covariance - alike).fixed_view::<3, 3>(from, from).amax();
             off <= ROUNDING * variance.abs()
@@ -134,42 +138,42 @@ impl PoseUncertainty {
     }
 }
 
-/// Covariance of a pose of which nobody has said how sure it is, rotation (rad) before position (m):
-/// what a careful survey reaches, 1 mrad and 5 cm an axis. A camera of which half as much were assumed
-/// would be believed before the others are.
+/// Covariance of a pose whose uncertainty nobody has stated, rotation (rad) before position (m):
+/// what a careful survey reaches, 1 mrad and 5 cm per axis. With half of it a camera would be
+/// believed before the others are.
 pub fn pose_covariance_of_careful_survey() -> Matrix6<f64> {
     const ROTATION_SD_RAD: f64 = 1e-3;
     const POSITION_SD_M: f64 = 0.05;
     PoseUncertainty::diagonal(ROTATION_SD_RAD.powi(2), POSITION_SD_M.powi(2))
 }
 
-/// What all bearings of an exposure have in common: the uncertainty of its time and of the
-/// camera's pose, and how much worse than it says the camera has been found to be.
+/// What all bearings of an exposure have in common: the uncertainty of its time and of the camera's
+/// pose, and how much worse than reported the camera has been found to be.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct CameraUncertainty {
     /// Standard deviation of the capture time, s.
     pub(crate) time_sd_s: f64,
-    /// The reported covariances count this many times.
+    /// Factor on the reported covariances.
     pub(crate) factor: f64,
-    /// What is uncertain of the pose as declared, ...
+    /// Uncertainty of the pose as declared.
     pub(crate) pose: Option<PoseUncertainty>,
-    /// ... and how many times that is what the camera's lines have shown.
+    /// Factor on its covariance, as learnt from the camera's lines.
     pub(crate) pose_scale: f64,
-    /// Whether the clock's error is taken for noise of each bearing: where the velocity is not
-    /// known yet, what it shifts the bearings by is not either.
+    /// Whether the clock's error counts as noise of each bearing: where the velocity is not known
+    /// yet, the shift by that error is not either.
     pub(crate) clock_is_noise: bool,
-    /// What sets the clock that the capture time is by.
+    /// Time source of the clock that stamps the exposure.
     pub(crate) clock_source: ClockSource,
-    /// What the clock wanders by beside its offset and its drift, s^2/s.
+    /// Random walk of the clock beside its offset and its drift, s^2/s.
     pub(crate) clock_walk: f64,
     /// The part of its bearings' noise that lasts.
     pub(crate) lasting: LastingNoise,
-    /// World from camera: the shared errors keep to the camera's axes.
+    /// Rotation from camera to world axes: the shared errors keep to the camera's axes.
     pub(crate) axes: Rotation3<f64>,
 }
 
 impl CameraUncertainty {
-    /// A camera of exact pose and clock, with the time's standard deviation.
+    /// A camera of exact pose, with this standard deviation of its time, s.
     pub(crate) fn of_time(time_sd_s: f64) -> Self {
         Self {
             time_sd_s,
@@ -184,9 +188,9 @@ impl CameraUncertainty {
         }
     }
 
-    /// How the camera's shared errors shift a bearing, rad, each in units of its own deviation: what
-    /// pose and clock are off by hits every bearing of the camera alike, what lasts those of a
-    /// while, and more bearings do not average it away.
+    /// Shifts of a bearing by the camera's shared errors, rad per standard deviation of each.
+    /// Errors of pose and clock shift every bearing of the camera alike, those that last all
+    /// bearings of a while, and more bearings do not average them away.
     pub(crate) fn shifts(&self, model: &BearingModel, velocity: Vector3<f64>) -> Shifts {
         let mut shifts = Shifts::zeros();
         let pose = self.declared_pose(model) * self.pose_scale.sqrt();
@@ -201,7 +205,7 @@ impl CameraUncertainty {
         shifts
     }
 
-    /// Covariance of what in a bearing is noise, rad^2; `own` is the covariance that it reports.
+    /// Covariance of a bearing's noise, rad^2; `own` is the covariance that it reports.
     pub(crate) fn noise(
         &self,
         model: &BearingModel,
@@ -216,37 +220,40 @@ impl CameraUncertainty {
         own * self.factor + clock * clock.transpose()
     }
 
-    /// What the pose shifts a bearing by as declared: the root of its covariance, rad.
+    /// Shift of a bearing by the pose's error as declared: a root of its covariance, rad.
     pub(crate) fn declared_pose(&self, model: &BearingModel) -> Matrix2<f64> {
         match self.pose {
             None => Matrix2::zeros(),
             Some(PoseUncertainty { alike: Some([rotation, position]), .. }) => {
+                // All axes alike: the variance is that of the rotation plus that of the position
+                // over r^2.
                 let shift = (rotation + position / model.range.powi(2)).sqrt();
                 self.turn(model) * shift
             }
             Some(PoseUncertainty { covariance, alike: None }) => {
                 let by = model.by_pose();
                 let turn = self.turn(model);
+                // A root of J P J', taken in tangents of the camera's own axes.
                 turn * root(&(turn.transpose() * (by * covariance * by.transpose()) * turn))
             }
         }
     }
 
-    /// From tangents in the camera's own axes to the model's: the columns of a root in the former
-    /// keep to the camera's axes as the direction changes.
+    /// Rotation from tangents in the camera's own axes to those of the model: the columns of a root
+    /// taken in the former keep to the camera's axes as the direction changes.
     fn turn(&self, model: &BearingModel) -> Matrix2<f64> {
         let direction = Unit::new_unchecked(self.axes.inverse() * model.direction.into_inner());
         model.basis.transpose() * (self.axes.matrix() * tangent_basis(&direction))
     }
 
-    /// Covariance of what the shared errors shift a bearing by, rad^2.
+    /// Covariance of the shift of a bearing by the shared errors, rad^2.
     pub(crate) fn shared(&self, model: &BearingModel, velocity: Vector3<f64>) -> Matrix2<f64> {
         let shifts = self.shifts(model, velocity);
         shifts * shifts.transpose()
     }
 }
 
-/// The lower triangular root of a covariance; of one that is singular, what there is of it.
+/// The lower triangular root of a covariance; of a singular one, the part that exists.
 fn root(covariance: &Matrix2<f64>) -> Matrix2<f64> {
     let first = covariance.m11.max(0.0).sqrt();
     let across = if first > 0.0 { covariance.m12 / first } else { 0.0 };
@@ -291,15 +298,15 @@ mod tests {
         assert!(shared.m12.abs() < 1e-12);
     }
 
-    /// A calibration from landmarks ties rotation to position: a camera thought to stand too far
-    /// left is turned too far right. Drawn from such a covariance, bearings scatter as `shared`
-    /// says.
+    /// A calibration from landmarks correlates rotation with position: a camera thought to stand
+    /// too far left is turned too far right. Bearings drawn from such a covariance scatter as
+    /// `shared` says.
     #[test]
     fn a_correlated_pose_shifts_bearings_as_a_thousand_drawn_poses_do() {
         const RUNS: usize = 4000;
         let (origin, place) = (Point3::new(5.0, 0.0, 2.0), Point3::new(10.0, 60.0, 12.0));
         let model = BearingModel::new(origin, place).unwrap();
-        // Landmarks 40 m away: a position error c is made up for by a rotation about the vertical.
+        // Landmarks 40 m away: a rotation about the vertical compensates for a position error c.
         let mut factor = Matrix6::<f64>::identity() * 2e-4;
         factor[(3, 3)] = 0.2;
         factor[(2, 3)] = 0.2 / 40.0;

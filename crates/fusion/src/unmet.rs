@@ -1,8 +1,8 @@
 //! Why nothing is found where cameras see something at the same time.
 //!
-//! Poses that are wrong, clocks that are off and targets beyond all range have one face: no track.
-//! While there is none, the lines of every two cameras are compared, and what most comparisons show
-//! is said in one sentence.
+//! Wrong poses, clocks that are off and targets beyond all range look the same: no track. While
+//! there is none, the lines of every two cameras are compared, and what most comparisons show is
+//! said in one sentence.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -14,35 +14,35 @@ use crate::initiation::{Passing, Passings, lines_with_pose};
 use crate::spatial::TimedLine;
 use crate::{Exposure, Initiation, Sighting};
 
-/// So long there must have been no track before anything is said, s: a target is found within two.
+/// How long there must have been no track before anything is said, s: a target is found within two.
 const PATIENCE_S: f64 = 5.0;
 /// How often two cameras are compared, s.
 const INTERVAL_S: f64 = 0.25;
-/// What they show is concluded this often, s: counting costs more than comparing.
+/// How often a conclusion is drawn, s: counting costs more than comparing.
 const CONCLUDED_EVERY_S: f64 = 1.0;
-/// What so many comparisons of two cameras show counts: the last five seconds.
+/// Number of comparisons of two cameras that count: those of the last five seconds.
 const REMEMBERED: usize = 20;
-/// In this share of them both must have seen something.
+/// Share of these comparisons in which both cameras must have seen something.
 const LEAST_SHARE: f64 = 0.8;
 /// What an agent has followed in its image for this long is something, s: clutter comes and goes.
 const SOMETHING_S: f64 = 1.0;
 /// Exposures further apart than this are not compared, s.
 const MAX_APART_S: f64 = 0.5;
-/// Lines of one exposure that are compared: time is bounded.
+/// Most lines of one exposure that are compared: time is bounded.
 const MAX_LINES: usize = 30;
-/// Image tracks of a camera that are remembered: memory is bounded.
+/// Most image tracks of a camera that are remembered: memory is bounded.
 const MAX_IMAGE_TRACKS: usize = 1_000;
 
 /// Why no target is found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WhyNothing {
-    /// The two cameras in which it shows.
+    /// The two cameras that show it most clearly.
     pub cameras: [CameraName; 2],
     /// What their lines do.
     pub lines: UnmetLines,
 }
 
-/// What the lines of two cameras do that find no target.
+/// What the lines of two cameras do where no target is found.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum UnmetLines {
     /// They pass each other.
@@ -55,12 +55,12 @@ pub enum UnmetLines {
         /// The longest range, m.
         max_range_m: f64,
     },
-    /// They meet, and no target's motion explains how.
+    /// They meet, but not as any target's motion would explain.
     Unsteady,
 }
 
 impl WhyNothing {
-    /// Whether another says the same, its numbers within a third.
+    /// Whether another finding says the same, with its numbers within a third.
     fn is_like(&self, other: &Self) -> bool {
         let lines = match (self.lines, other.lines) {
             (UnmetLines::Apart { by_m: one }, UnmetLines::Apart { by_m: two }) => {
@@ -98,7 +98,7 @@ impl fmt::Display for WhyNothing {
     }
 }
 
-/// What one comparison has shown.
+/// Result of one comparison.
 #[derive(Clone, Copy, Debug)]
 enum Shown {
     /// One of the cameras saw nothing.
@@ -106,12 +106,12 @@ enum Shown {
     Lines(Passing),
 }
 
-/// What one camera has seen of late.
+/// What one camera has seen lately.
 #[derive(Clone, Debug)]
 struct Seen {
     time: Timestamp,
     lines: Vec<TimedLine>,
-    /// Since when each of its image tracks has been there, and until when.
+    /// Since when and until when each of its image tracks has been there.
     since: BTreeMap<u64, (Timestamp, Timestamp)>,
 }
 
@@ -131,7 +131,7 @@ pub(crate) struct Unmet {
     pairs: BTreeMap<[CameraName; 2], Pair>,
     /// Since when there has been no track.
     since: Option<Timestamp>,
-    /// When it was concluded last.
+    /// When a conclusion was drawn last.
     concluded: Option<Timestamp>,
     why: Option<WhyNothing>,
 }
@@ -149,19 +149,19 @@ impl Unmet {
         }
     }
 
-    /// Why nothing is found; `None` as long as something is, or it is not clear.
+    /// Why nothing is found; `None` as long as something is, or while the reason is not clear.
     pub(crate) fn why(&self) -> Option<&WhyNothing> {
         self.why.as_ref()
     }
 
-    /// There is a target: what was compared before says nothing of what comes after it.
+    /// Notes that there is a target: what was compared before says nothing of what comes after it.
     pub(crate) fn found(&mut self) {
         self.pairs.clear();
         (self.since, self.concluded, self.why) = (None, None, None);
     }
 
     /// Takes in an exposure's bearings that belong to no track; returns what each comparison has
-    /// shown, by the name of its counter.
+    /// shown, as the name of its counter.
     pub(crate) fn see(&mut self, exposure: &Exposure) -> Vec<&'static str> {
         let now = exposure.time;
         let since = *self.since.get_or_insert(now);
@@ -206,7 +206,8 @@ impl Unmet {
         counted
     }
 
-    /// Keeps an exposure's lines of what its agent has followed for a while, and returns them.
+    /// Keeps an exposure's lines of what its agent has followed for a while, and returns these
+    /// lines.
     fn note(&mut self, exposure: &Exposure) -> Vec<TimedLine> {
         let now = exposure.time;
         let nothing = || Seen { time: now, lines: Vec::new(), since: BTreeMap::new() };
@@ -230,8 +231,8 @@ impl Unmet {
         lines
     }
 
-    /// What most comparisons of the cameras that see something have shown, and in which two it
-    /// shows most clearly.
+    /// What most comparisons of the cameras that see something have shown, and the two cameras that
+    /// show it most clearly.
     fn conclusion(&self) -> Option<WhyNothing> {
         let both = |pair: &Pair| {
             pair.shown.iter().filter(|shown| matches!(shown, Shown::Lines(_))).count()
@@ -272,7 +273,7 @@ fn counter(passing: Passing) -> &'static str {
     }
 }
 
-/// What the closest two lines of two cameras do.
+/// What the two closest lines of two cameras do.
 fn compared(one: &[TimedLine], other: &[TimedLine], passings: &Passings) -> Shown {
     let all = one.iter().flat_map(|first| other.iter().map(|second| passings.of(first, second)));
     let closeness = |passing: &Passing| match passing {

@@ -1,5 +1,11 @@
-//! One bearing into one state: an iterated extended Kalman update in the coordinates of
-//! [`RangeChart`], with the camera's shared errors considered (Schmidt); what they are is told of apart.
+//! The measurement update of one state by one bearing: an iterated extended Kalman update in the
+//! coordinates of [`RangeChart`]. The camera's shared errors are considered (Schmidt) and not part
+//! of the state; what the bearing tells of them is returned separately ([`Told`]).
+//!
+//! Notation: P is the state's covariance, H the bearing's Jacobian by the state, s the camera's
+//! shared errors (each in units of its own standard deviation), J their effect on the bearing
+//! (`shifts`), X the cross-covariance of state and s (`ties`), R the bearing's noise, z the
+//! innovation and S its covariance.
 
 use std::f64::consts::PI;
 
@@ -10,59 +16,64 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix6, Matrix6x2, Point3, Vector
 use crate::range_chart::Chart;
 use crate::uncertainty::{CameraUncertainty, SharedErrors, SharedTies, Shifts};
 
-/// Rounds of the iterated update: from a range known to a factor of three it takes four or five.
+/// Most rounds of the iterated update: with a range known to a factor of three it takes four or
+/// five.
 const MAX_ROUNDS: usize = 10;
-/// The linearisation has settled when what a round leaves out, the square of the angle of its step,
-/// is less than this share of the bearing's noise.
+/// The iteration has converged when what the linearisation leaves out, the square of the round's
+/// step (as an angle), is less than this share of the standard deviation of the bearing's noise.
 const SETTLED: f64 = 0.01;
-/// A range known worse than this (standard deviation of its logarithm) is looked for along the
-/// sight line first: from its middle the iteration may not find the crossing.
+/// If the logarithm of the range has a larger standard deviation than this, the iteration starts
+/// where the sight line passes nearest to the bearing: started at the middle of the range it may
+/// not find the crossing.
 pub(crate) const VAGUE_LOG_RANGE_SD: f64 = 0.1;
 
-/// A bearing with what its camera is uncertain of.
+/// A bearing with the uncertainties of its camera.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Measured<'a> {
     pub(crate) line: &'a SightLine,
     pub(crate) camera: &'a CameraUncertainty,
-    /// What is known of the camera's shared errors.
+    /// What the track knows of the camera's shared errors.
     pub(crate) errors: &'a SharedErrors,
 }
 
-/// A state after a bearing.
+/// A state updated by a bearing.
 #[derive(Clone, Debug)]
 pub(crate) struct Updated {
     pub(crate) state: KinematicState,
-    /// Squared Mahalanobis distance of the bearing, two degrees of freedom.
+    /// Normalised innovation squared of the bearing, two degrees of freedom.
     pub(crate) nis: f64,
     /// Logarithm of the bearing's likelihood, 1/sr.
     pub(crate) log_likelihood: f64,
     pub(crate) told: Told,
 }
 
-/// What a bearing tells of all that goes with it, or what it tells in the mean over the models.
+/// What a bearing tells of errors outside the state that are correlated with it; for one motion
+/// model, or as the mean over the models.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Told {
-    /// What the update does to the state's covariance with any error: `carried * ties`, ...
+    /// carried = I - K H. The update turns Y, the cross-covariance of the state with any outside
+    /// error, into `carried * Y`, ...
     pub(crate) carried: Matrix6<f64>,
-    /// ... less `gained` times the camera's own errors' covariance with it.
+    /// ... less `gained` times the covariance of the camera's own errors with that error; gained =
+    /// K J.
     pub(crate) gained: SharedTies,
-    /// How the bearing follows position and velocity before it, ...
+    /// H: the bearing's Jacobian by position and velocity before the update, ...
     pub(crate) by: Matrix2x6<f64>,
-    /// ... and the camera's errors.
+    /// ... and J: its Jacobian by the camera's errors.
     pub(crate) shifts: Shifts,
-    /// The inverse S^-1 of the innovation's covariance, ...
+    /// S^-1, the inverse of the innovation's covariance, ...
     pub(crate) weight: Matrix2<f64>,
-    /// ... and its product with the innovation, S^-1 z: an error of which C is the covariance with
-    /// the bearing is thought to be C S^-1 z larger, ...
+    /// ... and its product with the innovation, S^-1 z: the estimate of an error whose covariance
+    /// with the bearing is C grows by C S^-1 z, ...
     pub(crate) pull: Vector2<f64>,
-    /// ... with the covariance of that over the models, ...
+    /// ... the covariance of S^-1 z over the models (zero for one model), ...
     pub(crate) pull_spread: Matrix2<f64>,
-    /// ... and how the state goes with it.
+    /// ... and the covariance of the updated state's mean with S^-1 z over the models.
     pub(crate) moved: Matrix6x2<f64>,
 }
 
 impl Told {
-    /// In the mean over models of such probabilities.
+    /// The mean over motion models with their probabilities, and the spread over them.
     pub(crate) fn over<'a>(models: impl Iterator<Item = (&'a Updated, f64)> + Clone) -> Self {
         let mut mean = Self {
             carried: Matrix6::zeros(),
@@ -93,8 +104,8 @@ impl Told {
     }
 }
 
-/// The state after a bearing of its time; `seen_from` is where the camera stands that follows the
-/// target alone, so that the range is uncertain from there. `None` if the numbers fail.
+/// The state updated by a bearing of the same time. `seen_from` is the position of the camera that
+/// alone follows the target, so that the range from there is uncertain. `None` if the numbers fail.
 pub(crate) fn updated(
     prior: &KinematicState,
     seen_from: Option<Point3<f64>>,
@@ -105,6 +116,7 @@ pub(crate) fn updated(
         Some(origin) => Chart::by_range(origin, prior)?,
         None => Chart::cartesian(prior),
     };
+    // P and X in the chart's coordinates, whose origin is the prior mean.
     let (covariance, ties) = chart.expressed(&prior.covariance, &errors.ties);
     let is_own = seen_from == Some(line.origin);
     let mut coordinates = Vector6::zeros();
@@ -116,22 +128,26 @@ pub(crate) fn updated(
         let model = BearingModel::new(line.origin, point.place)?;
         let offset = model.offset(line)?;
         let shifts = camera.shifts(&model, point.velocity);
-        // Of the state only the place is seen: the first three coordinates.
+        // A bearing depends on the position only, the first three coordinates: H = [by, 0].
         let by: Matrix2x3<f64> = model.by_position() * point.place_by;
         let tied: Matrix6x2<f64> = ties * shifts.transpose();
+        // Cov(state, bearing) = P H' + X J', and Cov(predicted position, shift) = H X J'.
         let seen: Matrix6x2<f64> = covariance.fixed_columns::<3>(0) * by.transpose();
         let across = seen + tied;
         let cross: Matrix2<f64> = by * tied.fixed_rows::<3>(0);
         let noise = camera.noise(&model, point.velocity, &model.covariance_of(line))
             + errors.spread(&shifts);
+        // S = H P H' + H X J' + J X' H' + J W J' + R, with W the covariance of s.
         let spread = by * seen.fixed_rows::<3>(0) + cross + cross.transpose() + noise;
         let determinant = spread.determinant();
         let inverse = spread.try_inverse()?;
         if !(determinant > 0.0 && spread.m11 > 0.0) {
             return None;
         }
+        // z of the iterated filter, linearised at this round's point: offset + H x - J E(s).
         let innovation: Vector2<f64> =
             offset + by * coordinates.fixed_rows::<3>(0) - shifts * errors.mean;
+        // K = (P H' + X J') S^-1, and the next point is K z.
         let gain = across * inverse;
         let next = gain * innovation;
         let moved = (point.place_by * (next - coordinates).fixed_rows::<3>(0)).norm() / model.range;
@@ -140,20 +156,23 @@ pub(crate) fn updated(
         if !(is_own || settled || round == MAX_ROUNDS) {
             continue;
         }
-        // Not negative but for rounding, where the spread is nearly singular.
+        // Only rounding can make it negative, where S is nearly singular.
         let nis = innovation.dot(&(inverse * innovation)).max(0.0);
         let point = chart.point(&coordinates);
+        // P <- P - K S K', and back to position and velocity.
         let (covariance, carried, gain) =
             chart.from(&point, covariance - gain * across.transpose(), &by, gain);
         let state = KinematicState {
             mean: point.mean(),
             covariance: (covariance + covariance.transpose()) / 2.0,
         };
-        // Where a place was known to no kilometre, rounding may leave of it less than nothing.
+        // If the prior range was uncertain by kilometres, rounding may leave a covariance that is
+        // not positive definite.
         let positive = state.covariance.cholesky().is_some();
         return (positive && state.is_finite() && nis.is_finite()).then(|| Updated {
             state,
             nis,
+            // ln N(z; 0, S) in two dimensions: -(z' S^-1 z + ln((2 pi)^2 |S|)) / 2.
             log_likelihood: -(nis + (4.0 * PI.powi(2) * determinant).ln()) / 2.0,
             told: Told {
                 carried,

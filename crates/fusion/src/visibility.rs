@@ -2,30 +2,30 @@
 
 use crossfix_message::Timestamp;
 
-/// What hides a target from cameras hides it for about so long, s.
+/// Typical time for which an obstacle hides a target from cameras, s.
 const HIDDEN_S: f64 = 0.25;
 
-/// How much of a piece of evidence counts that follows another of the same target after an interval
-/// of seconds: exposures close together tell no more than one.
+/// Weight of a piece of evidence that follows another of the same target after `interval_s`
+/// seconds: exposures close together tell no more than one.
 pub(crate) fn independent_share(interval_s: f64) -> f64 {
     (interval_s / HIDDEN_S).clamp(0.0, 1.0)
 }
 
-/// How often a visible target is hidden from a camera (by a tree, a house, glare) within the time
-/// for which a camera's bearing holds a track: once in twenty seconds. With half of it a camera
-/// that is blind for a target costs its track too much.
+/// Rate at which a visible target is hidden from a camera (by a tree, a house, glare), per time for
+/// which a camera's bearing holds (supports) a track: once in twenty seconds. With half of it a
+/// camera that is blind for a target costs its track too much.
 const HIDDEN: f64 = 0.075;
-/// How often one that is hidden comes into sight again within that time: every two seconds.
+/// Rate at which a hidden target comes into sight again, per the same time: every two seconds.
 const APPEARS: f64 = 0.75;
 
-/// Log-likelihood ratio of a camera's not reporting a target that is visible to it with a probability, and
-/// that it reports with another where it is.
+/// Log-likelihood ratio of a missed report, for a target that the camera can see with probability
+/// `visible` and then reports with probability `detection`.
 pub(crate) fn log_missed(visible: f64, detection: f64) -> f64 {
     (1.0 - visible * detection).ln()
 }
 
-/// Whether a camera can see a target: a chain of two states, visible and hidden. A camera that
-/// misses a target ten times running has it behind something; that is one event and not ten.
+/// Whether a camera can see a target: a Markov chain of two states, visible and hidden. A camera
+/// that misses a target ten times running has it behind something; that is one event and not ten.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Visibility {
     visible: f64,
@@ -33,7 +33,7 @@ pub(crate) struct Visibility {
 }
 
 impl Visibility {
-    /// The probability that a target is visible of which nothing is known.
+    /// Probability that a target of which nothing is known is visible: the chain's stationary one.
     pub(crate) const UNKNOWN: f64 = APPEARS / (APPEARS + HIDDEN);
 
     pub(crate) fn new(time: Timestamp) -> Self {
@@ -44,28 +44,30 @@ impl Visibility {
         Self { visible: 1.0, time }
     }
 
-    /// When the camera was exposed last.
+    /// Time of the camera's last exposure.
     pub(crate) fn last_look(&self) -> Timestamp {
         self.time
     }
 
-    /// The probability that the target is visible at a time; a bearing holds a track for
-    /// `holding_s`.
+    /// Probability that the target is visible at a time; `holding_s` is how long a bearing holds a
+    /// track.
     pub(crate) fn at(&self, time: Timestamp, holding_s: f64) -> f64 {
         let interval = time.seconds_since(self.time).max(0.0) / holding_s;
+        // p(t) = p_inf + (p - p_inf) exp(-(a + b) t), with the two rates a and b.
         let kept = (-(HIDDEN + APPEARS) * interval).exp();
         Self::UNKNOWN + (self.visible - Self::UNKNOWN) * kept
     }
 
-    /// All clocks have stepped by so much, s.
+    /// Handles a step of all clocks by `step_s`, s.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.time = self.time.plus_seconds(step_s);
     }
 
-    /// The camera has been exposed and has seen the target or not; `detection` is the probability
-    /// that it reports one that is visible.
+    /// Takes in an exposure that has shown the target or not; `detection` is the probability that
+    /// the camera reports a target that is visible.
     pub(crate) fn look(&mut self, time: Timestamp, seen: bool, detection: f64, holding_s: f64) {
         let before = self.at(time, holding_s);
+        // Bayes: P(visible | missed) = v (1 - d) / (v (1 - d) + 1 - v).
         let missed = before * (1.0 - detection);
         self.visible = if seen { 1.0 } else { missed / (missed + 1.0 - before) };
         self.time = time;

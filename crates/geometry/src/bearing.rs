@@ -4,14 +4,14 @@ use nalgebra::{Matrix2, Matrix3x2, Point3, Unit, Vector2, Vector3};
 
 use crate::GeometryError;
 
-/// How far the length of a vector may be from 1 for it to pass as a unit vector.
+/// Largest deviation from 1 of the length of a vector that passes as a unit vector.
 const UNIT_TOLERANCE: f64 = 1e-6;
 
 /// The two tangents of the unit sphere at `direction`, as columns.
 ///
-/// The first is the frame's x axis made perpendicular to the direction (its y
-/// axis where the direction lies within 0.1 rad of x), the second is
-/// direction x first. A bearing's covariance is expressed in them.
+/// The first is the frame's x axis made perpendicular to the direction (its y axis where the
+/// direction lies within 0.1 rad of x), the second is the cross product of direction and first. A
+/// bearing's covariance is expressed in these axes.
 pub fn tangent_basis(direction: &Unit<Vector3<f64>>) -> Matrix3x2<f64> {
     let axis = if direction.x.abs() < 0.995 { Vector3::x() } else { Vector3::y() };
     let first = (axis - direction.into_inner() * direction.dot(&axis)).normalize();
@@ -28,8 +28,8 @@ pub struct Bearing {
 }
 
 impl Bearing {
-    /// The largest standard deviation along a tangent, rad: what is known no better than to half a turn
-    /// may be anywhere.
+    /// The largest standard deviation along a tangent, rad: a direction known no better than to
+    /// half a turn may be any.
     pub const WIDEST_RAD: f64 = PI;
 
     /// A bearing from a vector of length one and a positive definite covariance.
@@ -80,12 +80,12 @@ pub struct SightLine {
     pub covariance: Matrix2<f64>,
 }
 
-/// Squared sine below which two directions are parallel: their lines pass nearest at a range beyond
-/// all use.
+/// Squared sine of the angle below which two directions count as parallel: their lines would pass
+/// nearest at a range beyond all use.
 const PARALLEL: f64 = 1e-9;
 
-/// The ranges (m) at which two rays pass nearest to each other, each given by its origin and
-/// direction; negative where that is behind the origin.
+/// The ranges (m) along two rays at which they pass nearest to each other. Each ray is given by its
+/// origin and direction; a range is negative where that point is behind the origin.
 ///
 /// ```
 /// use crossfix_geometry::passing_ranges;
@@ -99,6 +99,8 @@ pub fn passing_ranges(
     (origin, u): (Point3<f64>, &Unit<Vector3<f64>>),
     (other_origin, v): (Point3<f64>, &Unit<Vector3<f64>>),
 ) -> [f64; 2] {
+    // Minimises |s u - t v - b|^2 over the ranges s and t, with the base line b and c = u.v:
+    // s = (u.b - c v.b) / (1 - c^2), t = (c u.b - v.b) / (1 - c^2).
     let base = other_origin - origin;
     let cosine = u.dot(v);
     let sine_squared = (1.0 - cosine * cosine).max(PARALLEL);
@@ -107,7 +109,8 @@ pub fn passing_ranges(
 }
 
 impl SightLine {
-    /// The distance of a point from the ray, metres; from the origin if the point lies behind it.
+    /// The distance of a point from the ray, metres; the distance from the origin if the point lies
+    /// behind it.
     pub fn miss_distance(&self, point: Point3<f64>) -> f64 {
         let offset = point - self.origin;
         let along = offset.dot(&self.direction);
@@ -118,7 +121,7 @@ impl SightLine {
         }
     }
 
-    /// The direction to a point as an offset from this ray on its tangent plane, rad.
+    /// Offset of the direction to a point from this ray on its tangent plane, rad.
     ///
     /// `None` if the point lies at or behind the origin.
     pub fn tangent_offset(&self, point: Point3<f64>) -> Option<Vector2<f64>> {
@@ -127,7 +130,7 @@ impl SightLine {
         (offset.dot(&self.direction) > 0.0).then(|| self.basis.transpose() * (offset / distance))
     }
 
-    /// The root of the mean variance over both tangents, rad.
+    /// The standard deviation as the root of the mean variance over both tangents, rad.
     pub fn standard_deviation(&self) -> f64 {
         (self.covariance.trace() / 2.0).sqrt()
     }

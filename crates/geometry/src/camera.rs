@@ -4,9 +4,11 @@ use opencv_ros_camera::{Distortion as OpenCvDistortion, RosOpenCvIntrinsics, Ter
 
 use crate::{Bearing, GeometryError, Pose, SightLine, fisheye, tangent_basis};
 
-/// Steps of the fixed-point inversion of Brown-Conrady: the widest lens measured needs 40.
+/// Steps of the fixed-point inversion of the Brown-Conrady distortion: the widest lens measured
+/// needs 40.
 const FIXED_POINT_STEPS: usize = 100;
-/// A direction that comes back from its pixel farther off than this was folded into the image, rad.
+/// A direction farther than this from the one that its pixel maps back to was folded into the image
+/// by the lens polynomial, rad.
 const FOLDED_RAD: f64 = 1e-3;
 
 /// A place in the recorded (distorted) image, pixels; (0, 0) is the middle of the top left pixel,
@@ -62,7 +64,7 @@ pub enum Distortion {
     Fisheye([f64; 4]),
 }
 
-/// The numbers of a camera model, pixels; not yet checked.
+/// The parameters of a camera model, pixels; not yet checked.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {
     /// Sides of the image.
@@ -75,7 +77,7 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Principal point, row.
     pub cy: f64,
-    /// The lens.
+    /// The lens distortion.
     pub distortion: Distortion,
 }
 
@@ -96,10 +98,10 @@ fn check(
 }
 
 impl CameraModel {
-    /// A model from its numbers.
+    /// A model from its parameters.
     ///
     /// # Errors
-    /// [`GeometryError::Intrinsics`] naming the number that no camera has.
+    /// [`GeometryError::Intrinsics`] naming the parameter that no camera can have.
     pub fn new(intrinsics: Intrinsics) -> Result<Self, GeometryError> {
         let Intrinsics { size, fx, fy, cx, cy, distortion } = intrinsics;
         let [width, height] = [f64::from(size.width), f64::from(size.height)];
@@ -131,7 +133,7 @@ impl CameraModel {
         Ok(Self { intrinsics, brown_conrady })
     }
 
-    /// The numbers it was made from.
+    /// The parameters it was made from.
     pub fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics
     }
@@ -152,7 +154,7 @@ impl CameraModel {
             Distortion::Fisheye(k) => fisheye::unproject(k, plane).ok_or_else(no_inverse)?,
             Distortion::BrownConrady(_) => {
                 let distorted = Pixels::new(RowVector2::new(pixel.x(), pixel.y()));
-                // Not `Eps`: it never ends where the iteration does not converge.
+                // Not `Eps`: the iteration would never end where it does not converge.
                 let criteria = TermCriteria::MaxIter(FIXED_POINT_STEPS);
                 let undistorted = self.brown_conrady.undistort_ext(&distorted, criteria);
                 let ray = self.brown_conrady.undistorted_pixel_to_camera(&undistorted);
@@ -160,14 +162,16 @@ impl CameraModel {
             }
         };
         let direction = Unit::try_new(direction, 1e-12).ok_or_else(no_inverse)?;
-        // A fixed-point inversion can settle on a wrong branch far outside the image.
+        // A fixed-point inversion can converge to a wrong branch far outside the image: the
+        // direction must project back to its pixel.
         let back = self.project(&direction).ok_or_else(no_inverse)?;
         if (back.0 - pixel.0).norm() < 1e-3 { Ok(direction) } else { Err(no_inverse()) }
     }
 
     /// The pixel on which a direction of the camera frame falls, in or outside the image.
     ///
-    /// `None` if it lies behind the camera.
+    /// `None` if it lies behind the camera, unless the lens is a fisheye, which maps every
+    /// direction.
     pub fn project(&self, direction: &Vector3<f64>) -> Option<Pixel> {
         let Intrinsics { fx, fy, cx, cy, distortion, .. } = self.intrinsics;
         // On the plane z = 1, bent by the lens, then in pixels.
@@ -209,11 +213,12 @@ impl CameraModel {
             .pixels_per_radian(&direction)
             .and_then(|j| j.try_inverse())
             .ok_or_else(no_inverse)?;
+        // J^-1 C J^-T, with J the pixels per radian.
         let tangent = tangent_per_pixel * covariance.0 * tangent_per_pixel.transpose();
         Bearing::new(direction.into_inner(), tangent)
     }
 
-    /// A bearing's pixel and the covariance on the image; `None` if it lies behind the camera.
+    /// A bearing's pixel with its covariance in the image; `None` if it lies behind the camera.
     pub fn pixel(&self, bearing: &Bearing) -> Option<(Pixel, PixelCovariance)> {
         let direction = bearing.direction();
         let jacobian = self.pixels_per_radian(&direction)?;
@@ -221,8 +226,8 @@ impl CameraModel {
         Some((self.project(&direction)?, PixelCovariance(covariance)))
     }
 
-    /// Derivative of the projection along the tangents at a direction, pixels a radian, by central
-    /// differences (exact to about 1e-9 of itself).
+    /// Jacobian of the projection along the tangents at a direction, pixels per radian, by central
+    /// differences (relative error about 1e-9).
     fn pixels_per_radian(&self, direction: &Unit<Vector3<f64>>) -> Option<Matrix2<f64>> {
         const STEP: f64 = 1e-5;
         let basis = tangent_basis(direction);
@@ -236,7 +241,7 @@ impl CameraModel {
     }
 }
 
-/// A camera model in its place.
+/// A camera model with its pose.
 #[derive(Clone, Debug)]
 pub struct Camera {
     model: CameraModel,
@@ -244,10 +249,10 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera from its numbers and its pose.
+    /// A camera from its parameters and its pose.
     ///
     /// # Errors
-    /// [`GeometryError`] if the numbers are no camera's.
+    /// [`GeometryError`] if the parameters are no camera's.
     pub fn new(intrinsics: Intrinsics, pose: Pose) -> Result<Self, GeometryError> {
         Ok(Self { model: CameraModel::new(intrinsics)?, pose })
     }
@@ -263,12 +268,13 @@ impl Camera {
         &self.model
     }
 
-    /// Its place.
+    /// Its pose.
     pub fn pose(&self) -> &Pose {
         &self.pose
     }
 
-    /// A bearing of this camera as a sight line of the world.
+    /// A bearing of this camera as a sight line in the world. The covariance stays as it is: its
+    /// axes are turned with the bearing.
     pub fn sight_line(&self, bearing: &Bearing) -> SightLine {
         let rotation = self.pose.rotation();
         let direction = bearing.direction();
@@ -285,11 +291,11 @@ impl Camera {
         self.model.project(&self.pose.camera_from_world(point))
     }
 
-    /// The sight line on which this camera sees a world point whose place in the image has this
-    /// covariance; `None` if it is not in the image.
+    /// The sight line on which this camera sees a world point, with this covariance of its place in
+    /// the image; `None` if the point is not in the image.
     ///
-    /// Unlike [`Camera::sees`] it is not deceived by a lens polynomial that folds directions far
-    /// outside the field of view back into the image.
+    /// Unlike [`Camera::sees`] this rejects directions far outside the field of view that a lens
+    /// polynomial folds back into the image.
     pub fn sight_line_to(
         &self,
         point: Point3<f64>,
@@ -368,6 +374,7 @@ mod tests {
         let pixel = model.project(&behind).unwrap();
         let back = model.direction(pixel).unwrap();
         assert!((back.into_inner() - behind).norm() < 1e-9);
+        assert!(model.sees(&Vector3::z()) && !model.sees(&-Vector3::z()));
     }
 
     #[test]

@@ -25,13 +25,13 @@ pub enum GeometryError {
         /// Variance along the second axis.
         yy: f64,
     },
-    /// A direction that may be any.
+    /// A standard deviation so large that the bearing may point anywhere.
     #[error("a bearing with a standard deviation of {sd:.3e} rad may lie anywhere")]
     Anywhere {
         /// The larger of its two standard deviations, rad.
         sd: f64,
     },
-    /// A matrix that should be a rotation is none.
+    /// A matrix that should be a rotation is not one.
     #[error(
         "the rotation is not orthonormal: R'R differs from the identity by {deviation:.2e} \
          and its determinant is {determinant:.3}"
@@ -45,7 +45,8 @@ pub enum GeometryError {
     /// A camera that looks at its own centre or straight up or down has no defined roll.
     #[error("a camera cannot be aimed at a point straight above, below or at itself")]
     Aim,
-    /// A mount whose angles have no order, or go beyond a turn.
+    /// A mount whose angle limits are not in order, or go beyond a turn (azimuth) or a quarter of
+    /// one (elevation).
     #[error(
         "a mount's least angles must not be above its most, the azimuth's within a turn and the \
          elevation's within a quarter of one"
@@ -56,17 +57,17 @@ pub enum GeometryError {
     Intrinsics {
         /// Which number.
         what: &'static str,
-        /// What it is.
+        /// Its value.
         value: f64,
         /// What it must be.
         must: &'static str,
     },
-    /// A latitude, longitude or height that is on no map.
+    /// A latitude, longitude or height outside its valid range.
     #[error("{what} is {value}: it must be {must}")]
     Geodetic {
         /// Which number.
         what: &'static str,
-        /// What it is.
+        /// Its value.
         value: f64,
         /// What it must be.
         must: &'static str,

@@ -1,7 +1,7 @@
-//! The Kannala-Brandt equidistant projection with four coefficients (ROS:
-//! `equidistant`, OpenCV: `fisheye`). The kept crates that offer it each bring
-//! a second nalgebra, and stop inverting at 1e-6 of a focal length or panic on
-//! bad input; it is a page, so it is here.
+//! The Kannala-Brandt equidistant projection with four coefficients (ROS: `equidistant`, OpenCV:
+//! `fisheye`). It is implemented here, as it takes only a page: the maintained crates that offer it
+//! each bring a second nalgebra, and stop inverting at 1e-6 of a focal length or panic on bad
+//! input.
 
 use nalgebra::{Vector2, Vector3};
 
@@ -11,23 +11,24 @@ fn distorted_angle([k1, k2, k3, k4]: [f64; 4], theta: f64) -> f64 {
     theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 }
 
+/// d theta_d / d theta = 1 + 3 k1 theta^2 + 5 k2 theta^4 + 7 k3 theta^6 + 9 k4 theta^8.
 fn slope([k1, k2, k3, k4]: [f64; 4], theta: f64) -> f64 {
     let t2 = theta * theta;
     1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
 }
 
-/// Where a direction (camera frame, any length) falls, in focal lengths from the principal point.
+/// The image point of a direction (camera frame, any length), in focal lengths from the principal
+/// point.
 pub(crate) fn project(k: [f64; 4], direction: &Vector3<f64>) -> Vector2<f64> {
     let radius = direction.x.hypot(direction.y);
     let theta = radius.atan2(direction.z);
-    if radius < 1e-15 {
-        return Vector2::zeros();
-    }
-    direction.xy() * (distorted_angle(k, theta) / radius)
+    // Exactly backwards every direction across is as good.
+    let across = if radius > 0.0 { direction.xy() / radius } else { Vector2::x() };
+    across * distorted_angle(k, theta)
 }
 
-/// The direction (not normalised to a plane: any angle up to pi) that falls there; `None` where
-/// the model has no inverse.
+/// The direction (a vector, not a point on z = 1: any angle up to pi) that falls on an image point;
+/// `None` where the model has no inverse.
 pub(crate) fn unproject(k: [f64; 4], point: Vector2<f64>) -> Option<Vector3<f64>> {
     let wanted = point.norm();
     // Newton's method for theta (1 + k1 theta^2 + ...) = |point|.
@@ -39,7 +40,7 @@ pub(crate) fn unproject(k: [f64; 4], point: Vector2<f64>) -> Option<Vector3<f64>
             break;
         }
     }
-    // Where the polynomial falls again, its root is none of the lens.
+    // Where the polynomial decreases again, its root is not a direction that the lens images.
     let found = (distorted_angle(k, theta) - wanted).abs() < 1e-9 && slope(k, theta) > 0.0;
     let (sin, cos) = theta.sin_cos();
     let across = if wanted > 1e-15 { point / wanted * sin } else { Vector2::zeros() };

@@ -6,10 +6,10 @@ use crate::GeometryError;
 const EQUATORIAL_RADIUS_M: f64 = 6_378_137.0;
 /// Flattening of the WGS84 ellipsoid.
 const FLATTENING: f64 = 1.0 / 298.257_223_563;
-/// Square of its first eccentricity.
+/// Square of the first eccentricity of the WGS84 ellipsoid, e^2 = f (2 - f).
 const ECCENTRICITY_SQUARED: f64 = FLATTENING * (2.0 - FLATTENING);
-/// Steps of the latitude's iteration: each is 200 times as exact as the last, the first is good to
-/// 1e-5.
+/// Steps of the latitude's iteration: each reduces the error by a factor of 200, and the first
+/// leaves 1e-5.
 const LATITUDE_STEPS: usize = 6;
 
 /// A place on or above the Earth: WGS84, with the height above the ellipsoid.
@@ -21,10 +21,11 @@ pub struct Geodetic {
 }
 
 impl Geodetic {
-    /// A place from degrees north, degrees east and metres above the ellipsoid.
+    /// A place from latitude (degrees north), longitude (degrees east) and height (metres above the
+    /// ellipsoid).
     ///
     /// # Errors
-    /// [`GeometryError::Geodetic`] naming the number that is on no map.
+    /// [`GeometryError::Geodetic`] naming the number that is out of range.
     pub fn from_degrees(
         latitude_deg: f64,
         longitude_deg: f64,
@@ -73,6 +74,8 @@ impl Geodetic {
     /// The place in the Earth's own axes (ECEF), m.
     fn earth_centred(&self) -> Point3<f64> {
         let (sin, cos) = self.latitude.sin_cos();
+        // Radius of curvature N = a / sqrt(1 - e^2 sin^2 lat); distance from the axis
+        // (N + h) cos lat, z = (N (1 - e^2) + h) sin lat.
         let normal = EQUATORIAL_RADIUS_M / (1.0 - ECCENTRICITY_SQUARED * sin * sin).sqrt();
         let from_axis = (normal + self.height) * cos;
         Point3::new(
@@ -82,27 +85,32 @@ impl Geodetic {
         )
     }
 
-    /// The place of Earth-centred axes (ECEF, m), by iteration of Bowring's reduced latitude.
+    /// The place at a point of the Earth's own axes (ECEF, m), by iteration of Bowring's reduced
+    /// latitude.
     fn from_earth_centred(point: Point3<f64>) -> Self {
         let from_axis = point.x.hypot(point.y);
         let polar_radius = EQUATORIAL_RADIUS_M * (1.0 - FLATTENING);
         let second = ECCENTRICITY_SQUARED / (1.0 - ECCENTRICITY_SQUARED);
+        // Start: exact on the ellipsoid.
         let mut latitude = point.z.atan2(from_axis * (1.0 - ECCENTRICITY_SQUARED));
         for _ in 0..LATITUDE_STEPS {
+            // With p the distance from the axis and b = a (1 - f): tan beta = (1 - f) tan lat, then
+            // tan lat = (z + e'^2 b sin^3 beta) / (p - e^2 a cos^3 beta).
             let reduced = ((1.0 - FLATTENING) * latitude.sin()).atan2(latitude.cos());
             let (sin, cos) = reduced.sin_cos();
             latitude = (point.z + second * polar_radius * sin.powi(3))
                 .atan2(from_axis - ECCENTRICITY_SQUARED * EQUATORIAL_RADIUS_M * cos.powi(3));
         }
         let (sin, cos) = latitude.sin_cos();
-        // Holds at the poles as well, where the distance from the axis over the cosine does not.
+        // h = p cos lat + z sin lat - a sqrt(1 - e^2 sin^2 lat) is valid at the poles as well,
+        // where p / cos lat - N is not.
         let surface = EQUATORIAL_RADIUS_M * (1.0 - ECCENTRICITY_SQUARED * sin * sin).sqrt();
         let height = from_axis * cos + point.z * sin - surface;
         Self { latitude, longitude: point.y.atan2(point.x), height }
     }
 }
 
-/// The site's world frame tied to the Earth: local east, north, up at an anchor.
+/// The site's world frame on the Earth: local east, north, up at an anchor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LocalFrame {
     origin: Point3<f64>,
@@ -115,6 +123,7 @@ impl LocalFrame {
     pub fn at(anchor: Geodetic) -> Self {
         let (sin_latitude, cos_latitude) = anchor.latitude.sin_cos();
         let (sin_longitude, cos_longitude) = anchor.longitude.sin_cos();
+        // East, north = up x east, and up in the Earth's axes.
         let east = Vector3::new(-sin_longitude, cos_longitude, 0.0);
         let up =
             Vector3::new(cos_latitude * cos_longitude, cos_latitude * sin_longitude, sin_latitude);
@@ -127,8 +136,8 @@ impl LocalFrame {
         Geodetic::from_earth_centred(self.origin + self.earth_from_local * point.coords)
     }
 
-    /// What turns a vector of this frame into the axes of another: those at a place 5 km away are
-    /// turned by 0.8 mrad.
+    /// The rotation of a vector from this frame into the axes of another: those of a frame 5 km
+    /// away are turned by 0.8 mrad.
     pub fn axes_at(&self, other: &Self) -> Matrix3<f64> {
         other.earth_from_local.transpose() * self.earth_from_local
     }
@@ -186,7 +195,7 @@ mod tests {
         let expected = (100.0 / along).to_degrees();
         assert!((north.latitude_deg() - 45.0 - expected).abs() < 1e-8);
         assert!((expected - 0.8998e-3).abs() < 1e-7, "{expected}");
-        // The plane leaves the ellipsoid by d^2 / 2R.
+        // The tangent plane rises above the ellipsoid by d^2 / 2R.
         assert!((north.height() - 100.0_f64.powi(2) / (2.0 * along)).abs() < 1e-6);
     }
 

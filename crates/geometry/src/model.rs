@@ -2,13 +2,13 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix3x2, Point3, Unit, 
 
 use crate::{SightLine, tangent_basis};
 
-/// The bearing model: how a camera at `origin` sees a place, and how that changes with the place,
-/// with the camera's pose and with its clock.
+/// The bearing model: the direction in which a camera at `origin` sees a place, and the derivatives
+/// of that by the place, by the camera's pose and by its clock.
 ///
-/// A bearing is compared as an offset on the tangent plane at the expected direction, measured less
-/// expected. The Jacobians say how that offset changes with a true value that the expectation does
-/// not know: `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is the
-/// true place less the expected one (m, world), `de` the true pose less the stated one (a small
+/// A bearing is compared with its expectation as an offset on the tangent plane at the expected
+/// direction, measured less expected. The Jacobians say how that offset changes with errors of the
+/// expectation: `offset = by_position * dp + by_pose * de + by_time * dt + noise`, where `dp` is
+/// the true place less the expected one (m, world), `de` the true pose less the stated one (a small
 /// rotation vector about the world's axes, rad, then the position, m) and `dt` the stated capture
 /// time less the true one (s).
 ///
@@ -32,18 +32,19 @@ pub struct BearingModel {
 }
 
 impl BearingModel {
-    /// Of a camera at `origin` and a place, m, world; `None` if both are one.
+    /// The model for a camera at `origin` and a place, m, world; `None` if the two coincide.
     pub fn new(origin: Point3<f64>, place: Point3<f64>) -> Option<Self> {
         let (direction, range) = Unit::try_new_and_get(place - origin, 1e-6)?;
         Some(Self { direction, basis: tangent_basis(&direction), range })
     }
 
-    /// The same for a known direction and range.
+    /// The model for a known direction (world) and range (m).
     pub fn along(direction: Unit<Vector3<f64>>, range: f64) -> Self {
         Self { direction, basis: tangent_basis(&direction), range }
     }
 
-    /// A measured line less the expected direction, rad; `None` if it points to the other side.
+    /// Offset of a measured line from the expected direction, rad; `None` if the line points to the
+    /// opposite half space.
     pub fn offset(&self, line: &SightLine) -> Option<Vector2<f64>> {
         (self.direction.dot(&line.direction) > 0.0)
             .then(|| self.basis.transpose() * line.direction.into_inner())
@@ -55,14 +56,14 @@ impl BearingModel {
         turn * line.covariance * turn.transpose()
     }
 
-    /// Change with the place, rad/m.
+    /// Jacobian by the place, `B' / range` with the tangents B, rad/m.
     pub fn by_position(&self) -> Matrix2x3<f64> {
         self.basis.transpose() / self.range
     }
 
-    /// Change with the pose: rad/rad, then rad/m. A camera that is turned by `d` more than it says
-    /// measures in its stated axes the direction turned back by `d`; one that stands farther by `c`
-    /// sees the place moved by `-c`.
+    /// Jacobian by the pose: rad/rad, then rad/m. A camera that is turned by `d` more than stated
+    /// measures, in its stated axes, the direction u turned back by `d`, which is u + u x d; one
+    /// that stands farther by `c` sees the place moved by `-c`.
     pub fn by_pose(&self) -> Matrix2x6<f64> {
         let tangents = self.basis.transpose();
         let cross: Matrix3<f64> = self.direction.cross_matrix();
@@ -72,8 +73,8 @@ impl BearingModel {
         jacobian
     }
 
-    /// Change with the clock, rad/s: one that is ahead shows the target of `velocity` (m/s) where
-    /// it was.
+    /// Jacobian by the clock, rad/s: a clock that is ahead shows a target of `velocity` (m/s) where
+    /// it was earlier than the stated time.
     pub fn by_time(&self, velocity: Vector3<f64>) -> Vector2<f64> {
         -(self.by_position() * velocity)
     }

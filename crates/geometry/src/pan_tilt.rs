@@ -5,10 +5,10 @@ use nalgebra::{Rotation3, Unit, Vector3};
 use crate::scanning::camera_from_paper;
 use crate::{GeometryError, Pose, ScanAngles};
 
-/// A mount that turns a camera about its own centre: first about the vertical of the camera at
-/// rest, to the left, by the azimuth, then about the camera's own horizontal axis, upwards, by the
-/// elevation. So the camera's axis points along [`ScanAngles::bearing`] of the two (Klochko 2020,
-/// eq. 2), and [`ScanAngles::of`] is the cue for a direction (eq. 3).
+/// A mount that turns a camera about the camera's own centre: first about the vertical axis of the
+/// camera at rest, to the left, by the azimuth, then about the camera's own horizontal axis,
+/// upwards, by the elevation. So the camera's axis points along [`ScanAngles::bearing`] of the two
+/// angles (Klochko 2020, eq. 2), and [`ScanAngles::of`] is the cue for a direction (eq. 3).
 ///
 /// ```
 /// use crossfix_geometry::{PanTilt, Pose, ScanAngles};
@@ -32,11 +32,11 @@ pub struct PanTilt {
 }
 
 impl PanTilt {
-    /// A mount by the camera's pose with both angles at zero, and how far each angle goes (least
+    /// A mount from the camera's pose with both angles at zero, and the limits of each angle (least
     /// and most, rad).
     ///
     /// # Errors
-    /// [`GeometryError::Reach`] if a least angle is above its most, or any is beyond a turn
+    /// [`GeometryError::Reach`] if a least angle is above its most, or a limit is beyond a turn
     /// (azimuth) or a quarter of one (elevation).
     pub fn new(rest: Pose, azimuth: [f64; 2], elevation: [f64; 2]) -> Result<Self, GeometryError> {
         use std::f64::consts::{FRAC_PI_2, TAU};
@@ -73,15 +73,15 @@ impl PanTilt {
 
     /// The camera's pose at angles, whether or not the mount reaches them.
     pub fn pose(&self, angles: ScanAngles) -> Pose {
-        // Left about y, which points down, is against the sense of a turn about it; upwards about x
-        // is with it.
+        // The camera's y axis points down: a turn to the left is negative about it. Upwards is
+        // positive about x.
         let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), -angles.azimuth)
             * Rotation3::from_axis_angle(&Vector3::x_axis(), angles.elevation);
         self.rest.turned(&turn)
     }
 
-    /// The angles at which the camera's axis points along a direction of its frame at rest, as near
-    /// as the mount reaches them.
+    /// The angles at which the camera's axis points along a direction (in the camera's frame at
+    /// rest), or as near to it as the mount reaches.
     pub fn aim(&self, direction: &Unit<Vector3<f64>>) -> ScanAngles {
         let paper = Unit::new_unchecked(camera_from_paper(direction.into_inner()));
         let ScanAngles { azimuth, elevation } = ScanAngles::of(&paper);
@@ -92,7 +92,7 @@ impl PanTilt {
     }
 }
 
-/// An angle within bounds that points the same way; where there is none, the nearer bound.
+/// The same angle plus or minus whole turns, within bounds; where none is, the nearer bound.
 fn nearest_turn(angle: f64, [least, most]: [f64; 2]) -> f64 {
     use std::f64::consts::TAU;
     let turns = [angle, angle - TAU, angle + TAU];

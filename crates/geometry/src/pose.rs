@@ -2,7 +2,8 @@ use nalgebra::{Matrix3, Point3, Quaternion, Rotation3, Unit, UnitQuaternion, Vec
 
 use crate::GeometryError;
 
-/// How far R'R may be from the identity: what a matrix printed with six digits keeps.
+/// Largest deviation of an element of R'R from the identity: what a matrix printed with six digits
+/// keeps.
 const ORTHONORMAL_TOLERANCE: f64 = 1e-5;
 
 /// Where a camera is and how it is turned: `world_from_camera`.
@@ -16,18 +17,21 @@ pub struct Pose {
 
 /// A rotation as its axis times its angle, rad.
 ///
-/// Of next to no turn it is next to nothing, where [`Rotation3::scaled_axis`] is no number as soon as rounding
-/// makes the matrix' trace larger than three.
+/// For a nearly zero turn the result is nearly zero, where [`Rotation3::scaled_axis`] gives NaN as
+/// soon as rounding makes the matrix' trace larger than three.
 pub fn turn_vector(rotation: &Rotation3<f64>) -> Vector3<f64> {
     UnitQuaternion::from_rotation_matrix(rotation).scaled_axis()
 }
 
-/// The smallest turn of one direction onto another; `None` where they are opposite within a microradian.
+/// The smallest turn of one direction onto another; `None` where they are opposite to within a
+/// microradian.
 ///
-/// [`Rotation3::rotation_between`] is no number where rounding makes the cosine of directions that are next
-/// to equal larger than one, and knows a small angle no better than to 1e-8 rad.
+/// [`Rotation3::rotation_between`] gives NaN where rounding makes the cosine of nearly equal
+/// directions larger than one, and resolves small angles only to 1e-8 rad.
 pub fn turn_between(from: &Unit<Vector3<f64>>, to: &Unit<Vector3<f64>>) -> Option<Rotation3<f64>> {
-    // 1 + cos a = 2 cos^2 (a/2) and sin a = 2 sin (a/2) cos (a/2): twice the cosine times the half turn.
+    // The quaternion (1 + cos a, n sin a) = 2 cos(a/2) (cos(a/2), n sin(a/2)), as
+    // 1 + cos a = 2 cos^2(a/2) and sin a = 2 sin(a/2) cos(a/2): normalised, it is that of a turn by
+    // a about n.
     let half = Quaternion::from_parts(1.0 + from.dot(to), from.cross(to));
     Unit::try_new(half, 1e-6).map(|half| half.to_rotation_matrix())
 }
@@ -48,12 +52,14 @@ impl Pose {
         if deviation > ORTHONORMAL_TOLERANCE || determinant < 0.0 {
             return Err(GeometryError::NotRotation { deviation, determinant });
         }
-        // One Newton step towards the polar factor: exact to the square of the deviation.
+        // One Newton step towards the polar factor, R (3 I - R'R) / 2: its error is of the order of
+        // the squared deviation.
         let nearest = matrix * (Matrix3::identity() * 3.0 - matrix.transpose() * matrix) * 0.5;
         Ok(Self { rotation: Rotation3::from_matrix_unchecked(nearest), position })
     }
 
-    /// A camera at the world's origin whose axes are the world's: where nothing is known.
+    /// A camera at the world's origin whose axes are the world's: a placeholder where no pose is
+    /// known.
     pub fn at_origin() -> Self {
         Self { rotation: Rotation3::identity(), position: Point3::origin() }
     }
@@ -63,13 +69,14 @@ impl Pose {
     /// # Errors
     /// [`GeometryError::Aim`] if the target is straight above, below or at the camera.
     pub fn looking_at(position: Point3<f64>, target: Point3<f64>) -> Result<Self, GeometryError> {
+        // z forward, x = forward x up (level), y = forward x right (down).
         let forward = (target - position).try_normalize(1e-9).ok_or(GeometryError::Aim)?;
         let right = forward.cross(&Vector3::z()).try_normalize(1e-9).ok_or(GeometryError::Aim)?;
         let down = forward.cross(&right);
         Self::new(Matrix3::from_columns(&[right, down, forward]), position)
     }
 
-    /// The pose of a camera that stands in the same place and is turned about its own axes.
+    /// The pose of a camera in the same place, turned about its own axes.
     #[must_use]
     pub fn turned(&self, turn: &Rotation3<f64>) -> Self {
         Self { rotation: self.rotation * turn, position: self.position }
@@ -136,7 +143,7 @@ mod tests {
             let axis = Unit::new_normalize(axis);
             let to = Unit::new_normalize(Rotation3::from_axis_angle(&axis, angle) * *from);
             let turn = turn_between(&from, &to).unwrap();
-            // By rounding, which weighs the more the nearer they are to opposite.
+            // Rounding matters the more, the nearer the directions are to opposite.
             let exact = 1e-14 / (angle / 2.0).cos();
             prop_assert!((turn * *from - *to).norm() < exact);
             prop_assert!((turn_vector(&turn) - *axis * angle).norm() < exact);
@@ -152,7 +159,8 @@ mod tests {
 
     #[test]
     fn a_turn_of_next_to_nothing_is_next_to_nothing() {
-        // Products of rotations: their traces lie on both sides of three by rounding.
+        // Products of a rotation with its inverse: by rounding, their traces lie on both sides of
+        // three.
         for k in 1..1000 {
             let rotation = Rotation3::new(Vector3::new(0.3, -1.1, 0.7) * f64::from(k));
             let turn = turn_vector(&(rotation.inverse() * rotation));

@@ -3,11 +3,11 @@
 //! paper's: z towards the object, y up, so x points to the left of a camera
 //! that looks along z.
 //!
-//! A scanning receiver is a camera like any other to the rest of the system:
-//! [`ScanMeasurement::bearing`] is its measurement in a camera's frame. It
-//! meets each target at another time, so it sends a message for each target,
-//! with the time at which the beam met it. Its pose is that of its zero
-//! direction, and the intrinsics of its calibration say where it scans.
+//! To the rest of the system a scanning receiver is a camera like any other:
+//! [`ScanMeasurement::bearing`] is its measurement in a camera's frame. It meets each target at
+//! another time, so it sends one message per target, with the time at which the beam met that
+//! target. Its pose is that of its zero direction, and the intrinsics of its calibration say where
+//! it scans.
 //!
 //! ```
 //! use crossfix_geometry::{Camera, Distortion, ImageSize, Intrinsics, Pose, ScanAngles, ScanMeasurement};
@@ -36,16 +36,16 @@ use nalgebra::{Matrix2, Matrix3x2, Unit, Vector3};
 
 use crate::{Bearing, GeometryError, tangent_basis};
 
-/// A vector of the paper's axes (x left, y up, z forward) in the camera's frame (x right, y down,
-/// z forward), or back: half a turn about z.
+/// Transforms a vector of the paper's axes (x left, y up, z forward) to the camera's frame (x
+/// right, y down, z forward), or back: half a turn about z.
 pub fn camera_from_paper(vector: Vector3<f64>) -> Vector3<f64> {
     Vector3::new(-vector.x, -vector.y, vector.z)
 }
 
 /// The direction from an image point of an optical receiver (Klochko 2020, eq. 1), paper's axes.
 ///
-/// `x`, `y` and the focal length `f` in one unit; the image is upside down, hence the signs.
-/// `None` if the focal length is not positive.
+/// `x`, `y` and the focal length `f` are in the same unit; the image is upside down, hence the
+/// signs. `None` if the focal length is not positive.
 pub fn optical_bearing(x: f64, y: f64, f: f64) -> Option<Unit<Vector3<f64>>> {
     (f > 0.0).then(|| Unit::new_normalize(Vector3::new(-x, -y, f)))
 }
@@ -54,7 +54,7 @@ pub fn optical_bearing(x: f64, y: f64, f: f64) -> Option<Unit<Vector3<f64>>> {
 /// the horizontal plane, elevation above that plane.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScanAngles {
-    /// phi, in the horizontal plane from the axis z.
+    /// phi, in the horizontal plane, from the z axis towards x.
     pub azimuth: f64,
     /// theta, above the horizontal plane.
     pub elevation: f64,
@@ -73,12 +73,12 @@ impl ScanAngles {
     }
 
     /// The angles of a direction (Klochko 2020, eq. 3; erratum: without the factor mu in the
-    /// azimuth, and with the quadrant).
+    /// azimuth, and with atan2 for the right quadrant).
     pub fn of(bearing: &Unit<Vector3<f64>>) -> Self {
         Self { azimuth: bearing.x.atan2(bearing.z), elevation: bearing.y.clamp(-1.0, 1.0).asin() }
     }
 
-    /// How the direction changes with azimuth and elevation, as columns, paper's axes.
+    /// Derivatives of the direction by azimuth and elevation, as columns, paper's axes.
     fn derivative(self) -> Matrix3x2<f64> {
         let (sin_azimuth, cos_azimuth) = self.azimuth.sin_cos();
         let (sin_elevation, cos_elevation) = self.elevation.sin_cos();
@@ -88,19 +88,20 @@ impl ScanAngles {
         ])
     }
 
-    /// The angles to which an image point cues the scanning receiver beside its optical one
-    /// (Klochko 2020, eq. 3 mended: phi = atan2(-x, f)).
+    /// The angles to which an image point cues the scanning receiver that stands beside the optical
+    /// one (Klochko 2020, eq. 3 corrected: phi = atan2(-x, f)).
     pub fn cue(x: f64, y: f64, f: f64) -> Option<Self> {
         optical_bearing(x, y, f).map(|bearing| Self::of(&bearing))
     }
 }
 
-/// What a scanning receiver measures of one target.
+/// One target's measurement by a scanning receiver.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScanMeasurement {
     /// The angles, paper's axes.
     pub angles: ScanAngles,
-    /// Standard deviation of the azimuth, rad; on the sky it is smaller by the elevation's cosine.
+    /// Standard deviation of the azimuth, rad; the deviation of the direction is smaller by the
+    /// cosine of the elevation.
     pub azimuth_sd: f64,
     /// Standard deviation of the elevation, rad.
     pub elevation_sd: f64,
@@ -120,6 +121,7 @@ impl ScanMeasurement {
             camera_from_paper(paper.column(0).into_owned()),
             camera_from_paper(paper.column(1).into_owned()),
         ]);
+        // With J = B' d(direction)/d(angles) on the tangents B: covariance = J diag(sd^2) J'.
         let tangents = tangent_basis(&direction).transpose() * derivative;
         let variances = Matrix2::new(self.azimuth_sd.powi(2), 0.0, 0.0, self.elevation_sd.powi(2));
         Bearing::new(direction.into_inner(), tangents * variances * tangents.transpose())

@@ -12,48 +12,51 @@ use crate::{
     Pointing, Timestamp, Vector3,
 };
 
-/// A pose whose rotation about an axis is known no better than this is not known, rad.
+/// Largest standard deviation of a pose's rotation about an axis, rad: beyond this the pose counts
+/// as unknown.
 pub const MOST_ROTATION_SD: f64 = 1.0;
-/// The same of its place along an axis, m: a site is smaller than some of these.
+/// Largest standard deviation of a pose's position along an axis, m: some sites are smaller than
+/// this.
 pub const MOST_POSITION_SD: f64 = 1000.0;
 
-/// A [`CameraCalibration`] that has been read and found possible.
+/// A [`CameraCalibration`] that has been parsed and found possible.
 #[derive(Clone, Debug)]
 pub struct Calibration {
-    /// Whose it is.
+    /// The camera's name.
     pub name: CameraName,
-    /// Its model and place; of a camera on a mount with both angles at zero.
+    /// Its model and pose; for a camera on a mount, the pose with both angles at zero.
     pub camera: Camera,
     /// What turns it, if something does.
     pub mount: Option<PanTilt>,
-    /// Whether it looks for what it is told to look for.
+    /// Whether it looks for the targets that cues announce.
     pub takes_cues: bool,
     /// Covariance of the pose in the world's axes, rotation about them (rad), then position (m);
     /// `None`: exact.
     pub pose_covariance: Option<Matrix6<f64>>,
-    /// The part of its bearings' noise that lasts from one to the next; `None`: each errs anew.
+    /// The part of its bearings' noise that is correlated from one bearing to the next; `None`: the
+    /// noise is white.
     pub lasting_noise: Option<LastingNoise>,
-    /// What its clock wanders by, s after one second.
+    /// Random wander of its clock, s after one second.
     pub clock_wander_s: f64,
-    /// What the whole site may be off by, beside the pose's covariance.
+    /// Uncertainty of the site as a whole, in addition to the pose's covariance.
     pub datum: Option<Datum>,
-    /// It holds from this time on.
+    /// It is valid from this time on.
     pub valid_from: Timestamp,
 }
 
-/// Noise of bearings that lasts from one to the next.
+/// Bearing noise that is correlated from one bearing to the next.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LastingNoise {
     /// Standard deviation per tangent, rad.
     pub sd_rad: f64,
-    /// Time after which e^-1 of it is left, s.
+    /// Correlation time, after which e^-1 of it is left, s.
     pub time_s: f64,
 }
 
 /// Why a [`CameraCalibration`] cannot be used.
 #[derive(Debug, Error)]
 pub enum CalibrationError {
-    /// The camera's name is none.
+    /// The camera's name is not a valid name.
     #[error("a calibration's camera has an impossible name")]
     Name(#[source] NameError),
     /// The numbers describe no camera.
@@ -65,14 +68,14 @@ pub enum CalibrationError {
         #[source]
         source: GeometryError,
     },
-    /// It says nothing of where the camera stands.
+    /// It has no pose.
     #[error("camera `{camera}` has a lens and no pose: calibrate it (crossfix calibrate)")]
     NoPose {
         /// The camera.
         camera: CameraName,
     },
-    /// The pose's covariance is none: not finite, not symmetric, or negative along some axis; or it is that
-    /// of a pose that nobody knows ([`MOST_ROTATION_SD`], [`MOST_POSITION_SD`]).
+    /// The pose's covariance is not one: not finite, not symmetric, or negative along some axis; or
+    /// it is so large that the pose counts as unknown ([`MOST_ROTATION_SD`], [`MOST_POSITION_SD`]).
     #[error(
         "the calibration of camera `{camera}`: pose_covariance is no covariance, or of a pose that is not known \
          to {MOST_ROTATION_SD} rad and {MOST_POSITION_SD} m"
@@ -127,7 +130,7 @@ impl CameraCalibration {
         Sha256::digest(bare.encode_to_vec()).to_vec()
     }
 
-    /// Reads the message: the camera it describes, or why it describes none.
+    /// Parses the message into the camera that it describes, or says why it describes none.
     ///
     /// # Errors
     /// [`CalibrationError`] naming the camera and the part.
@@ -145,7 +148,7 @@ impl CameraCalibration {
         let is_bare = self.rotation.is_empty() && self.position.is_none();
         let mount = match &self.mount {
             None => None,
-            // A pose that stays and one that turns.
+            // A fixed pose and one that turns contradict each other.
             Some(_) if !is_bare => return Err(shape("mount")),
             Some(mount) => {
                 let rest = read_pose(&mount.rotation, mount.position)?;
@@ -194,8 +197,8 @@ impl CameraCalibration {
         })
     }
 
-    /// The same calibration of a camera on a mount: its pose is that of the mount with both angles
-    /// at zero, and it looks where it is told to look.
+    /// The same calibration for a camera on a mount: its pose is that of the mount with both angles
+    /// at zero, and it takes cues.
     #[must_use]
     pub fn on_mount(mut self, mount: &PanTilt) -> Self {
         let [azimuth_min, azimuth_max] = mount.azimuth();
@@ -213,7 +216,7 @@ impl CameraCalibration {
         self.taking_cues()
     }
 
-    /// The same calibration of a camera that looks for what it is told to look for.
+    /// The same calibration for a camera that takes cues: it looks for what it is told to look for.
     #[must_use]
     pub fn taking_cues(mut self) -> Self {
         self.takes_cues = true;
@@ -255,8 +258,8 @@ impl CameraCalibration {
         self
     }
 
-    /// The same calibration with what of the bearings' noise lasts, and what the clock wanders by (s
-    /// after one second).
+    /// The same calibration with the correlated part of the bearings' noise, and the wander of the
+    /// clock (s after one second).
     #[must_use]
     pub fn with_lasting_errors(mut self, noise: LastingNoise, clock_wander_s: f64) -> Self {
         (self.lasting_noise_rad, self.lasting_noise_s) = (noise.sd_rad, noise.time_s);
@@ -265,7 +268,13 @@ impl CameraCalibration {
         self
     }
 
-    /// The same calibration of a site that may be off as a whole.
+    /// Whether it comes from a flight, which corrects the camera's clock too: the times of bearings that are
+    /// published with it are corrected already.
+    pub fn corrects_clock(&self) -> bool {
+        self.datum.is_some() || self.clock_wander_s > 0.0
+    }
+
+    /// The same calibration with the uncertainty of the site as a whole.
     #[must_use]
     pub fn with_datum(mut self, datum: &Datum) -> Self {
         self.datum = Some(datum.into());
@@ -273,10 +282,10 @@ impl CameraCalibration {
         self
     }
 
-    /// The message for a camera of which nobody knows yet where it stands: its lens alone.
+    /// The message for a camera whose pose is not known yet: its lens alone.
     ///
     /// # Errors
-    /// [`GeometryError::Intrinsics`] where the numbers are no lens's.
+    /// [`GeometryError::Intrinsics`] where the parameters are no lens's.
     pub fn of_lens(
         name: &CameraName,
         intrinsics: Intrinsics,
@@ -310,8 +319,8 @@ fn rows_of(pose: &Pose) -> Vec<f64> {
 }
 
 impl Calibration {
-    /// The camera as it was turned for a frame, and where it pointed; the camera as it is for one that
-    /// stands still. `None` if it is on a mount and the frame does not say where it pointed.
+    /// The camera with the pose that it had in a frame whose pointing this is; a camera without a
+    /// mount as it is. `None` if it is on a mount and the frame does not say where it pointed.
     pub fn pointed(&self, pointing: Option<&Pointing>) -> Option<Camera> {
         let Some(mount) = &self.mount else { return Some(self.camera.clone()) };
         Some(self.camera.posed(mount.pose(pointing?.angles()?)))
@@ -319,7 +328,7 @@ impl Calibration {
 }
 
 impl Pointing {
-    /// The angles, where they are possible.
+    /// The angles; `None` if they are impossible.
     pub fn angles(&self) -> Option<ScanAngles> {
         let Self { azimuth, elevation, .. } = *self;
         let within = |angle: f64, turns: f64| angle.abs() <= turns * std::f64::consts::TAU;
@@ -338,8 +347,8 @@ impl PanTiltMount {
     }
 }
 
-/// The covariance on the wire (rotation about the camera's axes) turned into the world's axes;
-/// `None` if it is no covariance.
+/// The covariance on the wire (rotation about the camera's axes) transformed to the world's axes;
+/// `None` if it is not a covariance, or so large that the pose counts as unknown.
 fn read_pose_covariance(values: &[f64; 36], camera: &Camera) -> Option<Matrix6<f64>> {
     let own = Matrix6::from_row_slice(values);
     let sd = own.diagonal().map(|variance| variance.max(0.0).sqrt());
@@ -438,7 +447,7 @@ mod tests {
         assert!(parsed.pointed(None).is_none());
         let impossible = Pointing { elevation: 2.0, ..pointing };
         assert!(parsed.pointed(Some(&impossible)).is_none());
-        // One that stands still does as if nothing had been said.
+        // A camera that stands still ignores any pointing.
         let still = message().parse().unwrap();
         assert_eq!(still.pointed(Some(&pointing)).unwrap().pose(), still.camera.pose());
     }

@@ -2,8 +2,9 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, SMatrix, SVector};
 
-/// Whether a matrix is finite, symmetric and along no axis negative, each to rounding, by what is largest of
-/// each unit: `units` are the places of what has one unit.
+/// Whether a matrix is a covariance: finite, symmetric and positive semidefinite, to within
+/// rounding relative to the largest variance of each unit. `units` are the index ranges that share
+/// a unit.
 pub(crate) fn is_covariance<const N: usize>(
     matrix: &SMatrix<f64, N, N>,
     units: &[Range<usize>],
@@ -11,19 +12,21 @@ pub(crate) fn is_covariance<const N: usize>(
     if !matrix.iter().all(|value| value.is_finite()) {
         return false;
     }
+    // Scaled by one over the largest standard deviation of each unit, all numbers are comparable.
     let mut by = SVector::<f64, N>::zeros();
     for unit in units {
         let largest = unit.clone().map(|place| matrix[(place, place)]).fold(0.0, f64::max);
         if largest > 0.0 {
             by.rows_range_mut(unit.clone()).fill(largest.sqrt().recip());
         } else if matrix.rows_range(unit.clone()).iter().any(|tie| *tie != 0.0) {
-            // What is exact is tied to nothing.
+            // A parameter without variance cannot correlate with anything.
             return false;
         }
     }
     let scale = SMatrix::from_diagonal(&by);
     let scaled = scale * matrix * scale;
     let is_symmetric = (scaled - scaled.transpose()).amax() <= 1e-9;
+    // No negative variance along any axis: all eigenvalues are at least 0 to within rounding.
     let axes = DMatrix::from_column_slice(N, N, scaled.as_slice()).symmetric_eigenvalues();
     is_symmetric && axes.min() >= -1e-9
 }
@@ -48,7 +51,7 @@ mod tests {
         assert!(!possible(f64::NAN, 0.0, 0.0, 1.0));
     }
 
-    /// Some variance is next to nothing then, and as well below it.
+    /// Some variances are nearly zero after the turn, and may be slightly negative.
     #[test]
     fn what_is_unknown_about_one_axis_alone_may_be_turned() {
         let about_up = Matrix3::from_diagonal(&Vector3::new(0.0, 0.0, 1e-4));

@@ -5,13 +5,14 @@ use nalgebra::{Matrix3, Matrix6, Point3, SMatrix, Vector3 as Vector};
 use crate::covariance::is_covariance;
 use crate::{SiteDatum, Timestamp};
 
-/// What nobody knows better than this is not known (m, rad, s, ratios): the Earth is as large in metres.
+/// Largest standard deviation that is accepted (m, rad, s, ratios); anything larger is not known at
+/// all: the Earth is as large in metres.
 const LARGEST_SD: f64 = 1e7;
 
-/// What a whole site may be off by: all that it says of places and times, alike.
+/// Uncertainty of a site as a whole: errors that all its places and times have in common.
 ///
-/// Tracks of one site do not feel it and do not hold it. Whoever compares them with places from
-/// elsewhere adds it.
+/// Tracks of one site do not notice these errors, and their covariances do not contain them.
+/// Whoever compares tracks with places from elsewhere adds this covariance.
 ///
 /// ```
 /// use crossfix_message::{Datum, Timestamp};
@@ -27,28 +28,29 @@ const LARGEST_SD: f64 = 1e7;
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Datum {
-    /// What the site turns and grows about, local ENU, m.
+    /// The point about which the site turns and grows, local ENU, m.
     pub middle: Point3<f64>,
-    /// The time at which its clocks are late together and from which they go slow.
+    /// The reference time of the clocks' errors: lateness is the common offset at this time, and
+    /// slowness accumulates from it.
     pub time: Timestamp,
     /// Covariance of shift (m, 3), turn (rad, 3), growth (a ratio), lateness (s) and slowness (a
-    /// ratio): what is true less what is said.
+    /// ratio): true less stated.
     pub covariance: SMatrix<f64, { Datum::WAYS }, { Datum::WAYS }>,
 }
 
 impl Datum {
-    /// Ways in which a site may be off as a whole.
+    /// Number of parameters by which a site may be off as a whole.
     pub const WAYS: usize = 9;
-    /// Where the turn begins among them, ...
+    /// Index of the first turn among them, ...
     pub const TURN: usize = 3;
-    /// ... and where growth, lateness and slowness are.
+    /// ... and of growth.
     pub const GROWTH: usize = 6;
-    /// The clocks' common offset.
+    /// Index of lateness, the clocks' common offset.
     pub const LATE: usize = 7;
-    /// The clocks' common rate.
+    /// Index of slowness, the clocks' common rate.
     pub const SLOW: usize = 8;
 
-    /// The ways of one unit.
+    /// Index ranges of parameters that share a unit.
     const UNITS: [Range<usize>; 5] = [
         0..Self::TURN,
         Self::TURN..Self::GROWTH,
@@ -62,7 +64,8 @@ impl Datum {
         std::array::from_fn(|way| self.covariance[(way, way)].max(0.0).sqrt())
     }
 
-    /// Covariance of the position (m) and velocity (m/s) of a target that is at a place at a time.
+    /// Covariance of the position (m) and velocity (m/s) of a target at a place at a time, owing to
+    /// these errors.
     pub fn of_state(
         &self,
         position: &Point3<f64>,
@@ -70,6 +73,9 @@ impl Datum {
         time: Timestamp,
     ) -> Matrix6<f64> {
         let arm = position - self.middle;
+        // J C J', with J the derivatives of position p and velocity v. With arm = p - middle: a
+        // turn w adds w x arm to p and w x v to v; growth g adds g arm and g v; lateness d adds
+        // -d v to p; slowness s adds -s v (t - time) to p and -s v to v.
         let mut by_datum = SMatrix::<f64, 6, { Self::WAYS }>::zeros();
         by_datum.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
         by_datum.fixed_view_mut::<3, 3>(0, Self::TURN).copy_from(&-arm.cross_matrix());
@@ -83,7 +89,7 @@ impl Datum {
         by_datum * self.covariance * by_datum.transpose()
     }
 
-    /// Whether its numbers can be.
+    /// Whether its numbers are possible.
     pub fn is_possible(&self) -> bool {
         self.middle.iter().all(|value| value.is_finite())
             && is_covariance(&self.covariance, &Self::UNITS)
@@ -96,7 +102,7 @@ impl From<&Datum> for SiteDatum {
         Self {
             middle: Some(datum.middle.into()),
             time_ns: datum.time.nanos(),
-            // It is symmetric: rows are columns.
+            // Symmetric, so row order and column order are the same.
             covariance: datum.covariance.as_slice().to_vec(),
         }
     }

@@ -4,18 +4,18 @@ use crate::{
     Timestamp, TrackEvent, TrackFrame, TruthFrame, VERSION,
 };
 
-/// What a recorder must know of a message: no more than that is read of it, so that a message of a
-/// newer version can be kept, and a large one costs nothing.
+/// What a recorder must know of a message. Nothing else is read of it, so that a message of a newer
+/// version can be kept, and a large one costs nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Glance {
-    /// The time that it speaks of; the epoch if it says none.
+    /// The data time of the message; the epoch if it has none.
     pub time: Timestamp,
-    /// Whether this build can read it, or its sender speaks a newer major version.
+    /// Whether this build can read it; `false` if its sender speaks a newer major version.
     pub is_readable: bool,
 }
 
-/// Looks at the bytes of a channel's message without decoding it; `None` for channels that carry
-/// none.
+/// Reads the data time and readability from the bytes of a channel's message without decoding it;
+/// `None` for channels that carry no messages.
 ///
 /// # Errors
 /// [`DecodeError::Malformed`] if the bytes are no protobuf message.
@@ -44,7 +44,7 @@ pub fn glance(channel: &Channel, bytes: &[u8]) -> Result<Option<Glance>, DecodeE
     seen.map(Some)
 }
 
-/// The field `version` of every message, and `major` in it.
+/// Numbers of the field `version` of every message, and of `major` in it.
 const VERSION_TAG: u32 = 1;
 const MAJOR_TAG: u32 = 1;
 

@@ -6,14 +6,14 @@ use thiserror::Error;
 use crate::name::{FUSION, RECORDER, TRUTH};
 use crate::{AreaName, CameraName, NameError, SiteName};
 
-/// What goes over a key, and so its message type.
+/// The kind of data that is published under a key, which determines its message type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Channel {
     /// `<camera>/bearings`: [`crate::BearingFrame`].
     Bearings(CameraName),
     /// `<camera>/calibration`: [`crate::CameraCalibration`], on change and every two seconds.
     Calibration(CameraName),
-    /// `<camera>/preview`: [`crate::Preview`], a few a second, may be lost.
+    /// `<camera>/preview`: [`crate::Preview`], a few per second; some may be lost.
     Preview(CameraName),
     /// `<camera>/health`: [`crate::Health`], once a second.
     CameraHealth(CameraName),
@@ -21,8 +21,8 @@ pub enum Channel {
     Alive(CameraName),
     /// `fusion/tracks`: [`crate::TrackFrame`].
     Tracks,
-    /// `fusion/smoothed`: [`crate::TrackFrame`], each a while after that of `fusion/tracks`, as the
-    /// bearings since have told.
+    /// `fusion/smoothed`: [`crate::TrackFrame`], each some time after that of `fusion/tracks`,
+    /// improved by the bearings that have come since.
     Smoothed,
     /// `fusion/events`: [`crate::TrackEvent`].
     Events,
@@ -41,7 +41,7 @@ pub enum Channel {
 }
 
 /// A key expression of Crossfix: `crossfix/<site>/<component>/<kind>`, and where a site has several
-/// fusion centres `crossfix/<site>/fusion/<area>/<kind>` of each.
+/// fusion centres `crossfix/<site>/fusion/<area>/<kind>` for each of them.
 ///
 /// ```
 /// use crossfix_message::{Channel, Key};
@@ -56,10 +56,10 @@ pub enum Channel {
 pub struct Key {
     /// The site.
     pub site: SiteName,
-    /// Of which of several fusion centres it is; `None` of one that is the only one, and of all
-    /// that is no fusion centre's.
+    /// The area whose fusion centre it belongs to; `None` if the site has only one fusion centre,
+    /// and for keys that are not a fusion centre's.
     pub area: Option<AreaName>,
-    /// The rest.
+    /// The component and kind.
     pub channel: Channel,
 }
 
@@ -69,7 +69,7 @@ pub enum KeyError {
     /// Not of the form `crossfix/<site>/<component>/<kind>`.
     #[error("`{0}` is not of the form crossfix/<site>/<component>/<kind>")]
     Form(String),
-    /// A site or camera that is no name.
+    /// An impossible name of a site, area or camera.
     #[error("`{key}` holds an impossible name")]
     Name {
         /// The text.
@@ -100,30 +100,30 @@ impl Key {
         Self { site, area: None, channel }
     }
 
-    /// The key of a channel of a fusion centre: of an area's, or of a site's only one.
+    /// The key of a channel of a fusion centre: of an area's, or of the only one of a site.
     pub fn of_centre(site: SiteName, area: Option<AreaName>, channel: Channel) -> Self {
         Self { site, area, channel }
     }
 
-    /// The key expression that holds everything of a site.
+    /// The key expression that matches everything of a site.
     pub fn everything_of(site: &SiteName) -> String {
         format!("crossfix/{site}/**")
     }
 
-    /// The key expression that holds one kind of channel of all cameras of a site.
+    /// The key expression that matches one kind of channel of all cameras of a site.
     ///
     /// `kind` is the last part of a key: `bearings`, `calibration`, `preview`, `health`, `alive`.
     pub fn of_all_cameras(site: &SiteName, kind: &str) -> String {
         format!("crossfix/{site}/*/{kind}")
     }
 
-    /// The key expression that holds one kind of channel of the fusion centres of a site's areas; the
-    /// one of a site without areas is among [`Self::of_all_cameras`].
+    /// The key expression that matches one kind of channel of the fusion centres of a site's areas.
+    /// That of a site without areas is matched by [`Self::of_all_cameras`].
     pub fn of_all_areas(site: &SiteName, kind: &str) -> String {
         format!("crossfix/{site}/{FUSION}/*/{kind}")
     }
 
-    /// The key expression that holds one kind of channel of all fusion centres of a site.
+    /// The key expression that matches one kind of channel of all fusion centres of a site.
     ///
     /// `kind` is the last part of a key: `tracks`, `smoothed`, `events`, `cues`, `health`, `alive`.
     pub fn of_all_centres(site: &SiteName, kind: &str) -> String {

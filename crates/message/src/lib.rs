@@ -1,10 +1,9 @@
-//! What Crossfix says on the wire and writes into its recordings.
+//! The messages that Crossfix sends over the network and writes into its recordings.
 //!
-//! The messages are protobuf (`proto/crossfix/v1/messages.proto`); the same
-//! types carry `serde` for JSON. The bytes that go over Zenoh are the bytes
-//! in a recording, so [`Payload::encode`] and [`decode`] are the only two ways in and
-//! out. [`decode`] refuses a newer major version; unknown fields of a newer
-//! minor version are skipped.
+//! The messages are protobuf (`proto/crossfix/v1/messages.proto`); the same types carry `serde` for
+//! JSON. The bytes that go over Zenoh are the bytes in a recording, so [`Payload::encode`] and
+//! [`decode`] are the only way out and the only way in. [`decode`] refuses a newer major version;
+//! unknown fields of a newer minor version are skipped.
 //!
 //! ```
 //! use crossfix_message::{BearingFrame, Payload, decode};
@@ -37,8 +36,7 @@ pub use time::Timestamp;
 pub use track::{TrackNumber, renumbered, track_id};
 pub use wire::*;
 
-/// The types that `tests/generated.rs` makes of `messages.proto`; their documentation is the
-/// definitions'.
+/// The types that `tests/generated.rs` generates from `messages.proto`, which documents them.
 #[allow(missing_docs, clippy::all)]
 mod wire {
     include!("generated/crossfix.v1.rs");

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// The name that stands for a component in key expressions, beside the cameras' names.
+/// The component name of the fusion centre in key expressions, where cameras have their names.
 pub(crate) const FUSION: &str = "fusion";
-/// The name under which truth is published.
+/// The component name under which ground truth is published.
 pub(crate) const TRUTH: &str = "truth";
-/// The name that stands for the recorder.
+/// The component name of the recorder.
 pub(crate) const RECORDER: &str = "recorder";
 
 /// Why a text is not a name.
@@ -26,7 +26,7 @@ pub enum NameError {
         /// The first character that does not belong.
         character: char,
     },
-    /// A name that Crossfix keeps for itself.
+    /// A name that is reserved for Crossfix itself.
     #[error("`{0}` is kept for Crossfix itself: choose another name")]
     Reserved(String),
 }
@@ -104,7 +104,7 @@ name_type!(
     [FUSION, RECORDER, TRUTH]
 );
 name_type!(
-    /// The name of a site: its cameras and what is made of what they see.
+    /// The name of a site: a set of cameras and everything that is derived from them.
     SiteName,
     []
 );

@@ -7,16 +7,16 @@ use crate::{
     VERSION, Version,
 };
 
-/// A message that stands alone on the wire and in recordings.
+/// A message type that stands alone on the wire and in recordings.
 pub trait Payload: Message + Default + Clone {
-    /// Its full protobuf name, the schema's name in a recording.
+    /// Its full protobuf name, which is the schema's name in a recording.
     const SCHEMA: &'static str;
-    /// The field that says which time it speaks of.
+    /// Number of the field that holds its data time.
     const TIME_TAG: u32;
-    /// Its lists, so that its size is known before it is decoded.
+    /// Its lists, by which its size in memory is known before it is decoded.
     const LISTS: &'static [Repeated];
 
-    /// The version its sender was built with, if it says.
+    /// The version that its sender was built with, if it states one.
     fn version(&self) -> Option<Version>;
 
     /// The same message stamped with this build's version.
@@ -26,14 +26,14 @@ pub trait Payload: Message + Default + Clone {
     /// The bytes for wire and recording, stamped with this build's version.
     fn encode(&self) -> Vec<u8>;
 
-    /// A message of its bytes, whatever its version and size: for [`decode`].
+    /// Decodes a message, whatever its version and size; only for use by [`decode`].
     ///
     /// # Errors
     /// If the bytes are no such message.
     #[doc(hidden)]
     fn of_bytes(bytes: &[u8]) -> Result<Self, prost::DecodeError>;
 
-    /// The bytes with the version that the message has, as another sender's.
+    /// The bytes with the version that the message has, as if from another sender.
     fn encode_unstamped(&self) -> Vec<u8> {
         self.encode_to_vec()
     }
@@ -55,8 +55,8 @@ macro_rules! payload {
                 self
             }
 
-            // Both are here and not in the trait, so that they are compiled with this crate, and
-            // as well optimised, and not anew in each crate that uses them.
+            // Both are implemented here and not in the trait, so that they are compiled and
+            // optimised with this crate, and not again in each crate that uses them.
             fn encode(&self) -> Vec<u8> {
                 self.clone().stamped().encode_to_vec()
             }
@@ -91,14 +91,14 @@ pub enum DecodeError {
         #[source]
         source: prost::DecodeError,
     },
-    /// The message would take more memory than any true one.
+    /// The message would take more memory than any real one.
     #[error(
         "a {schema} of {wire_bytes} bytes would take more than {MAX_DECODED_BYTES} bytes of memory"
     )]
     TooLarge {
         /// The message that was expected.
         schema: &'static str,
-        /// How long it is.
+        /// Its length.
         wire_bytes: usize,
     },
     /// The sender speaks a newer major version.
@@ -113,7 +113,7 @@ pub enum DecodeError {
     },
 }
 
-/// Reads a message from the bytes of wire or recording. What it would take in memory is reckoned
+/// Decodes a message from the bytes of wire or recording. The memory that it would take is computed
 /// before it is decoded: at most [`MAX_DECODED_BYTES`], and twice that while it is read.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! What a message would take in memory, told from its bytes before any of it is decoded.
+//! The memory that a message would take, computed from its bytes before any of it is decoded.
 
 use prost::DecodeError;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
@@ -7,23 +7,23 @@ use crate::{
     BearingTrack, CameraHealth, CameraResidual, Counter, Cue, Expected, TakenOver, Track, TrueState,
 };
 
-/// The longest message that is taken in or recorded, bytes. The largest true ones are previews
+/// The longest message that is accepted or recorded, bytes. The largest real ones are previews
 /// (about 100 kB) and frames of a thousand tracks (about 1 MB).
 pub const MAX_MESSAGE_BYTES: usize = 8 << 20;
 
-/// The most that a message may take once it is decoded, bytes: 80 000 bearings. Lists double as
-/// they grow, so that decoding one takes twice as much for a moment.
+/// The most memory that a decoded message may take, bytes: 80 000 bearings. Lists double as they
+/// grow, so that decoding one takes twice as much for a moment.
 pub const MAX_DECODED_BYTES: usize = 16 << 20;
 
-/// A list in a message that may be longer in memory than on the wire: an element that says nothing
-/// has two bytes there and its whole size here.
+/// A list in a message that may be larger in memory than on the wire: an empty element has two
+/// bytes on the wire and its whole size in memory.
 #[derive(Debug)]
 pub struct Repeated {
-    /// Number of the field.
+    /// Number of the list's field.
     pub(crate) tag: u32,
     /// Size of an element in memory, bytes.
     pub(crate) bytes: usize,
-    /// The lists in an element.
+    /// The lists inside an element.
     pub(crate) inside: &'static [Repeated],
 }
 
@@ -45,8 +45,8 @@ pub(crate) const HEALTH: &[Repeated] = &[
 ];
 pub(crate) const TRUTH_FRAME: &[Repeated] = &[list::<TrueState>(3, NOTHING)];
 
-/// Bytes that a message takes once it is decoded, at least as many as it has on the wire. Stops
-/// early when it is more than `limit`.
+/// Memory that a decoded message takes, bytes; at least as many as it has on the wire. Counting
+/// stops early above `limit`.
 ///
 /// # Errors
 /// If the bytes are no protobuf message.
@@ -70,7 +70,7 @@ pub(crate) fn decoded_bytes(
     Ok(total)
 }
 
-/// A field's value as it lies on the wire.
+/// A field's value in its wire encoding.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Value<'a> {
     Varint(u64),
@@ -79,10 +79,11 @@ pub(crate) enum Value<'a> {
     Other,
 }
 
-/// Goes through the fields of one message, not into them, for as long as `visit` wants more.
+/// Goes through the fields of one message, without descending into them, for as long as `visit`
+/// returns `true`.
 ///
 /// # Errors
-/// If the bytes are no protobuf message, or what `visit` says.
+/// If the bytes are no protobuf message, or the error of `visit`.
 pub(crate) fn fields<'a>(
     mut wire: &'a [u8],
     mut visit: impl FnMut(u32, Value<'a>) -> Result<bool, DecodeError>,
@@ -120,7 +121,8 @@ mod tests {
         file_descriptor_set,
     };
 
-    /// The tags of the lists of messages and texts of a message, with the name of what is in them.
+    /// The tags of a message's repeated fields that hold messages, strings or bytes, with the type
+    /// name of their elements.
     fn described(set: &FileDescriptorSet, name: &str) -> Vec<(u32, String)> {
         let message =
             set.file.iter().flat_map(|f| &f.message_type).find(|m| m.name() == name).unwrap();
@@ -162,7 +164,7 @@ mod tests {
         let empty_bearings = [0x42, 0x00].repeat(MAX_MESSAGE_BYTES / 2);
         let refused = decode::<BearingFrame>(&empty_bearings);
         assert!(matches!(refused, Err(crate::DecodeError::TooLarge { .. })), "{refused:?}");
-        // One track with as many empty residuals.
+        // One track with very many empty residuals.
         let residuals = [0x32, 0x00].repeat(1 << 20);
         let mut track = vec![0x32];
         prost::encoding::encode_varint(residuals.len() as u64, &mut track);

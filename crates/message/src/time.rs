@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 /// An instant: nanoseconds since the Unix epoch, UTC.
 ///
-/// Data without absolute time starts at the epoch. Differences come out in
-/// seconds, as the mathematics wants them.
+/// Data without absolute time starts at the epoch. Differences are in seconds, as the mathematics
+/// wants them.
 ///
 /// ```
 /// use crossfix_message::Timestamp;
@@ -20,9 +20,9 @@ use serde::{Deserialize, Serialize};
 pub struct Timestamp(i64);
 
 impl Timestamp {
-    /// The earliest instant that can be said.
+    /// The earliest instant that can be represented.
     pub const MIN: Self = Self(i64::MIN);
-    /// The latest one.
+    /// The latest instant that can be represented.
     pub const MAX: Self = Self(i64::MAX);
     /// The Unix epoch.
     pub const EPOCH: Self = Self(0);
@@ -49,7 +49,7 @@ impl Timestamp {
         self.0 as f64 / 1e9
     }
 
-    /// Seconds from `earlier` to this instant; negative if it is the later one.
+    /// Seconds from `earlier` to this instant; negative if `earlier` is in fact later.
     pub fn seconds_since(self, earlier: Self) -> f64 {
         match self.0.checked_sub(earlier.0) {
             Some(nanos) => nanos as f64 / 1e9,

@@ -2,28 +2,29 @@ use std::fmt;
 
 use crate::Timestamp;
 
-/// Tracks of one run of the fusion centre. A run that makes more goes on into the numbers of a run
-/// that began a second later, and is unique among runs that did not.
+/// Number of track identities reserved for one run of the fusion centre. A run that makes more
+/// tracks continues into the identities of a run that began a second later; they stay unique as
+/// long as no run began then.
 const TRACKS_A_RUN: u64 = 1 << 20;
 
-/// The identity of the `number`-th track (from 1) of a run of the fusion centre that began at a
-/// data time.
+/// The identity of the `number`-th track (counted from 1) of a run of the fusion centre that began
+/// at a data time.
 ///
 /// It follows from the data alone, so that the same bearings give the same tracks live and
-/// replayed; and a fusion centre that was started again, which begins at a later time, gives other
-/// identities. Less than 2^53, which JSON's readers take without loss.
+/// replayed. A restarted fusion centre begins at a later time and so gives other identities. Less
+/// than 2^53, which JSON readers take without loss.
 pub fn track_id(run_began: Timestamp, number: u64) -> u64 {
-    // Data without absolute time begin at the epoch: their tracks are 1, 2, 3.
+    // Data without absolute time begins at the epoch: its tracks are 1, 2, 3.
     let seconds = u64::try_from(run_began.nanos()).unwrap_or(0) / 1_000_000_000;
     seconds * TRACKS_A_RUN + number
 }
 
-/// The identity of another number in the same run.
+/// The identity of track `number` in the same run as track `id`.
 pub fn renumbered(id: u64, number: u64) -> u64 {
     id - id % TRACKS_A_RUN + number
 }
 
-/// A track's number in its run: what people call it.
+/// A track identity, displayed as the track's number in its run, which is what people call it.
 ///
 /// ```
 /// use crossfix_message::{Timestamp, TrackNumber, track_id};
@@ -35,7 +36,7 @@ pub fn renumbered(id: u64, number: u64) -> u64 {
 pub struct TrackNumber(pub u64);
 
 impl TrackNumber {
-    /// The number that people call it by.
+    /// The number of the track in its run, from 1.
     pub fn in_run(self) -> u64 {
         self.0 % TRACKS_A_RUN
     }

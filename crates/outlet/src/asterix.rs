@@ -1,4 +1,4 @@
-//! ASTERIX category 062, byte by byte (EUROCONTROL-SPEC-0149-9).
+//! ASTERIX category 062, encoded byte by byte (EUROCONTROL-SPEC-0149-9).
 
 use std::collections::BTreeMap;
 
@@ -8,17 +8,18 @@ use crate::{Outlet, Snapshot, Target};
 
 /// The category: system track data.
 const CATEGORY: u8 = 62;
-/// Which items a record has (FSPEC): 010 070 105 185, 040 080, 130, 220 500.
+/// Items of a record (FSPEC): 010 070 105 185, 040 080, 130, 220 500.
 const ITEMS: [u8; 4] = [0x9B, 0x0D, 0x15, 0x04];
-/// The bytes of a block before its records, and of a record.
+/// Bytes of a block before its records, and of one record.
 const HEAD_BYTES: usize = 3;
 const RECORD_BYTES: usize = 42;
-/// A block fits a datagram of an ordinary network.
+/// Most records of a block, so that it fits into one datagram of an ordinary network.
 const MOST_RECORDS: usize = (1400 - HEAD_BYTES) / RECORD_BYTES;
-/// A track number is given again so long after its track was lost, s: displays have forgotten it.
+/// A track number is reused only this long after its track was lost, s: displays have forgotten it
+/// by then.
 const NUMBER_RESTS_S: f64 = 60.0;
 
-/// Units of the items' last bits.
+/// Resolution of the items: the value of their last bits.
 const DEGREE_LSB: f64 = 180.0 / (1 << 25) as f64;
 const VELOCITY_LSB_MPS: f64 = 0.25;
 const FOOT_M: f64 = 0.3048;
@@ -26,15 +27,15 @@ const ALTITUDE_LSB_M: f64 = 6.25 * FOOT_M;
 const CLIMB_LSB_MPS: f64 = 6.25 * FOOT_M / 60.0;
 const TIME_LSB_S: f64 = 1.0 / 128.0;
 const DAY_S: f64 = 86_400.0;
-/// Metres in a degree of a great circle, to a third of a percent: for standard deviations.
+/// Metres per degree of a great circle, to a third of a percent: used for standard deviations only.
 const DEGREE_M: f64 = 111_320.0;
 
-/// ASTERIX category 062, edition 1.18 and later (EUROCONTROL-SPEC-0149-9): system tracks, for air traffic
-/// displays. A block of up to 33 tracks is one datagram.
+/// ASTERIX category 062, edition 1.18 and later (EUROCONTROL-SPEC-0149-9): system tracks, for air
+/// traffic displays. A block of up to 33 tracks is one datagram.
 ///
-/// Standard deviations (item 500) are rounded up to the format's steps, of which that of a place is
-/// 0.6 m. Heights are geometric, above the WGS84 ellipsoid (item 130). Its track numbers have 16 bits:
-/// each track has one of its own for as long as it lives, and a minute.
+/// Standard deviations (item 500) are rounded up to the format's steps; that of a position is 0.6
+/// m. Heights are geometric, above the WGS84 ellipsoid (item 130). Track numbers have 16 bits: a
+/// track keeps its number while it lives, and the number is not reused for a minute after that.
 #[derive(Clone, Debug)]
 pub struct Asterix {
     /// System area code and system identification code.
@@ -43,7 +44,8 @@ pub struct Asterix {
 }
 
 impl Asterix {
-    /// Of a data source, by its system area code (a country's) and system identification code.
+    /// An outlet of a data source with a system area code (a country's) and a system identification
+    /// code.
     pub fn of_source(area: u8, identification: u8) -> Self {
         Self { source: [area, identification], numbers: TrackNumbers::default() }
     }
@@ -74,38 +76,41 @@ fn time_of_day(time: Timestamp) -> u32 {
     (seconds / TIME_LSB_S).round().rem_euclid(DAY_S / TIME_LSB_S) as u32
 }
 
-/// A signed number of so many bytes, held at its ends.
+/// A signed number of `BYTES` bytes, big-endian, clamped to its range.
 fn signed<const BYTES: usize>(value: f64) -> [u8; BYTES] {
     let most = (1_i64 << (8 * BYTES - 1)) - 1;
-    // A number beyond the range, or none, saturates.
+    // The cast saturates beyond the range, and turns NaN into 0.
     let held = (value.round() as i64).clamp(-most - 1, most);
     let bytes = held.to_be_bytes();
     std::array::from_fn(|k| bytes[8 - BYTES + k])
 }
 
-/// A standard deviation of so many bytes: rounded up, at least one step, held at its end.
+/// A standard deviation of `BYTES` bytes, in steps: rounded up, at least one step, clamped to its
+/// range.
 fn deviation<const BYTES: usize>(sd: f64, step: f64) -> [u8; BYTES] {
     let most = (1_u64 << (8 * BYTES)) - 1;
-    let held = ((sd / step).ceil() as u64).clamp(1, most);
+    // What is no number is as bad as can be said: the cast would make it the best.
+    let steps = if sd.is_nan() { f64::INFINITY } else { (sd / step).ceil() };
+    let held = (steps as u64).clamp(1, most);
     let bytes = held.to_be_bytes();
     std::array::from_fn(|k| bytes[8 - BYTES + k])
 }
 
 /// Track status, item 080.
 fn status(state: TrackState, is_new: bool) -> [u8; 5] {
-    /// Made of one sensor.
+    /// Made by one sensor (monosensor track).
     const MON: u8 = 0x80;
     /// The geometric height is the reliable one.
     const MRH: u8 = 0x20;
     /// The height's source: triangulation.
     const SRC_TRIANGULATION: u8 = 3 << 2;
-    /// Tentative.
+    /// Tentative track.
     const CNF: u8 = 0x02;
     /// Last and first message of the track.
     const TSE: u8 = 0x40;
     const TSB: u8 = 0x20;
     const COASTING: u8 = 0x80;
-    /// No radar of any kind has seen it.
+    /// Not seen by radar of any kind.
     const NO_RADAR: u8 = 0x78;
     /// Not cooperative.
     const SDS: u8 = 2 << 6;
@@ -123,11 +128,11 @@ fn status(state: TrackState, is_new: bool) -> [u8; 5] {
     [first | FX, ends | FX, FX, fourth | FX, SDS]
 }
 
-/// Estimated accuracies, item 500: place, height, velocity and rate of climb.
+/// Estimated accuracies, item 500: position, height, velocity and rate of climb.
 fn accuracies(target: &Target) -> Vec<u8> {
-    /// Place (APW), height (AGA), velocity (ATV), and another octet.
+    /// Present: position (APW), height (AGA), velocity (ATV), and another octet.
     const FIRST: u8 = 0x35;
-    /// Rate of climb (ARC).
+    /// Present: rate of climb (ARC).
     const SECOND: u8 = 0x80;
     let (place, velocity) = (target.place_sd_m(), target.velocity_sd_mps());
     let parallel_m = DEGREE_M * target.place.latitude().cos().max(f64::EPSILON);
@@ -157,16 +162,16 @@ impl Outlet for Asterix {
     }
 }
 
-/// Gives each track a number of 16 bits.
+/// Assigns each track a number of 16 bits.
 #[derive(Clone, Debug, Default)]
 struct TrackNumbers {
     given: BTreeMap<u64, u16>,
-    /// Numbers whose tracks were lost, and when.
+    /// Numbers of lost tracks that may not be reused yet, and when each track was lost.
     resting: BTreeMap<u16, Timestamp>,
 }
 
 impl TrackNumbers {
-    /// A track's number, and whether it has just been given.
+    /// A track's number, and whether it was assigned just now.
     fn of(&mut self, target: &Target, now: Timestamp) -> (u16, bool) {
         let known = self.given.get(&target.id).copied();
         let number = known.unwrap_or_else(|| self.free(now));
@@ -179,7 +184,8 @@ impl TrackNumbers {
         (number, known.is_none())
     }
 
-    /// The lowest number that no track has or has had of late; with 65 535 tracks at once, the last.
+    /// The lowest number that is neither in use nor resting; if none of the 65 535 is free, the
+    /// last.
     fn free(&mut self, now: Timestamp) -> u16 {
         self.resting.retain(|_, lost| now.seconds_since(*lost) < NUMBER_RESTS_S);
         let taken: std::collections::BTreeSet<u16> =
@@ -213,7 +219,7 @@ mod tests {
 
     #[test]
     fn a_block_is_that_of_a_calculation_by_hand() {
-        // 2026-11-26 12:34:56.789; each item by its last bit: docs/outlets.md.
+        // 2026-11-26 12:34:56.789; each item's last bit is derived in docs/outlets.md.
         let time = Timestamp::from_nanos(1_795_696_496_789_000_000);
         let sure = target(
             [47.3769, 8.5417, 512.3],
@@ -222,7 +228,7 @@ mod tests {
             TrackState::Confirmed,
         );
         let mut asterix = Asterix::of_source(25, 10);
-        // Its first message was before.
+        // The track was reported before, so this is not its first message.
         asterix.numbers.given.insert(99, 4711);
         let snapshot = Snapshot { site: "s".parse().unwrap(), time, targets: vec![sure] };
         let said = asterix.tracks(&snapshot);
@@ -261,7 +267,7 @@ mod tests {
         let numbers: std::collections::BTreeSet<u16> =
             asterix.numbers.given.values().copied().collect();
         assert_eq!((numbers.len(), numbers.first(), numbers.last()), (80, Some(&1), Some(&80)));
-        // A lost track's number rests for a minute.
+        // A lost track's number is not reused for a minute.
         let next = Target { id: 1000, ..one };
         let lost = Target { id: 0, state: TrackState::Lost, ..one };
         asterix.numbers.of(&lost, time);

@@ -1,4 +1,4 @@
-//! Cursor on Target, as MITRE's schema has it.
+//! Cursor on Target, by MITRE's schema.
 
 use crossfix_message::{Timestamp, TrackState};
 
@@ -6,19 +6,20 @@ use crate::target::{Motion, Target};
 use crate::text::utc;
 use crate::{Outlet, Snapshot};
 
-/// What a target is called if nobody says what it is: unknown, in the air. It claims nothing more.
+/// Type of a target if none is configured: unknown, in the air. It claims nothing more.
 const UNKNOWN_IN_THE_AIR: &str = "a-u-A";
-/// A target that nothing is said of for so long is not there any more, s.
+/// Time after its last event when a target is no longer valid, s.
 const STALE_S: f64 = 10.0;
-/// Digits after the point of a degree: a centimetre.
+/// Decimals of a degree: a resolution of a centimetre.
 const DEGREE_DIGITS: usize = 7;
 
-/// Cursor on Target: an XML event a target (MITRE's event schema 2.0), for TAK's servers and clients.
+/// Cursor on Target: one XML event per target (MITRE's event schema 2.0), for TAK's servers and
+/// clients.
 ///
-/// `ce` and `le` are the schema's "one sigma point": the standard deviation in the horizontal direction
-/// in which it is largest, and that of the height above the ellipsoid. `how` says what made it: `m-f`
-/// fused from several cameras, `m-i` measured in one camera's images alone, `m-p` predicted while
-/// nobody sees it.
+/// `ce` and `le` are the schema's "one sigma point": the standard deviation in the horizontal
+/// direction in which it is largest, and that of the height above the ellipsoid. `how` tells how
+/// the position was obtained: `m-f` fused from several cameras, `m-i` measured in one camera's
+/// images alone, `m-p` predicted while no camera sees the target.
 #[derive(Clone, Debug)]
 pub struct CursorOnTarget {
     kind: String,
@@ -31,8 +32,9 @@ impl Default for CursorOnTarget {
 }
 
 impl CursorOnTarget {
-    /// With a type for all targets, for sites that know what flies: `a-u-A-M-H-Q` is a rotary drone of
-    /// unknown allegiance. Letters, digits and dashes; `None` of anything else.
+    /// An outlet with one type for all targets, for sites that know what flies: `a-u-A-M-H-Q` is a
+    /// rotary drone of unknown allegiance. A type starts with `a-` and has letters, digits and
+    /// dashes only; `None` for anything else.
     pub fn of_type(kind: &str) -> Option<Self> {
         let good = kind.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
         (good && kind.starts_with("a-")).then(|| Self { kind: kind.to_owned() })
@@ -62,9 +64,9 @@ impl CursorOnTarget {
     }
 }
 
-/// Where it is, and one standard deviation of that.
+/// The target's position with one standard deviation.
 fn point(target: &Target) -> String {
-    // The schema wants more than nought.
+    // The schema requires a value above zero.
     let sd = |value: f64| format!("{:.2}", value.max(0.01));
     format!(
         "<point lat=\"{:.DEGREE_DIGITS$}\" lon=\"{:.DEGREE_DIGITS$}\" hae=\"{:.2}\" ce=\"{}\" le=\"{}\"/>",
@@ -78,7 +80,7 @@ fn point(target: &Target) -> String {
 
 fn track(motion: &Motion) -> String {
     let Motion { course_deg, speed_mps, slope_deg } = motion;
-    // Rounded, 359.996 is north again.
+    // 359.996 is rounded to 360.00, which is north again.
     let course = format!("{:.2}", course_deg.value);
     let course = if course == "360.00" { "0.00" } else { &course };
     format!(

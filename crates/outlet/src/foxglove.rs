@@ -1,6 +1,7 @@
-//! Foxglove's well-known schemas: what a site says, so that Foxglove and Rerun show it without Crossfix.
+//! A site's data in Foxglove's well-known schemas, so that Foxglove and Rerun show them without
+//! Crossfix.
 //!
-//! Written beside our own messages, never instead of them: they hold less.
+//! These are written in addition to our own messages, never instead of them: they contain less.
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{
@@ -12,23 +13,24 @@ use prost::Message;
 
 use crate::situation::Situation;
 
-/// Foxglove's messages, as `proto/foxglove/foxglove.proto` has them.
+/// Foxglove's messages, as defined in `proto/foxglove/foxglove.proto`.
 #[allow(missing_docs, clippy::all)]
 pub mod wire {
     include!("generated/foxglove.rs");
 }
 
-/// The definitions of these messages as a `google.protobuf.FileDescriptorSet`: the schema of all.
+/// The definitions of these messages as a `google.protobuf.FileDescriptorSet`, the schema of all of
+/// them.
 pub fn file_descriptor_set() -> &'static [u8] {
     include_bytes!("generated/foxglove.bin")
 }
 
-/// The frame of the site: local east, north, up.
+/// Name of the site's coordinate frame: local east, north, up.
 const SITE_FRAME: &str = "site";
-/// A track's topic has its number's last two digits: a recorder that writes for years has no more than
-/// a hundred of them.
+/// Number of topics for tracks: a topic has the last two digits of the track's number, so that a
+/// recorder that writes for years has no more than a hundred.
 const TOPICS_OF_TRACKS: u64 = 100;
-/// A track's place is said so often at most, s.
+/// Least time between two writings of the tracks' places, s.
 const PLACE_PERIOD_S: f64 = 0.1;
 
 /// A message in one of Foxglove's schemas.
@@ -38,22 +40,22 @@ pub struct FoxgloveMessage {
     pub topic: String,
     /// The schema's full name: `foxglove.CompressedImage`.
     pub schema: &'static str,
-    /// What time it speaks of.
+    /// The data time of the message.
     pub time: Timestamp,
-    /// The message.
+    /// The encoded message.
     pub data: Vec<u8>,
 }
 
-/// Whether pictures are said again in Foxglove's schema: they are most of a recording.
+/// Whether pictures are written in Foxglove's schema too: they are most of a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pictures {
-    /// They are.
+    /// They are written.
     Said,
     /// They are left out.
     LeftOut,
 }
 
-/// Says in Foxglove's schemas what goes over a site's channels.
+/// Translates the messages of a site's channels into Foxglove's schemas.
 #[derive(Debug)]
 pub struct FoxgloveView {
     pictures: Pictures,
@@ -62,7 +64,7 @@ pub struct FoxgloveView {
 }
 
 impl FoxgloveView {
-    /// Of a site; with an anchor it says where on the Earth the targets are, too.
+    /// A view of a site; with an anchor it also writes where on the Earth the targets are.
     pub fn new(
         site: &crossfix_message::SiteName,
         anchor: Option<Geodetic>,
@@ -72,11 +74,11 @@ impl FoxgloveView {
         Self { pictures, situation, said_at: None }
     }
 
-    /// What a message on a channel says in Foxglove's schemas. Bytes that are no such message say
-    /// nothing.
+    /// The Foxglove messages that follow from a message on a channel. Bytes that are not a valid
+    /// message give none.
     pub fn of(&mut self, key: &Key, data: &[u8], time: Timestamp) -> Vec<FoxgloveMessage> {
         match &key.channel {
-            // Whose it is the channel says: a message that says otherwise is nobody's.
+            // The channel tells which camera it is: a message that names another one is ignored.
             Channel::Calibration(camera) => decode::<CameraCalibration>(data)
                 .ok()
                 .filter(|message| message.camera == camera.as_str())
@@ -127,7 +129,7 @@ impl FoxgloveView {
     }
 }
 
-/// A message of Foxglove's and its name.
+/// A message of Foxglove's with the name of its schema.
 trait Named: Message {
     const SCHEMA: &'static str;
 }
@@ -156,7 +158,8 @@ fn vector(from: Vector3) -> wire::Vector3 {
     wire::Vector3 { x: from.x, y: from.y, z: from.z }
 }
 
-/// A lens: K and P as OpenCV has them, with pixels counted as ours from the middle of the first.
+/// A lens: K and P as in OpenCV; pixel coordinates count from the centre of the first pixel, as
+/// ours do.
 fn lens_of(message: &CameraCalibration, time: Timestamp) -> wire::CameraCalibration {
     let CameraCalibration { fx, fy, cx, cy, .. } = *message;
     let (model, coefficients) = match message.distortion_model() {
@@ -177,7 +180,7 @@ fn lens_of(message: &CameraCalibration, time: Timestamp) -> wire::CameraCalibrat
     }
 }
 
-/// Where a camera stands and looks; `None` of one that turns.
+/// A camera's pose; `None` for a camera on a mount.
 fn transform_of(message: &CameraCalibration, time: Timestamp) -> Option<wire::FrameTransform> {
     let rotation = <[f64; 9]>::try_from(message.rotation.as_slice()).ok()?;
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_row_slice(&rotation));
@@ -204,13 +207,13 @@ fn of_preview(message: Preview) -> FoxgloveMessage {
     said(topic, time, &image)
 }
 
-/// The topic of a track's place.
+/// The topic of a track's data.
 fn topic_of(track_id: u64, what: &str) -> String {
-    // A run's numbers are what is left of 2^20.
+    // The track's number within its run is its identity modulo 2^20.
     format!("/track/{:02}/{what}", track_id % (1 << 20) % TOPICS_OF_TRACKS)
 }
 
-/// A sure track's place in the site.
+/// A sure track's position in the site's frame; `None` if the track is not sure.
 fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
     let is_sure = matches!(track.state(), TrackState::Confirmed | TrackState::Coasting);
     let position = track.position.filter(|_| is_sure)?;
@@ -225,7 +228,7 @@ fn pose_of(track: &Track, time: Timestamp) -> Option<FoxgloveMessage> {
     Some(said(topic_of(track.id, "pose"), time, &pose))
 }
 
-/// The targets on the Earth.
+/// The positions of the sure targets on the Earth.
 fn fixes_of(snapshot: &crate::Snapshot) -> Vec<FoxgloveMessage> {
     let is_there = |target: &&crate::Target| {
         matches!(target.state, TrackState::Confirmed | TrackState::Coasting)

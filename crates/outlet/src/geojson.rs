@@ -1,4 +1,4 @@
-//! GeoJSON (RFC 7946): points of now, lines of whole flights.
+//! GeoJSON (RFC 7946): points of the present, lines of whole flights.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use crate::target::{Motion, Target};
 use crate::text::{state, utc};
 use crate::{Outlet, Snapshot};
 
-/// A number with so many digits after the point: nobody needs more.
+/// Rounds a number to some decimals; more are of no use.
 fn rounded(value: f64, digits: i32) -> f64 {
     let scale = 10_f64.powi(digits);
     (value * scale).round() / scale
@@ -25,8 +25,8 @@ fn position(target: &Target) -> [f64; 3] {
     ]
 }
 
-/// GeoJSON (RFC 7946), a collection of points a snapshot, each on a line of its own. Numbers that are
-/// too large for JavaScript (`id`, `time_ns`) are texts.
+/// GeoJSON (RFC 7946): one collection of points per snapshot, each collection on a line of its own.
+/// Numbers that are too large for JavaScript (`id`, `time_ns`) are strings.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct GeoJsonLines;
 
@@ -63,7 +63,7 @@ impl Outlet for GeoJsonLines {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Passed {
     pub time: Timestamp,
-    /// Longitude, latitude, height above the ellipsoid.
+    /// Longitude, latitude (degrees), height above the ellipsoid (m).
     pub position: [f64; 3],
 }
 
@@ -83,8 +83,8 @@ impl Flights {
     }
 }
 
-/// GeoJSON (RFC 7946), one document: each track's flight as a line, its times in the property
-/// `coordTimes`. A track that was seen at one snapshot alone is a point.
+/// GeoJSON (RFC 7946), one document: each track's flight as a line, with its times in the property
+/// `coordTimes`. A track that is in one snapshot only is a point.
 #[derive(Clone, Debug, Default)]
 pub struct GeoJsonFlights {
     flights: Flights,

@@ -10,8 +10,8 @@ use crate::{Outlet, Snapshot};
 
 /// KML 2.2 with Google's tracks, one document: each track's flight over time.
 ///
-/// KML's heights are above the geoid, Crossfix's above the WGS84 ellipsoid, and the two are up to 100 m
-/// apart: the site's height of the geoid is taken off.
+/// KML's heights are above the geoid, Crossfix's above the WGS84 ellipsoid, and the two differ by
+/// up to 100 m: the geoid's height at the site is subtracted.
 #[derive(Clone, Debug)]
 pub struct Kml {
     geoid_height_m: f64,
@@ -19,7 +19,8 @@ pub struct Kml {
 }
 
 impl Kml {
-    /// With the height of the geoid (mean sea level, EGM96) above the ellipsoid at the site, m.
+    /// An outlet for a site where the geoid (mean sea level, EGM96) has this height above the
+    /// ellipsoid, m.
     pub fn above_geoid(geoid_height_m: f64) -> Self {
         Self { geoid_height_m, flights: Flights::default() }
     }
@@ -33,8 +34,8 @@ impl Kml {
         );
         for (id, flight) in &self.flights.tracks {
             let number = TrackNumber(*id);
-            // The schema's order: name, style, data, geometry; all times before all places. Writing
-            // into a text cannot fail.
+            // The order that the schema requires: name, style, data, geometry; all times before all
+            // places. Writing into a string cannot fail.
             let _ = write!(
                 text,
                 "<Placemark id=\"t{id}\"><name>{number}</name><styleUrl>#track</styleUrl>\

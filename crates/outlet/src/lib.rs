@@ -1,18 +1,18 @@
-//! Tracks for others: what leaves a site for programs that are not Crossfix.
+//! Outlets: a site's tracks in the formats of programs that are not Crossfix.
 //!
-//! A [`Situation`] hears the fusion centre's tracks and says where all targets are at one instant, on
-//! the Earth and with their uncertainty: a [`Snapshot`]. An [`Outlet`] makes bytes of it, in a format
-//! of others:
+//! A [`Situation`] takes in the fusion centre's tracks and computes where all targets are at one
+//! instant, on the Earth and with their uncertainty: a [`Snapshot`]. An [`Outlet`] encodes it in
+//! another program's format:
 //!
 //! | format | outlet | its uncertainty |
 //! |---|---|---|
-//! | Cursor on Target (MITRE, XML 2.0) | [`CursorOnTarget`] | one standard deviation, circular and linear |
-//! | SAPIENT (BSI Flex 335 v2.0) | [`Sapient`] | one standard deviation an axis |
-//! | ASTERIX category 062 (EUROCONTROL) | [`Asterix`] | one standard deviation an axis, rounded up |
+//! | Cursor on Target (MITRE, XML 2.0) | [`CursorOnTarget`] | 1 standard deviation, circular and linear |
+//! | SAPIENT (BSI Flex 335 v2.0) | [`Sapient`] | 1 standard deviation per axis |
+//! | ASTERIX category 062 (EUROCONTROL) | [`Asterix`] | 1 standard deviation per axis, rounded up |
 //! | GeoJSON (RFC 7946) | [`GeoJsonLines`], [`GeoJsonFlights`] | properties of our own |
 //! | KML 2.2 (OGC) | [`Kml`] | none |
 //!
-//! [`foxglove`] has Foxglove's well-known schemas beside our own messages.
+//! [`foxglove`] writes Foxglove's well-known schemas beside our own messages.
 //!
 //! The datum is WGS84 (G2139 or whatever the anchor was measured in), heights are above the ellipsoid;
 //! where a format wants another height, its outlet says so.
@@ -43,7 +43,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! An outlet of one's own is a type with [`Outlet::tracks`]: `examples/own_outlet.rs` is one.
+//! To write an own outlet, implement [`Outlet::tracks`] for a type, as in `examples/own_outlet.rs`.
 
 mod asterix;
 mod cot;
@@ -68,35 +68,37 @@ pub use sapient::Sapient;
 pub use situation::{Situation, Snapshot};
 pub use target::Target;
 
-/// Why the other side takes nothing.
+/// Why the other side does not take our messages.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum Refused {
-    /// It does not take this site.
+    /// It refuses this site.
     #[error("it refuses this site: {0}")]
     Registration(String),
-    /// What it says is not of the format.
+    /// What it sends is not in the format.
     #[error("what it says cannot be read: {0}")]
     Malformed(String),
 }
 
-/// Makes bytes of tracks and events, in a format of others.
+/// Encodes tracks and events in another program's format.
 ///
-/// Who carries them calls [`Self::greeting`] on each new connection, [`Self::heard`] with whatever the
-/// other side says, and, once [`Self::is_ready`], [`Self::tracks`] with one snapshot after the other,
-/// whose times grow, and [`Self::event`]; last [`Self::farewell`]. Each returned element is one message:
-/// a datagram, or a part of a stream that needs nothing between it and the next.
+/// The caller that carries the bytes calls [`Self::greeting`] on each new connection and
+/// [`Self::heard`] with whatever the other side sends. Once [`Self::is_ready`], it calls
+/// [`Self::tracks`] with one snapshot after the other, in increasing time, and [`Self::event`];
+/// last [`Self::farewell`]. Each returned element is one message: a datagram, or a part of a stream
+/// that needs no separator before the next.
 ///
-/// Only `tracks` must be written; the others do nothing for formats that know of nothing of the kind.
+/// Only `tracks` must be implemented; the others do nothing by default, for formats that have
+/// nothing of the kind.
 pub trait Outlet {
-    /// What is said first on a connection. Whatever was said on an earlier one is forgotten.
+    /// The first messages on a connection; the state of an earlier connection is reset.
     fn greeting(&mut self, _now: Timestamp) -> Vec<Vec<u8>> {
         Vec::new()
     }
 
-    /// Takes what the other side says.
+    /// Takes what the other side sends.
     ///
     /// # Errors
-    /// [`Refused`] if it takes nothing: the connection is of no use.
+    /// [`Refused`] if the other side takes nothing: the connection is useless then.
     fn heard(&mut self, _bytes: &[u8]) -> Result<(), Refused> {
         Ok(())
     }
@@ -106,15 +108,15 @@ pub trait Outlet {
         true
     }
 
-    /// Where all targets are at one instant.
+    /// Encodes where all targets are at one instant.
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>>;
 
-    /// What happened to a track.
+    /// Encodes what happened to a track.
     fn event(&mut self, _event: &TrackEvent) -> Vec<Vec<u8>> {
         Vec::new()
     }
 
-    /// What is said last. Formats of whole documents say everything here.
+    /// The last messages. Formats of whole documents return everything here.
     fn farewell(&mut self, _now: Timestamp) -> Vec<Vec<u8>> {
         Vec::new()
     }

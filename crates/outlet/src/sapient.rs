@@ -1,4 +1,4 @@
-//! SAPIENT, as dstl's middleware takes it.
+//! SAPIENT, as dstl's middleware accepts it.
 
 use crossfix_message::{SiteName, Timestamp, TrackEvent, TrackEventKind, TrackState};
 use prost::Message;
@@ -9,31 +9,32 @@ use sha2::{Digest, Sha256};
 use crate::text::state;
 use crate::{Outlet, Refused, Snapshot, Target};
 
-/// The version of the interface, as its validators want it to be written.
+/// The interface's version, spelt as its validators require.
 const VERSION: &str = "BSI Flex 335 v2.0";
-/// How often the node says that it is there, s of the data.
+/// Interval between the node's status reports, s of data time.
 const STATUS_PERIOD_S: f64 = 5.0;
-/// Detections come at least so far apart, s: dstl's middleware refuses what is less than 0.08 s after the
+/// Least time between two detections, s: dstl's middleware refuses one less than 0.08 s after the
 /// last.
 const DETECTION_PERIOD_S: f64 = 0.1;
-/// A longer frame is none: dstl's middleware takes one megabyte.
+/// Most bytes of a frame; a longer one is damage: dstl's middleware takes one megabyte.
 const MOST_FRAME_BYTES: usize = 1 << 20;
-/// Metres in a degree of a great circle, to a third of a percent: for standard deviations.
+/// Metres per degree of a great circle, to a third of a percent: used for standard deviations only.
 const DEGREE_M: f64 = 111_320.0;
 
-/// SAPIENT (BSI Flex 335 v2.0): the site is a fusion node that registers with a middleware or a parent,
-/// and reports its tracks as detections with a place on the Earth and a velocity.
+/// SAPIENT (BSI Flex 335 v2.0): the site is a fusion node that registers with a middleware or a
+/// parent node, and reports its tracks as detections with a position on the Earth and a velocity.
 ///
-/// Each message is a frame: its length in four bytes, the lowest first, and the protobuf message. A
-/// detection has no time of its own but that of its message, so all tracks are said at one time, at most
-/// ten times a second. Errors are one standard deviation an axis: of the place in the units of its
-/// coordinates (degrees, degrees, metres), of the velocity in m/s; the registration says so. Identifiers
-/// follow from the site, the track and the time, so that the same data say the same bytes.
+/// Each message is a frame: its length in four bytes, little-endian, and the protobuf message. A
+/// detection has no time of its own except that of its message, so all tracks are reported at one
+/// time, at most ten times a second. Errors are one standard deviation per axis: of the position in
+/// the units of its coordinates (degrees, degrees, metres), of the velocity in m/s; the
+/// registration states this. Identifiers follow from the site, the track and the time, so that the
+/// same data give the same bytes.
 #[derive(Clone, Debug)]
 pub struct Sapient {
     site: SiteName,
     node: String,
-    /// What came and is no whole frame yet.
+    /// Bytes received that are not a whole frame yet.
     inbox: Vec<u8>,
     is_registered: bool,
     status_at: Option<Timestamp>,
@@ -41,10 +42,10 @@ pub struct Sapient {
 }
 
 impl Sapient {
-    /// Of a site, whose node has the same identity each time.
+    /// An outlet of a site; its node has the same identity each time.
     pub fn of_site(site: SiteName) -> Self {
         let mut bytes = digest(&["crossfix-node", site.as_str()]);
-        // As a random UUID is marked (RFC 9562), which is the only kind that is taken.
+        // Marked as a random UUID (RFC 9562), the only kind that is accepted.
         bytes[6] = bytes[6] & 0x0f | 0x40;
         bytes[8] = bytes[8] & 0x3f | 0x80;
         let hex: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -71,7 +72,7 @@ impl Sapient {
             ..Default::default()
         };
         let bytes = message.encode_to_vec();
-        // Ours are a few kilobytes.
+        // Our messages have a few kilobytes, so the length always fits.
         let length = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         [length.to_le_bytes().as_slice(), &bytes].concat()
     }
@@ -112,7 +113,7 @@ impl Sapient {
         self.frame(time, Content::DetectionReport(report))
     }
 
-    /// The frames that have come whole.
+    /// Takes the complete frames out of the inbox.
     fn whole_frames(&mut self) -> Result<Vec<Vec<u8>>, Refused> {
         let mut frames = Vec::new();
         while let Some((head, rest)) = self.inbox.split_first_chunk::<4>() {
@@ -128,13 +129,14 @@ impl Sapient {
     }
 }
 
-/// The first 16 bytes of a digest of some texts.
+/// The first 16 bytes of the SHA-256 digest of several texts.
 fn digest(texts: &[&str]) -> [u8; 16] {
     let hash = Sha256::digest(texts.join("\0"));
     std::array::from_fn(|k| hash[k])
 }
 
-/// An identifier as SAPIENT wants it (ULID): 48 bits of time, ms, and 80 that follow from what it is of.
+/// An identifier as SAPIENT requires it (ULID): 48 bits of time, ms, and 80 bits of a digest of
+/// what it identifies.
 fn ulid(node: &str, kind: &str, of: &str, time: Timestamp) -> String {
     const DIGITS: &[u8; 32] = b"0123456789ABCDEFGHJKMNPQRSTVWXYZ";
     let ms = u64::try_from(time.nanos() / 1_000_000).unwrap_or(0) & ((1 << 48) - 1);
@@ -144,7 +146,7 @@ fn ulid(node: &str, kind: &str, of: &str, time: Timestamp) -> String {
     (0..26).rev().map(|k| DIGITS[(value >> (5 * k) & 31) as usize] as char).collect()
 }
 
-/// When the fusion centre's run began that gave a track its identity.
+/// When the fusion centre's run began that assigned a track's identity.
 fn born(track_id: u64) -> Timestamp {
     Timestamp::from_seconds((track_id >> 20) as f64)
 }
@@ -167,7 +169,7 @@ fn location(target: &Target) -> sapient::Location {
 
 fn velocity(target: &Target) -> sapient::EnuVelocity {
     let sd = target.velocity_sd_mps();
-    // dstl's test harness takes a rate of exactly nought for one that is missing.
+    // dstl's test harness takes a rate of exactly zero as missing.
     let rate = |value: f64| Some(if value == 0.0 { f64::MIN_POSITIVE } else { value });
     sapient::EnuVelocity {
         east_rate: rate(target.velocity.x),
@@ -271,7 +273,8 @@ impl Outlet for Sapient {
         vec![self.frame(now, Content::Registration(registration(&self.site)))]
     }
 
-    /// Hears whether the registration was taken. Tasks and the rest are for nodes that can be steered.
+    /// Takes in the answer to the registration. Tasks and other messages are ignored: they are for
+    /// nodes that can be steered.
     fn heard(&mut self, bytes: &[u8]) -> Result<(), Refused> {
         self.inbox.extend(bytes);
         for frame in self.whole_frames()? {
@@ -293,7 +296,7 @@ impl Outlet for Sapient {
 
     fn tracks(&mut self, snapshot: &Snapshot) -> Vec<Vec<u8>> {
         let time = snapshot.time;
-        // Where time has gone back, all is due.
+        // If time has gone back, everything is due.
         let since = |at: Option<Timestamp>| {
             at.map(|at| time.seconds_since(at)).filter(|s| *s >= 0.0).unwrap_or(f64::INFINITY)
         };
@@ -371,7 +374,7 @@ mod tests {
                 .frame(Timestamp::EPOCH, Content::RegistrationAck(answer))
         };
         let yes = ack(true);
-        // In two parts, as streams come.
+        // In two parts, as a stream may deliver it.
         sapient.heard(&yes[..7]).unwrap();
         assert!(!sapient.is_ready());
         sapient.heard(&yes[7..]).unwrap();

@@ -1,4 +1,5 @@
-//! All tracks at one time: a fusion centre says each at its own, and only those that have changed.
+//! All tracks at one time: a fusion centre sends each track at its own time, and only those that
+//! have changed.
 
 use std::collections::BTreeMap;
 
@@ -10,12 +11,12 @@ use nalgebra::{Matrix3, Matrix6, Point3, Vector3};
 
 use crate::Target;
 
-/// A track that nobody has said anything of for so long is gone, s: a fusion centre says each of its
-/// tracks at least every half second. With half as much a link that stutters loses tracks.
+/// A track of which nothing was heard for this long is lost, s: a fusion centre sends each of its
+/// tracks at least every half second. With half of it, tracks are lost on a link that stutters.
 const SILENCE_S: f64 = 2.0;
-/// Tracks that are kept count of; a fusion centre has a thousand at most.
+/// Most tracks that are kept; a fusion centre has a thousand at most.
 const MOST_TRACKS: usize = 10_000;
-/// Fusion centres that are kept count of.
+/// Most fusion centres whose time is kept.
 const MOST_CENTRES: usize = 1000;
 
 /// Where all targets are at one instant.
@@ -23,14 +24,14 @@ const MOST_CENTRES: usize = 1000;
 pub struct Snapshot {
     /// The site.
     pub site: SiteName,
-    /// When, of the data.
+    /// The time, by the data.
     pub time: Timestamp,
-    /// The targets that are sure, ordered by id: confirmed ones, those that one camera follows, those
-    /// not seen of late, and once those that were lost since the snapshot before.
+    /// The sure targets, ordered by id: confirmed tracks, those that one camera follows and those
+    /// not seen lately; and, once, those that were lost since the snapshot before.
     pub targets: Vec<Target>,
 }
 
-/// A track as it was said last, in the site's axes.
+/// A track as it was last heard, in the site's axes.
 #[derive(Clone, Debug)]
 struct Known {
     state: TrackState,
@@ -42,15 +43,15 @@ struct Known {
     covariance: Matrix6<f64>,
 }
 
-/// Hears tracks as they are said, each at its own time, and knows where all are at one.
+/// Takes in tracks, each at its own time, and predicts all of them to one time.
 #[derive(Clone, Debug)]
 pub struct Situation {
     site: SiteName,
     frame: LocalFrame,
-    /// What the whole site may be off by.
+    /// The error that the whole site has in common.
     datum: Option<Datum>,
     tracks: BTreeMap<u64, Known>,
-    /// The newest time that each fusion centre has said, by its area.
+    /// The newest time heard from each fusion centre, by its area.
     newest: BTreeMap<Option<AreaName>, Timestamp>,
     now: Option<Timestamp>,
 }
@@ -60,7 +61,7 @@ fn is_sure(state: TrackState) -> bool {
 }
 
 impl Known {
-    /// A track of a message; `None` if it has no place, or numbers that are none.
+    /// Reads a track of a message; `None` if it has no position, or a number is not finite.
     fn parse(track: &Track, frame: &TrackFrame) -> Option<Self> {
         let covariance = <[f64; 36]>::try_from(track.covariance.as_slice()).ok()?;
         let known = Self {
@@ -76,20 +77,22 @@ impl Known {
         (numbers.all(|number| number.is_finite()) && known.time_sd_s.is_finite()).then_some(known)
     }
 
-    /// The same track at another time, if it flies straight on.
+    /// The track predicted to another time at constant velocity, as a target on the Earth.
     fn at(&self, time: Timestamp, frame: &LocalFrame, datum: Option<&Datum>, id: u64) -> Target {
         let elapsed = time.seconds_since(self.time);
         let position = self.position + self.velocity * elapsed;
+        // F = [I, dt I; 0, I], P = F P F' + datum
         let mut transition = Matrix6::identity();
         transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * elapsed));
         let mut covariance = transition * self.covariance * transition.transpose();
         if let Some(datum) = datum {
             covariance += datum.of_state(&position, &self.velocity, time);
         }
-        // Along its way it may be farther or less far, by its speed times what the time is off by.
+        // An error of the time moves the target along its velocity: P += v v' time_sd^2.
         let mut places = covariance.fixed_view_mut::<3, 3>(0, 0);
         places += self.velocity * self.velocity.transpose() * self.time_sd_s.powi(2);
         let place = frame.geodetic(position);
+        // Turns the site's axes into east, north, up at the target.
         let turn = frame.axes_at(&LocalFrame::at(place));
         let mut turns = Matrix6::zeros();
         turns.fixed_view_mut::<3, 3>(0, 0).copy_from(&turn);
@@ -106,7 +109,7 @@ impl Known {
 }
 
 impl Situation {
-    /// Nothing heard yet, of a site whose origin is at an anchor.
+    /// A situation of a site whose origin is at an anchor, before anything was heard.
     pub fn new(site: SiteName, anchor: Geodetic) -> Self {
         let frame = LocalFrame::at(anchor);
         Self {
@@ -119,20 +122,21 @@ impl Situation {
         }
     }
 
-    /// Hears a calibration: what it says of the whole site is in all tracks' covariances from then on.
+    /// Takes in a calibration: the error that it states for the whole site is part of all tracks'
+    /// covariances from then on.
     pub fn hear_calibration(&mut self, calibration: &CameraCalibration) {
         let datum = calibration.datum.as_ref().and_then(|datum| datum.parse());
         self.datum = datum.or(self.datum.take());
     }
 
-    /// Hears tracks of a fusion centre: of its area, where there are several. One without a place, or
-    /// with numbers that are none, is left out.
+    /// Takes in the tracks of a fusion centre: that of `area`, if there are several. A track
+    /// without a position, or with a number that is not finite, is left out.
     pub fn hear(&mut self, area: Option<&AreaName>, frame: &TrackFrame) {
         let time = Timestamp::from_nanos(frame.time_ns);
         let area = area.cloned();
         if self.newest.get(&area).is_some_and(|newest| newest.seconds_since(time) > SILENCE_S) {
-            // Time has gone back: a fusion centre that was started again, or another replay. What was
-            // known is of a time that is not.
+            // Time has gone back: a fusion centre that was restarted, or another replay. The tracks
+            // so far belong to another time.
             self.tracks.clear();
             self.newest.clear();
             self.now = None;
@@ -150,16 +154,16 @@ impl Situation {
             }
             match (Known::parse(track, frame), self.tracks.get_mut(&track.id)) {
                 (Some(known), _) => drop(self.tracks.insert(track.id, known)),
-                // A lost track need not say where it was.
+                // A lost track may come without its position.
                 (None, Some(known)) => known.state = track.state(),
                 (None, None) => {}
             }
         }
     }
 
-    /// Where all targets are at the newest time that was heard, where the fusion centre has been silent
-    /// for so long since, s; `None` if it never was heard. One that is silent for two seconds has no
-    /// tracks any more.
+    /// All targets at the newest time that was heard; `None` if nothing was heard yet. `silent_s`
+    /// is how long the fusion centre has been silent since, s: after two seconds all its tracks are
+    /// lost.
     pub fn snapshot(&mut self, silent_s: f64) -> Option<Snapshot> {
         let time = self.now?;
         for known in self.tracks.values_mut() {
@@ -170,7 +174,7 @@ impl Situation {
         }
         let (frame, datum) = (&self.frame, self.datum.as_ref());
         let target = |(&id, known): (&u64, &Known)| {
-            // A lost one stays where it was.
+            // A lost target is not predicted: it stays where it was.
             let at = if known.state == TrackState::Lost { known.time } else { time };
             known.at(at, frame, datum, id)
         };
@@ -219,10 +223,11 @@ mod tests {
         let snapshot = situation.snapshot(0.0).unwrap();
         assert_eq!(snapshot.time, Timestamp::from_seconds(START + 0.5));
         let [one, two] = &snapshot.targets[..] else { panic!("{snapshot:?}") };
-        // 5 m east at 48 degrees north.
+        // One: 5 m east at 48 degrees north.
         assert_relative_eq!(one.place.longitude_deg(), 11.0 + 5.0 / 74_625.0, epsilon = 1e-7);
         assert_relative_eq!(two.place.longitude_deg(), 11.0, epsilon = 1e-12);
-        // 0.2 m at rest, 0.2 m/s for half a second, 10 m/s times 10 ms.
+        // Variances: 0.2 m of position; for the first track also 0.2 m/s for half a second; 10 m/s
+        // times 10 ms.
         let east = |target: &Target| target.place_sd_m().x;
         assert_relative_eq!(east(two), (0.04_f64 + 0.01).sqrt(), epsilon = 1e-9);
         assert_relative_eq!(east(one), (0.04_f64 + 0.01 + 0.01).sqrt(), epsilon = 1e-9);

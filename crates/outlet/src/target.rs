@@ -1,4 +1,4 @@
-//! A track as others want it: on the Earth, with course, speed, and one standard deviation of each.
+//! A track for other programs: on the Earth, with course, speed and one standard deviation of each.
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{Timestamp, TrackNumber, TrackState};
@@ -9,16 +9,16 @@ use nalgebra::{Matrix2, Matrix3, Matrix6, Vector3};
 pub struct Target {
     /// The track's identity.
     pub id: u64,
-    /// What is known of it. A lost one is said once.
+    /// The track's state. A lost track is contained in one snapshot only.
     pub state: TrackState,
-    /// Where it is: WGS84, height above the ellipsoid.
+    /// Its position: WGS84, height above the ellipsoid.
     pub place: Geodetic,
-    /// Velocity in east, north and up at its place, m/s.
+    /// Velocity in east, north and up at its position, m/s.
     pub velocity: Vector3<f64>,
-    /// Covariance of place and velocity in these axes, m and m/s: what the cameras' poses and clocks
-    /// may be off by is in it, and what the whole site may, where it says.
+    /// Covariance of position and velocity in the same axes, m and m/s. It contains the errors of
+    /// the cameras' poses and clocks, and that of the whole site if a calibration states it.
     pub covariance: Matrix6<f64>,
-    /// When it was seen last.
+    /// When it was last seen.
     pub seen: Timestamp,
 }
 
@@ -31,10 +31,10 @@ pub struct Uncertain {
     pub sd: f64,
 }
 
-/// How a target moves, as people say it.
+/// A target's motion as course, speed and slope.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
-    /// Direction over ground, degrees from north, clockwise, from 0 to less than 360.
+    /// Direction over ground, degrees clockwise from north, from 0 to less than 360.
     pub course_deg: Uncertain,
     /// Speed in space, m/s.
     pub speed_mps: Uncertain,
@@ -42,11 +42,11 @@ pub struct Motion {
     pub slope_deg: Uncertain,
 }
 
-/// A speed below this has no direction, m/s.
+/// Least speed that is divided by, m/s: below it there is no direction.
 const SLOWEST_MPS: f64 = 1e-6;
 
 impl Target {
-    /// The track's number, as people call it.
+    /// The track's number as it is shown to people.
     pub fn number(&self) -> TrackNumber {
         TrackNumber(self.id)
     }
@@ -61,10 +61,10 @@ impl Target {
         self.covariance.fixed_view::<3, 3>(3, 3).diagonal().map(|v| v.max(0.0).sqrt())
     }
 
-    /// The horizontal standard deviation in the direction in which it is largest, m: in every
-    /// direction the target is known at least as well.
+    /// The horizontal standard deviation in the direction in which it is largest, m.
     pub fn horizontal_sd_m(&self) -> f64 {
         let horizontal: Matrix2<f64> = self.covariance.fixed_view::<2, 2>(0, 0).into_owned();
+        // largest eigenvalue of [a c; c b] = (a + b) / 2 + sqrt(((a - b) / 2)^2 + c^2)
         let half_trace = horizontal.trace() / 2.0;
         let half_difference = (horizontal[(0, 0)] - horizontal[(1, 1)]) / 2.0;
         let largest = half_trace + half_difference.hypot(horizontal[(0, 1)]);
@@ -75,12 +75,15 @@ impl Target {
     pub fn motion(&self) -> Motion {
         let velocity = self.velocity;
         let covariance: Matrix3<f64> = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        // standard deviation of the velocity along a unit vector u: sqrt(u' P u)
         let sd_along = |axis: Vector3<f64>| (axis.dot(&(covariance * axis))).max(0.0).sqrt();
         let speed = velocity.norm().max(SLOWEST_MPS);
         let over_ground = velocity.x.hypot(velocity.y).max(SLOWEST_MPS);
         let along = velocity / speed;
+        // The horizontal unit vector at right angles to the course: d(course) = across . dv /
+        // over_ground.
         let across = Vector3::new(velocity.y, -velocity.x, 0.0) / over_ground;
-        // The unit vector along which the slope grows.
+        // The unit vector along which the slope grows: d(slope) = upwards . dv / speed.
         let upwards = Vector3::new(
             -velocity.z * velocity.x / over_ground,
             -velocity.z * velocity.y / over_ground,
@@ -123,7 +126,7 @@ mod tests {
     fn the_horizontal_deviation_is_that_of_the_worst_direction() {
         let mut covariance = Matrix6::from_diagonal(&Vector6::new(1.0, 4.0, 9.0, 1.0, 1.0, 1.0));
         assert_relative_eq!(target(Vector3::x(), covariance).horizontal_sd_m(), 2.0);
-        // A line to the north-east, one metre and nothing across.
+        // A line to the north-east: one metre along it, nothing across.
         for (row, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
             covariance[(row, column)] = 0.5;
         }
@@ -132,7 +135,7 @@ mod tests {
 
     #[test]
     fn motion_is_that_of_a_hand_calculation() {
-        // 3 east, 4 north, and as fast upwards: course atan(3/4), speed 5 sqrt 2, slope 45 degrees.
+        // 3 east, 4 north, 5 up: course atan(3/4), speed 5 sqrt 2, slope 45 degrees.
         let covariance = Matrix6::identity() * 0.04;
         let motion = target(Vector3::new(3.0, 4.0, 5.0), covariance).motion();
         assert_relative_eq!(motion.course_deg.value, 36.869_897_6, epsilon = 1e-6);
@@ -155,7 +158,7 @@ mod tests {
         for uncertain in [motion.course_deg, motion.speed_mps, motion.slope_deg] {
             assert!(uncertain.value.is_finite() && uncertain.sd.is_finite(), "{motion:?}");
         }
-        // Nobody knows where it goes.
+        // The direction of motion is unknown.
         let slow = target(Vector3::x() * 1e-9, Matrix6::identity()).motion();
         assert_eq!(slow.slope_deg.sd, 180.0);
     }

@@ -1,9 +1,9 @@
-//! Texts that several formats share.
+//! Texts that several formats use.
 
 use crossfix_message::{Timestamp, TrackState};
 use time::OffsetDateTime;
 
-/// An instant as RFC 3339 has it, in UTC, to the millisecond: `2026-11-26T12:34:56.789Z`.
+/// An instant as in RFC 3339, in UTC, to the millisecond: `2026-11-26T12:34:56.789Z`.
 pub(crate) fn utc(time: Timestamp) -> String {
     let whole_ms = i128::from(time.nanos()).div_euclid(1_000_000) * 1_000_000;
     let at =
@@ -20,7 +20,7 @@ pub(crate) fn utc(time: Timestamp) -> String {
     )
 }
 
-/// What a track is, in words.
+/// A track's state in words.
 pub(crate) fn state(state: TrackState) -> &'static str {
     match state {
         TrackState::Unspecified | TrackState::Tentative => "tentative",

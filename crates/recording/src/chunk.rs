@@ -1,4 +1,4 @@
-//! The records of an MCAP file as they lie in it, and how a chunk is known by its looks.
+//! The framing of records in an MCAP file, and how a chunk is recognised by its byte pattern.
 
 use std::io::Read;
 
@@ -6,22 +6,23 @@ use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, McapResult};
 
-/// Kind and length of a record.
+/// Bytes of a record's head: opcode (1) and length (8).
 pub(crate) const HEAD_BYTES: usize = 9;
-/// A record longer than this is skipped, and a chunk that says it holds more is not unpacked. The
-/// writer closes a chunk at half a megabyte and takes no message above 8, so its own are shorter.
+/// Longest record that is read, bytes; a longer one is skipped, and a chunk that claims to hold
+/// more is not unpacked. The writer closes a chunk at half a megabyte and takes no message above 8
+/// MB, so its own records are shorter.
 pub(crate) const MAX_RECORD_BYTES: u64 = 64 << 20;
-/// Of a chunk: head, first and last time, size, checksum, the name of the compression and its
-/// length.
+/// Bytes at the beginning of a chunk by which it is recognised: record head, first and last time,
+/// unpacked size, checksum, the compression's name with its length before it, and the packed size.
 pub(crate) const LOOKS_BYTES: usize = HEAD_BYTES + 8 + 8 + 8 + 4 + 4 + COMPRESSION.len() + 8;
 /// The only compression that Crossfix writes.
 const COMPRESSION: &[u8] = b"zstd";
-/// The longest name of a compression, bytes: the format has `zstd` and `lz4`.
+/// The longest compression name that is accepted, bytes: the format has `zstd` and `lz4`.
 const LONGEST_NAME: usize = 32;
-/// Of a chunk's body, all that is not its packed records.
+/// Bytes of a chunk's body before its packed records.
 const FIXED_BYTES: u64 = (LOOKS_BYTES - HEAD_BYTES) as u64;
 
-/// A record as it lies in the file.
+/// A record as it is framed in the file.
 pub(crate) struct Framing {
     pub(crate) opcode: u8,
     pub(crate) body: Vec<u8>,
@@ -29,12 +30,13 @@ pub(crate) struct Framing {
     pub(crate) next: u64,
 }
 
-/// Whether a record may be of this kind. Private ones, which we never write, would hide damage.
+/// Whether this is an opcode that a record may have. Private ones, which we never write, would hide
+/// damage.
 pub(crate) fn is_opcode(opcode: u8) -> bool {
     matches!(opcode, op::HEADER..=op::DATA_END)
 }
 
-/// Whether a record's body has the shape of a chunk's, whatever its kind says.
+/// Whether a record's body has the shape of a chunk's, whatever its opcode says.
 pub(crate) fn has_shape(body: &[u8]) -> bool {
     let name = (FIXED_BYTES as usize) - 8 - COMPRESSION.len();
     let packed = body.get(name + COMPRESSION.len()..FIXED_BYTES as usize);
@@ -44,13 +46,13 @@ pub(crate) fn has_shape(body: &[u8]) -> bool {
             == (body.len() as u64).checked_sub(FIXED_BYTES)
 }
 
-/// The first place in some bytes where a chunk begins, of which `left` bytes are left in the file.
+/// Offset of the first chunk in some bytes; `left` bytes of the file are left from their beginning.
 pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
     let u64_at = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
     (0..bytes.len().saturating_sub(LOOKS_BYTES - 1)).find(|&at| {
         let name = at + LOOKS_BYTES - 8 - COMPRESSION.len();
-        // Its kind may be what is damaged. The record's length and that of its packed part must
-        // agree.
+        // The opcode may be what is damaged, so it is not compared. The record's length must agree
+        // with that of its packed part.
         bytes[name - 4..name] == [4, 0, 0, 0]
             && bytes[name..].starts_with(COMPRESSION)
             && u64_at(at + 1).zip(u64_at(name + COMPRESSION.len())).is_some_and(
@@ -63,8 +65,8 @@ pub(crate) fn find(bytes: &[u8], left: u64) -> Option<usize> {
     })
 }
 
-/// How much of a record's body is the chunk's own, by what the chunk says: of one that was read
-/// well.
+/// Number of bytes of a record's body that belong to the chunk, as the chunk itself states it; only
+/// valid for a chunk that was read without error.
 pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     match mcap::parse_record(op::CHUNK, body) {
         Ok(Record::Chunk { header, .. }) => {
@@ -75,8 +77,8 @@ pub(crate) fn own_bytes(body: &[u8]) -> u64 {
     }
 }
 
-/// Whether the records of a chunk that is not packed, as other programs write them, end where it ends. Of one
-/// that goes on, the library would count less than nothing as left.
+/// Whether the records of an uncompressed chunk, as other programs write them, end where the chunk
+/// ends. Where they go on beyond it, the library's count of the bytes left would underflow.
 fn is_filled(body: &[u8]) -> bool {
     let Ok(Record::Chunk { header, data }) = mcap::parse_record(op::CHUNK, body) else {
         return false;
@@ -92,16 +94,16 @@ fn is_filled(body: &[u8]) -> bool {
     true
 }
 
-/// Hands on the records of a chunk. Its checksum is compared before the first one, so that of a
-/// damaged chunk none is handed on.
+/// Hands on the records of a chunk. Its checksum is compared before the first one, so that no
+/// record of a damaged chunk is handed on.
 ///
 /// # Errors
-/// The inner error is what is wrong with the chunk, the outer one what the handler says.
+/// The inner error says what is wrong with the chunk, the outer one comes from the handler.
 pub(crate) fn for_each_record<E>(
     body: &[u8],
     mut handle: impl FnMut(u8, &[u8]) -> Result<(), E>,
 ) -> Result<McapResult<()>, E> {
-    // The library would reserve as much memory as a damaged length says.
+    // The library would reserve as much memory as a damaged length states.
     let name_bytes =
         body.get(28..32).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);
     if name_bytes.is_none_or(|bytes| bytes as usize > LONGEST_NAME) {

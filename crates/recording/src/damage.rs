@@ -2,21 +2,21 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// What of a recording could not be read.
+/// The parts of a recording that could not be read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Damage {
-    /// Places where it is damaged.
+    /// Number of damaged places.
     pub places: u64,
-    /// Bytes of the file that were skipped.
+    /// Number of bytes of the file that were skipped.
     pub bytes: u64,
-    /// Where the first of them is, bytes from the file's beginning.
+    /// Position of the first damaged place, bytes from the file's beginning.
     pub first_at: u64,
     /// What is wrong there.
     pub first: String,
 }
 
 impl Damage {
-    /// Adds a damaged place to what is known.
+    /// Adds a damaged place to those known.
     pub(crate) fn note(known: &mut Option<Self>, at: u64, bytes: u64, what: &str) {
         let damage = known.get_or_insert_with(|| Self {
             places: 0,

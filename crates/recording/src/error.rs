@@ -2,10 +2,10 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// What can go wrong with a recording.
+/// Errors of writing and reading recordings.
 #[derive(Debug, Error)]
 pub enum RecordingError {
-    /// The file cannot be made.
+    /// The file cannot be created.
     #[error("cannot write {}", path.display())]
     Create {
         /// The file.
@@ -23,21 +23,22 @@ pub enum RecordingError {
         #[source]
         source: std::io::Error,
     },
-    /// The file is there already, and is not to be replaced.
+    /// The file exists already, and is not to be replaced.
     #[error("{} is there already", path.display())]
     Exists {
         /// The file.
         path: PathBuf,
     },
-    /// A message is longer than readers take: it is left out, and the recording goes on.
+    /// A message is longer than readers accept: it is left out, and the recording goes on.
     #[error("a message of {bytes} bytes on `{topic}` is too long for a recording")]
     TooLong {
         /// Where it was published.
         topic: String,
-        /// How long it is.
+        /// Its length.
         bytes: usize,
     },
-    /// The file cannot be written, often as the disk is full. What was flushed before can be read.
+    /// The file cannot be written, often because the disk is full. What was flushed before can be
+    /// read.
     #[error("cannot write the recording; what was flushed before is readable")]
     Write(#[source] mcap::McapError),
     /// The file has not a single byte.
@@ -64,7 +65,8 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
-    /// Whether what it is written to does not take it: a full disk, and not a file that holds no more.
+    /// Whether the medium written to refused the data, as a full disk does; `false` where the file
+    /// itself can hold no more.
     pub fn is_of_disk(&self) -> bool {
         matches!(self, Self::Write(mcap::McapError::Io(_)))
     }

@@ -7,14 +7,14 @@ use serde::Serialize;
 
 use crate::{Damage, Entry, ReadFailure, RecordingError, RecordingReader, Source, schema_of};
 
-/// What one channel of a recording holds.
+/// Contents of one channel of a recording.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ChannelInfo {
     /// The Zenoh key.
     pub topic: String,
     /// The full protobuf name of its messages.
     pub schema: &'static str,
-    /// How many.
+    /// Number of messages.
     pub messages: u64,
     /// Bytes of all messages, before compression.
     pub bytes: u64,
@@ -24,12 +24,12 @@ pub struct ChannelInfo {
     pub last: Timestamp,
 }
 
-/// What a component said of itself last.
+/// The last health report of a component.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct LastHealth {
-    /// What it counted, without what it never met.
+    /// Its counters, without those that are zero.
     pub counters: BTreeMap<String, u64>,
-    /// What was wrong then.
+    /// The problems that it reported then.
     pub problems: Vec<String>,
 }
 
@@ -48,26 +48,26 @@ impl LastHealth {
     }
 }
 
-/// What a recording holds.
+/// Contents of a recording.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RecordingInfo {
     /// Ordered by topic.
     pub channels: Vec<ChannelInfo>,
-    /// Messages on topics that are not Crossfix's.
+    /// Number of messages on topics that are not Crossfix's.
     pub foreign: u64,
-    /// Who wrote it, if it says.
+    /// Who wrote it, if the file states it.
     pub source: Option<Source>,
-    /// What each component said of itself last, by its name: what it counted, and what was wrong.
+    /// The last health report of each component, by its name: counters and problems.
     pub health: BTreeMap<String, LastHealth>,
-    /// What could not be read, if there is any.
+    /// What could not be read, if anything.
     pub damage: Option<Damage>,
 }
 
 impl RecordingInfo {
-    /// Goes through a recording and says what it holds, and what of it is damaged.
+    /// Reads a recording and summarises its contents and its damage.
     ///
     /// # Errors
-    /// [`RecordingError`] if it is not there or no MCAP file.
+    /// [`RecordingError`] if it does not exist or is not an MCAP file.
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut channels: BTreeMap<String, ChannelInfo> = BTreeMap::new();
         let mut health = BTreeMap::new();

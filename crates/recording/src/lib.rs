@@ -49,35 +49,35 @@ pub use writer::RecordingWriter;
 
 use crossfix_message::{Key, Timestamp};
 
-/// The name of the metadata record that says the channels once more: their ids and topics.
+/// The name of the metadata record that repeats the channels' ids and topics.
 pub(crate) const CHANNELS: &str = "crossfix.channels";
 
 /// One message of a recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// Where it was published.
+    /// The key under which it was published.
     pub key: Key,
-    /// The time it speaks of.
+    /// Its data time.
     pub data_time: Timestamp,
     /// When the recorder received it; equal to `data_time` in imported data.
     pub arrival: Timestamp,
-    /// The bytes of the wire.
+    /// The bytes as on the wire.
     pub data: Vec<u8>,
 }
 
-/// A message in a schema of others, written beside ours.
+/// A message in a foreign schema, written in addition to our own messages.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beside<'a> {
-    /// Its topic: none of ours, which begin with `crossfix/`.
+    /// Its topic, which must not be one of ours: those begin with `crossfix/`.
     pub topic: &'a str,
     /// Its schema's full protobuf name.
     pub schema: &'a str,
     /// The schema's definitions, a `google.protobuf.FileDescriptorSet`.
     pub definitions: &'a [u8],
-    /// The time it speaks of.
+    /// Its data time.
     pub data_time: Timestamp,
-    /// When what it was made of was received.
+    /// When the message that it was derived from was received.
     pub arrival: Timestamp,
-    /// The message.
+    /// The encoded message.
     pub data: &'a [u8],
 }

@@ -12,37 +12,37 @@ use crate::chunk::{self, Framing, HEAD_BYTES, MAX_RECORD_BYTES};
 use crate::source::{self, Texts};
 use crate::{CHANNELS, Damage, Entry, RecordingError, Source};
 
-/// Damaged records may claim what is not theirs, so that what lies in them is read again: this many
-/// times the whole file at most.
+/// Damaged records may claim bytes that belong to other records, so that these bytes are read
+/// again: in total at most this many times the size of the file.
 const MOST_READINGS: u64 = 16;
 
-/// What a recording held, and what it lacks.
+/// Result of reading a recording: what it held, and what could not be read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReadReport {
-    /// Messages handed on.
+    /// Number of messages handed on.
     pub messages: u64,
-    /// Messages on topics that are not Crossfix's, left out.
+    /// Number of messages on topics that are not Crossfix's; they were left out.
     pub foreign: u64,
-    /// Who wrote it, if it says.
+    /// Who wrote it, if the file states it.
     pub source: Option<Source>,
     /// What could not be read; everything else was handed on.
     pub damage: Option<Damage>,
 }
 
-/// Why going through a recording stopped.
+/// Why reading a recording stopped.
 #[derive(Debug, Error)]
 pub enum ReadFailure<E: std::error::Error + 'static> {
-    /// The recording.
+    /// The recording itself.
     #[error("the recording cannot be read")]
     Recording(#[source] RecordingError),
-    /// What the messages were handed to.
+    /// The handler that the messages were handed to.
     #[error("a message of the recording could not be handled")]
     Handler(#[source] E),
 }
 
 /// Reads a recording from its first to its last message, in constant memory. Damage costs the chunk
-/// that it is in, about a second: the next one is found again, by its place or by what it looks
-/// like.
+/// that it is in, which holds about a second: the next chunk is found again, by its place or by its
+/// byte pattern.
 #[derive(Debug)]
 pub struct RecordingReader<R: Read + Seek> {
     source: R,
@@ -53,18 +53,20 @@ pub struct RecordingReader<R: Read + Seek> {
     /// The keys of the file's channels; `None` for those that are not Crossfix's.
     keys: BTreeMap<u16, Option<Key>>,
     report: ReadReport,
-    /// All chunks that begin before this place have been found: a chunk has a checksum.
+    /// All chunks that begin before this place have been found: a chunk has a checksum that
+    /// confirms its extent.
     sure_until: u64,
     /// Whether the record that ends the messages has been seen.
     is_complete: bool,
-    /// Where the index begins, if the file ends as a whole one does.
+    /// Where the index begins, if the file has a valid end.
     index_at: Option<u64>,
-    /// Bytes of damaged records, which may have to be read again.
+    /// Total bytes of damaged records so far, which may have to be read again.
     spent: u64,
 }
 
 impl<R: Read + Seek> RecordingReader<R> {
-    /// The keys of a whole file's channels; none of a torn one, which says them among its messages.
+    /// The keys of the channels of a complete file; none for a torn one, which names them only
+    /// among its messages.
     pub fn keys(&self) -> impl Iterator<Item = &Key> {
         self.keys.values().flatten()
     }
@@ -86,7 +88,7 @@ impl RecordingReader<BufReader<File>> {
 }
 
 impl<R: Read + Seek> RecordingReader<R> {
-    /// Reads from anything; `path` is for messages.
+    /// Reads from any source; `path` is only for error messages.
     ///
     /// # Errors
     /// [`RecordingError`] if it cannot be read, is empty, or no MCAP file.
@@ -117,15 +119,16 @@ impl<R: Read + Seek> RecordingReader<R> {
         let has_magic = self.fill(0, &mut magic)? && magic == MAGIC;
         self.at = MAGIC.len() as u64;
         if !has_magic {
-            // A damaged first byte costs no more than any other, if the file has the looks of one.
+            // A damaged first byte costs no more than any other, if anything in the file looks like
+            // a chunk.
             self.at = 0;
             self.lose("it does not begin as an MCAP file", 0)?;
             if self.at >= self.size {
                 return Err(RecordingError::NotMcap { path: self.path.clone() });
             }
         }
-        // The channels are said in the first chunk, and again at the end: first, in case that chunk
-        // is lost.
+        // The channels are listed in the first chunk, and again at the end of the file: they are
+        // read from there first, in case that chunk is lost.
         self.learn_channels()
     }
 
@@ -133,7 +136,7 @@ impl<R: Read + Seek> RecordingReader<R> {
     /// error.
     ///
     /// # Errors
-    /// [`ReadFailure`]; damage is no error but a report.
+    /// [`ReadFailure`]; damage is not an error but is reported.
     pub fn for_each<E: std::error::Error + 'static>(
         mut self,
         mut handle: impl FnMut(Entry) -> Result<(), E>,
@@ -165,8 +168,9 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(self.report)
     }
 
-    /// Goes on behind a record. Where its length is what is damaged, other chunks lie in what it
-    /// claims; a chunk that was read well says again inside, under its checksum, how long it is.
+    /// Continues after a record. Where its length is what is damaged, other chunks lie in the bytes
+    /// that it claims. A chunk that was read without error states its length once more inside,
+    /// under its checksum.
     fn go_on(&mut self, opcode: u8, body: &[u8], mut next: u64, read: Result<(), String>) {
         if opcode == op::CHUNK && read.is_ok() {
             next = next.min(self.at + HEAD_BYTES as u64 + chunk::own_bytes(body));
@@ -187,15 +191,16 @@ impl<R: Read + Seek> RecordingReader<R> {
             self.sure_until = if inside.is_some() { self.at + 1 } else { resumed };
         }
         self.at = resumed;
-        // Of a file made so that everything in it is read many times, the rest is given up.
+        // The rest of a file is given up if it was made to have everything in it read many times.
         if self.spent > self.size.saturating_mul(MOST_READINGS) {
             self.note(self.at, self.size - self.at, "it is damaged in too many places");
             self.at = self.size;
         }
     }
 
-    /// One record of a chunk; what is wrong with it is the inner error. The library's parser is
-    /// given nothing else, as it believes what damaged records say of their lengths.
+    /// Handles one record of a chunk; the inner error says what is wrong with it. The library's
+    /// parser is given only message records here, as it trusts the lengths that damaged records
+    /// state.
     fn take_inner<E: std::error::Error + 'static>(
         &mut self,
         opcode: u8,
@@ -237,7 +242,7 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(Ok(()))
     }
 
-    /// One record outside of the chunks; a file without chunks has its messages there.
+    /// Handles one record outside of the chunks; a file without chunks has its messages there.
     fn take_outer<E: std::error::Error + 'static>(
         &mut self,
         opcode: u8,
@@ -245,7 +250,7 @@ impl<R: Read + Seek> RecordingReader<R> {
         handle: &mut impl FnMut(Entry) -> Result<(), E>,
     ) -> Result<Result<(), String>, ReadFailure<E>> {
         match opcode {
-            // What is written in chunks has no message beside them: it is another record, damaged.
+            // A file with chunks has no messages outside of them: this is another record, damaged.
             op::MESSAGE if self.sure_until > 0 => {
                 Ok(Err("a message lies between chunks".to_owned()))
             }
@@ -255,7 +260,7 @@ impl<R: Read + Seek> RecordingReader<R> {
                 texts.iter().for_each(|texts| self.learn_texts(texts));
                 Ok(texts.map(drop).ok_or_else(|| "a metadata record is damaged".to_owned()))
             }
-            // What follows the end record is an index, and the channels again.
+            // After the end record come only an index, and the channels again.
             op::DATA_END => {
                 let next = self.at + (HEAD_BYTES + body.len()) as u64;
                 self.is_complete = self.index_at.is_none_or(|index| index == next);
@@ -280,7 +285,7 @@ impl<R: Read + Seek> RecordingReader<R> {
         self.report.source = Source::read(texts).or(self.report.source.take());
     }
 
-    /// Reads the channels that a whole file says again after its messages.
+    /// Reads the channels that a complete file lists again after its messages.
     fn learn_channels(&mut self) -> Result<(), RecordingError> {
         // The footer: a record of 20 bytes, then the magic.
         const FOOTER_BYTES: u64 = HEAD_BYTES as u64 + 20 + MAGIC.len() as u64;
@@ -318,7 +323,7 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(())
     }
 
-    /// The next whole record; damage before it is noted.
+    /// The next complete record; damage before it is noted.
     fn next_record(&mut self) -> Result<Option<Framing>, RecordingError> {
         if self.is_complete || self.at >= self.size {
             return Ok(None);
@@ -329,13 +334,13 @@ impl<R: Read + Seek> RecordingReader<R> {
                 return Ok(Some(Framing { opcode, body: self.body(self.at, length)?, next }));
             }
             Some(_) => self.lose("a record is too long to be true", self.at + 1)?,
-            // The record before may have claimed the beginning of the one that is missing.
+            // The record before may have claimed the beginning of the one that is missing here.
             None => self.lose("no record begins where one must", self.sure_until)?,
         }
         self.chunk_here()
     }
 
-    /// The chunk that was found by its shape, whatever its kind says.
+    /// The chunk at this place, which was found by its shape, whatever its opcode says.
     fn chunk_here(&mut self) -> Result<Option<Framing>, RecordingError> {
         let mut head = [0; HEAD_BYTES];
         if self.at >= self.size || !self.fill(self.at, &mut head)? {
@@ -347,7 +352,8 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(Some(Framing { opcode: op::CHUNK, body, next: self.at + HEAD_BYTES as u64 + length }))
     }
 
-    /// The kind and length of the record at a place, if there is one that ends within the file.
+    /// The opcode and length of the record at a place, if it has a valid opcode and ends within the
+    /// file.
     fn head(&mut self, at: u64) -> Result<Option<(u8, u64)>, RecordingError> {
         let mut head = [0; HEAD_BYTES];
         if !self.fill(at, &mut head)? {
@@ -365,12 +371,13 @@ impl<R: Read + Seek> RecordingReader<R> {
         Ok(body)
     }
 
-    /// Gives up what lies between here and the next thing that looks like a chunk.
+    /// Skips to the next thing that looks like a chunk.
     fn lose(&mut self, what: &str, search_from: u64) -> Result<(), RecordingError> {
         let begun = self.at.max(search_from);
         let found = self.find_chunk(search_from)?;
         self.at = found.unwrap_or(self.size);
-        // The rest of a file that was cut off is not damage within it: the missing end says it all.
+        // The rest of a file that was cut off is not damage within it: the note on the missing end
+        // covers it.
         if found.is_some() {
             self.note(begun, self.at.saturating_sub(begun), what);
         }
@@ -399,7 +406,8 @@ impl<R: Read + Seek> RecordingReader<R> {
             return Ok(false);
         }
         self.io(|source| {
-            // Within the buffer where it can be: the file is read from its beginning to its end.
+            // No seek where none is needed, as it would empty the reader's buffer: the file is read
+            // mostly from its beginning to its end.
             let here = source.stream_position()?;
             if here != at {
                 source.seek(SeekFrom::Start(at))?;

@@ -3,7 +3,8 @@ use crossfix_message::{
     TrackFrame, TruthFrame,
 };
 
-/// The full protobuf name of what goes over a channel; liveliness tokens carry nothing.
+/// The full protobuf name of a channel's messages; `None` for liveliness tokens, which carry no
+/// message.
 pub fn schema_of(channel: &Channel) -> Option<&'static str> {
     Some(match channel {
         Channel::Bearings(_) => BearingFrame::SCHEMA,

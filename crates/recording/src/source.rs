@@ -13,14 +13,14 @@ pub struct Source {
     pub command: String,
     /// The version of Crossfix.
     pub version: String,
-    /// The run of the command, as its health says it; empty offline.
+    /// The identity of the command's run, as in its health messages; empty offline.
     pub run: String,
-    /// The host that it ran on, and the number of its process.
+    /// The host that it ran on, and its process id.
     pub host: String,
 }
 
 impl Source {
-    /// A command of this build, without a run: one that is not on a network.
+    /// A command of this build without a run, as one that is not on a network.
     pub fn of(command: &str) -> Self {
         Self {
             command: command.to_owned(),
@@ -48,7 +48,7 @@ impl Source {
     }
 }
 
-/// A metadata record, read without believing what it says of its lengths: the library would reserve
+/// A metadata record, parsed without trusting the lengths that it states: the library would reserve
 /// gigabytes for a damaged one.
 #[derive(Debug)]
 pub(crate) struct Texts {
@@ -68,7 +68,7 @@ impl Texts {
     }
 }
 
-/// Bytes that have their length before them.
+/// Length-prefixed bytes.
 fn bytes<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
     let (length, after) = rest.split_first_chunk::<4>()?;
     let (bytes, after) = after.split_at_checked(u32::from_le_bytes(*length) as usize)?;
@@ -76,10 +76,10 @@ fn bytes<'a>(rest: &mut &'a [u8]) -> Option<&'a [u8]> {
     Some(bytes)
 }
 
-/// Id and topic of a channel record, read in the same way.
+/// Id and topic of a channel record, likewise parsed without trusting its lengths.
 pub(crate) fn channel(body: &[u8]) -> Option<(u16, String)> {
     let (id, rest) = body.split_first_chunk::<2>()?;
-    // Then the schema's id.
+    // Skips the schema's id.
     let mut rest = rest.get(2..)?;
     Some((u16::from_le_bytes(*id), text(&mut rest)?))
 }

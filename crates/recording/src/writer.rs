@@ -9,13 +9,14 @@ use mcap::{Compression, McapResult, WriteOptions, Writer};
 
 use crate::{Beside, CHANNELS, Entry, RecordingError, Source, schema_of};
 
-/// The fastest: what fills recordings is floating-point numbers, which higher levels hardly make
-/// smaller.
+/// The fastest compression: recordings are mostly floating-point numbers, which higher levels
+/// hardly make smaller.
 const COMPRESSION_LEVEL: u32 = 1;
 /// Uncompressed size at which a chunk is closed: small enough that a crash loses little.
 const CHUNK_BYTES: u64 = 512 * 1024;
 
-/// What precedes the so many-th message of a channel. MCAP has no time before the epoch.
+/// Header of a channel's message with this sequence number. MCAP has no time before the epoch:
+/// earlier times become 0.
 fn header(
     (channel_id, sequence): (u16, u32),
     data_time: Timestamp,
@@ -29,15 +30,15 @@ fn header(
 pub struct RecordingWriter<W: Write + Seek> {
     writer: Writer<W>,
     channels: BTreeMap<Key, (u16, u32)>,
-    /// The channels of messages in others' schemas, by topic.
+    /// The channels of messages in foreign schemas, by topic: id and next sequence number.
     beside: BTreeMap<String, (u16, u32)>,
-    /// Whether a channel has been added since they were last said outside of the chunks.
+    /// Whether a channel has been added since the channels were last listed outside of the chunks.
     has_new_channels: bool,
     messages: u64,
 }
 
 impl RecordingWriter<BufWriter<File>> {
-    /// A new file; an existing one is replaced.
+    /// Creates a file; an existing one is replaced.
     ///
     /// # Errors
     /// [`RecordingError::Create`] if it cannot be made.
@@ -46,7 +47,7 @@ impl RecordingWriter<BufWriter<File>> {
         Self::new(BufWriter::new(File::create(path).map_err(create)?))
     }
 
-    /// A new file where none is.
+    /// Creates a file where none exists.
     ///
     /// # Errors
     /// [`RecordingError::Exists`] if there is one, [`RecordingError::Create`] if it cannot be made.
@@ -60,7 +61,7 @@ impl RecordingWriter<BufWriter<File>> {
 }
 
 impl<W: Write + Seek> RecordingWriter<W> {
-    /// A recording into anything that can be written.
+    /// A recording to any sink.
     ///
     /// # Errors
     /// [`RecordingError::Write`] if the first bytes cannot be written.
@@ -70,7 +71,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
             .compression_level(COMPRESSION_LEVEL)
             .compression_threads(0)
             .chunk_size(Some(CHUNK_BYTES))
-            // Chunks are put together in memory and written whole: a crash leaves no half header.
+            // Chunks are assembled in memory and written whole: a crash leaves no half-written
+            // header.
             .disable_seeking(true)
             .library(concat!("crossfix ", env!("CARGO_PKG_VERSION")))
             .create(sink)
@@ -84,7 +86,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
         })
     }
 
-    /// Says in the file who writes it.
+    /// Writes to the file who writes it.
     ///
     /// # Errors
     /// [`RecordingError::Write`].
@@ -118,8 +120,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
         Ok(())
     }
 
-    /// Writes a message in a schema of others beside ours, for their programs. Our own readers leave
-    /// it out, and it is not counted.
+    /// Writes a message in a foreign schema for other programs. Our own readers leave it out, and
+    /// it is not counted.
     ///
     /// # Errors
     /// [`RecordingError::Write`].
@@ -148,8 +150,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.writer.add_channel(schema, &key.to_string(), "protobuf", &BTreeMap::new())
     }
 
-    /// Says the channels outside of the chunks: of a torn file, which has no end to say them again,
-    /// a damaged first chunk must not take all later ones with it.
+    /// Lists the channels outside of the chunks. A torn file has no end to list them again, and
+    /// without this a damaged first chunk would make all later ones unreadable.
     fn say_channels(&mut self) -> McapResult<()> {
         if !std::mem::take(&mut self.has_new_channels) {
             return Ok(());
@@ -161,7 +163,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
             .write_metadata(&Metadata { name: CHANNELS.to_owned(), metadata: said.collect() })
     }
 
-    /// Closes the chunk and hands all bytes to the system.
+    /// Closes the chunk and hands all bytes to the operating system.
     ///
     /// # Errors
     /// [`RecordingError::Write`].
@@ -169,7 +171,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.say_channels().and_then(|()| self.writer.flush()).map_err(RecordingError::Write)
     }
 
-    /// Messages written so far.
+    /// Number of messages written so far.
     pub fn messages(&self) -> u64 {
         self.messages
     }
@@ -180,7 +182,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
     /// [`RecordingError::Write`].
     pub fn finish(mut self) -> Result<u64, RecordingError> {
         self.writer.finish().map_err(RecordingError::Write)?;
-        // Dropped, a buffer keeps to itself what the disk did not take.
+        // Flushed here, as a dropped buffer does not report what the disk did not take.
         self.writer.into_inner().flush().map_err(|error| RecordingError::Write(error.into()))?;
         Ok(self.messages)
     }

@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimulatedClock {
-    /// What it shows at the scene's start, s.
+    /// What it shows at the scene's start (true time 0), s.
     pub offset_s: f64,
-    /// How much too fast it runs, millionths.
+    /// How much too fast it runs, parts per million.
     pub drift_ppm: f64,
 }
 

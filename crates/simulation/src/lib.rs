@@ -1,7 +1,6 @@
-//! Scenes with flying targets and cameras that look at them: truth, rendered
-//! images, clocks with offset and drift. A scene and its seed give the same
-//! images bit for bit. A [`Site`] has many cameras and targets, and gives their
-//! bearings without images.
+//! Scenes with flying targets and cameras that look at them: ground truth, rendered images, clocks
+//! with offset and drift. The same scene and seed give the same images bit for bit. A [`Site`] has
+//! many cameras and targets, and gives their bearings without images.
 //!
 //! ```
 //! use crossfix_simulation::Scene;

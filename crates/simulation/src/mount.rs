@@ -1,4 +1,5 @@
-//! A mount that turns a camera of a scene: it takes time, and its angles are not quite what it says.
+//! A simulated mount that turns a camera: turning takes time, and its true angles differ slightly
+//! from those that it reports.
 
 use crossfix_geometry::{GeometryError, PanTilt, Pose, ScanAngles};
 use rand::SeedableRng;
@@ -6,23 +7,24 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-/// What turns a camera of a scene. At rest it looks where the camera does.
+/// Description of a mount that turns a camera of a scene. At rest the camera looks as the scene
+/// says.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneMount {
-    /// How far it turns to the left (least and most), degrees.
+    /// Limits of the azimuth, to the left (least and most), degrees.
     pub azimuth_deg: [f64; 2],
-    /// How far it turns upwards (least and most), degrees.
+    /// Limits of the elevation, upwards (least and most), degrees.
     pub elevation_deg: [f64; 2],
-    /// How fast it turns about each axis, degrees a second.
+    /// Rate of turn about each axis, degrees per second.
     pub rate_deg_per_s: f64,
-    /// Standard deviation of what each angle is off by, anew after each turn, mrad.
+    /// Standard deviation of each angle's error, which is drawn again at each turn, mrad.
     #[serde(default)]
     pub angle_sd_mrad: f64,
 }
 
 impl SceneMount {
-    /// Its geometry, by the camera's pose at rest.
+    /// The mount's geometry, from the camera's pose at rest.
     ///
     /// # Errors
     /// [`GeometryError::Reach`] where no mount turns so.
@@ -32,18 +34,18 @@ impl SceneMount {
     }
 }
 
-/// Where a mount points at a time, and where it says that it does.
+/// True and reported angles of a mount at one time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MountState {
-    /// Where it points.
+    /// The true angles.
     pub truth: ScanAngles,
-    /// Where it says.
+    /// The reported angles.
     pub said: ScanAngles,
     /// Whether it stands still.
     pub settled: bool,
 }
 
-/// A mount in action.
+/// A mount in operation.
 ///
 /// ```
 /// use crossfix_geometry::ScanAngles;
@@ -66,7 +68,7 @@ pub struct SimulatedMount {
     rate: f64,
     angle_sd: f64,
     noise: ChaCha8Rng,
-    /// What it says is so far off, to the left and upwards, rad.
+    /// True less reported angles, to the left and upwards, rad.
     off: [f64; 2],
     from: ScanAngles,
     to: ScanAngles,
@@ -74,7 +76,7 @@ pub struct SimulatedMount {
 }
 
 impl SimulatedMount {
-    /// A mount at rest, with random errors of a seed.
+    /// A mount at rest, with random errors from a seed.
     pub fn new(mount: &SceneMount, seed: u64) -> Self {
         let rest = ScanAngles { azimuth: 0.0, elevation: 0.0 };
         let mut at_rest = Self {
@@ -97,7 +99,8 @@ impl SimulatedMount {
         });
     }
 
-    /// Begins to turn to where it is told, by what it says, at a time (s); from where it is by then.
+    /// Begins at time `t` (s) to turn towards the reported angles `to`, from where the mount is by
+    /// then.
     pub fn aim(&mut self, t: f64, to: ScanAngles) {
         if to != self.to {
             (self.from, self.to, self.began_s) = (self.at(t).said, to, t);
@@ -105,9 +108,10 @@ impl SimulatedMount {
         }
     }
 
-    /// Where it points at a time (s), if it is told nothing else.
+    /// State at a time (s), if no other order follows.
     pub fn at(&self, t: f64) -> MountState {
         let reach = (self.rate * (t - self.began_s)).max(0.0);
+        // Each angle moves at the constant rate until it is there.
         let on_the_way = |from: f64, to: f64| {
             if (to - from).abs() <= reach { to } else { from + reach.copysign(to - from) }
         };
@@ -144,7 +148,7 @@ mod tests {
         let half = mount.at(10.5);
         assert!(!half.settled && (half.said.azimuth - 0.5).abs() < 1e-12);
         assert!((half.said.elevation - 0.2).abs() < 1e-12);
-        // No multiple of its step, and there all the same.
+        // Not a whole number of steps later, and settled all the same.
         assert!(mount.at(11.7).settled);
         mount.aim(10.5, ScanAngles { azimuth: 0.0, elevation: 0.2 });
         assert!(!mount.at(10.9).settled);
@@ -164,7 +168,7 @@ mod tests {
             squares += off(t + 5.0).powi(2);
         }
         let sd = (squares / 500.0).sqrt();
-        // A deviation of n draws is known to one in the root of 2 n.
+        // The standard deviation of n draws has a relative error of 1 / sqrt(2 n).
         assert!((sd / 0.5e-3 - 1.0).abs() < 4.0 / 1000f64.sqrt(), "{sd}");
     }
 }

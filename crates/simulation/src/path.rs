@@ -3,32 +3,33 @@ use std::f64::consts::TAU;
 use nalgebra::{Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// How a target flies. Metres, seconds, world frame (ENU).
+/// The path of a target. Metres, seconds, world frame (ENU).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum FlightPath {
     /// Straight, at constant velocity.
     Straight {
-        /// Where it is at the start.
+        /// Position at the start.
         from_m: [f64; 3],
-        /// How fast it flies.
+        /// Velocity.
         velocity_mps: [f64; 3],
     },
-    /// About a centre, each axis a sine of its own: circles, eights, helices that never end.
+    /// Around a centre, with a sine of its own on each axis: circles, eights, helices that never
+    /// end.
     Curved {
-        /// The middle.
+        /// The centre.
         centre_m: [f64; 3],
-        /// How far it swings to either side, an axis.
+        /// Amplitude to either side, per axis.
         amplitude_m: [f64; 3],
-        /// How long a swing takes, an axis.
+        /// Period of the sine, per axis.
         period_s: [f64; 3],
-        /// Where in its swing it starts, in turns, an axis.
+        /// Phase at the start, in turns, per axis.
         phase_turns: [f64; 3],
     },
 }
 
 impl FlightPath {
-    /// Position and velocity at a time from the scene's start.
+    /// Position and velocity at a time `t`, s from the scene's start.
     pub fn state(&self, t: f64) -> (Point3<f64>, Vector3<f64>) {
         match self {
             Self::Straight { from_m, velocity_mps } => {
@@ -47,7 +48,7 @@ impl FlightPath {
         }
     }
 
-    /// Whether every number is finite and no period is zero.
+    /// Whether every number is finite and every period positive.
     pub(crate) fn is_possible(&self) -> bool {
         match self {
             Self::Straight { from_m, velocity_mps } => {

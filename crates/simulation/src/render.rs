@@ -1,11 +1,11 @@
 //! Drawing a target into an image: a dark silhouette with soft edges, smeared
 //! along its motion during the exposure.
 
-/// How much darker than the sky a target is, 8-bit levels.
+/// Difference of brightness between the sky and a target, 8-bit levels.
 const DARKNESS: f32 = 85.0;
-/// Copies that make up the smear of motion.
+/// Number of copies of a target that make up its motion blur.
 const SMEAR_STEPS: usize = 3;
-/// Sub-samples a pixel and axis.
+/// Number of sub-samples per pixel and axis.
 const SUPERSAMPLING: usize = 4;
 
 /// A frame as a camera of the scene delivers it.
@@ -15,7 +15,7 @@ pub struct RenderedFrame {
     pub index: u64,
     /// True time of its mid-exposure, s from the scene's start.
     pub true_s: f64,
-    /// What the camera's clock shows then, s.
+    /// What the camera's clock shows at mid-exposure, s.
     pub own_s: f64,
     /// Columns.
     pub width: usize,
@@ -37,8 +37,8 @@ pub(crate) struct Appearance {
     pub(crate) blur: f64,
 }
 
-/// Share of the light that a silhouette takes at a place in units of half its span: a body, two
-/// arms and four rotors seen from the side, symmetric about its centre.
+/// Whether a silhouette covers a place, in units of half its span: a body, two arms and four rotors
+/// seen from the side, symmetric about its centre.
 fn silhouette(u: f64, v: f64) -> bool {
     let body = (u / 0.34).powi(2) + (v / 0.30).powi(2) < 1.0;
     let arms = v.abs() < 0.08 && u.abs() < 0.9;
@@ -67,7 +67,7 @@ pub(crate) fn draw(image: &mut [f32], width: usize, height: usize, target: &Appe
     }
 }
 
-/// How much of a pixel the smeared, blurred silhouette covers.
+/// Share of a pixel that the smeared, blurred silhouette covers.
 fn cover(x: usize, y: usize, half: f64, soft: f64, target: &Appearance) -> f64 {
     // The blur as a 3x3 quadrature of the Gaussian: nodes at 0 and +-sqrt(3) sigma.
     const NODES: [(f64, f64); 3] =

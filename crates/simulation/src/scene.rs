@@ -17,9 +17,9 @@ pub struct Scene {
     pub seed: u64,
     /// How long it lasts, s.
     pub duration_s: f64,
-    /// What flies.
+    /// The targets.
     pub targets: Vec<SceneTarget>,
-    /// What looks.
+    /// The cameras.
     pub cameras: Vec<SceneCamera>,
 }
 
@@ -31,10 +31,10 @@ pub struct SceneTarget {
     pub id: u64,
     /// Its span, m.
     pub span_m: f64,
-    /// When it comes into being, s from the start.
+    /// Time at which it appears, s from the start.
     #[serde(default)]
     pub appears_s: f64,
-    /// How it flies.
+    /// Its path.
     pub path: FlightPath,
 }
 
@@ -44,7 +44,7 @@ pub struct SceneTarget {
 pub struct SceneCamera {
     /// Its name.
     pub name: CameraName,
-    /// Its centre, m.
+    /// Its optical centre, world, m.
     pub position_m: [f64; 3],
     /// The point that its optical axis goes through, m.
     pub look_at_m: [f64; 3],
@@ -55,7 +55,7 @@ pub struct SceneCamera {
     /// Brown-Conrady coefficients k1 k2 p1 p2 k3.
     #[serde(default)]
     pub distortion: [f64; 5],
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: f64,
     /// True time of the first frame, s.
     #[serde(default)]
@@ -69,7 +69,7 @@ pub struct SceneCamera {
     /// Its clock.
     #[serde(default)]
     pub clock: SimulatedClock,
-    /// What turns it, if something does.
+    /// Its mount, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mount: Option<SceneMount>,
 }
@@ -80,9 +80,9 @@ pub enum SceneError {
     /// A number that makes no sense.
     #[error("{what} is {value}: it must be {must}")]
     Number {
-        /// Whose and which.
+        /// The parameter, and of what.
         what: String,
-        /// What it is.
+        /// Its value.
         value: f64,
         /// What it must be.
         must: &'static str,
@@ -93,13 +93,13 @@ pub enum SceneError {
         /// The target.
         target: u64,
     },
-    /// Two cameras of one name or two targets of one number.
+    /// Two cameras of the same name or two targets of the same number.
     #[error("`{name}` is there twice")]
     Twice {
         /// The name or number.
         name: String,
     },
-    /// A camera that cannot be.
+    /// An impossible camera.
     #[error("camera `{camera}` of the scene is impossible")]
     Camera {
         /// The camera.
@@ -111,7 +111,7 @@ pub enum SceneError {
 }
 
 impl SceneCamera {
-    /// Its model and place.
+    /// Its model and pose.
     ///
     /// # Errors
     /// [`GeometryError`] if the numbers are no camera's.
@@ -136,7 +136,7 @@ impl SceneCamera {
 }
 
 impl Scene {
-    /// The scene ready to be looked at.
+    /// Checks the scene and builds the world that can be rendered.
     ///
     /// # Errors
     /// [`SceneError`] naming what is wrong.

@@ -1,13 +1,13 @@
-//! Drone silhouettes of the sizes, contrasts and energies of Lytvynets 2020, table 1, drawn at any
-//! place, size and angle.
+//! Drone silhouettes with the sizes, contrasts and energies of Lytvynets 2020, table 1, drawn at
+//! any place, size and angle.
 
-/// Sub-samples a pixel and axis.
+/// Number of sub-samples per pixel and axis.
 const SUPERSAMPLING: usize = 8;
 /// Standard deviation of the blur, px.
 const BLUR: f64 = 0.35;
-/// Pixels around the box into which the blur and a turn reach.
+/// Margin around the box, pixels, into which blur and turn reach.
 const MARGIN: f64 = 4.0;
-/// The silhouette fills this share of half the box.
+/// Half side of the silhouette as a share of the box' full side.
 const FILL: f64 = 0.47;
 
 /// The sizes of Herasymenko 2021, Fig. 3 and Lytvynets 2020, Fig. 6.1.
@@ -15,7 +15,7 @@ pub const TEMPLATE_SIZES: [[usize; 2]; 4] = [[50, 30], [25, 15], [18, 12], [10, 
 
 /// A silhouette as brightness above the background, from 0 to about 1.
 ///
-/// It is drawn once on a grid of an eighth of a pixel, blurred, and averaged over pixels about
+/// It is drawn once on a grid of an eighth of a pixel, blurred, and averaged over a pixel around
 /// every sub-sample; a pixel at any place is then interpolated.
 ///
 /// ```
@@ -29,15 +29,16 @@ pub const TEMPLATE_SIZES: [[usize; 2]; 4] = [[50, 30], [25, 15], [18, 12], [10, 
 pub struct Silhouette {
     sides: [usize; 2],
     contrast: f64,
-    /// Pixel values about each sub-sample, and how many there are in a row.
+    /// Brightness of a pixel centred at each sub-sample, row by row, and the number of sub-samples
+    /// in a row.
     fine: Vec<f32>,
     fine_width: usize,
-    /// Half sides of what is drawn, px.
+    /// Half sides of the drawn grid, px.
     reach: [f64; 2],
 }
 
-/// The standard deviation of brightness inside the box (Lytvynets 2020, table 1; 18x12 is not in
-/// it).
+/// The standard deviation of brightness inside the box, by its width (Lytvynets 2020, table 1; that
+/// of 18x12 is not in it).
 fn table_deviation(width: usize) -> f64 {
     match width {
         ..=12 => 0.2943,
@@ -47,7 +48,8 @@ fn table_deviation(width: usize) -> f64 {
     }
 }
 
-/// Brightness of a silhouette of a box of `width` columns, in units of its own half sides.
+/// Brightness at (`u`, `v`), in units of the silhouette's own half sides, for a box of `width`
+/// columns.
 fn brightness(width: usize, u: f64, v: f64) -> f64 {
     let ellipse = |x: f64, rx: f64, y: f64, ry: f64| (x / rx).powi(2) + (y / ry).powi(2) < 1.0;
     let layers: &[(f64, bool)] = if width > 12 {
@@ -84,6 +86,7 @@ impl Silhouette {
             .collect();
         let mean = inside.iter().sum::<f64>() / inside.len() as f64;
         let variance = inside.iter().map(|b| (b - mean).powi(2)).sum::<f64>() / inside.len() as f64;
+        // Drawn again with the contrast that gives the table's deviation inside the box.
         Self::drawn([width, height], table_deviation(width) / variance.sqrt(), 1.0, 0.0)
     }
 
@@ -97,6 +100,7 @@ impl Silhouette {
         let step = 1.0 / SUPERSAMPLING as f64;
         let (cos, sin) = (angle_rad.cos(), angle_rad.sin());
         let half = sides.map(|side| scale * side as f64 / 2.0);
+        // Half sides of the bounding box of the turned box.
         let spans =
             [half[0] * cos.abs() + half[1] * sin.abs(), half[0] * sin.abs() + half[1] * cos.abs()];
         let reach = spans.map(|span| (span + MARGIN).ceil());
@@ -106,6 +110,7 @@ impl Silhouette {
         let mut fine: Vec<f32> = (0..rows * columns)
             .map(|i| {
                 let (x, y) = (at(i % columns, reach[0]), at(i / columns, reach[1]));
+                // Turned back into the silhouette's own axes.
                 let (u, v) = ((cos * x + sin * y) / units[0], (cos * y - sin * x) / units[1]);
                 (contrast * brightness(sides[0], u, v)) as f32
             })
@@ -114,7 +119,7 @@ impl Silhouette {
         let span = (4.0 * sigma).ceil() as isize;
         let gaussian: Vec<f64> =
             (-span..=span).map(|k| (-0.5 * (k as f64 / sigma).powi(2)).exp()).collect();
-        // The mean over a pixel whose middle is the upper left corner of a sub-sample.
+        // The mean over a pixel centred at the upper left corner of a sub-sample.
         let pixel = vec![1.0; SUPERSAMPLING];
         for kernel in [gaussian, pixel] {
             fine = filtered(&fine, columns, &kernel);
@@ -122,12 +127,12 @@ impl Silhouette {
         Self { sides, contrast, fine, fine_width: columns, reach }
     }
 
-    /// Columns and rows of its box at scale 1.
+    /// Columns and rows of the silhouette's box at scale 1.
     pub fn sides(&self) -> [usize; 2] {
         self.sides
     }
 
-    /// Brightness of the pixel whose middle lies at (x, y) from the silhouette's, px.
+    /// Brightness of the pixel centred at (x, y) relative to the silhouette's middle, px.
     pub fn pixel(&self, x: f64, y: f64) -> f32 {
         let place = |at: f64, reach: f64| (at + reach) * SUPERSAMPLING as f64;
         let (column, row) = (place(x, self.reach[0]), place(y, self.reach[1]));
@@ -142,12 +147,14 @@ impl Silhouette {
         let (i, j) = (column as usize, row as usize);
         let (fx, fy) = ((column - i as f64) as f32, (row - j as f64) as f32);
         let at = |i: usize, j: usize| self.fine[j * self.fine_width + i];
+        // Bilinear between the four sub-samples around the place.
         let upper = at(i, j) * (1.0 - fx) + at(i + 1, j) * fx;
         let lower = at(i, j + 1) * (1.0 - fx) + at(i + 1, j + 1) * fx;
         upper * (1.0 - fy) + lower * fy
     }
 
-    /// Adds it, times `strength`, to an image of `width` columns, its middle at `centre`.
+    /// Adds the silhouette, times `strength`, to an image of `width` columns, with its middle at
+    /// `centre`.
     pub fn draw(&self, image: &mut [f32], width: usize, centre: [f64; 2], strength: f32) {
         let height = image.len() / width;
         let range = |centre: f64, reach: f64, side: usize| {
@@ -163,7 +170,8 @@ impl Silhouette {
         }
     }
 
-    /// It alone, in the middle of a canvas of its sides and a margin on each side, row by row.
+    /// The silhouette alone, in the middle of a canvas of its sides plus a margin on each side, row
+    /// by row.
     pub fn canvas(&self, margin: usize) -> Vec<f32> {
         let [width, height] = self.sides.map(|side| side + 2 * margin);
         let mut image = vec![0.0; width * height];
@@ -173,7 +181,8 @@ impl Silhouette {
     }
 }
 
-/// A filter along the rows and the columns, made to sum to 1; outside is nothing.
+/// Filters along the rows and the columns with a kernel normalised to sum to 1; samples outside
+/// count as 0.
 fn filtered(samples: &[f32], columns: usize, kernel: &[f64]) -> Vec<f32> {
     let sum: f64 = kernel.iter().sum();
     let (rows, half) = (samples.len() / columns, kernel.len() / 2);

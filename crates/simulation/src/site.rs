@@ -1,5 +1,5 @@
-//! Sites of many cameras and many targets, as bearings without images: what a fusion centre is
-//! measured with.
+//! Sites of many cameras and many targets, as bearings without images: test input for fusion
+//! centres.
 
 use std::f64::consts::TAU;
 
@@ -19,57 +19,58 @@ use rand_distr::{Distribution, Poisson, StandardNormal};
 use crate::circuit::{Airspace, Circuit};
 use crate::{SceneError, TargetState};
 
-/// Bearings of one exposure have numbers below this times the sequence number of the next.
+/// Track numbers per exposure: the bearings of an exposure are numbered from its sequence number
+/// times this.
 const NUMBERS_PER_EXPOSURE: u64 = 1 << 16;
-/// Height of the cameras above the ground, m.
+/// Height of the lowest cameras above the ground, m; others stand at two and three times this.
 const MAST_M: f64 = 4.0;
 
-/// How the cameras of a site stand.
+/// Arrangement of the cameras of a site.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Layout {
-    /// On an ellipse about the area, all looking at the middle of the volume.
+    /// On the ellipse inscribed in the area, all looking at the middle of the volume.
     Ring,
     /// In rows and columns from border to border. Each block of two by two looks inwards, so that
-    /// what the whole grid sees is much the same everywhere.
+    /// coverage by the whole grid is much the same everywhere.
     Grid,
 }
 
-/// A site as it is described: cameras, targets and what the cameras make of them. World frame (ENU)
-/// with its origin on the ground in the middle of the area.
+/// Description of a site: cameras, targets and how the cameras detect them. World frame (ENU) with
+/// its origin on the ground in the middle of the area.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Site {
     /// Seed of everything random. The same site gives the same bytes.
     pub seed: u64,
     /// How long it lasts, s. Default 20.
     pub duration_s: f64,
-    /// Sides of the area that targets keep within, east and north, m; in a corner they may go
+    /// Sides of the area that targets stay within, east and north, m; in a corner they may go
     /// beyond it by three quarters of the radius of their turn. Default 600 x 600.
     pub area_m: [f64; 2],
-    /// Lowest and highest that they fly, m. Default 40 to 160.
+    /// Lowest and highest altitude of the targets, m. Default 40 to 160.
     pub heights_m: [f64; 2],
-    /// How many targets. Default 10.
+    /// Number of targets. Default 10.
     pub targets: usize,
-    /// Slowest and fastest of them, m/s. Default 5 to 20.
+    /// Slowest and fastest speed of the targets, m/s. Default 5 to 20.
     pub speeds_mps: [f64; 2],
-    /// Greatest rate of turn on the way, rad/s. Default 0: straight, but for the border, where
-    /// everybody turns back at 0.2 rad/s or this, whichever is more.
+    /// Greatest rate of turn away from the border, rad/s. Default 0: straight, except at the
+    /// border, where every target turns back at 0.2 rad/s or at this rate, whichever is greater.
     pub turn_rps: f64,
-    /// How many cameras, 1 to 999. Default 4. They are named `cam0`, `cam1` ...
+    /// Number of cameras, 1 to 999. Default 4. They are named `cam0`, `cam1` ...
     pub cameras: usize,
-    /// How they stand. Default: [`Layout::Ring`].
+    /// Arrangement of the cameras. Default: [`Layout::Ring`].
     pub layout: Layout,
     /// Columns and rows of their images. Default 1920 x 1080.
     pub size_px: [u32; 2],
     /// Focal length, pixels. Default 960: a field of view of 90 degrees across.
     pub focal_px: f64,
-    /// Farther away than this a camera sees nothing, m. Default 2000.
+    /// Range beyond which a camera sees nothing, m. Default 2000.
     pub range_m: f64,
-    /// Exposures a second of each camera, spread evenly among them. Default 30.
+    /// Exposures per second of each camera; those of different cameras are spread evenly in time.
+    /// Default 30.
     pub rate_hz: f64,
     /// Probability that a target in the image is reported. Default 0.95.
     pub detection_probability: f64,
-    /// False bearings that an exposure is expected to bring (Poisson), anywhere in the image.
-    /// Default 1.
+    /// Expected number of false bearings per exposure (Poisson), anywhere in the image. Default 1.
     pub clutter: f64,
     /// Standard deviation of a bearing, rad per axis. Default 0.0005.
     pub noise_rad: f64,
@@ -103,26 +104,26 @@ impl Default for Site {
 pub struct SiteCamera {
     /// Its name.
     pub name: CameraName,
-    /// Its model and place.
+    /// Its model and pose.
     pub camera: Camera,
     /// True time of its first exposure, s.
     pub phase_s: f64,
 }
 
-/// What one camera reports at one time.
+/// One exposure of one camera: the bearings that it reports at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SiteExposure {
-    /// Which camera, by its place in [`SimulatedSite::cameras`].
+    /// The camera, as its index in [`SimulatedSite::cameras`].
     pub camera: usize,
     /// True time, s from the start; the frame's capture time, without error.
     pub time_s: f64,
     /// The message.
     pub frame: BearingFrame,
-    /// Of each of the frame's bearings the target, and `None` for clutter: for scoring only.
+    /// For each bearing of the frame its target, and `None` for clutter: for scoring only.
     pub sources: Vec<Option<u64>>,
 }
 
-/// A site whose targets fly.
+/// A built site with the flights of its targets.
 #[derive(Clone, Debug)]
 pub struct SimulatedSite {
     description: Site,
@@ -131,7 +132,7 @@ pub struct SimulatedSite {
 }
 
 impl Site {
-    /// The site ready to be looked at.
+    /// Checks the description and builds the site.
     ///
     /// # Errors
     /// [`SceneError`] naming the number that makes no sense.
@@ -214,7 +215,8 @@ impl Site {
     fn pose(&self, index: usize) -> Result<Pose, GeometryError> {
         let [low, high] = self.heights_m;
         let middle = (low + high) / 2.0;
-        // No two at one height: what lies in one plane is not well seen.
+        // Three heights in turn, so that not all cameras lie in one plane: that is poorly
+        // observable.
         let mast = MAST_M * (1 + index % 3) as f64;
         let half = Vector2::from(self.area_m) / 2.0;
         match self.layout {
@@ -241,7 +243,7 @@ impl Site {
 }
 
 impl SimulatedSite {
-    /// What it was made from.
+    /// The description it was built from.
     pub fn description(&self) -> &Site {
         &self.description
     }
@@ -251,7 +253,7 @@ impl SimulatedSite {
         &self.cameras
     }
 
-    /// What a fusion centre has to know of every camera.
+    /// The calibrations that a fusion centre needs, one per camera.
     pub fn calibrations(&self) -> Vec<CameraCalibration> {
         let message = |c: &SiteCamera| {
             CameraCalibration::new(&c.name, &c.camera, Timestamp::EPOCH).with_pose_sd(0.0, 0.0)
@@ -259,7 +261,7 @@ impl SimulatedSite {
         self.cameras.iter().map(message).collect()
     }
 
-    /// Where every target is at a true time, s from the start; their ids are 0, 1 ...
+    /// The state of every target at a true time, s from the start; their ids are 0, 1 ...
     pub fn truth(&self, t: f64) -> impl Iterator<Item = TargetState> + '_ {
         self.flights.iter().zip(0..).map(move |(flight, id)| {
             let (position, velocity) = flight.state(t);
@@ -267,12 +269,12 @@ impl SimulatedSite {
         })
     }
 
-    /// How many cameras have a place in their field of view and within their range.
+    /// Number of cameras that have a place in their field of view and within their range.
     pub fn cameras_that_see(&self, place: Point3<f64>) -> usize {
         self.cameras.iter().filter(|c| self.sees(&c.camera, place)).count()
     }
 
-    /// How many exposures all cameras take together.
+    /// Total number of exposures of all cameras.
     pub fn exposures(&self) -> u64 {
         let Site { duration_s, rate_hz, .. } = self.description;
         let of = |c: &SiteCamera| ((duration_s - c.phase_s) * rate_hz).ceil().max(0.0) as u64;
@@ -284,19 +286,20 @@ impl SimulatedSite {
         (0..self.exposures()).map(|index| self.exposure(index))
     }
 
-    /// One exposure, counted over all cameras in order of time; the same whenever it is asked for.
+    /// The exposure with this index, counted over all cameras in order of time. Each call gives the
+    /// same.
     pub fn exposure(&self, index: u64) -> SiteExposure {
         let cameras = self.cameras.len() as u64;
         let (sequence, which) = (index / cameras, (index % cameras) as usize);
         let SiteCamera { name, camera, phase_s } = &self.cameras[which];
         let time_s = phase_s + sequence as f64 / self.description.rate_hz;
         let mut rng = ChaCha8Rng::seed_from_u64(self.description.seed);
-        // The targets' flights have the streams before these.
+        // The lower streams belong to the targets' flights.
         rng.set_stream((1 << 32) + index);
         let mut bearings = self.detections(camera, time_s, &mut rng);
         bearings
             .extend(self.clutter(camera, &mut rng).into_iter().map(|direction| (direction, None)));
-        // Nobody must tell them by their order.
+        // Shuffled, so that clutter cannot be told from targets by its order.
         bearings.shuffle(&mut rng);
         let numbered = (sequence * NUMBERS_PER_EXPOSURE..).zip(&bearings);
         let tracks = numbered.map(|(number, (bearing, _))| self.track(number, camera, bearing));
@@ -316,7 +319,7 @@ impl SimulatedSite {
         (place - camera.pose().position()).norm() <= self.description.range_m && camera.sees(place)
     }
 
-    /// Directions in the camera's frame in which targets are reported.
+    /// Detections: measured directions in the camera's frame, with the target of each.
     fn detections(
         &self,
         camera: &Camera,
@@ -340,9 +343,9 @@ impl SimulatedSite {
         found
     }
 
-    /// Directions in the camera's frame in which nothing is.
+    /// Clutter: random directions in the camera's frame.
     fn clutter(&self, camera: &Camera, rng: &mut ChaCha8Rng) -> Vec<Unit<Vector3<f64>>> {
-        // A mean of zero has no distribution, and no clutter.
+        // For a mean of zero there is no Poisson distribution, and no clutter.
         let count =
             Poisson::new(self.description.clutter).map_or(0.0, |poisson| poisson.sample(rng));
         let [width, height] = self.description.size_px.map(|side| f64::from(side) - 1.0);

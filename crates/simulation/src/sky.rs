@@ -3,18 +3,18 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Brightness at the horizon's side and the zenith's side of the image, 8-bit levels.
+/// Brightness at the lower (horizon) and the upper (zenith) edge of the image, 8-bit levels.
 const GRADIENT: [f32; 2] = [190.0, 130.0];
-/// Strength of the coarsest clouds, levels; each finer octave has half of it.
+/// Amplitude of the coarsest clouds, 8-bit levels; each finer octave has half of it.
 const CLOUDS: f32 = 22.0;
 /// Size of the coarsest clouds, pixels.
 const COARSEST: usize = 160;
 const OCTAVES: u32 = 5;
 
-/// Knots of the coarsest clouds and all others after which they come again, where a camera turns.
+/// Period of a panorama's clouds in knots, in every octave: after this many the clouds repeat.
 const PERIOD: usize = 64;
 
-/// A sky of a size, row by row.
+/// A sky of `width` by `height` pixels, row by row.
 pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut samples = gradient(width, height);
@@ -32,7 +32,7 @@ pub(crate) fn sky(width: usize, height: usize, seed: u64) -> Vec<f32> {
     samples
 }
 
-/// Brightness that falls from the horizon's side to the zenith's.
+/// Brightness that falls from the lower edge to the upper one.
 fn gradient(width: usize, height: usize) -> Vec<f32> {
     let level = |index: usize| {
         let up = 1.0 - (index / width) as f32 / height as f32;
@@ -46,7 +46,7 @@ fn cell_and_strength(octave: u32) -> (usize, f32) {
     ((COARSEST >> octave).max(2), CLOUDS / (1 << octave) as f32)
 }
 
-/// Between the knots at the corners of a cell, smoothly.
+/// Interpolates between the knots at the corners of a cell, by smoothstep weights `t^2 (3 - 2 t)`.
 fn between(corner: impl Fn(usize, usize) -> f32, [x, y]: [usize; 2], cell: usize) -> f32 {
     let smooth = |offset: usize| {
         let t = offset as f32 / cell as f32;
@@ -58,7 +58,7 @@ fn between(corner: impl Fn(usize, usize) -> f32, [x, y]: [usize; 2], cell: usize
     upper * (1.0 - ty) + lower * ty
 }
 
-/// A sky all about, of which a camera that turns sees a part: clouds that come again and again.
+/// A periodic sky all around, of which a camera that turns sees a part.
 #[derive(Clone, Debug)]
 pub(crate) struct Panorama {
     octaves: Vec<Vec<f32>>,
@@ -71,7 +71,8 @@ impl Panorama {
         Self { octaves: (0..OCTAVES).map(|_| knots()).collect() }
     }
 
-    /// The part that begins so many pixels to the right and below of its middle, row by row.
+    /// The part that begins `left` pixels to the right of the panorama's origin and `top` pixels
+    /// below it, row by row.
     pub(crate) fn part(&self, [left, top]: [i64; 2], width: usize, height: usize) -> Vec<f32> {
         let mut samples = gradient(width, height);
         for (octave, knots) in (0..).zip(&self.octaves) {

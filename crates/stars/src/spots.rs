@@ -1,4 +1,4 @@
-//! What shines like a star in a picture.
+//! Detection of what looks like a star in a picture.
 
 use crossfix_geometry::Pixel;
 use tetra3::{CentroidExtractionConfig, DeblendMode, extract_centroids_from_raw};
@@ -16,33 +16,33 @@ pub struct Picture<'a> {
     pub brightness: &'a [f32],
 }
 
-/// Something that shines like a star.
+/// Something that looks like a star.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spot {
-    /// Its middle.
+    /// Its centre.
     pub pixel: Pixel,
-    /// What it adds to the background, summed over its pixels, in the picture's unit.
+    /// Its excess over the background, summed over its pixels, in the picture's unit.
     pub brightness: f64,
 }
 
-/// More than this many spots are lights of a town, or noise; the brightest are kept.
+/// Largest number of spots: more are lights of a town, or noise; the brightest are kept.
 const MOST_SPOTS: usize = 600;
 
-/// Finds what shines like a star: small, round, against what is round it. Brightest first.
+/// Finds what looks like a star: small, round, brighter than its surroundings. Brightest first.
 ///
 /// # Errors
-/// [`StarError::Picture`], for one without pixels.
+/// [`StarError::Picture`], for a picture without pixels.
 pub fn find_spots(picture: &Picture<'_>) -> Result<Vec<Spot>, StarError> {
     let Picture { width, height, brightness } = *picture;
     let config = CentroidExtractionConfig {
         max_centroids: Some(MOST_SPOTS),
-        // Two stars in one spot have their middle beside both.
+        // The centroid of two stars in one spot would lie on neither.
         deblend: DeblendMode::Reject,
         ..CentroidExtractionConfig::default()
     };
     let found = extract_centroids_from_raw(brightness, width, height, &config)
         .map_err(|error| StarError::Picture(error.to_string()))?;
-    // Counted from the middle of the image there, from the first pixel's middle here.
+    // The library counts from the middle of the image, pixels here from the middle of the first.
     let spot = |centroid: &tetra3::Centroid| Spot {
         pixel: Pixel::new(
             f64::from(centroid.x) + (f64::from(width) - 1.0) / 2.0,

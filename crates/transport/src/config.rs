@@ -10,14 +10,14 @@ use thiserror::Error;
 
 use crate::security::{Identity, Security};
 
-/// Who connects to whom.
+/// Which components connect to which.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
-    /// Everybody to those who are listed before him.
+    /// Each component connects to those that are listed before it.
     #[default]
     Peer,
-    /// Everybody to a Zenoh router.
+    /// Each component connects to a Zenoh router.
     Client,
 }
 
@@ -29,8 +29,8 @@ pub struct Anchor {
     pub latitude_deg: f64,
     /// Degrees east, -180 to 180.
     pub longitude_deg: f64,
-    /// Metres above the ellipsoid: what a GNSS receiver says plus its geoid height, if it says heights
-    /// above the sea.
+    /// Metres above the ellipsoid. For a GNSS receiver that gives heights above the sea, add its
+    /// geoid height.
     pub height_m: f64,
 }
 
@@ -40,8 +40,8 @@ pub struct Anchor {
 pub struct Area {
     /// The fusion centre's endpoint.
     pub fusion: String,
-    /// The cameras that it hears. Those that see into two areas belong to both: where they see a
-    /// target it passes from the one to the other.
+    /// The cameras that it hears. A camera that sees into two areas belongs to both: where it sees
+    /// a target, the target is handed over from one area to the other.
     pub cameras: Vec<CameraName>,
 }
 
@@ -57,8 +57,8 @@ pub struct NetworkConfig {
     /// Endpoints of Zenoh routers, with `mode = "client"`, e.g. `tcp/10.0.0.1:7447`.
     #[serde(default)]
     pub routers: Vec<String>,
-    /// `true`: components listen beyond their own host although nothing is encrypted and anybody may
-    /// say anything. Without it and without `[security]` they listen on loopback only.
+    /// `true`: components listen beyond their own host although nothing is encrypted and anybody
+    /// may publish anything. Without it and without `[security]` they listen on loopback only.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unsecured: bool,
     /// The fusion centre's endpoint, e.g. `tcp/127.0.0.1:7450`; absent where there are `areas`.
@@ -69,26 +69,27 @@ pub struct NetworkConfig {
     /// The areas of a site that is too large for one fusion centre.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub areas: BTreeMap<AreaName, Area>,
-    /// Where on the Earth the site is: what tells others where its targets are needs it.
+    /// Where on Earth the site is; needed by outlets, which tell other programs where its targets
+    /// are.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub anchor: Option<Anchor>,
-    /// Certificates: with them every link is mutual TLS, also where its endpoint says `tcp/`, and
-    /// each component may say only what is its own.
+    /// Certificates: with them every link is mutual TLS, even if its endpoint says `tcp/`, and each
+    /// component may publish only its own messages.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security: Option<Security>,
 }
 
-/// What is wrong with a network's configuration.
+/// Errors in a network's configuration.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum NetworkError {
-    /// An endpoint that is none.
+    /// An endpoint of a wrong form.
     #[error(
         "the endpoint `{endpoint}` of `{of}` is not of the form tcp/HOST:PORT, nor tls/HOST:PORT with [security]"
     )]
     Endpoint {
-        /// Whose.
+        /// Whose endpoint.
         of: String,
-        /// What it is.
+        /// The endpoint.
         endpoint: String,
     },
     /// Two components on one endpoint.
@@ -98,7 +99,7 @@ pub enum NetworkError {
         one: String,
         /// The second.
         other: String,
-        /// Theirs.
+        /// Their endpoint.
         endpoint: String,
     },
     /// A client without a router.
@@ -107,13 +108,13 @@ pub enum NetworkError {
     /// A camera that the network does not know.
     #[error("camera `{0}` has no endpoint: add it to [cameras] of the network file")]
     UnknownCamera(CameraName),
-    /// Nobody fuses, or too many.
+    /// Neither `fusion` nor areas, or both.
     #[error("name the fusion centre's endpoint as `fusion`, or each area's in [areas], not both")]
     Centres,
     /// An area that the network does not know.
     #[error("the network has no area `{0}`: add it as [areas.{0}]")]
     UnknownArea(AreaName),
-    /// Which of several areas is not said.
+    /// It is not said which of several areas.
     #[error("the network has areas: say by `area` of the fusion centre's file which is its own")]
     WhichArea,
     /// An area's camera that the network does not know.
@@ -124,13 +125,13 @@ pub enum NetworkError {
         /// The camera.
         camera: CameraName,
     },
-    /// An area that could place no target.
+    /// An area with fewer than two distinct cameras, which could place no target.
     #[error("area `{0}` needs two cameras or more, each named once: one alone places no target")]
     CamerasOfArea(AreaName),
     /// A camera that no fusion centre hears.
     #[error("camera `{0}` is in no area: nobody would hear it")]
     CameraOfNoArea(CameraName),
-    /// Anybody could say anything.
+    /// Components would listen beyond their host although anybody could publish anything.
     #[error(
         "{0} can be reached from other hosts, and the network has no [security]: anybody there could \
          add cameras and tracks. Run `crossfix enroll`, or set `unsecured = true` in the network file"
@@ -144,30 +145,31 @@ pub enum NetworkError {
     NobodysIdentity,
 }
 
-/// What a session is for.
+/// The component that a session is for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Role {
     /// A camera's agent.
     Camera(CameraName),
     /// The fusion centre: an area's, or the only one.
     Fusion(Option<AreaName>),
-    /// A recorder: listens nowhere, hears everybody, says how it does.
+    /// A recorder: does not listen, hears everything, publishes its health.
     Recorder,
-    /// A viewer, a status, an outlet: listens nowhere, hears everybody, says nothing.
+    /// A viewer, a status display or an outlet: does not listen, hears everything, publishes
+    /// nothing.
     Observer,
-    /// A Zenoh router that listens at some endpoints: carries everybody's messages.
+    /// A Zenoh router, which listens at its own endpoints and carries all messages.
     Router {
         /// Where it listens.
         listen: Vec<String>,
     },
-    /// Stands in for all cameras, and where it brings tracks too for the fusion centre: a replay.
+    /// A replay, which stands in for all cameras and, if it has tracks too, for the fusion centre.
     Cameras {
         /// Whether it stands in for the fusion centre as well.
         and_fusion: bool,
     },
 }
 
-/// The host and the port of an endpoint: what follows `tcp/` or `tls/`.
+/// The host and port of an endpoint: what follows `tcp/` or `tls/`.
 ///
 /// ```
 /// assert_eq!(crossfix_transport::address("tcp/10.0.0.1:7450"), "10.0.0.1:7450");
@@ -182,14 +184,14 @@ pub fn host_of(endpoint: &str) -> &str {
     address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']'])
 }
 
-/// Whether an endpoint can be reached from this host alone.
+/// Whether an endpoint can be reached from this host only.
 fn is_loopback(endpoint: &str) -> bool {
     let host = host_of(endpoint);
     host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
 }
 
 impl Role {
-    /// Whose certificate it shows; `None` of what stands in for several.
+    /// The identity whose certificate it shows; `None` if it stands in for several components.
     pub fn identity(&self) -> Option<Identity> {
         match self {
             Self::Camera(name) => Some(Identity::Camera(name.clone())),
@@ -203,26 +205,26 @@ impl Role {
 }
 
 impl NetworkConfig {
-    /// Whether an endpoint is of a form that this network can have.
+    /// Whether an endpoint has a form that is allowed in this network.
     fn is_endpoint(&self, text: &str) -> bool {
         let known =
             text.starts_with("tcp/") || (text.starts_with("tls/") && self.security.is_some());
         let Some((host, port)) = address(text).rsplit_once(':').filter(|_| known) else {
             return false;
         };
-        // Behind a `#` or `?` Zenoh would take settings, such as to do without certificates.
+        // After a `#` or `?` Zenoh would read settings, such as one that turns certificates off.
         let is_host = |c: char| c.is_ascii_alphanumeric() || "-._:[]%".contains(c);
         let is_named = !host.is_empty() && host.chars().all(is_host);
         is_named && port.parse::<u16>().is_ok_and(|port| port > 0)
     }
 
-    /// An endpoint as it is spoken: by TLS where there are certificates.
+    /// An endpoint with the protocol that is used: TLS if there are certificates.
     fn spoken(&self, endpoint: &str) -> String {
         let protocol = if self.security.is_some() { "tls" } else { "tcp" };
         format!("{protocol}/{}", address(endpoint))
     }
 
-    /// Checks that who listens is not there for everybody.
+    /// Checks that an unsecured component does not listen beyond its host.
     fn check_reach(&self, listen: &[String]) -> Result<(), NetworkError> {
         if self.security.is_some() || self.unsecured {
             return Ok(());
@@ -287,14 +289,15 @@ impl NetworkConfig {
             .map_or(Ok(()), Err)
     }
 
-    /// The fusion centres, each with its area where there are several, and their endpoints.
+    /// The fusion centres, each with its area if there are several, and their endpoints.
     pub fn centres(&self) -> impl Iterator<Item = (Option<AreaName>, &str)> {
         let only = self.fusion.iter().map(|endpoint| (None, endpoint.as_str()));
         let of_areas = self.areas.iter();
         only.chain(of_areas.map(|(area, of)| (Some(area.clone()), of.fusion.as_str())))
     }
 
-    /// Whether a key is of a camera or of a fusion centre of this network, or of neither kind.
+    /// Whether a key belongs to a camera or fusion centre of this network, or to neither kind of
+    /// component.
     pub fn names(&self, key: &Key) -> bool {
         match &key.channel {
             channel if channel.camera().is_some() => {
@@ -305,14 +308,14 @@ impl NetworkConfig {
         }
     }
 
-    /// The areas that hear a camera, by name; none where there is one fusion centre for all. The
-    /// first is the one that tells it what to look for.
+    /// The areas that hear a camera, by name; empty if there is one fusion centre for all. The
+    /// first area is the one that cues the camera.
     pub fn heard_by(&self, camera: &CameraName) -> Vec<AreaName> {
         let hear = |(_, of): &(&AreaName, &Area)| of.cameras.contains(camera);
         self.areas.iter().filter(hear).map(|(area, _)| area.clone()).collect()
     }
 
-    /// The fusion centres that hear a camera, by their areas.
+    /// The areas of the fusion centres that hear a camera; `None` stands for the only one.
     pub fn centres_of(&self, camera: &CameraName) -> Vec<Option<AreaName>> {
         let heard_by = self.heard_by(camera);
         let hears = |area: &Option<AreaName>| area.as_ref().is_none_or(|a| heard_by.contains(a));
@@ -334,7 +337,7 @@ impl NetworkConfig {
         }
     }
 
-    /// The areas that share a camera with one: targets pass from it to them.
+    /// The areas that share a camera with `area`: targets are handed over to them.
     pub fn neighbours(&self, area: &AreaName) -> Vec<AreaName> {
         let Some(own) = self.areas.get(area) else { return Vec::new() };
         let is_beside = |(name, of): &(&AreaName, &Area)| {
@@ -343,14 +346,14 @@ impl NetworkConfig {
         self.areas.iter().filter(is_beside).map(|(name, _)| name.clone()).collect()
     }
 
-    /// The first endpoint beyond this host that a session connects to with nothing encrypted; `None`
-    /// where there is none.
+    /// The first endpoint beyond this host that a session connects to without encryption; `None` if
+    /// there is none.
     pub fn unencrypted(&self, role: &Role) -> Option<String> {
         let (_, connect) = self.declared(role).ok().filter(|_| self.security.is_none())?;
         connect.into_iter().find(|endpoint| !is_loopback(endpoint))
     }
 
-    /// Where a session listens and whom it connects to.
+    /// The endpoints at which a session listens, and those that it connects to.
     pub(crate) fn endpoints(
         &self,
         role: &Role,
@@ -362,7 +365,7 @@ impl NetworkConfig {
         Ok((spoken(listen), spoken(connect)))
     }
 
-    /// The same as the file says them.
+    /// The same endpoints as the file states them, before the protocol is chosen.
     fn declared(&self, role: &Role) -> Result<(Vec<String>, Vec<String>), NetworkError> {
         if let Role::Router { listen } = role {
             let others = self.routers.iter().filter(|router| !listen.contains(router));
@@ -392,8 +395,8 @@ impl NetworkConfig {
         })
     }
 
-    /// A fusion centre connects to its cameras, and to those of the areas beside that come before it
-    /// by name: one link is enough for both.
+    /// A fusion centre connects to its cameras, and to neighbouring fusion centres whose area comes
+    /// before its own by name: so each pair has one link.
     fn declared_of_centre(
         &self,
         area: Option<&AreaName>,

@@ -21,36 +21,37 @@ use crate::subscription::Intake;
 use crate::{Mode, NetworkConfig, NetworkError, Origin, Presence, Role, RunId, Subscription};
 
 /// Batches of 64 kB that wait for one slow receiver of bearings and tracks before it loses the
-/// next: 1 MB, the most that Zenoh takes. Half as much, and a burst of a thousand tracks is lost to
-/// a good receiver.
+/// next: 1 MB, the most that Zenoh takes. With half of it, a good receiver loses part of a burst of
+/// a thousand tracks.
 const QUEUED_BATCHES: u32 = 16;
-/// The same of pictures: what a slow receiver sees is at most this much old.
+/// The same for pictures, so that what a slow receiver sees is at most this much old.
 const PICTURE_BATCHES: u32 = 4;
-/// Bytes that the system holds for one receiver beyond that. Left to itself it takes four
-/// megabytes, and a receiver behind 5 kB per second would be told of tracks a quarter of an hour old
+/// Bytes that the operating system holds for one receiver besides that. Its own default is four
+/// megabytes: then a receiver behind 5 kB per second would get tracks a quarter of an hour old
 /// before it loses one.
 const SEND_BUFFER_BYTES: u32 = 256 << 10;
 /// How long opening a link may take, ms: with a one-way delay of 700 ms two exchanges take three
-/// seconds. Whoever waits for a router that does not answer at all has a word of it within five.
+/// seconds. A program that waits for a router that does not answer at all can report that within
+/// five seconds.
 const OPEN_TIMEOUT_MS: u32 = 4000;
-/// A peer that has not been heard for this long is gone, ms.
+/// A peer that has not been heard for this long is taken as gone, ms.
 const LEASE_MS: u32 = 3000;
-/// How often a router that does not answer is tried.
+/// Interval at which a router that does not answer is tried again.
 const RETRY_PERIOD: Duration = Duration::from_millis(500);
 
-/// How often a liveliness query is repeated while waiting.
+/// How long a liveliness query may take; while waiting it is repeated.
 const ALIVE_PERIOD: Duration = Duration::from_millis(200);
 
 /// What can go wrong with the network.
 #[derive(Debug, Error)]
 pub enum LinkError {
-    /// The configuration.
+    /// The configuration is impossible.
     #[error("the network's configuration is impossible")]
     Config(#[source] NetworkError),
-    /// This component's certificate.
+    /// This component's certificate cannot be used.
     #[error("this component cannot show who it is")]
     Credentials(#[source] CredentialsError),
-    /// Zenoh says no.
+    /// Zenoh reports an error.
     #[error("{what}")]
     Zenoh {
         /// What was tried.
@@ -59,7 +60,7 @@ pub enum LinkError {
         #[source]
         source: Box<dyn Error + Send + Sync>,
     },
-    /// An endpoint of our own that cannot be listened on.
+    /// One of this component's own endpoints cannot be listened on.
     #[error("cannot listen on {endpoint}: {}", why_not(source))]
     Listen {
         /// The endpoint.
@@ -70,13 +71,13 @@ pub enum LinkError {
     /// No router answers.
     #[error("no Zenoh router answers at {}", routers.join(", "))]
     NoRouter {
-        /// Where they were looked for.
+        /// Their endpoints.
         routers: Vec<String>,
         /// What Zenoh says.
         #[source]
         source: Box<dyn Error + Send + Sync>,
     },
-    /// Somebody did not come.
+    /// A component did not come in time.
     #[error("`{0}` is not alive")]
     NotAlive(String),
 }
@@ -86,13 +87,13 @@ fn zenoh(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> LinkError {
     move |source| LinkError::Zenoh { what, source: said(&source) }
 }
 
-/// What Zenoh says, without the place in its own source code where it says it.
+/// Zenoh's message, without the position in its own source code.
 fn said(error: &zenoh::Error) -> Box<dyn Error + Send + Sync> {
     let text = error.to_string();
     text.split(" at /").next().unwrap_or(&text).trim().to_owned().into()
 }
 
-/// What people can do about an endpoint that cannot be listened on.
+/// In words: what people can do about an endpoint that cannot be listened on.
 fn why_not(error: &io::Error) -> String {
     match error.kind() {
         io::ErrorKind::AddrInUse => "another program on this machine uses it".to_owned(),
@@ -102,25 +103,25 @@ fn why_not(error: &io::Error) -> String {
     }
 }
 
-/// What becomes of a message when a receiver is slow.
+/// What happens to a message if a receiver is slow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// It waits for that receiver, and if too many wait, that receiver loses it and counts it.
-    /// Nobody else is held up: for all that is published while life goes on.
+    /// The message waits for that receiver. If too many wait, that receiver loses the message and
+    /// counts it. Nobody else is delayed: for all that is published live.
     Queued,
     /// The publisher waits, and so do all other receivers: for sources that are played as fast as
-    /// it goes.
+    /// possible.
     Every,
-    /// As queued, but behind everything else: pictures.
+    /// As queued, but behind all other messages: pictures.
     Picture,
 }
 
-/// A session with the site's network. Lost connections are made again by themselves.
+/// A session with the site's network. Lost connections are restored automatically.
 #[derive(Debug)]
 pub struct Link {
     session: Session,
     site: SiteName,
-    /// Of a fusion centre that is one of several.
+    /// The area of a fusion centre that is one of several.
     area: Option<AreaName>,
     run: RunId,
     shown: Option<OwnCertificate>,
@@ -131,15 +132,17 @@ pub struct Link {
 pub struct OwnCertificate {
     security: Security,
     identity: Identity,
-    /// Of the one that was there at the start, which is what a component that listens goes on showing.
+    /// Validity of the certificate at the start, which a listening component goes on showing.
     at_start: Validity,
     listens: bool,
 }
 
 impl OwnCertificate {
-    /// What is wrong with it at a time, in words: it is to be renewed, or cannot be read.
+    /// What is wrong with the certificate at a time, in words: it must be renewed, or cannot be
+    /// read.
     ///
-    /// What connects reads its file for each connection, what listens at its start alone.
+    /// A component that connects reads its file for each connection; one that listens reads it at
+    /// its start only.
     pub fn problem(&self, now: SystemTime) -> Option<String> {
         let mend = "run `crossfix enroll`, copy it here, and start this again";
         let shown = match Credentials::load(&self.security, &self.identity, now) {
@@ -154,8 +157,9 @@ impl OwnCertificate {
         })
     }
 
-    /// Why there is no link with whoever answers at an endpoint, in words; `None` where nobody answers,
-    /// or nothing is wrong with either certificate. Takes two seconds at most: not for a main loop.
+    /// Why there is no link with the component at an endpoint, in words; `None` if nobody answers,
+    /// or nothing is wrong with either certificate. Takes two seconds at most, so it is not for a
+    /// main loop.
     pub fn why_no_link(&self, endpoint: &str) -> Option<String> {
         let credentials = match Credentials::load(&self.security, &self.identity, SystemTime::now())
         {
@@ -169,7 +173,8 @@ impl OwnCertificate {
     }
 }
 
-/// What it takes to show who this is, and to take from others only what is theirs to say.
+/// Zenoh's settings by which this component shows its identity, and accepts from others only what
+/// each may publish.
 fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>, LinkError> {
     let Some(security) = &network.security else {
         return Ok(Vec::new());
@@ -185,7 +190,7 @@ fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>
         "listen_certificate": own, "listen_private_key": key,
         "connect_certificate": own, "connect_private_key": key,
         "enable_mtls": true, "verify_name_on_connect": true,
-        // Who holds on to a link does not outlive the certificate.
+        // A link is closed when its certificate ends.
         "close_link_on_expiration": true,
         "so_sndbuf": SEND_BUFFER_BYTES,
     });
@@ -196,7 +201,7 @@ fn secured(network: &NetworkConfig, role: &Role) -> Result<Vec<(String, String)>
     ])
 }
 
-/// The certificate that a session shows, checked; `None` where the network has none.
+/// The certificate that a session shows, checked; `None` if the network has none.
 fn own_certificate(
     network: &NetworkConfig,
     role: &Role,
@@ -215,8 +220,8 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
     network.validate().map_err(LinkError::Config)?;
     let (listen, connect) = network.endpoints(role).map_err(LinkError::Config)?;
     let is_router = matches!(role, Role::Router { .. });
-    // A client is told at once that no router is there, and tries again itself: Zenoh would not
-    // come back.
+    // A client is told at once that no router is there, and this program tries again: Zenoh itself
+    // would not.
     let (mode, patience) = match network.mode {
         _ if is_router => ("router", "-1"),
         Mode::Peer => ("peer", "-1"),
@@ -240,11 +245,11 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
         (queue("data"), QUEUED_BATCHES.to_string()),
         (queue("data_low"), PICTURE_BATCHES.to_string()),
         ("transport/link/tcp/so_sndbuf".to_owned(), SEND_BUFFER_BYTES.to_string()),
-        // A longer message is given up before it is whole.
+        // A message that gets longer than this is discarded before it is whole.
         ("transport/link/rx/max_message_size".to_owned(), (2 * MAX_MESSAGE_BYTES).to_string()),
         ("scouting/multicast/enabled".to_owned(), "false".to_owned()),
         ("scouting/gossip/enabled".to_owned(), "false".to_owned()),
-        // How long opening waits for peers that are not up yet.
+        // How long opening waits for peers that are not up yet, ms.
         ("scouting/delay".to_owned(), "200".to_owned()),
     ];
     for (key, value) in settings.into_iter().chain(secured(network, role)?) {
@@ -254,7 +259,7 @@ fn config(network: &NetworkConfig, role: &Role) -> Result<Config, LinkError> {
 }
 
 impl Link {
-    /// Opens a session. Those it connects to need not be there yet, but for a router.
+    /// Opens a session. The components that it connects to need not be up yet, except for a router.
     ///
     /// # Errors
     /// [`LinkError`] if the configuration is impossible, an endpoint cannot be listened on, or no
@@ -264,7 +269,7 @@ impl Link {
         let shown = own_certificate(network, role)?;
         let session =
             zenoh::open(config).wait().map_err(|source| explain(network, role, &source))?;
-        // The first half of what Zenoh draws for every session.
+        // The run is the first half of the random identity that Zenoh draws for every session.
         let bytes = session.zid().to_le_bytes();
         let run = bytes.first_chunk().map_or(0, |half| u64::from_le_bytes(*half));
         let area = match role {
@@ -274,7 +279,7 @@ impl Link {
         Ok(Self { session, site: network.site.clone(), area, run: RunId(run), shown })
     }
 
-    /// Opens a session, and tries again where no router answers for as long as `go_on` says.
+    /// Opens a session; while no router answers, tries again as long as `go_on` returns `true`.
     ///
     /// # Errors
     /// [`LinkError`] of the last try.
@@ -303,13 +308,13 @@ impl Link {
         &self.site
     }
 
-    /// What it shows the others, where the network has certificates.
+    /// The certificate that it shows to others, if the network has certificates.
     pub fn certificate(&self) -> Option<&OwnCertificate> {
         self.shown.as_ref()
     }
 
-    /// The key of a channel of the site, as this component says it: a fusion centre that is one of
-    /// several, as its area's.
+    /// The key of a channel as this component publishes it; that of a fusion centre that is one of
+    /// several includes its area.
     pub fn key(&self, channel: Channel) -> Key {
         Key::of_centre(self.site.clone(), self.area.clone(), channel)
     }
@@ -326,7 +331,7 @@ impl Link {
         self.publisher_of(self.area.clone(), channel, delivery)
     }
 
-    /// The same in the place of an area's fusion centre.
+    /// The same as if by the fusion centre of `area`.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -352,8 +357,7 @@ impl Link {
         Ok(LinkPublisher { publisher, run: self.run, published: AtomicU64::new(0) })
     }
 
-    /// Publishes one message on any key of any site, without saying who sends it, as other programs
-    /// do.
+    /// Publishes one message on any key of any site without an origin, as other programs do.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -365,8 +369,8 @@ impl Link {
             .map_err(zenoh(format!("cannot publish on `{key}`")))
     }
 
-    /// Subscribes to key expressions; foreign keys are left out. What one peer sends comes in the
-    /// order in which it was sent, whatever the keys.
+    /// Subscribes to key expressions; messages on keys that are not Crossfix's are left out.
+    /// Messages of one peer come in the order in which they were sent, whatever their keys.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -385,19 +389,20 @@ impl Link {
         Ok(subscription)
     }
 
-    /// Watches who is there.
+    /// Watches which components are alive.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
     pub fn presence(&self) -> Result<Presence, LinkError> {
-        // The only fusion centre and the recorder are beside the cameras.
+        // The first covers the cameras, the recorder and an only fusion centre, the second the
+        // areas' fusion centres.
         let expressions =
             [Key::of_all_cameras, Key::of_all_areas].map(|of_all| of_all(&self.site, "alive"));
         Presence::watch(&self.session, &expressions)
             .map_err(zenoh(format!("cannot watch who is there on `{}`", expressions.join("`, `"))))
     }
 
-    /// Says that this component is alive for as long as the token lives.
+    /// Declares that this component is alive, for as long as the token lives.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -405,7 +410,7 @@ impl Link {
         self.declare_alive_of(self.area.clone(), channel)
     }
 
-    /// The same in the place of an area's fusion centre.
+    /// The same as if by the fusion centre of `area`.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`].
@@ -440,10 +445,11 @@ impl Link {
         Ok(replies.recv().is_ok_and(|reply| reply.result().is_ok()))
     }
 
-    /// Waits until all of some components are alive.
+    /// Waits until all of several components are alive; gives up after `patience`, or when `go_on`
+    /// returns `false`.
     ///
     /// # Errors
-    /// [`LinkError::NotAlive`] naming the first that did not come in time.
+    /// [`LinkError::NotAlive`] naming the first component that did not come in time.
     pub fn wait_for(
         &self,
         channels: &[Channel],
@@ -463,13 +469,15 @@ impl Link {
         Ok(())
     }
 
-    /// Sends what still waits and says goodbye; gives up after a while on peers that do not listen.
+    /// Sends what still waits and closes the session; gives up after `patience` on peers that do
+    /// not take it.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`] if Zenoh cannot close it.
     pub fn close(self, patience: Duration) -> Result<(), LinkError> {
         let (done, closed) = channel();
-        // Its own patience is ten seconds, and not kept.
+        // Zenoh's own limit is ten seconds, and it does not keep to it: so another thread closes
+        // the session, and this one waits for `patience` at most.
         std::thread::spawn(move || done.send(self.session.close().wait()));
         match closed.recv_timeout(patience) {
             Ok(result) => result.map_err(zenoh("the Zenoh session did not close")),
@@ -495,7 +503,7 @@ fn explain(network: &NetworkConfig, role: &Role, source: &zenoh::Error) -> LinkE
     LinkError::Zenoh { what: "cannot open a Zenoh session".to_owned(), source: said(source) }
 }
 
-/// Publishes on one key.
+/// A publisher on one key.
 #[derive(Debug)]
 pub struct LinkPublisher {
     publisher: Publisher<'static>,
@@ -517,7 +525,7 @@ impl LinkPublisher {
         })
     }
 
-    /// Whether anybody subscribes to it.
+    /// Whether anybody subscribes to the key.
     ///
     /// # Errors
     /// [`LinkError::Zenoh`] if the session is closed.
@@ -527,7 +535,7 @@ impl LinkPublisher {
     }
 }
 
-/// Says that a component is alive until it is dropped.
+/// Declares a component alive until it is dropped.
 #[derive(Debug)]
 pub struct AliveToken {
     _token: LivelinessToken,

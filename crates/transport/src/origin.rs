@@ -2,7 +2,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// Drawn at random when a session opens: another number is another run of a program.
+/// Identifies a run of a program: drawn at random when a session opens.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(transparent)]
 pub struct RunId(pub u64);
@@ -13,18 +13,18 @@ impl fmt::Display for RunId {
     }
 }
 
-/// Who sent a message, and the how manieth it was on its key: goes beside the message, so that what
-/// is lost on the way to one receiver is counted by that receiver, whatever the message is.
+/// The sender of a message and the message's number on its key. It travels beside the message, so
+/// that each receiver can count what it lost, whatever the message is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Origin {
     /// The sender's run.
     pub run: RunId,
-    /// Counts what that run published on the key, from 0.
+    /// Number of the message among those that the run published on the key, from 0.
     pub sequence: u64,
 }
 
 impl Origin {
-    /// The run, then the sequence number, little end first.
+    /// The run, then the sequence number, little-endian.
     pub(crate) fn to_bytes(self) -> [u8; 16] {
         let mut bytes = [0; 16];
         bytes[..8].copy_from_slice(&self.run.0.to_le_bytes());
@@ -32,7 +32,7 @@ impl Origin {
         bytes
     }
 
-    /// `None` of what another program put there.
+    /// Reads an origin; `None` if the bytes are another program's.
     pub(crate) fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (run, sequence) = bytes.split_first_chunk::<8>()?;
         let sequence: [u8; 8] = sequence.try_into().ok()?;

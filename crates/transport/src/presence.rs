@@ -5,11 +5,10 @@ use crossfix_message::Key;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::SampleKind;
 
-/// Components that are kept count of; more is an attack.
+/// Most components that are tracked; more is an attack.
 const MAX_COMPONENTS: usize = 10_000;
 
-/// Who is there: the components of a site that have said that they are alive and not been lost
-/// since.
+/// The components of a site that are alive: they have declared it and have not been lost since.
 #[derive(Clone, Debug)]
 pub struct Presence {
     alive: Alive,
@@ -43,7 +42,7 @@ impl Presence {
         Ok(Self { alive, _subscribers: Arc::new(subscribers) })
     }
 
-    /// Whether a component is there: its key's channel is one of the `..Alive`.
+    /// Whether a component is alive; the channel of `key` is one of the `..Alive`.
     pub fn is_alive(&self, key: &Key) -> bool {
         self.alive.lock().unwrap_or_else(PoisonError::into_inner).contains(key)
     }

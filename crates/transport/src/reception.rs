@@ -5,18 +5,17 @@ use crossfix_message::Key;
 
 use crate::{Origin, RunId};
 
-/// Runs remembered of a key: the one that publishes, and those before it.
+/// Most runs remembered per key: the one that publishes, and those before it.
 const RUNS_A_KEY: usize = 4;
-/// Keys that are kept count of. A site of 1000 cameras has 5000; more is an attack.
+/// Most keys that are counted. A site of 1000 cameras has 5000; more is an attack.
 const MAX_KEYS: usize = 10_000;
-/// A gap of more than this is no loss but a number that makes no sense: three hours of 100 a
-/// second.
+/// A larger gap is not counted as a loss: the number makes no sense. This is three hours of 100
+/// messages per second.
 const LARGEST_GAP: u64 = 1_000_000;
-/// Two runs that took turns on a key less than this ago are at it still.
+/// Two runs that took turns on a key less than this ago still count as rivals.
 const RIVALRY: Duration = Duration::from_secs(10);
 
-/// Counts what did not arrive of what was published on each key, and notices two that publish on
-/// one.
+/// Counts the messages of each key that did not arrive, and notices two publishers on one key.
 ///
 /// ```
 /// use std::time::Instant;
@@ -40,17 +39,18 @@ pub struct Reception {
     missing: u64,
 }
 
-/// Who has published on a key.
+/// The runs that have published on a key.
 #[derive(Clone, Debug, Default)]
 struct Senders {
-    /// Each run with the sequence number that comes next; the one heard last is the last.
+    /// Each run with the sequence number that is expected next; the run heard most recently is the
+    /// last.
     runs: Vec<(RunId, u64)>,
-    /// When a run came back that another had taken over from.
+    /// When a run last published again after another run had taken over.
     took_turns: Option<Instant>,
 }
 
 impl Reception {
-    /// A message came at a time; returns how many are missing before it.
+    /// Notes a message that came at a time; returns how many are missing before it.
     pub fn see(&mut self, key: &Key, origin: Origin, now: Instant) -> u64 {
         if !self.keys.contains_key(key) && self.keys.len() >= MAX_KEYS {
             return 0;
@@ -58,7 +58,7 @@ impl Reception {
         let senders = self.keys.entry(key.clone()).or_default();
         let known = senders.runs.iter().position(|(run, _)| *run == origin.run);
         let expected = known.map(|index| senders.runs.remove(index).1);
-        // A run that was not the last one heard, and speaks again.
+        // A run that was not the one heard most recently publishes again: two runs take turns.
         if known.is_some_and(|index| index < senders.runs.len()) {
             senders.took_turns = Some(now);
         }
@@ -73,12 +73,12 @@ impl Reception {
         gap
     }
 
-    /// All that was missing so far.
+    /// Number of messages missing so far.
     pub fn missing(&self) -> u64 {
         self.missing
     }
 
-    /// The keys on which two runs take turns now, with the two heard last.
+    /// The keys on which two runs take turns now, each with the two runs heard most recently.
     pub fn rivals(&self, now: Instant) -> Vec<(&Key, [RunId; 2])> {
         let rival = |(key, senders)| {
             let Senders { runs, took_turns }: &Senders = senders;

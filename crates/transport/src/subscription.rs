@@ -9,30 +9,30 @@ use zenoh::sample::{Sample, SampleKind};
 
 use crate::Origin;
 
-/// Messages, and their bytes, that wait for the program before new ones are dropped and counted:
-/// two minutes of a site of 16 cameras at 30 Hz, half as many pictures.
+/// Messages, and their bytes, that may wait for the program before new ones are dropped and
+/// counted: two minutes of a site of 16 cameras at 30 Hz, half as many pictures.
 const MAX_WAITING: usize = 1 << 16;
 const MAX_WAITING_BYTES: usize = 64 << 20;
 
-/// A message that came over a key of Crossfix.
+/// A message that came on a key of Crossfix.
 #[derive(Clone, Debug)]
 pub struct Received {
     /// The key.
     pub key: Key,
     /// The bytes.
     pub data: Vec<u8>,
-    /// Who sent it; `None` of a program that does not say.
+    /// Who sent it; `None` if the sender did not state it.
     pub origin: Option<Origin>,
     /// When it came.
     pub at: Instant,
 }
 
-/// What a subscription did not hand on.
+/// Counts of messages that a subscription did not hand on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Refused {
-    /// Messages that came while the program was too slow.
+    /// Messages that were dropped as too many waited for the program.
     pub dropped: u64,
-    /// Messages longer than any true one.
+    /// Messages longer than any valid one.
     pub too_long: u64,
 }
 
@@ -43,7 +43,7 @@ struct Counts {
     too_long: AtomicU64,
 }
 
-/// What comes in over some key expressions.
+/// The messages on several key expressions.
 #[derive(Debug)]
 pub struct Subscription {
     receiver: Receiver<Received>,
@@ -51,7 +51,7 @@ pub struct Subscription {
     subscribers: Vec<Subscriber<()>>,
 }
 
-/// Where the receiving threads put what comes.
+/// The queue into which Zenoh's receiving threads put messages.
 #[derive(Clone)]
 pub(crate) struct Intake {
     sender: SyncSender<Received>,
@@ -59,7 +59,7 @@ pub(crate) struct Intake {
 }
 
 impl Intake {
-    /// A queue, and the subscription that it belongs to.
+    /// Creates a queue and the subscription that reads from it.
     pub(crate) fn new() -> (Self, Subscription) {
         let (sender, receiver) = sync_channel(MAX_WAITING);
         let counts = Arc::new(Counts::default());
@@ -68,7 +68,7 @@ impl Intake {
         (Self { sender, counts }, subscription)
     }
 
-    /// Runs on Zenoh's receiving thread: it must not wait for the program.
+    /// Takes a message. Runs on Zenoh's receiving thread, so it must not wait for the program.
     pub(crate) fn take(&self, sample: &Sample) {
         if sample.kind() != SampleKind::Put {
             return;
@@ -86,7 +86,8 @@ impl Intake {
         let origin = || Origin::from_bytes(&sample.attachment()?.to_bytes());
         let received = || Received {
             key,
-            // Copied: a payload of a few bytes would hold on to the transport's whole buffer.
+            // Copied: otherwise a payload of a few bytes would keep the transport's whole buffer
+            // alive.
             data: sample.payload().to_bytes().into_owned(),
             origin: origin(),
             at: Instant::now(),
@@ -103,26 +104,26 @@ impl Subscription {
         self.subscribers.push(subscriber);
     }
 
-    /// The next message, if one comes in time.
+    /// The next message, if one comes within `patience`.
     pub fn next(&self, patience: Duration) -> Option<Received> {
         let received = self.receiver.recv_timeout(patience).ok()?;
         self.counts.waiting_bytes.fetch_sub(received.data.len(), Ordering::Relaxed);
         Some(received)
     }
 
-    /// Takes nothing in any more; what came before can still be had from [`Self::next`].
+    /// Stops receiving; messages that have arrived can still be had from [`Self::next`].
     pub fn stop(&mut self) {
         self.subscribers.clear();
     }
 
-    /// Counts what still waits as dropped: there is no time for it.
+    /// Drops all waiting messages and counts them as dropped, for when there is no time for them.
     pub fn give_up(&self) {
         while self.next(Duration::ZERO).is_some() {
             self.counts.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
 
-    /// What was not handed on so far.
+    /// Counts so far.
     pub fn refused(&self) -> Refused {
         Refused {
             dropped: self.counts.dropped.load(Ordering::Relaxed),

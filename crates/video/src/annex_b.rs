@@ -1,6 +1,6 @@
-//! H.264 as a stream of bytes: units with start codes before them (ITU-T H.264, annex B).
+//! H.264 as a byte stream: units, each after a start code (ITU-T H.264, annex B).
 
-/// Kind of a picture that builds on no other.
+/// Unit type of a key picture, which needs no other (IDR slice).
 const KEY: u8 = 5;
 
 /// The units of an Annex B stream, without start codes.
@@ -21,7 +21,7 @@ pub(crate) fn units(stream: &[u8]) -> impl Iterator<Item = &[u8]> {
     starts.into_iter().zip(ends).map(|((_, from), to)| &stream[from..to.max(from)])
 }
 
-/// Whether a stream holds a picture that builds on no other.
+/// Whether a stream holds a picture that can be decoded without others.
 pub(crate) fn is_key(stream: &[u8]) -> bool {
     units(stream).any(|unit| unit.first().is_some_and(|head| head & 0x1f == KEY))
 }

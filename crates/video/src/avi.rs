@@ -4,20 +4,19 @@ use std::path::{Path, PathBuf};
 
 use crate::{CaptureTime, Frame, FrameClock, FrameSource, VideoError, decode_still};
 
-/// No JPEG picture of the largest image is longer, bytes.
+/// The longest frame that is read, bytes: no JPEG picture of the largest image is longer.
 const MOST_BYTES: u64 = 1 << 28;
-/// Codecs of which every frame is a JPEG picture.
+/// Codecs in which every frame is a JPEG picture.
 const MOTION_JPEG: [&[u8; 4]; 4] = [b"MJPG", b"mjpg", b"AVI1", b"JPEG"];
 
-/// An AVI file with Motion JPEG: its first stream of video.
+/// An AVI file with Motion JPEG; its first video stream is read.
 ///
-/// Chunks are read in the order of the file, so an index is not needed, and one that lies does no
-/// harm.
+/// Chunks are read in the order of the file, so no index is needed, and a wrong one does no harm.
 #[derive(Debug)]
 pub struct AviSource {
     chunks: Chunks,
     path: PathBuf,
-    /// The number of the stream of video, as it stands before the names of its chunks.
+    /// The number of the video stream: the first two letters of its chunks' names.
     stream: [u8; 2],
     rate_hz: f64,
     next: u64,
@@ -27,19 +26,20 @@ pub struct AviSource {
 /// The name of a chunk and its length in bytes.
 type Chunk = ([u8; 4], u64);
 
-/// A file of chunks, lists entered.
+/// The chunks of a file, those within lists included.
 #[derive(Debug)]
 struct Chunks {
     file: BufReader<File>,
     length: u64,
-    /// Where the next chunk is.
+    /// Where the next chunk begins.
     at: u64,
     /// Where the file has been read to.
     read_to: u64,
 }
 
 impl Chunks {
-    /// The next chunk that is no list; `None` at the end, a torn name included.
+    /// The next chunk that is no list; `None` at the end of the file, or where a chunk's head is
+    /// cut off.
     fn next(&mut self) -> std::io::Result<Option<Chunk>> {
         while self.at.saturating_add(8) <= self.length {
             let mut head = [0; 8];
@@ -50,7 +50,7 @@ impl Chunks {
             let (name, size) = ([a, b, c, d], u64::from(u32::from_le_bytes(size)));
             self.at += 8;
             if matches!(&name, b"RIFF" | b"LIST") {
-                // What is in it follows the four letters of its kind.
+                // A list's contents follow the four letters of its kind.
                 self.at += 4;
                 continue;
             }
@@ -59,7 +59,7 @@ impl Chunks {
         Ok(None)
     }
 
-    /// Goes to a place; what is buffered stays.
+    /// Seeks to a place, keeping what is buffered.
     fn go_to(&mut self, place: u64) -> std::io::Result<()> {
         let by = place as i64 - self.read_to as i64;
         self.file.seek_relative(by)?;
@@ -67,7 +67,7 @@ impl Chunks {
         Ok(())
     }
 
-    /// The bytes of the chunk that came last, as many as there are and at most so many.
+    /// The bytes of the chunk returned last, as many as there are and at most `most`.
     fn read(&mut self, size: u64, most: u64) -> std::io::Result<Vec<u8>> {
         let mut bytes = Vec::new();
         let got = self.file.by_ref().take(size.min(most)).read_to_end(&mut bytes);
@@ -76,7 +76,7 @@ impl Chunks {
         got.map(|_| bytes)
     }
 
-    /// Goes on behind the chunk that came last; chunks begin at even places.
+    /// Moves behind the chunk returned last; chunks begin at even places.
     fn skip(&mut self, size: u64) {
         self.at = self.at.saturating_add(size).saturating_add(size % 2);
     }
@@ -137,7 +137,7 @@ impl AviSource {
     }
 }
 
-/// The number in little-endian order at a place; 0 behind the end.
+/// The little-endian number at a place; 0 if it lies beyond the end.
 fn number(bytes: &[u8], at: usize) -> u32 {
     let four = bytes.get(at..at + 4).and_then(|four| four.try_into().ok());
     four.map_or(0, u32::from_le_bytes)

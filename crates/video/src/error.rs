@@ -50,38 +50,39 @@ pub enum VideoError {
         /// What is wrong.
         what: String,
     },
-    /// No address of a stream.
+    /// Not the address of a stream.
     #[error("it is no address of a stream, rtsp://HOST/PATH: {what}")]
     Address {
         /// What is wrong; never the address, which may hold a password.
         what: String,
     },
-    /// A stream cannot be had, or breaks off.
+    /// A stream cannot be opened, or breaks off.
     #[error("{url}: {what}")]
     Stream {
-        /// Where it is, without who asks.
+        /// Its address, without user and password.
         url: String,
         /// What is wrong.
         what: String,
     },
-    /// A camera does not let whoever asks watch.
+    /// A camera refuses the user or the password.
     #[error("{url}: the camera refuses: user or password are wrong")]
     Refused {
-        /// Where it is, without who asks.
+        /// Its address, without user and password.
         url: String,
     },
     /// A stream that should run sends nothing.
     #[error("{url} has sent no frame for {seconds:.1} s")]
     Silent {
-        /// Where it is, without who asks.
+        /// Its address, without user and password.
         url: String,
         /// For how long, s.
         seconds: f64,
     },
-    /// This host's clock, by which a live source's frames are timed, was set: it has to begin anew.
+    /// This host's clock, by which a live source's frames are timed, was set: the source must be
+    /// reopened.
     #[error("this host's clock was set by {by_s:+.1} s")]
     HostClockSet {
-        /// Forward by, s.
+        /// How far it was set forward, s.
         by_s: f64,
     },
     /// A live source ended.
@@ -90,7 +91,7 @@ pub enum VideoError {
     /// One frame of a stream cannot be decoded; the ones after it may.
     #[error("frame {index} of {url} cannot be decoded: {what}")]
     StreamFrame {
-        /// Where it is, without who asks.
+        /// Its address, without user and password.
         url: String,
         /// Number of the frame, from 0.
         index: u64,

@@ -2,9 +2,9 @@ use std::time::Instant;
 
 use crossfix_message::Timestamp;
 
-/// Red, green and blue's part in brightness (BT.601).
+/// Weights of red, green and blue in brightness (BT.601).
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
-/// What a 16-bit level is in 8-bit levels.
+/// Converts 16-bit levels to 8-bit levels.
 const SIXTEEN_TO_EIGHT: f32 = 1.0 / 257.0;
 
 /// When a frame was captured: mid-exposure.
@@ -16,13 +16,13 @@ pub struct CaptureTime {
     pub sd_s: f64,
 }
 
-/// How a frame of a live source came.
+/// How a frame of a live source arrived.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Arrival {
-    /// When its last byte was here.
+    /// When its last byte arrived.
     pub at: Instant,
-    /// Its time by the stream's own count, s, from an instant that nobody knows: even, whatever becomes
-    /// of the clocks. After the stream was opened anew it counts from another.
+    /// Its time by the stream's own count, s, from an unknown instant. The count is even, whatever
+    /// becomes of the clocks. After the stream was reopened it counts from another instant.
     pub stream_s: f64,
     /// Whose clock its capture time is by.
     pub timed_by: TimedBy,
@@ -31,19 +31,20 @@ pub struct Arrival {
 /// Whose clock a live frame's capture time is by.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TimedBy {
-    /// The camera's own, as it says itself.
+    /// The camera's own, as the camera itself reports it.
     Camera,
-    /// The camera's own, as it was known before the stream broke off, and by the frame's arrival: it has
-    /// not said anew what its clock shows.
+    /// The camera's own, by its offset known from before the stream broke off and by the frame's
+    /// arrival: since then the camera has not reported what its clock shows.
     Remembered,
-    /// This host's, by the driver of a camera that hangs on it.
+    /// This host's, by the driver of an attached camera, or by an industrial camera's own stamps
+    /// where its answers relate them to this host's clock.
     Driver,
-    /// This host's: the frame's arrival, less what it takes to come here. The camera has not said
-    /// yet what its clock shows, or is not to be asked.
+    /// This host's: the frame's arrival less its delay. The camera has not reported yet what its
+    /// clock shows, or its reports are not to be used.
     Arrival,
-    /// This host's, as the camera's clock shows another time altogether.
+    /// This host's, as the camera's clock shows a very different time.
     ArrivalAgainstCamera {
-        /// By how much the camera's clock is ahead of this host's, s.
+        /// How far the camera's clock is ahead of this host's, s.
         camera_ahead_s: f64,
     },
 }
@@ -51,9 +52,9 @@ pub enum TimedBy {
 /// The samples of an image, row by row, colours interleaved.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Pixels {
-    /// One sample of 8 bits a pixel.
+    /// One sample of 8 bits per pixel.
     Gray8(Vec<u8>),
-    /// One sample of 16 bits a pixel.
+    /// One sample of 16 bits per pixel.
     Gray16(Vec<u16>),
     /// Red, green, blue of 8 bits.
     Rgb8(Vec<u8>),
@@ -68,7 +69,7 @@ pub struct Frame {
     pub index: u64,
     /// When it was captured.
     pub capture: CaptureTime,
-    /// How it came, if the source is live.
+    /// How it arrived, if the source is live.
     pub live: Option<Arrival>,
     /// Columns.
     pub width: usize,

@@ -1,4 +1,4 @@
-//! Industrial cameras: GigE Vision.
+//! Industrial cameras (GigE Vision).
 
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
@@ -18,100 +18,107 @@ use crate::{
     VideoError,
 };
 
-/// How long a camera may take to answer: a question that is lost is asked again, and one that nobody
-/// answers is given up after four times as long.
+/// How long a camera may take to answer: a lost question is asked again, and one without an answer
+/// is given up after four times as long.
 const ANSWERED_WITHIN: Duration = Duration::from_millis(100);
-/// How long one may take that is asked whether it is there.
+/// How long a camera may take to answer whether it is there.
 const FOUND_WITHIN: Duration = Duration::from_millis(500);
-/// How often the camera is asked what its clock shows. Quartzes part by 50 us in a second: with ten times
-/// as long the line through the answers would follow a clock that warms up too late.
+/// How often the camera is asked what its clock shows. Quartz clocks drift apart by 50 us in a
+/// second: with ten times as long between questions, the line through the answers would follow a
+/// clock that warms up too late.
 const ASKED_EVERY: Duration = Duration::from_secs(1);
-/// A camera that does not answer is asked so seldom, as whoever asks waits.
+/// Interval for a camera that does not answer: longer, as every question waits for its answer.
 const ASKED_AGAIN: Duration = Duration::from_secs(10);
-/// An answer that took less is good enough, one that took more is off by half of it and none; in between
-/// the quickest of so many is.
+/// An answer that took less than `QUICK` is good enough. One that took more than `SLOW` is
+/// discarded: it may be off by half of what it took. In between, the quickest of `TRIES` is used.
 const QUICK: Duration = Duration::from_millis(1);
 const SLOW: Duration = Duration::from_millis(20);
 const TRIES: usize = 3;
-/// This host's clock was set by more than answers err by, s: what was answered before is of another time.
+/// This host's clock was set if it moved by more than answers err by, s: earlier answers are then
+/// invalid.
 const HOST_SET_S: f64 = 0.02;
-/// A camera's clock that is within this of the host's counts the same time as that; one that counts
-/// from when it was switched on is years off.
+/// A camera's clock within this of the host's is taken to show the same time, s; one that counts
+/// from when the camera was switched on is years off.
 const SAME_TIME_S: f64 = 2.0;
-/// A frame is here within this after the time that the camera's answers make of its stamp, or they are not of
-/// the clock that stamps frames, s: the one is half an answer's way, the other a long exposure's.
+/// Possible times from a frame's stamp, converted by the camera's answers, to its arrival, s. If
+/// frames lie outside, the answers are not of the clock that stamps frames. The lower end allows
+/// for half an answer's duration, the upper for a long exposure.
 const POSSIBLE_S: std::ops::Range<f64> = -0.02..1.0;
-/// So many impossible frames in a row are no stall's: it holds back sixteen.
+/// After this many impossible frames in a row the stamps are not believed: a stall holds back only
+/// sixteen.
 const IMPOSSIBLE: u32 = 20;
-/// Names of what says whether the camera's clock follows another by PTP, and what it says then.
+/// Names of the feature that tells whether the camera's clock follows another by PTP, and its value
+/// if so.
 const PTP: [&str; 2] = ["PtpStatus", "GevIEEE1588Status"];
 const FOLLOWS: &str = "Slave";
-/// What it takes from the exposure to the arrival where nothing better is known: an image is read out and
-/// sent in a frame's interval.
+/// Latency from the exposure to the arrival where nothing better is known: an image is read out and
+/// sent within a frame's interval.
 const LATENCY: Latency = Latency { mean_s: 0.04, sd_s: 0.04 };
-/// Registers that every camera has, some in name only: how many ticks a second has, the command that notes
-/// the time, and what was noted (GigE Vision 2.0, 28).
+/// Registers that every camera has, some in name only: ticks per second, the command that latches
+/// the time, and the latched time (GigE Vision 2.0, 28).
 const TICKS_AT: u64 = 0x93c;
 const LATCH_AT: u64 = 0x944;
 const LATCHED_AT: u64 = 0x948;
 const LATCH: [u8; 4] = 2_u32.to_be_bytes();
-/// Names under which cameras have the same where the registers are empty (SFNC, and as it was before 2.3).
+/// Names of the same for cameras whose registers are empty (SFNC, and its names before 2.3).
 const LATCHES: [&str; 3] = ["TimestampLatch", "GevTimestampControlLatch", "TimestampControlLatch"];
 const LATCHED: [&str; 3] = ["TimestampLatchValue", "GevTimestampValue", "TimestampValue"];
-/// Ticks a second of clocks that do not say.
+/// Ticks per second of clocks that do not say.
 const NANOSECONDS: f64 = 1e9;
-/// The exposure, us; what is longer than a second is none with which anything is followed.
+/// Names of the exposure time, us; a value above a second is ignored: nothing is followed with it.
 const EXPOSURES: [&str; 2] = ["ExposureTime", "ExposureTimeAbs"];
 const LONGEST_US: f64 = 1e6;
 
-/// How a GigE Vision camera is watched.
+/// Options for watching a GigE Vision camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GigeOptions {
-    /// Where it is.
+    /// Its address.
     pub address: Ipv4Addr,
-    /// Columns and rows; as it is set where it is not said.
+    /// Columns and rows; if `None`, the size that it is set to.
     pub size: Option<[u32; 2]>,
-    /// Frames a second; as it is set where it is not said.
+    /// Frames per second; if `None`, the rate that it is set to.
     pub rate_hz: Option<f64>,
-    /// From the middle of the exposure to the camera's time, s. Where it is not said, the time is that of
-    /// the exposure's start, as in the standard (SFNC, `Timestamp`), and half the exposure is added.
+    /// Time from the middle of the exposure to the camera's time stamp, s. If `None`, the stamp is
+    /// taken as the start of the exposure, as in the standard (SFNC, `Timestamp`), and half the
+    /// exposure is added.
     pub latency_s: Option<f64>,
     /// Standard deviation of its frames' times, s.
     pub sd_s: f64,
-    /// Whether its stamps are believed; else frames are timed by their arrival.
+    /// Whether its stamps are believed; otherwise frames are timed by their arrival.
     pub heeds_stamps: bool,
 }
 
-/// A GigE Vision camera that is opened again and again.
+/// A GigE Vision camera that can be opened again and again.
 #[derive(Clone, Debug)]
 pub struct GigeCamera {
     options: GigeOptions,
 }
 
 impl GigeCamera {
-    /// A camera that is watched so.
+    /// A camera that is watched with these options.
     pub fn new(options: GigeOptions) -> Self {
         Self { options }
     }
 
-    /// Where it is.
+    /// Its address.
     pub fn address(&self) -> String {
         format!("gige://{}", self.options.address)
     }
 
-    /// Takes control of it and asks for its images. `silence` is how long it may send nothing.
+    /// Takes control of it and asks for its images. `silence` is how long it may send nothing
+    /// before that is an error.
     ///
     /// # Errors
-    /// [`VideoError::Stream`] if nobody answers, somebody else has control, or it has neither the size nor
-    /// images of brightness.
+    /// [`VideoError::Stream`] if nobody answers, another program has control, or it does not have
+    /// the size or images of brightness.
     pub fn open(&self, silence: Duration) -> Result<Box<dyn FrameSource>, VideoError> {
         let source = GigeSource::open(&self.options, &self.address(), silence)?;
         Ok(Box::new(source))
     }
 }
 
-/// The GigE Vision cameras that answer a broadcast on this host's networks within a time: their addresses
-/// and what they call themselves.
+/// The GigE Vision cameras that answer a broadcast on this host's networks within a time: their
+/// addresses and the names that they report.
 ///
 /// # Errors
 /// What the system says where nothing can be sent.
@@ -125,43 +132,44 @@ pub fn gige_cameras(patience: Duration) -> Result<Vec<(Ipv4Addr, String)>, Strin
     Ok(found.iter().map(|device| (device.ip, described(device))).collect())
 }
 
-/// Whose time the camera's stamps are.
+/// Which time the camera's stamps are in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stamps {
-    /// UTC's: its clock follows another by PTP, or it cannot be asked and shows this host's time.
+    /// UTC: its clock follows another by PTP, or it cannot be asked and shows this host's time.
     Utc,
-    /// Its own, that counts from anywhere; this host's by what it answers.
+    /// The camera's own clock with any origin; its answers relate it to this host's time.
     Own,
-    /// Of no clock that it answers for, or not to be believed.
+    /// A clock that it does not answer for, or one that is not to be believed.
     Nobodys,
 }
 
 /// A camera's images until it falls silent or is lost.
 struct GigeSource {
-    /// Dropped before the camera, which sends as long as it is there.
+    /// Must be dropped before the camera, which sends as long as it is there.
     frames: FrameStream,
     camera: Camera<GigeRegisterIo>,
     options: GigeOptions,
     address: String,
     ticks_hz: f64,
-    /// Not known before the first frame of a camera that cannot be asked.
+    /// `None` until the first frame of a camera that cannot be asked.
     stamps: Option<Stamps>,
     clock: StreamClock,
     host: HostClock,
     ask_at: Instant,
-    /// What the last answer may be off by, s.
+    /// Bound on the last answer's error, s; used as its standard deviation.
     answer_sd_s: f64,
-    /// Whether a frame was possible by its stamp, and how many in a row were not since.
+    /// Whether any frame was possible by its stamp, and the number of impossible ones in a row
+    /// since.
     is_proven: bool,
     impossible: u32,
     exposure_s: f64,
     silence: Duration,
     is_silent: bool,
-    /// The camera's number of the block before, and the number of its frame.
+    /// The camera's number of the block before, and that block's frame number.
     before: Option<(u64, u64)>,
-    /// Frames that were not whole, as far as they were told, ...
+    /// Number of incomplete frames reported so far, ...
     torn: u64,
-    /// ... and the one that came after those that were not.
+    /// ... and the complete frame that came after them, until they are reported.
     held: Option<Block>,
 }
 
@@ -169,7 +177,7 @@ impl GigeSource {
     fn open(options: &GigeOptions, address: &str, silence: Duration) -> Result<Self, VideoError> {
         let said = |what: String| VideoError::Stream { url: address.to_owned(), what };
         let wrong = |error: GenicamError| said(in_words(&error));
-        // Whoever asks for control waits five seconds where nobody is.
+        // Asking for control waits five seconds if nobody is there, so presence is checked first.
         blocking::discover_ip(options.address, FOUND_WITHIN)
             .map_err(wrong)?
             .ok_or_else(|| said("no GigE Vision camera answers there".to_owned()))?;
@@ -209,8 +217,8 @@ impl GigeSource {
         Ok(source)
     }
 
-    /// Asks what the camera's clock shows and how long it exposes. Whoever asks waits for the answer, so it is
-    /// done between two frames.
+    /// Asks what the camera's clock shows and how long it exposes. This waits for the answer, so it
+    /// is called between two frames.
     fn ask(&mut self) {
         let mut said_us = EXPOSURES.iter().filter_map(|name| {
             self.camera.invalidate(name);
@@ -237,7 +245,7 @@ impl GigeSource {
         }
     }
 
-    /// When a frame was captured that came then.
+    /// When a frame with a stamp and an arrival was captured, and by whose clock; both times in s.
     fn timed(&mut self, stamp_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
         let arrived = self.host.at(arrived_s);
         let own = Timestamp::from_seconds(stamp_s);
@@ -257,6 +265,7 @@ impl GigeSource {
             return by_arrival(timed_by);
         }
         let stamped = CaptureTime {
+            // time = stamp + exposure / 2, or stamp - latency if that is given; variances add
             time: capture.time.plus_seconds(self.exposure_s / 2.0),
             sd_s: self.options.sd_s.hypot(self.answer_sd_s),
         };
@@ -277,7 +286,7 @@ impl GigeSource {
             self.stamps = Some(Stamps::Nobodys);
             self.clock = StreamClock::of_asked(self.host, LATENCY);
         }
-        // What a stall has held back is late, and its stamp is as good as ever.
+        // A frame that a stall held back is late, but its stamp is as good as ever.
         let is_late = self.is_proven && age_s > 0.0;
         if is_late { (stamped, TimedBy::Driver) } else { by_arrival(TimedBy::Arrival) }
     }
@@ -302,16 +311,17 @@ impl GigeSource {
         VideoError::StreamFrame { url: self.address.clone(), index, what }
     }
 
-    /// The number of a block's frame: those that the camera has counted and that never came are left out.
+    /// The number of a block's frame: numbers of frames that the camera counted but that never came
+    /// are left out.
     fn numbered(&mut self, block: u64) -> u64 {
-        /// The count of cameras of the first version goes to 65535 and begins again with 1.
+        /// Cameras of the first version count to 65535 and then start again from 1.
         const ROUND: u64 = 0xffff;
         let index = self.before.map_or(0, |(before, index)| {
             let is_round = block < ROUND / 2 && (ROUND / 2..=ROUND).contains(&before);
             let steps = match block.checked_sub(before) {
                 Some(steps) => steps,
                 None if is_round => block + ROUND - before,
-                // It counts anew.
+                // The camera's count has started again from elsewhere.
                 None => 1,
             };
             index + steps.clamp(1, ROUND)
@@ -320,7 +330,7 @@ impl GigeSource {
         index
     }
 
-    /// Tells, once for each, that a frame was not whole.
+    /// Reports each incomplete frame once.
     fn torn(&mut self) -> Option<VideoError> {
         let torn = self.frames.stats().frames_incomplete;
         (torn > self.torn).then(|| {
@@ -342,7 +352,7 @@ impl FrameSource for GigeSource {
         };
         self.is_silent = matches!(next, Err(GenicamError::Timeout(_)));
         if let Some(torn) = self.torn() {
-            // Of those that were not whole, one after the other is told before the next that is.
+            // Incomplete frames are reported one by one before the next complete one is handed on.
             self.held = next.ok().flatten();
             return Err(torn);
         }
@@ -373,16 +383,18 @@ impl FrameSource for GigeSource {
 
 impl Drop for GigeSource {
     fn drop(&mut self) {
-        // Control is given back when the camera is dropped; one that is gone is not waited for.
+        // Control is given back when the camera is dropped; a camera that is gone is not waited
+        // for.
         if !self.is_silent && self.camera.transport().control_state() == ControlState::Held {
             let _ = self.camera.acquisition_stop();
         }
     }
 }
 
-/// Images of brightness, one after another, of the size and at the rate.
+/// Sets the camera to continuous images of brightness, of the requested size and rate.
 fn set_up(camera: &mut Camera<GigeRegisterIo>, options: &GigeOptions) -> Result<(), GenicamError> {
-    // Whoever watched before may have left it in any state; what a camera has not, it cannot be left in.
+    // An earlier user may have left it in any state. Errors are ignored: a feature that the camera
+    // lacks cannot be in a wrong state.
     let _ = camera.acquisition_stop();
     let _ = camera.set_acquisition_mode("Continuous");
     let _ = camera.disable_trigger("FrameStart");
@@ -403,21 +415,21 @@ fn set_up(camera: &mut Camera<GigeRegisterIo>, options: &GigeOptions) -> Result<
     Ok(())
 }
 
-/// A number of eight bytes among the registers.
+/// The eight-byte number in the registers at an address.
 fn eight_bytes(camera: &Camera<GigeRegisterIo>, at: u64) -> Option<u64> {
     let bytes = camera.transport().read(at, 8).ok()?;
     Some(u64::from_be_bytes(bytes.try_into().ok()?))
 }
 
-/// What a camera's clock showed when it was asked.
+/// The camera's clock when it was asked.
 struct Answer {
     ticks: u64,
-    /// In the middle of the question and its answer: off by half of what they took at most.
+    /// Midway between the question and its answer: off by half of their distance at most.
     at: Instant,
     took: Duration,
 }
 
-/// The quickest of some answers; `None` if the camera has none, or none that is good for anything.
+/// The quickest of several answers; `None` if the camera gives none, or none that is quick enough.
 fn latched(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     let mut quickest: Option<Answer> = None;
     for _ in 0..TRIES {
@@ -433,7 +445,7 @@ fn latched(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     quickest.filter(|answer| answer.took < SLOW)
 }
 
-/// One question.
+/// Asks once, by the registers.
 fn latch(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     let sent = Instant::now();
     let noted = camera.transport().write(LATCH_AT, &LATCH).ok().map(|()| sent.elapsed());
@@ -444,7 +456,7 @@ fn latch(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     by_register.or_else(|| latch_by_name(camera))
 }
 
-/// The same of cameras that have it under a name alone.
+/// The same for cameras that have the command under a name only.
 fn latch_by_name(camera: &mut Camera<GigeRegisterIo>) -> Option<Answer> {
     let there = |name: &&&str| camera.nodemap().node(name).is_some();
     let (command, value) = (LATCHES.iter().find(there)?, LATCHED.iter().find(there)?);
@@ -464,7 +476,7 @@ fn follows_another(camera: &mut Camera<GigeRegisterIo>) -> bool {
     })
 }
 
-/// A block's pixels without what its rows are filled up with.
+/// A block's pixels without the padding of its rows.
 fn brightness(block: &Block) -> Result<Vec<u8>, String> {
     let (width, height) = (block.width as usize, block.height as usize);
     if block.pixel_format != PixelFormat::Mono8 {
@@ -482,7 +494,7 @@ fn brightness(block: &Block) -> Result<Vec<u8>, String> {
     Ok(pixels)
 }
 
-/// An error as people read it, with what caused it.
+/// An error in words for people, with its causes.
 fn in_words(error: &GenicamError) -> String {
     let mut words = error.to_string();
     let mut cause = std::error::Error::source(error);

@@ -14,13 +14,13 @@ use openh264::formats::{YUVSlices, YUVSource};
 use crate::annex_b::units;
 use crate::{MAX_PIXELS, Pixels};
 
-/// No decoder holds back more pictures than this: H.264 allows 16.
+/// Most units whose pictures are waited for: no decoder holds back more, H.264 allows 16.
 const MOST_PENDING: usize = 32;
 
-/// A decoded picture's brightness, row by row.
+/// The brightness of a decoded picture, row by row.
 #[derive(Debug)]
 pub(crate) struct Picture {
-    /// When it is to be shown, in the units of its source.
+    /// When it is to be shown, in the time units of its source.
     pub(crate) shown_at: i64,
     pub(crate) width: usize,
     pub(crate) height: usize,
@@ -36,18 +36,18 @@ impl Picture {
 
 /// Decodes H.264 to brightness, every picture with its own time.
 ///
-/// A decoder may hold pictures back until it is sure that none is to be shown before them, and in most
-/// profiles it is never sure. Of a live stream that neither says that its pictures come in another order
-/// than they are shown in nor has shown one which builds on later ones, each comes out at once, with the
-/// time of its own unit.
+/// A decoder may hold pictures back until it is sure that none is to be shown before them, and in
+/// most profiles it is never sure. A live stream is taken to be in display order until it says
+/// otherwise or shows a picture that builds on later ones (a B slice); until then each picture
+/// comes out at once, with the time of its own unit.
 pub(crate) struct H264Decoder {
     decoder: Decoder,
-    /// Whether pictures come out in another order than that of the units.
+    /// Whether pictures may come out in another order than their units.
     reorders: bool,
-    /// Times of the units whose pictures have not come out yet; pictures come out in the order of
-    /// display, so the smallest is the next picture's.
+    /// Times of the units whose pictures have not come out yet. Pictures come out in display order,
+    /// so the smallest time belongs to the next picture.
     pending: BinaryHeap<Reverse<i64>>,
-    /// Of what kind its pictures are, where that is none that is decoded.
+    /// What kind its pictures are, if that kind cannot be decoded.
     unreadable: Option<String>,
 }
 
@@ -72,18 +72,18 @@ impl H264Decoder {
     pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Option<Picture>, String> {
         self.pending.push(Reverse(shown_at));
         if self.pending.len() > MOST_PENDING {
-            // Units without a picture: nothing will come out of the first of them.
+            // Some units have no picture: nothing will come out for the oldest.
             self.pending.pop();
         }
-        // Holding back from the middle of a stream on spoils the pictures up to the next that builds on
-        // no other, so what the stream says of itself counts first.
+        // If holding back started in mid-stream, the pictures up to the next key picture would be
+        // spoilt. So the unit's own statements are read before it is decoded.
         self.reorders |= units(unit).any(|unit| says_it_reorders(unit) || builds_on_later(unit));
         if let Some(parameters) = units(unit).filter_map(sequence_parameters).last() {
             self.unreadable = unreadable(&parameters);
         }
         let flush = if self.reorders { Flush::NoFlush } else { Flush::Flush };
         if !self.reorders {
-            // What gave no picture before gives none now.
+            // An earlier unit without a picture gets none any more: its time is dropped.
             self.pending.retain(|Reverse(time)| *time == shown_at);
         }
         let options = DecodeOptions::new().flush_after_decode(flush);
@@ -105,21 +105,21 @@ impl H264Decoder {
     }
 }
 
-/// Whether a unit without its start code says that pictures come in another order than they are shown in
-/// (a sequence's parameters, where they speak of it at all: H.264, E.2.1).
+/// Whether a unit (without its start code) says that pictures are not in display order. Sequence
+/// parameter sets may say so (H.264, E.2.1).
 fn says_it_reorders(unit: &[u8]) -> bool {
     let restrictions = || sequence_parameters(unit)?.vui_parameters?.bitstream_restrictions;
     restrictions().is_some_and(|said| said.max_num_reorder_frames > 0)
 }
 
-/// What a unit without its start code says of the pictures that follow, if it is one that does.
+/// The sequence parameter set in a unit (without its start code), if it is one.
 fn sequence_parameters(unit: &[u8]) -> Option<SeqParameterSet> {
     unit.first().filter(|head| **head & 0x1f == 7)?;
     SeqParameterSet::from_bits(RefNal::new(unit, &[], true).rbsp_bits()).ok()
 }
 
-/// Why pictures of a sequence are not decoded: OpenH264 has eight bits and colours of a quarter of the
-/// places.
+/// Why a sequence's pictures cannot be decoded, if so: OpenH264 reads 8 bits and colours at a
+/// quarter of the pixels (4:2:0).
 fn unreadable(parameters: &SeqParameterSet) -> Option<String> {
     let of = &parameters.chroma_info;
     let colours = match of.chroma_format {
@@ -134,14 +134,16 @@ fn unreadable(parameters: &SeqParameterSet) -> Option<String> {
     Some(format!("its pictures are {kind}: H.264 of 8 bits and 4:2:0 is read (-pix_fmt yuv420p)"))
 }
 
-/// Whether a unit without its start code is a part of a picture that builds on later ones (a B slice).
+/// Whether a unit (without its start code) is part of a picture that builds on later ones (a B
+/// slice).
 fn builds_on_later(unit: &[u8]) -> bool {
     let is_slice = unit.first().is_some_and(|head| matches!(head & 0x1f, 1 | 5));
     let mut bits = unit.iter().skip(1).flat_map(|byte| (0..8).rev().map(move |n| byte >> n & 1));
-    // Two numbers in Exp-Golomb's code: where the slice begins, and its kind (H.264, 7.3.3 and 9.1).
+    // Two numbers in Exp-Golomb code: where the slice begins, and its type (H.264, 7.3.3 and 9.1).
     let mut number = || {
         let zeros = bits.by_ref().take(32).take_while(|bit| *bit == 0).count();
         let rest = bits.by_ref().take(zeros);
+        // z zeros, a 1 and z bits b: the value is 2^z + b - 1.
         rest.fold(1_u64, |number, bit| number << 1 | u64::from(bit)) - 1
     };
     is_slice && {
@@ -150,21 +152,21 @@ fn builds_on_later(unit: &[u8]) -> bool {
     }
 }
 
-/// How coarse pictures are encoded, by H.264's count, 0 to 51: as a good camera does. From 30 on faint
+/// Quantisation parameter, on H.264's scale of 0 to 51: that of a good camera. From 30 on faint
 /// targets are lost in blocks.
 const COARSENESS: u8 = 24;
 
-/// Encodes brightness as H.264, with a picture that builds on no other once a second.
+/// Encodes brightness as H.264, with a key picture once a second.
 ///
-/// For scenes that are played as cameras play.
+/// For scenes that are played as cameras play them.
 pub struct H264Encoder {
     encoder: Encoder,
-    /// Colourless: the middle of both colours.
+    /// Both colour planes of a grey picture: the middle value throughout.
     grey: Vec<u8>,
 }
 
 impl H264Encoder {
-    /// An encoder for so many frames a second.
+    /// An encoder for a rate in frames per second.
     ///
     /// # Errors
     /// What the encoder says.
@@ -175,7 +177,7 @@ impl H264Encoder {
             .usage_type(UsageType::CameraVideoRealTime)
             .intra_frame_period(IntraFramePeriod::from_num_frames(rate_hz.ceil().max(1.0) as u32))
             .qp(QpRange::new(COARSENESS, COARSENESS))
-            // A small thing that moves slowly is none of the background.
+            // A small target that moves slowly must not be treated as background.
             .background_detection(false)
             .adaptive_quantization(false)
             .skip_frames(false)
@@ -185,7 +187,7 @@ impl H264Encoder {
         Ok(Self { encoder, grey: Vec::new() })
     }
 
-    /// A picture as an access unit in Annex B. Width and height are even.
+    /// Encodes a picture as an access unit in Annex B. Width and height must be even.
     ///
     /// # Errors
     /// What is wrong with the picture, or what the encoder says.
@@ -210,7 +212,7 @@ impl H264Encoder {
     }
 }
 
-/// What it takes to decode an image of a size on this machine: the median of a moving, noisy scene.
+/// Time to decode an image of a size on this machine: the median over a moving, noisy scene.
 ///
 /// # Errors
 /// What encoder or decoder say.
@@ -219,7 +221,7 @@ pub fn decoding_time(width: usize, height: usize) -> Result<Duration, String> {
     let (mut encoder, mut decoder) =
         (H264Encoder::new(PICTURES as f64)?, H264Decoder::of_stream()?);
     let mut times = Vec::new();
-    // Any noise will do, of four levels.
+    // Pseudo-random noise of four levels; its kind does not matter.
     let mut noise = 1_u32;
     for number in 0..PICTURES {
         let picture: Vec<u8> = (0..width * height)
@@ -238,7 +240,7 @@ pub fn decoding_time(width: usize, height: usize) -> Result<Duration, String> {
     Ok(times[PICTURES / 2])
 }
 
-/// What the decoder says, in words for people: it counts its errors.
+/// A decoder error in words for people: the decoder itself only gives a number.
 fn in_words(error: &openh264::Error) -> String {
     let text = error.to_string();
     let number: String = text
@@ -275,7 +277,7 @@ mod tests {
 
     #[test]
     fn pictures_that_are_not_decoded_are_named_by_their_kind() {
-        // Of x264, 640x480, High 4:4:4 Predictive.
+        // From x264: 640x480, High 4:4:4 Predictive.
         let unit = [
             0x67, 0xf4, 0x00, 0x1e, 0x91, 0x96, 0x80, 0xa0, 0x3d, 0xb0, 0x16, 0xa0, 0xc0, 0xc0,
             0xc8, 0x00, 0x00, 0x03, 0x00, 0x08, 0x00, 0x00, 0x03, 0x01, 0xe4, 0x78, 0xb1, 0x75,
@@ -287,7 +289,7 @@ mod tests {
         let said = decoder.decode(&stream, 0).unwrap_err();
         assert!(said.contains("4:4:4") && said.contains("yuv420p"), "{said}");
 
-        // Our own are.
+        // Pictures of our own encoder are readable.
         let pixels = vec![90; 64 * 48];
         let stream = H264Encoder::new(30.0).unwrap().encode(&pixels, 64, 48).unwrap();
         let parameters = units(&stream).find_map(sequence_parameters).unwrap();

@@ -1,9 +1,9 @@
-//! Frames with their capture times, from files (PNG and JPEG sequences, Y4M,
-//! MP4 with H.264, AVI with Motion JPEG) from network cameras (RTSP with
-//! H.264 or Motion JPEG) and, on Linux, from those of the host (V4L2). Nothing but cargo dependencies.
+//! Frames with their capture times, from files (PNG and JPEG sequences, Y4M, MP4 with H.264, AVI
+//! with Motion JPEG), from network cameras (RTSP with H.264 or Motion JPEG) and, on Linux, from
+//! cameras of the host (V4L2). Needs nothing but cargo dependencies.
 //!
-//! The seam is [`FrameSource`]; [`Live`] keeps one that may break off. [`open`] finds the right one for a path; a camera of one's own is
-//! another:
+//! Every source implements [`FrameSource`]; [`Live`] reopens a live source that breaks off.
+//! [`open`] finds the right source for a path; a camera of one's own is another:
 //!
 //! ```
 //! use crossfix_message::Timestamp;
@@ -80,15 +80,14 @@ pub use y4m_file::Y4mSource;
 
 use crossfix_message::Timestamp;
 
-/// Images larger than this are refused: a damaged header must not take all memory.
+/// Images of more pixels than this are refused: a damaged header must not take all memory.
 pub const MAX_PIXELS: u64 = 1 << 26;
 
 /// A source of frames in the order of their capture.
 ///
-/// The caller asks until the answer is `Ok(None)`, the end. An error that
-/// [`VideoError::is_one_frame`] says is one frame's was counted in the frames'
-/// numbers, and the next call goes on with the frame after it; any other error
-/// is the end too.
+/// The caller asks until the answer is `Ok(None)`, the end. If [`VideoError::is_one_frame`] holds
+/// for an error, that frame still has its number, and the next call continues with the frame after
+/// it; any other error is the end too.
 pub trait FrameSource: Send {
     /// The next frame, or `None` at the end.
     ///
@@ -96,7 +95,7 @@ pub trait FrameSource: Send {
     /// [`VideoError`] naming the file and the frame.
     fn next_frame(&mut self) -> Result<Option<Frame>, VideoError>;
 
-    /// What was lost on the way from the camera, where it knows.
+    /// What was lost on the way from the camera, if the source knows.
     fn losses(&self) -> Losses {
         Losses::default()
     }
@@ -107,18 +106,18 @@ pub trait FrameSource: Send {
 pub struct Losses {
     /// Packets that never came.
     pub packets_lost: u64,
-    /// Packets that came when they were asked for once more.
+    /// Packets that came when they were requested again.
     pub packets_recovered: u64,
-    /// Frames that came and were given up, as they were not taken in time.
+    /// Frames that arrived but were discarded, as they were not taken in time.
     pub frames_left_out: u64,
 }
 
-/// When the frames of a file were captured, for files that do not say.
+/// Capture times of a file's frames, for files that do not state them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FrameClock {
     /// Capture time of the first frame.
     pub start: Timestamp,
-    /// Frames a second, for files that have no rate of their own.
+    /// Frames per second, for files that state no rate.
     pub fallback_rate_hz: f64,
     /// Standard deviation of the capture times, s.
     pub sd_s: f64,

@@ -5,28 +5,29 @@ use std::time::{Duration, Instant};
 
 use crate::{Frame, FrameSource, Losses, VideoError};
 
-/// A camera that sends nothing for so long is opened anew. Half of it would open one anew that is
+/// A camera that sends nothing for this long is reopened. Half of it would reopen a camera that is
 /// only busy; with twice as much, a target at 30 m/s flies on for 120 m unseen.
 pub(crate) const SILENCE: Duration = Duration::from_secs(2);
-/// The longest silence that is borne: cameras that send a frame in half a minute are none for this.
+/// Upper limit of the allowed silence: cameras that send a frame in half a minute are of no use
+/// here.
 const LONGEST_SILENCE: Duration = Duration::from_secs(32);
-/// The first pause before a camera is opened anew; each is twice as long as the one before, up to the
-/// longest: a camera that starts again takes half a minute, and is not to be pestered.
+/// Pause before a camera is reopened for the first time; each pause is twice the one before, up to
+/// the longest. A camera that restarts takes half a minute, and should not be asked all the time.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(8);
-/// A camera that was watched for less than this before it broke off is not steady: it is asked as if it
+/// A camera that broke off after less than this is not steady: its pauses go on growing as if it
 /// had never been there.
 const STEADY: Duration = Duration::from_secs(5);
-/// The pause before one is asked again that has refused: many makes lock out who asks too often with a
-/// wrong password.
+/// Pause before a camera that refused is asked again: many makes lock out a client that tries a
+/// wrong password too often.
 const REFUSED_PAUSE: Duration = Duration::from_secs(60);
-/// How long whoever wants it no more waits until it has taken leave of the camera: an interval between
-/// two frames, and the farewell.
+/// How long dropping a [`Live`] waits for the session with the camera to be closed: an interval
+/// between two frames, and the farewell.
 const LEAVE: Duration = Duration::from_millis(400);
-/// Frames that may wait to be looked at; when there are more, the oldest is left out. What has waited
-/// longer is of no use to who wants to know where something is now.
+/// Frames that may wait to be taken; if there are more, the oldest is discarded. One that has
+/// waited longer is of no use for where something is now.
 const WAITING: usize = 4;
-/// Troubles that may wait to be heard.
+/// Troubles that may wait to be taken.
 const TROUBLES: usize = 64;
 
 /// What a live camera shows at the moment.
@@ -34,27 +35,27 @@ const TROUBLES: usize = 64;
 pub enum Sight {
     /// The next frame.
     Frame(Frame),
-    /// One frame cannot be decoded, or the camera is lost; it is opened anew by itself.
+    /// One frame cannot be decoded, or the camera is lost; it is reopened automatically.
     Trouble(VideoError),
     /// Nothing yet.
     Nothing,
 }
 
-/// What became of a live camera's frames.
+/// Counts of a live camera's frames and packets.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LiveCounts {
-    /// How often the camera was there when it was asked.
+    /// How often the camera was opened successfully.
     pub opened: u64,
-    /// Frames that came and were never looked at, as newer ones were here.
+    /// Frames that arrived but were discarded, as newer ones had come.
     pub left_out: u64,
-    /// Packets in which they were that never came, where that is known.
+    /// Packets that never came, where that is known.
     pub packets_lost: u64,
-    /// Packets that came when they were asked for once more.
+    /// Packets that came when they were requested again.
     pub packets_recovered: u64,
 }
 
 impl LiveCounts {
-    /// Adds what was lost since it was told before.
+    /// Adds the increase of a source's losses since they were read before.
     fn add(&mut self, now: Losses, before: Losses) {
         self.left_out += now.frames_left_out - before.frames_left_out;
         self.packets_lost += now.packets_lost - before.packets_lost;
@@ -62,10 +63,10 @@ impl LiveCounts {
     }
 }
 
-/// A live camera that is opened anew whenever it breaks off or falls silent, on a thread of its own,
+/// A live camera that is reopened whenever it breaks off or falls silent, on a thread of its own,
 /// until this is dropped.
 ///
-/// Frames are numbered through; where the camera was opened anew one number is left out.
+/// Frames are numbered consecutively over all openings; one number is left out at each reopening.
 ///
 /// ```
 /// use std::time::Duration;
@@ -94,9 +95,9 @@ struct State {
     frames: VecDeque<Frame>,
     troubles: VecDeque<VideoError>,
     counts: LiveCounts,
-    /// Nobody wants it any more, ...
+    /// Set when this is dropped: no more frames are wanted, ...
     ended: bool,
-    /// ... and it has taken leave of the camera.
+    /// ... and set by the camera's thread once it has closed the session.
     left: bool,
 }
 
@@ -105,7 +106,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether nobody wants it any more.
+    /// Whether no more frames are wanted.
     fn ended(&self) -> bool {
         self.locked().ended
     }
@@ -130,7 +131,7 @@ impl Shared {
         self.changed.notify_all();
     }
 
-    /// Waits that long, or until nobody wants it any more.
+    /// Waits that long, or until no more frames are wanted.
     fn pause(&self, length: Duration) {
         let until = Instant::now() + length;
         let mut state = self.locked();
@@ -146,7 +147,7 @@ impl Shared {
 }
 
 impl Live {
-    /// Keeps what `open` opens; it is told how long the camera may be silent.
+    /// Runs a camera; `open` opens it, given how long it may be silent.
     pub fn start(
         mut open: impl FnMut(Duration) -> Result<Box<dyn FrameSource>, VideoError> + Send + 'static,
     ) -> Self {
@@ -156,7 +157,7 @@ impl Live {
         Self { shared }
     }
 
-    /// What it shows; waits for that long at most. Troubles come before frames.
+    /// The next trouble or frame; waits for `patience` at most. Troubles come before frames.
     pub fn next(&self, patience: Duration) -> Sight {
         let until = Instant::now() + patience;
         let mut state = self.shared.locked();
@@ -176,7 +177,7 @@ impl Live {
         }
     }
 
-    /// What became of its frames so far.
+    /// Counts so far.
     pub fn counts(&self) -> LiveCounts {
         self.shared.locked().counts
     }
@@ -187,7 +188,8 @@ impl Drop for Live {
         let mut state = self.shared.locked();
         state.ended = true;
         self.shared.changed.notify_all();
-        // A camera that is not told that nobody watches any more has no room for the next.
+        // If the camera is not told that nobody watches any more, it may have no room for the next
+        // client.
         let until = Instant::now() + LEAVE;
         while !state.left {
             let left = until.saturating_duration_since(Instant::now());
@@ -200,7 +202,7 @@ impl Drop for Live {
     }
 }
 
-/// Opens a camera again and again.
+/// Opens a camera again and again until no more frames are wanted.
 fn keep(
     shared: &Shared,
     open: &mut dyn FnMut(Duration) -> Result<Box<dyn FrameSource>, VideoError>,
@@ -209,19 +211,19 @@ fn keep(
     let mut number = 0;
     while !shared.ended() {
         let (begun, mut frames) = (Instant::now(), 0);
-        // What a camera sends may be made to hurt: whoever reads it may fail, but the camera is opened
-        // anew.
+        // What a camera sends may be malicious: a panic in what reads it only leads to a reopening.
         let watched = catch_unwind(AssertUnwindSafe(|| -> Result<(), VideoError> {
             let mut source = open(silence)?;
             shared.locked().counts.opened += 1;
             watch(shared, source.as_mut(), number, &mut frames)
         }));
         let trouble = watched.unwrap_or(Ok(())).err().unwrap_or(VideoError::Ended);
-        // A stream that is there and shows a single frame, or none, may be slow.
+        // A stream that was there but showed no more than one frame may just be slow: it gets more
+        // time.
         let may_be_slow = matches!(trouble, VideoError::Silent { .. }) && frames < 2;
         silence = if may_be_slow { (silence * 2).min(LONGEST_SILENCE) } else { SILENCE };
         if frames > 0 {
-            // One number is left out, so that the gap is seen.
+            // One number is left out, so that the gap is visible.
             number += frames + 1;
         }
         if frames > 0 && begun.elapsed() >= STEADY {
@@ -238,8 +240,8 @@ fn keep(
     shared.changed.notify_all();
 }
 
-/// Hands on what a source shows, from a number on, until it ends or nobody wants it; counts the
-/// frames.
+/// Hands on a source's frames, numbered from `first`, until it ends or no more are wanted; counts
+/// them in `frames`.
 fn watch(
     shared: &Shared,
     source: &mut dyn FrameSource,

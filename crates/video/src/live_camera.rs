@@ -2,21 +2,21 @@ use std::time::Duration;
 
 use crate::{FrameSource, GigeCamera, GstreamerCamera, RtspCamera, UsbCamera, VideoError};
 
-/// A camera that is watched live, and opened again whenever it breaks off.
+/// A camera that is watched live, and reopened whenever it breaks off.
 #[derive(Clone, Debug)]
 pub enum LiveCamera {
-    /// On the network.
+    /// A network camera (RTSP).
     Stream(RtspCamera),
-    /// On a bus of this host.
+    /// A camera on a bus of this host.
     Usb(UsbCamera),
-    /// An industrial one.
+    /// An industrial camera (GigE Vision).
     Gige(GigeCamera),
-    /// What GStreamer can show.
+    /// Anything that GStreamer can show.
     Gstreamer(GstreamerCamera),
 }
 
 impl LiveCamera {
-    /// Where it is, without who asks.
+    /// Its address, without user and password.
     pub fn address(&self) -> String {
         match self {
             Self::Stream(camera) => camera.address(),
@@ -26,7 +26,7 @@ impl LiveCamera {
         }
     }
 
-    /// Opens it. `silence` is how long it may send nothing.
+    /// Opens it. `silence` is how long it may send nothing before that is an error.
     ///
     /// # Errors
     /// [`VideoError`] naming the camera and what keeps it from being watched.

@@ -2,7 +2,8 @@ use std::path::{Path, PathBuf};
 
 use crate::{Frame, FrameClock, FrameSource, VideoError, decode_still};
 
-/// A folder of PNG or JPEG images, in the order of their names, numbers counted as numbers.
+/// A folder of PNG or JPEG images in the order of their names, with numbers in names compared as
+/// numbers.
 #[derive(Debug)]
 pub struct SequenceSource {
     files: Vec<PathBuf>,
@@ -10,7 +11,7 @@ pub struct SequenceSource {
     clock: FrameClock,
 }
 
-/// A name cut into its texts and numbers, so that `9.png` comes before `10.png`.
+/// A name split into texts and numbers, so that `9.png` comes before `10.png`.
 fn natural_key(path: &Path) -> Vec<(u64, String)> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut key = Vec::new();

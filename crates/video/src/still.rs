@@ -10,7 +10,7 @@ use crate::{MAX_PIXELS, Pixels};
 /// Columns, rows and samples of a still image.
 pub type Still = (usize, usize, Pixels);
 
-/// Decodes a PNG or JPEG image from its bytes; transparency is left out.
+/// Decodes a PNG or JPEG image from its bytes; transparency is dropped.
 ///
 /// # Errors
 /// What is wrong, in words: neither format, damaged, or too large.
@@ -27,7 +27,7 @@ fn check_size(width: u64, height: u64) -> Result<(), String> {
     if fits { Ok(()) } else { Err(format!("its size is {width}x{height}")) }
 }
 
-/// Keeps the first `kept` of every `channels` samples.
+/// Keeps the first `kept` samples of every `channels`.
 fn drop_alpha<T: Copy>(samples: &[T], channels: usize, kept: usize) -> Vec<T> {
     samples.chunks_exact(channels).flat_map(|pixel| &pixel[..kept]).copied().collect()
 }

@@ -1,4 +1,4 @@
-//! What a stream's frames have to do with UTC.
+//! UTC capture times of a stream's frames, from the camera's clock or from their arrival.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,44 +8,48 @@ use crossfix_message::Timestamp;
 
 use crate::{CaptureTime, Latency, TimedBy};
 
-/// Seconds from the beginning of NTP's count, in 1900, to that of Unix's, in 1970.
+/// Seconds from the start of NTP's count, in 1900, to that of Unix's, in 1970.
 pub(crate) const NTP_TO_UNIX_S: u64 = 2_208_988_800;
-/// Sender reports of this long tell what the camera's clock shows, s. They come every five seconds
-/// or so and each may be some milliseconds off; over a minute a quartz stays a straight line.
+/// How long a sender report is used to estimate the camera's clock, s. Reports come every five
+/// seconds or so and each may be some milliseconds off; over a minute a quartz clock's drift is a
+/// straight line.
 const REPORTS_S: f64 = 60.0;
-/// Reports that are kept: more in a minute come from no camera, and would be work for each image.
+/// Most reports that are kept: no camera sends more in a minute, and each costs work per image.
 const MOST_REPORTS: usize = 64;
-/// A clock that is this far from what it showed before was set, s: more than a busy camera is late in
-/// reporting, and than a quartz loses between two reports.
+/// A clock that differs by more than this from what its reports predicted was set, s: more than a
+/// busy camera is late in reporting, and more than a quartz drifts between two reports.
 pub(crate) const SET_S: f64 = 0.25;
-/// A camera's clock that is farther from the host's is not on UTC, or the host's is not, s. A network
-/// that stalls holds frames for as long; half of it would refuse cameras on bad networks.
+/// If the camera's clock differs from the host's by more than this, one of them is not on UTC, s. A
+/// network that stalls holds frames for as long; half of it would refuse cameras on bad networks.
 const FARTHEST_S: f64 = 2.0;
-/// A line through reports that span less would follow what they err by, s: cameras report when they get round to
-/// it, to some milliseconds.
+/// Reports that span less than this are averaged, not fitted by a sloping line, s: the slope would
+/// follow their errors of some milliseconds, as cameras report when they get round to it.
 const LEVEL_S: f64 = REPORTS_S / 5.0;
-/// The same of answers to a question, which are good to a tenth of a millisecond: half as long, and the line would
-/// err by as much as the fastest quartz gains.
+/// The same for a camera's answers to a question, which are good to a tenth of a millisecond, s:
+/// with half of it the line would err by as much as the fastest quartz gains.
 const ASKED_LEVEL_S: f64 = 2.0;
-/// The quickest arrival of this long is taken for one that nothing held up, s. A quartz drifts by a
-/// millisecond in it; half as long, and a stall of some seconds would be taken for the camera's.
+/// The quickest arrival within this time is taken for one that nothing delayed, s. A quartz drifts
+/// by a millisecond in it; with half of it, a stall of some seconds would be attributed to the
+/// camera.
 const ARRIVALS_S: f64 = 30.0;
-/// What was known of a camera's clock against the host's is good for so long after a stream broke off,
-/// s: two quartzes part by 30 ms in it.
+/// After a stream broke off, what was known of the camera's clock relative to the host's is used
+/// for this long, s: two quartz clocks drift apart by 30 ms in it.
 const REMEMBERED_S: f64 = 600.0;
 
-/// How well frames are timed by what is remembered, s: the first of a stream come as late as the
-/// quickest before them, or later by what a camera takes to begin.
+/// Standard deviation of capture times that come from the remembered clock, s: the first frames of
+/// a stream arrive as late as the quickest before them, or later by what a camera takes to start.
 const REMEMBERED_SD_S: f64 = 0.1;
 
-/// A camera's clock as its last reports tell it.
+/// A camera's clock, estimated from its latest reports.
 #[derive(Clone, Debug)]
 struct Reports {
-    /// Stream time, s, and what the camera's clock showed then beyond the line of the first report, s.
+    /// Stream time, s, and how far the camera's clock was then ahead of the first report's line, s.
+    /// That line has slope 1: it advances as the stream's count does.
     told: VecDeque<(f64, f64)>,
     /// The clock's time at the stream's time 0, by the first report.
     zero: Option<Timestamp>,
-    /// As long as the reports span less, s, the clock is taken to run as the stream's count does.
+    /// While the reports span less than this, s, the clock is taken to run as the stream's count
+    /// does.
     level_s: f64,
 }
 
@@ -54,9 +58,10 @@ impl Reports {
         Self { told: VecDeque::new(), zero: None, level_s }
     }
 
-    /// Takes a report in.
+    /// Adds a report; where it shows that the clock was set, the earlier ones are discarded.
     fn add(&mut self, stream_s: f64, told: Timestamp) {
         let zero = *self.zero.get_or_insert(told.plus_seconds(-stream_s));
+        // beyond = told - (zero + stream_s)
         let beyond = told.seconds_since(zero.plus_seconds(stream_s));
         let was_set = !self.told.is_empty() && (beyond - self.beyond(stream_s)).abs() > SET_S;
         if was_set {
@@ -71,8 +76,8 @@ impl Reports {
         }
     }
 
-    /// What the clock shows beyond the first report's line at a stream time, s: a straight line through
-    /// the reports, level as long as they span too little.
+    /// How far the clock is ahead of the first report's line at a stream time, s: the least-squares
+    /// line through the reports, or their mean while they span too little.
     fn beyond(&self, stream_s: f64) -> f64 {
         let n = self.told.len().max(1) as f64;
         let mean = |of: fn(&(f64, f64)) -> f64| self.told.iter().map(of).sum::<f64>() / n;
@@ -82,6 +87,7 @@ impl Reports {
         if span < self.level_s || spread == 0.0 {
             return level;
         }
+        // slope = sum (s - mid) (b - level) / sum (s - mid)^2
         let slope = self.told.iter().map(|(s, b)| (s - mid) * (b - level)).sum::<f64>() / spread;
         level + slope * (stream_s - mid)
     }
@@ -92,16 +98,17 @@ impl Reports {
     }
 }
 
-/// The quickest arrivals of late.
+/// The quickest recent arrivals.
 #[derive(Clone, Debug, Default)]
 struct Arrivals {
-    /// Arrival and how much later than its stream time it was, s, each quicker than all after it: the
-    /// first is the quickest.
+    /// Arrival time and delay relative to the stream time, s. Each entry is quicker than all after
+    /// it, so the first is the quickest.
     quickest: VecDeque<(f64, f64)>,
 }
 
 impl Arrivals {
     fn add(&mut self, stream_s: f64, arrived_s: f64) {
+        // Drops entries that this arrival beats: they can never be the quickest again.
         let late = arrived_s - stream_s;
         while self.quickest.back().is_some_and(|(_, other)| *other >= late) {
             self.quickest.pop_back();
@@ -112,18 +119,18 @@ impl Arrivals {
         }
     }
 
-    /// When a frame of that stream time would have come, had nothing held it up, s.
+    /// When a frame of that stream time would have arrived if nothing had delayed it, s.
     fn unhindered_s(&self, stream_s: f64) -> Option<f64> {
         self.quickest.front().map(|(_, late)| stream_s + late)
     }
 }
 
-/// What is known of a camera's clock beyond a stream that broke off: the next one begins without a
-/// report.
+/// What is known of a camera's clock, kept when a stream breaks off: the next stream begins without
+/// a report.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ClockMemory(Arc<Mutex<Option<Ahead>>>);
 
-/// By how much the camera's clock at the exposure is ahead of the host's at the arrival, s, when that
+/// How far the camera's clock at the exposure is ahead of the host's at the arrival, s, when that
 /// was found, and by which reading of the host's clock.
 #[derive(Clone, Copy, Debug)]
 struct Ahead {
@@ -132,7 +139,7 @@ struct Ahead {
     host: HostClock,
 }
 
-/// This host's clock, read once: what is done to it later changes nothing.
+/// This host's clock, read once: setting the clock later changes nothing here.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct HostClock {
     wall: Timestamp,
@@ -140,7 +147,7 @@ pub(crate) struct HostClock {
 }
 
 impl HostClock {
-    /// What it showed so many seconds after it was read.
+    /// Host time this many seconds after the reading.
     pub(crate) fn at(&self, seconds: f64) -> Timestamp {
         self.wall.plus_seconds(seconds)
     }
@@ -151,12 +158,12 @@ impl HostClock {
         Self { wall: Timestamp::from_nanos(nanos), read: Instant::now() }
     }
 
-    /// An instant, s since it was read; 0 for one before.
+    /// Seconds from the reading to an instant; 0 for an instant before it.
     pub(crate) fn since_s(&self, instant: Instant) -> f64 {
         instant.saturating_duration_since(self.read).as_secs_f64()
     }
 
-    /// By how much it was set forward from this reading to a later one, s.
+    /// By how much the host's clock was set forward between this reading and a later one, s.
     pub(crate) fn set_by_s(&self, later: &Self) -> f64 {
         later.wall.seconds_since(self.wall) - self.since_s(later.read)
     }
@@ -167,7 +174,7 @@ impl ClockMemory {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What was found last, if it is not too long ago and the host's clock has not been set since.
+    /// The offset found last, s, if it is not too old and the host's clock has not been set since.
     fn ahead_s(&self, now: Timestamp, host: &HostClock) -> Option<f64> {
         let holds = |ahead: &Ahead| {
             now.seconds_since(ahead.at).abs() <= REMEMBERED_S
@@ -177,11 +184,11 @@ impl ClockMemory {
     }
 }
 
-/// Tells when a stream's frames were captured: by what the camera says of its clock, and before it
-/// has, or where that cannot be true, by when they come.
+/// Computes when a stream's frames were captured: by the camera's reports of its clock, and by the
+/// frames' arrival before the first report or where the reports cannot be true.
 ///
-/// Streams count time from an instant of their own; a camera says from time to time (RTCP sender
-/// reports) what its clock showed when the count stood where.
+/// Streams count time from an instant of their own. From time to time a camera reports (RTCP sender
+/// reports) what its clock showed at a given value of that count.
 #[derive(Clone, Debug)]
 pub(crate) struct StreamClock {
     host: HostClock,
@@ -195,7 +202,7 @@ pub(crate) struct StreamClock {
 }
 
 impl StreamClock {
-    /// A clock of a stream whose arrivals count from when the host's clock was read.
+    /// A clock for a stream whose arrival times count from when the host's clock was read.
     pub(crate) fn new(
         host: HostClock,
         latency: Latency,
@@ -206,7 +213,7 @@ impl StreamClock {
         Self { host, latency, heeds_reports, reports, arrivals, memory, last: None }
     }
 
-    /// The same of a camera that is asked what its clock shows over a quick network.
+    /// The same for a camera that is asked over a fast network what its clock shows.
     pub(crate) fn of_asked(host: HostClock, latency: Latency) -> Self {
         let reports = Reports::new(ASKED_LEVEL_S);
         Self { reports, ..Self::new(host, latency, true, ClockMemory::default()) }
@@ -219,19 +226,21 @@ impl StreamClock {
         }
     }
 
-    /// When a frame of a stream time that came `arrived_s` after the beginning was captured, by the
-    /// camera's clock or by this host's.
+    /// Capture time of a frame with a stream time, which arrived `arrived_s` after the host's clock
+    /// was read, and whose clock it is by.
     pub(crate) fn time(&mut self, stream_s: f64, arrived_s: f64) -> (CaptureTime, TimedBy) {
         if let Some((stream_before_s, arrived_before_s)) = self.last.replace((stream_s, arrived_s))
         {
             let passed_s = stream_s - stream_before_s;
-            // It counts from another instant. A network may hold up what it likes: late is late alone.
+            // The stream's count started again from another instant: it went back, or ahead of the
+            // arrivals. The reverse is no sign of that: a network may delay a frame by any time.
             if passed_s < 0.0 || passed_s - (arrived_s - arrived_before_s) > FARTHEST_S {
                 self.reports = Reports::new(self.reports.level_s);
                 self.arrivals = Arrivals::default();
             }
         }
         self.arrivals.add(stream_s, arrived_s);
+        // An arrival as if nothing had delayed the frame: every time below is relative to it.
         let unhindered = self.arrivals.unhindered_s(stream_s).unwrap_or(arrived_s);
         let arrival = self.host.wall.plus_seconds(unhindered);
         let Latency { mean_s, sd_s } = self.latency;
@@ -255,8 +264,8 @@ impl StreamClock {
     }
 }
 
-/// NTP's time, 32 bits of seconds and 32 of their fractions, by Unix's count; `None` where a camera says
-/// that it knows none. The count begins again in 2036 (RFC 4330, 3).
+/// Unix time of an NTP time (32 bits of seconds, 32 bits of fraction); `None` for 0, by which a
+/// camera says that it knows no time. NTP's seconds start again from 0 in 2036 (RFC 4330, 3).
 pub(crate) fn unix_time(ntp: u64) -> Option<Timestamp> {
     let (seconds, fraction) = ((ntp >> 32) as i64, ntp & 0xFFFF_FFFF);
     let seconds = if seconds < 1 << 31 { seconds + (1 << 32) } else { seconds };
@@ -281,8 +290,9 @@ mod tests {
         StreamClock::new(host, LATENCY, true, memory.clone())
     }
 
-    /// A camera whose count began 7 s before the host's, at 30 frames a second, whose frames take 80 ms
-    /// and up to 50 ms more; the frame's stream time, arrival and true capture time, s after the host's.
+    /// A camera whose count began 7 s before the host's, at 30 frames per second, whose frames take
+    /// 80 ms and up to 50 ms more. Returns the frame's stream time, arrival and true capture time;
+    /// the last two count from the host's start, s.
     fn frame(n: u32) -> (f64, f64, f64) {
         let exposed = f64::from(n) / 30.0 + 0.5;
         (exposed + 7.0, exposed + 0.08 + 0.05 * f64::from(n * 7 % 11) / 10.0, exposed)
@@ -299,7 +309,8 @@ mod tests {
             let (stream_s, arrived_s, exposed_s) = frame(n);
             let (found, by) = clock.time(stream_s, arrived_s);
             assert_eq!(by, TimedBy::Arrival);
-            // 80 ms where 100 are taken: once the quickest has come, evenly.
+            // The true delay is 80 ms, and 100 ms are assumed: once the quickest frame has come,
+            // all are off by the same 20 ms.
             assert!(n < 11 || (error_s(found, exposed_s) + 0.02).abs() < 1e-6, "{n}");
             assert!(error_s(found, exposed_s).abs() < found.sd_s);
         }
@@ -308,8 +319,8 @@ mod tests {
     #[test]
     fn reports_are_followed_through_noise_and_drift() {
         let mut clock = clock(&ClockMemory::default());
-        // The camera's clock is 30 ms ahead and gains 40 microseconds a second; its reports are
-        // 2 ms off in turn.
+        // The camera's clock is 30 ms ahead and gains 40 microseconds per second; its reports are
+        // alternately 2 ms too late and too early.
         let shows = |exposed_s: f64| exposed_s + 0.03 + 40e-6 * exposed_s;
         let mut worst: f64 = 0.0;
         for n in 0..9000 {
@@ -368,7 +379,7 @@ mod tests {
             last = Some(error_s(found, exposed_s + 0.03));
         }
         assert!(last.unwrap().abs() < 1e-6, "{last:?}");
-        // Where the host's clock has been set since, nothing is known.
+        // If the host's clock has been set since, the remembered offset is not used.
         let set = HostClock { wall: host().plus_seconds(3600.0), read: Instant::now() };
         let mut set = StreamClock::new(set, LATENCY, true, memory);
         assert_eq!(set.time(0.0, 0.1).1, TimedBy::Arrival);
@@ -388,7 +399,8 @@ mod tests {
                 let is_told = !(300..375).contains(&n);
                 let expected = if is_told { TimedBy::Camera } else { TimedBy::Remembered };
                 assert_eq!(by, expected, "{jump_s} s, frame {n}");
-                // By what was known of the camera until it says more, as soon as the quickest has come.
+                // Until the camera reports again the remembered offset is used; it is exact once
+                // the quickest arrival has come.
                 let known_s = if is_told { 1e-6 } else { 0.051 };
                 assert!(error_s(found, exposed_s).abs() < known_s, "{jump_s} s, frame {n}");
             }
@@ -400,7 +412,8 @@ mod tests {
         let (mut clock, mut came_s) = (clock(&ClockMemory::default()), 0.0_f64);
         for n in 0..600 {
             let (stream_s, arrived_s, exposed_s) = frame(n);
-            // From the tenth second on everything comes three seconds late, and then at once.
+            // From the tenth second on frames are delayed more and more, by up to three seconds,
+            // and then all come at once.
             let held_s = if (300..450).contains(&n) { f64::from(n - 300) * 0.02 } else { 0.0 };
             if n % 300 == 0 {
                 clock.report(stream_s, host().plus_seconds(exposed_s));

@@ -6,12 +6,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::{Frame, FrameClock, FrameSource, MAX_PIXELS, Pixels, VideoError};
 
-/// The longest header line that is read.
+/// The longest header line that is read, bytes.
 const MAX_HEADER: u64 = 4096;
 
 type Input = Chain<Cursor<Vec<u8>>, Counted>;
 
-/// A file of which is known how much has been read since it was asked last.
+/// A file that counts how many bytes have been read since the count was reset.
 struct Counted {
     file: BufReader<File>,
     read: Arc<AtomicU64>,
@@ -25,15 +25,15 @@ impl Read for Counted {
     }
 }
 
-/// A YUV4MPEG2 file; the brightness plane is used, 8 to 16 bits.
+/// A YUV4MPEG2 file; only the brightness plane is used, 8 to 16 bits.
 pub struct Y4mSource {
     decoder: y4m::Decoder<Input>,
-    /// Bytes read of the frame that is read now.
+    /// Bytes read so far of the current frame.
     read: Arc<AtomicU64>,
     path: PathBuf,
     next: u64,
     rate_hz: f64,
-    /// Multiplies a sample of more than 8 bits to fill 16.
+    /// Left shift that scales a sample of more than 8 bits to 16.
     shift: u32,
     clock: FrameClock,
 }
@@ -53,7 +53,7 @@ impl Y4mSource {
         if !text.starts_with("YUV4MPEG2") {
             return Err(damaged("it does not begin with YUV4MPEG2".to_owned()));
         }
-        // The library takes the last of several, whatever it is: there must be one.
+        // The library takes the last of several values, whatever it is, so exactly one is allowed.
         let side = |letter: char| {
             let mut tokens = text.split_whitespace().filter_map(|token| token.strip_prefix(letter));
             let only = tokens.next().filter(|_| tokens.next().is_none());
@@ -63,7 +63,7 @@ impl Y4mSource {
         if width == 0 || height == 0 || width.saturating_mul(height) > MAX_PIXELS {
             return Err(damaged(format!("its size is {width}x{height}")));
         }
-        // The library has no mono16, which is laid out as mono12.
+        // The library does not know mono16, which is laid out as mono12.
         let sixteen = text.contains("Cmono16");
         let header = text.replace("Cmono16", "Cmono12").into_bytes();
         let read = Arc::new(AtomicU64::new(0));

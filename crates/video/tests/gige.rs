@@ -48,6 +48,7 @@ fn own_clock() -> Behaviour {
         resends: false,
         follows: false,
         taken: false,
+        describes: |right| right,
     }
 }
 
@@ -204,4 +205,46 @@ fn a_camera_that_somebody_else_controls_or_that_is_not_there_is_said() {
     });
     let said = first(Live::start(move |silence| nobody.open(silence)));
     assert!(said.contains("no GigE Vision camera answers there"), "{said}");
+}
+
+/// What comes first of a camera that describes itself wrongly: frames by what can be read of it, or trouble.
+fn first_of(last: u8, describes: fn(String) -> String) -> Sight {
+    let camera = Fake::start(address(last), Behaviour { describes, ..own_clock() });
+    watched(&camera).next(Duration::from_secs(10))
+}
+
+#[test]
+fn a_camera_whose_width_is_its_width_is_trouble() {
+    let sight = first_of(7, |right| right.replace("<pValue>WidthReg<", "<pValue>Width<"));
+    assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
+}
+
+#[test]
+fn a_camera_whose_payload_is_a_sum_of_itself_is_survived() {
+    let sight =
+        first_of(8, |right| right.replace(">WidthReg</pVariable>", ">PayloadSize</pVariable>"));
+    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+}
+
+#[test]
+fn a_camera_whose_formula_has_brackets_without_end_is_survived() {
+    let sight = first_of(9, |right| {
+        right.replace("W*H", &format!("{}W*H{}", "(".repeat(100_000), ")".repeat(100_000)))
+    });
+    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+}
+
+#[test]
+fn a_camera_that_describes_groups_within_groups_is_survived() {
+    let sight = first_of(10, |right| {
+        let group = "<Group Comment=\"a\">".repeat(50_000) + &"</Group>".repeat(50_000);
+        right.replace("<Port ", &(group + "<Port "))
+    });
+    assert!(!matches!(sight, Sight::Nothing), "{sight:?}");
+}
+
+#[test]
+fn a_camera_whose_description_breaks_off_is_trouble() {
+    let sight = first_of(11, |right| right[..right.len() / 2].to_owned());
+    assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
 }

@@ -2,19 +2,19 @@ use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;
 
-/// Frames of a camera that are remembered: half a minute of 30 per second, and tracks follow within
-/// one.
+/// Frames per camera whose arrival is remembered: half a minute at 30 per second; the tracks follow
+/// within that time.
 const FRAMES_A_CAMERA: usize = 1000;
 
-/// When each camera's frames arrived, until the tracks come that follow from them.
+/// Arrival times of each camera's frames, kept until the tracks that follow from them come.
 #[derive(Debug, Default)]
 pub(crate) struct Arrivals(BTreeMap<String, BTreeMap<u64, Timestamp>>);
 
 impl Arrivals {
-    /// A camera's frame arrived.
+    /// Notes the arrival of a camera's frame.
     pub(crate) fn note(&mut self, camera: &str, sequence: u64, arrival: Timestamp) {
         let frames = self.0.entry(camera.to_owned()).or_default();
-        // A camera that was started again counts from the start: its old frames are another run's.
+        // A restarted camera numbers from 0 again: its old frames belong to another run.
         if frames.last_key_value().is_some_and(|(&last, _)| {
             sequence < last.saturating_sub(FRAMES_A_CAMERA as u64 / 2) || sequence == 0
         }) {
@@ -26,7 +26,7 @@ impl Arrivals {
         }
     }
 
-    /// When a frame arrived; asked once.
+    /// The arrival of a frame; it is removed, so it can be asked for once.
     pub(crate) fn take(&mut self, camera: &str, sequence: u64) -> Option<Timestamp> {
         self.0.get_mut(camera)?.remove(&sequence)
     }

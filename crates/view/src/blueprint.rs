@@ -17,16 +17,17 @@ use crate::extent::Extent;
 use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, eye};
 
-/// A camera's images in the layout.
+/// The view of a camera's images in the layout.
 pub(crate) struct CameraPanel {
     /// The camera.
     pub(crate) name: String,
-    /// The part of its pictures that is shown, low and high corner in the picture's pixels; all
-    /// without.
+    /// Low and high corner of the part of its pictures that is shown, in the picture's pixels;
+    /// `None` for all of it.
     pub(crate) shown: Option<[[f64; 2]; 2]>,
 }
 
-/// Lays a site out: the world, plots and the legend on the left, images and events on the right.
+/// Sends a site's layout: the world, plots and the legend on the left, images and events on the
+/// right.
 pub(crate) fn send(
     stream: &RecordingStream,
     cameras: &[CameraPanel],
@@ -44,7 +45,7 @@ pub(crate) fn send(
     ];
     let plots = Horizontal::new(plots).with_column_shares([1.0, 1.0, 1.3]);
     let left = Vertical::new([site, plots.into()]).with_row_shares([3.2, 1.0]);
-    // One below the other they are wide, and few enough to be high.
+    // Up to three images are stacked: so they are wide, and few enough to be high as well.
     let columns = if cameras.len() <= 3 { 1 } else { 2 };
     let right = Vertical::new([
         ContainerLike::from(Grid::new(images).with_grid_columns(columns)),
@@ -74,8 +75,8 @@ pub(crate) fn send(
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, zooms)
 }
 
-/// The site with a map behind it, which asks for its tiles only when somebody turns to it.
-/// Also where the map's properties are written.
+/// Puts the site and a map into tabs; the map asks for its tiles only when somebody opens its tab.
+/// Also returns where the map's properties are written.
 fn with_map(site: ContainerLike) -> (ContainerLike, Option<EntityPath>) {
     let map: ContainerLike = MapView::new("map").with_origin(MAP).into();
     let path = path_of(&map);
@@ -94,7 +95,7 @@ fn visual_bounds([low, high]: [[f64; 2]; 2]) -> VisualBounds2D {
     VisualBounds2D::new(Range2D { x_range: range(0).into(), y_range: range(1).into() })
 }
 
-/// A blueprint with nothing open but what it shows.
+/// A blueprint whose side panels are collapsed.
 fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
     Blueprint::new(root)
         .with_auto_views(false)
@@ -103,8 +104,8 @@ fn without_panels(root: impl Into<ContainerLike>) -> Blueprint {
         .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
 }
 
-/// Lays a calibration's flight out: the site, the residuals and the legend on the left, images on the
-/// right.
+/// Sends the layout of a calibration's flight: the site, the residuals and the legend on the left,
+/// images on the right.
 pub(crate) fn send_flight(
     stream: &RecordingStream,
     cameras: &[String],
@@ -125,7 +126,7 @@ pub(crate) fn send_flight(
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, vec![])
 }
 
-/// Lays runs beside each other out: the site, how far each is from the truth below it, and the words.
+/// Sends the layout of several runs: the site, and below it their errors and the legend.
 pub(crate) fn send_comparison(stream: &RecordingStream, extent: &Extent) -> Result<(), ViewError> {
     let (site, site_path) = site_view();
     let below: [ContainerLike; 2] = [
@@ -138,7 +139,8 @@ pub(crate) fn send_comparison(stream: &RecordingStream, extent: &Extent) -> Resu
     send_site(stream, &without_panels(root).with_time_panel(time), site_path, extent, vec![])
 }
 
-/// Lays a volume out: the site on the left, the scale of colours and the words on the right.
+/// Sends the layout of a volume: the site on the left, the colour scale and the legend on the
+/// right.
 pub(crate) fn send_volume(
     stream: &RecordingStream,
     places: &[Point3<f64>],
@@ -170,8 +172,8 @@ fn path_of(view: &ContainerLike) -> Option<EntityPath> {
     }
 }
 
-/// Sends a blueprint whose view of the world has all of a box in view, before a dark background and
-/// without Rerun's grid, which has no end and no scale.
+/// Sends a blueprint whose 3D view shows a whole box, on a dark background and without Rerun's
+/// grid, which has no end and no scale.
 fn send_site(
     stream: &RecordingStream,
     blueprint: &Blueprint,
@@ -194,7 +196,7 @@ fn send_site(
     send_with(stream, blueprint, &properties)
 }
 
-/// Lays an image tracker's work out: the video on the left, the curves on the right.
+/// Sends the layout of an image tracker's work: the video on the left, the curves on the right.
 pub(crate) fn send_tracking(stream: &RecordingStream) -> Result<(), ViewError> {
     let video: ContainerLike = Spatial2DView::new("video").with_origin("/video").into();
     let curves = Vertical::new([
@@ -206,8 +208,8 @@ pub(crate) fn send_tracking(stream: &RecordingStream) -> Result<(), ViewError> {
     send_with(stream, &without_panels(root).with_time_panel(time), &[])
 }
 
-/// Sends a blueprint with properties of views, for which this version of Rerun has no setters in
-/// Rust: they are written into the blueprint's own store, as its Python code does.
+/// Sends a blueprint with properties of views for which this version of Rerun has no setters in
+/// Rust: they are written into the blueprint's own store, as Rerun's Python code does.
 fn send_with(
     stream: &RecordingStream,
     blueprint: &Blueprint,

@@ -1,15 +1,15 @@
 use crossfix_message::TrackNumber;
 use rerun_types::components::Color;
 
-/// Colours of cameras that can be told apart, also by those who see red and green alike.
+/// Colours of cameras: they can be told apart, also by those who confuse red and green.
 const PALETTE: [[u8; 3]; 6] =
     [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [180, 180, 180]];
 
-/// Colours of tracks: none is a camera's, and the first two are a warm one and a cold one.
+/// Colours of tracks: none is a camera's, and the first two are a warm and a cold one.
 const TRACKS: [[u8; 3]; 5] =
     [[255, 190, 225], [255, 80, 70], [185, 130, 255], [255, 60, 190], [190, 120, 90]];
 
-/// By the number that is shown, so that the colours of a run come in their order.
+/// A track's colour follows from the number that is shown, so the colours of a run come in order.
 fn of_id(id: u64) -> [u8; 3] {
     TRACKS[(TrackNumber(id).in_run() % TRACKS.len() as u64) as usize]
 }
@@ -20,7 +20,7 @@ pub(crate) fn of_track(id: u64) -> Color {
     Color::from_rgb(r, g, b)
 }
 
-/// The same, see-through, of a track that is not sure or not seen.
+/// The same but translucent, for a track that is not sure or not seen.
 pub(crate) fn of_unsure_track(id: u64) -> Color {
     let [r, g, b] = of_id(id);
     Color::from_unmultiplied_rgba(r, g, b, 120)
@@ -32,13 +32,14 @@ pub(crate) fn of(index: u64) -> Color {
     Color::from_rgb(r, g, b)
 }
 
-/// The same, see-through.
+/// The same but translucent.
 pub(crate) fn faint(index: u64, alpha: u8) -> Color {
     let [r, g, b] = PALETTE[(index % PALETTE.len() as u64) as usize];
     Color::from_unmultiplied_rgba(r, g, b, alpha)
 }
 
-/// Dark to light, even to the eye and to those who see red and green alike (matplotlib's viridis).
+/// Colour scale from dark to light, even to the eye, also to those who confuse red and green
+/// (matplotlib's viridis).
 const SCALE: [[u8; 3]; 9] = [
     [68, 1, 84],
     [71, 44, 122],
@@ -53,7 +54,7 @@ const SCALE: [[u8; 3]; 9] = [
 
 /// A colour from dark (0) to light (1), red, green and blue.
 pub(crate) fn scale(share: f64) -> [u8; 3] {
-    // What is no number is dark.
+    // NaN counts as dark.
     let share = if share > 0.0 { share.min(1.0) } else { 0.0 };
     let place = share * (SCALE.len() - 1) as f64;
     let low = place as usize;

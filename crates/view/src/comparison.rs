@@ -13,9 +13,10 @@ use crate::extent::Extent;
 use crate::paths::TIMELINE;
 use crate::{ViewError, blueprint, colour, ground};
 
-/// Where the targets really were.
+/// Colour of the true targets.
 const TRUTH: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));
-/// A place farther on in time than this is not joined by a line: the track was lost between, s.
+/// Longest gap between two places that are joined by a line, s: over a longer one the track was
+/// lost.
 const LONGEST_JOIN_S: f64 = 1.0;
 
 /// A place of a target or track at a time.
@@ -23,7 +24,7 @@ const LONGEST_JOIN_S: f64 = 1.0;
 pub struct PlaceInTime {
     /// When.
     pub time: Timestamp,
-    /// Whose: of the truth a target, of a run a track.
+    /// Whose: a target of the truth, or a track of a run.
     pub id: u64,
     /// Where, world, m.
     pub place: Point3<f64>,
@@ -32,14 +33,14 @@ pub struct PlaceInTime {
 /// One of several runs over the same data.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ComparedRun {
-    /// What it is called: its file.
+    /// Its name: the file's.
     pub name: String,
     /// Its tracks at the instants of the truth, in the order of time.
     pub tracks: Vec<PlaceInTime>,
 }
 
-/// Runs over the same data beside each other: their tracks and the truth in space, and how far each
-/// answer is from the nearest target over time.
+/// Several runs over the same data: their tracks and the truth in space, and each track's distance
+/// from the nearest target over time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ComparisonPicture {
     /// The truth, in the order of time.
@@ -49,7 +50,7 @@ pub struct ComparisonPicture {
 }
 
 impl ComparisonPicture {
-    /// Draws it all on a stream of [`crate::save`], and waits until it is drawn.
+    /// Draws all of it on a stream of [`crate::save`], and waits until it is drawn.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -70,7 +71,7 @@ impl ComparisonPicture {
         stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    /// How far each answer of a run is from the nearest target, m, over time.
+    /// Draws the distance of each of a run's tracks from the nearest target, m, over time.
     fn draw_errors(
         &self,
         stream: &RecordingStream,
@@ -109,8 +110,8 @@ impl ComparisonPicture {
     }
 }
 
-/// The ways of all targets or tracks, broken where there is no place for a while, and their places at
-/// their times.
+/// Draws the trajectories of all targets or tracks, interrupted at gaps, and each place at its
+/// time.
 fn draw_ways(
     stream: &RecordingStream,
     path: &str,

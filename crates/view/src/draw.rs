@@ -1,4 +1,4 @@
-//! What each thing looks like.
+//! The appearance of cameras, sight lines and tracks.
 
 use crossfix_geometry::{Camera, ImageSize};
 use crossfix_message::{BearingFrame, BearingTrack, Track, TrackNumber, TrackState};
@@ -15,22 +15,22 @@ use crate::{ViewError, colour};
 
 /// Length of the frustums, m: large enough to be seen in a site of 100 m.
 const FRUSTUM_M: f32 = 12.0;
-/// An ellipsoid's half axes, standard deviations.
+/// Half axes of an ellipsoid, standard deviations.
 pub(crate) const SIGMAS: f64 = 3.0;
-/// Ellipsoids of tracks that are known to within [`ENLARGED_UP_TO_M`] are drawn so many times too
-/// large, as the legend says: five centimetres are less than a point of the screen in a site of 100
-/// m.
+/// Factor by which ellipsoids of tracks known to within [`ENLARGED_UP_TO_M`] are drawn too large,
+/// as the legend says: five centimetres are less than a point of the screen in a site of 100 m.
 pub(crate) const ENLARGED: f64 = 30.0;
-/// Standard deviation along the worst axis, m: enlarged it would be as large as the site.
+/// Standard deviation along the worst axis up to which an ellipsoid is enlarged, m: enlarged, one
+/// of this size is as large as the site.
 pub(crate) const ENLARGED_UP_TO_M: f64 = 0.5;
-/// Arrows show the way of this time, s.
+/// An arrow's length is the distance flown in this time, s.
 const ARROW_S: f64 = 1.0;
 
 pub(crate) fn f32s(v: &Vector3<f64>) -> [f32; 3] {
     [v.x as f32, v.y as f32, v.z as f32]
 }
 
-/// Where a camera stands and looks.
+/// A camera's pose.
 fn transform(camera: &Camera) -> Transform3D {
     let matrix = camera.pose().rotation().matrix();
     let column = |i: usize| [matrix[(0, i)] as f32, matrix[(1, i)] as f32, matrix[(2, i)] as f32];
@@ -38,7 +38,7 @@ fn transform(camera: &Camera) -> Transform3D {
     Transform3D::from_translation_mat3x3(position, [column(0), column(1), column(2)])
 }
 
-/// A camera that nothing turns: where it looks for all times.
+/// Draws the pose of a fixed camera, for all times.
 pub(crate) fn fixed_pose(
     stream: &RecordingStream,
     name: &str,
@@ -47,7 +47,7 @@ pub(crate) fn fixed_pose(
     Ok(stream.log_static(format!("world/cameras/{name}"), &transform(camera))?)
 }
 
-/// A camera on a mount: where it looks from now on.
+/// Draws the pose of a camera on a mount, from now on.
 pub(crate) fn turned_pose(
     stream: &RecordingStream,
     name: &str,
@@ -56,7 +56,7 @@ pub(crate) fn turned_pose(
     Ok(stream.log(format!("world/cameras/{name}"), &transform(camera))?)
 }
 
-/// A camera: its place, and a frustum whose image has sides scaled by `scale`.
+/// Draws a camera: its position, and a frustum whose image is scaled by `scale`.
 pub(crate) fn camera(
     stream: &RecordingStream,
     name: &str,
@@ -91,7 +91,7 @@ pub(crate) fn camera(
     Ok(())
 }
 
-/// What the plot of a camera's residuals looks like.
+/// Sets name and colour of a camera's residual plot.
 pub(crate) fn residual_plot(
     stream: &RecordingStream,
     name: &str,
@@ -104,7 +104,7 @@ pub(crate) fn residual_plot(
     Ok(())
 }
 
-/// The sight lines of a frame, `reach_m` long.
+/// Draws the sight lines of a frame, `reach_m` long.
 pub(crate) fn bearings(
     stream: &RecordingStream,
     frame: &BearingFrame,
@@ -141,7 +141,7 @@ pub(crate) fn tint(track: &Track) -> Color {
     }
 }
 
-/// Where a track has been.
+/// Draws a track's trail.
 pub(crate) fn trail(
     stream: &RecordingStream,
     track: &Track,
@@ -153,7 +153,7 @@ pub(crate) fn trail(
     Ok(stream.log(format!("world/tracks/{}/trail", track.id), &strip)?)
 }
 
-/// A track: where it is, how fast, and how sure.
+/// Draws a track: position, velocity and covariance.
 pub(crate) fn track(stream: &RecordingStream, track: &Track) -> Result<(), ViewError> {
     let (Some(position), Some(velocity)) = (track.position, track.velocity) else {
         return Ok(());
@@ -179,7 +179,8 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track) -> Result<(), ViewE
             .with_colors([tint])
             .with_radii([Radius::new_ui_points(1.5)]),
     )?;
-    // One that only one camera sees is anywhere along its sight line, which is drawn already.
+    // A track that only one camera sees may be anywhere along its sight line, which is drawn
+    // already.
     let ellipsoid = ellipsoid(track).filter(|_| track.state() != TrackState::OneCamera);
     let (half_axes, rotation): (Vec<_>, Vec<_>) = ellipsoid.into_iter().unzip();
     let centres = half_axes.iter().map(|_| place);
@@ -193,23 +194,24 @@ pub(crate) fn track(stream: &RecordingStream, track: &Track) -> Result<(), ViewE
     Ok(())
 }
 
-/// The root of the sum of the variances of a track's position, m.
+/// Standard deviation of a track's position, m: the root of the sum of its three variances.
 pub(crate) fn position_sd(track: &Track) -> f64 {
     let variance: f64 = (0..3).filter_map(|axis| track.covariance.get(7 * axis)).sum();
     variance.max(0.0).sqrt()
 }
 
 /// A bound on the standard deviation of a track's position across a line, m: the root of the sum of
-/// its variances, without the one along it.
+/// its three variances, less the variance along the line.
 pub(crate) fn across_sd(track: &Track, line: &Vector3<f64>) -> f64 {
     let length = line.norm();
     let of = |row: usize, column: usize| track.covariance.get(6 * row + column).unwrap_or(&0.0);
+    // along = u' P u with u = line / |line|; across = sqrt(trace P - along)
     let along: f64 =
         (0..9).map(|k| of(k / 3, k % 3) * line[k / 3] * line[k % 3]).sum::<f64>() / length.powi(2);
     (position_sd(track).powi(2) - along).max(0.0).sqrt()
 }
 
-/// What a track's label says: its number, and what it is or how fast, how high and how sure.
+/// A track's label: its number, and its state or its height, speed and standard deviation.
 fn label(track: &Track, speed: f64, height: f64) -> String {
     let number = TrackNumber(track.id);
     let what = match track.state() {
@@ -222,18 +224,19 @@ fn label(track: &Track, speed: f64, height: f64) -> String {
     format!("{number}  {what}{height:.0} m  {speed:.0} m/s  \u{b1}{sd:.2}")
 }
 
-/// Half axes and turn of a track's ellipsoid of position.
+/// Half axes and rotation of the ellipsoid of a track's position.
 fn ellipsoid(track: &Track) -> Option<([f32; 3], Quaternion)> {
     let covariance: &[f64; 36] = track.covariance.as_slice().try_into().ok()?;
     ellipsoid_of(&Matrix3::from_fn(|row, column| covariance[6 * row + column]))
 }
 
-/// Half axes and turn of the ellipsoid of a covariance, m^2.
+/// Half axes and rotation of a covariance's ellipsoid; the covariance is in m^2.
 pub(crate) fn ellipsoid_of(covariance: &Matrix3<f64>) -> Option<([f32; 3], Quaternion)> {
     if !covariance.iter().all(|v| v.is_finite()) {
         return None;
     }
     let SymmetricEigen { eigenvalues, mut eigenvectors } = covariance.symmetric_eigen();
+    // A rotation needs determinant +1: one eigenvector is turned round.
     if eigenvectors.determinant() < 0.0 {
         eigenvectors.column_mut(0).neg_mut();
     }

@@ -1,4 +1,4 @@
-//! Where on Earth the site is: what is drawn on a map, and a picture of the ground.
+//! Where on Earth the site is: its map, and a picture of the ground.
 
 use crossfix_geometry::{Geodetic, LocalFrame};
 use crossfix_message::{Track, TrackState};
@@ -12,30 +12,33 @@ use rerun_types::datatypes::Rgba32;
 use crate::extent::Extent;
 use crate::{ViewError, draw};
 
-/// Where the map's view finds its points.
+/// Entity path from which the map view takes its points.
 pub(crate) const MAP: &str = "map";
-/// The picture of the ground.
+/// Entity path of the picture of the ground.
 const PICTURE: &str = "world/ground/picture";
-/// So much of a picture's light is left, of 255: sight lines and trails must stand out from it.
+/// Brightness to which the picture is dimmed, of 255: sight lines and trails must stand out from
+/// it.
 const DIMMED: u8 = 130;
-/// The picture lies so far below the grid, parts of the site's length: in one plane they would flicker.
+/// How far the picture lies below the grid, as a share of the diagonal of the site's extent: in one
+/// plane the two would flicker.
 const BELOW_GRID: f64 = 1e-3;
 
-/// What a point of the map is at the equator where all of it is 256 points wide, m.
+/// Size of a point of the map at the equator, at the zoom where the whole map is 256 points wide,
+/// m.
 const WHOLE_MAP_M: f64 = 156_543.0;
-/// The site is so many points of the map high, so that it fits into the smallest view.
+/// Length of the site's diagonal on the map, points: so it fits into the smallest view.
 const SITE_POINTS: f64 = 250.0;
 
 /// A picture of the ground from above, north up: an orthophoto, a plan, a piece of a map.
 #[derive(Clone, Debug)]
 pub struct GroundPicture {
-    /// Its pixels across and down.
+    /// Columns and rows.
     pub size: [u32; 2],
-    /// Red, green and blue of each, row by row from the north-west.
+    /// Red, green and blue of each pixel, row by row from the north-west.
     pub rgb: Vec<u8>,
-    /// Where its south-western corner is.
+    /// Its south-western corner.
     pub south_west: Geodetic,
-    /// Where its north-eastern corner is.
+    /// Its north-eastern corner.
     pub north_east: Geodetic,
 }
 
@@ -53,13 +56,13 @@ impl Earth {
     ) -> Result<Self, ViewError> {
         let earth = Self { frame: LocalFrame::at(anchor), has_picture: picture.is_some() };
         if let Some(picture) = picture {
-            // Once: it may be many megabytes.
+            // Logged once: it may be many megabytes.
             stream.log_static(format!("{PICTURE}/mesh"), &earth.mesh(picture))?;
         }
         Ok(earth)
     }
 
-    /// A picture of the ground, at the height of the site's origin.
+    /// The picture of the ground as a mesh at the height of the site's origin.
     fn mesh(&self, picture: GroundPicture) -> Mesh3D {
         let [from, to] =
             [picture.south_west, picture.north_east].map(|corner| self.frame.local(corner));
@@ -76,11 +79,12 @@ impl Earth {
         (place.latitude_deg(), place.longitude_deg())
     }
 
-    /// What has a site as a whole on the map.
+    /// The zoom at which the map shows the whole site.
     pub(crate) fn zoom(&self, extent: &Extent) -> MapZoom {
         let (low, high) = extent.bounds();
         let across = (high - low).norm().max(1.0);
         let (latitude_deg, _) = self.lat_lon(extent.middle());
+        // metres per point at zoom z: WHOLE_MAP_M cos(latitude) / 2^z
         let point_m = WHOLE_MAP_M * latitude_deg.to_radians().cos();
         MapZoom::new((point_m * SITE_POINTS / across).log2().clamp(0.0, 20.0))
     }
@@ -99,7 +103,7 @@ impl Earth {
         Ok(stream.log_static(format!("{MAP}/cameras/{name}"), &point)?)
     }
 
-    /// A track on the map, with its way; one that only one camera sees is nowhere on it.
+    /// Draws a track on the map, with its trail; a track of one camera is taken off the map.
     pub(crate) fn track(
         &self,
         stream: &RecordingStream,
@@ -123,12 +127,12 @@ impl Earth {
         Ok(stream.log(format!("{MAP}/tracks/{id}/trail"), &way)?)
     }
 
-    /// A track that is none any more.
+    /// Takes an ended track off the map.
     pub(crate) fn clear(&self, stream: &RecordingStream, id: u64) -> Result<(), ViewError> {
         Ok(stream.log(format!("{MAP}/tracks/{id}"), &Clear::recursive())?)
     }
 
-    /// Lays the picture of the ground, if there is one, under the grid of a site.
+    /// Places the picture of the ground, if there is one, just under the grid of a site.
     pub(crate) fn ground(
         &self,
         stream: &RecordingStream,

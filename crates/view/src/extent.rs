@@ -1,18 +1,18 @@
 use nalgebra::{Point3, Vector3};
 
-/// A box along the world's axes that holds everything it has been shown.
+/// A box along the world's axes that contains all points it was given.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Extent(Option<(Point3<f64>, Point3<f64>)>);
 
 impl Extent {
-    /// The box of these points.
+    /// The smallest box of these points.
     pub(crate) fn of(points: impl IntoIterator<Item = Point3<f64>>) -> Self {
         let mut extent = Self::default();
         points.into_iter().for_each(|point| extent.include(point));
         extent
     }
 
-    /// Makes room for a point; one that is no place is left out.
+    /// Enlarges the box to contain a point; a point that is not finite is ignored.
     pub(crate) fn include(&mut self, point: Point3<f64>) {
         if !point.iter().all(|v| v.is_finite()) {
             return;
@@ -22,12 +22,12 @@ impl Extent {
         *high = high.sup(&point);
     }
 
-    /// Whether it holds nothing.
+    /// Whether no point was included.
     pub(crate) fn is_empty(&self) -> bool {
         self.0.is_none()
     }
 
-    /// Lowest and highest corner; a point at the origin if it holds nothing.
+    /// Lowest and highest corner; both at the origin if the box is empty.
     pub(crate) fn bounds(&self) -> (Point3<f64>, Point3<f64>) {
         self.0.unwrap_or((Point3::origin(), Point3::origin()))
     }
@@ -41,7 +41,7 @@ impl Extent {
         })
     }
 
-    /// Its middle.
+    /// Its centre.
     pub(crate) fn middle(&self) -> Point3<f64> {
         let (low, high) = self.bounds();
         nalgebra::center(&low, &high)

@@ -1,4 +1,4 @@
-//! From where the world is looked at.
+//! The point from which the 3D view looks at a site.
 
 use nalgebra::{Point3, Vector3};
 use rerun_types::blueprint::archetypes::EyeControls3D;
@@ -6,18 +6,18 @@ use rerun_types::blueprint::components::Eye3DKind;
 
 use crate::extent::Extent;
 
-/// Half of Rerun's vertical field of view, as a tangent (55 degrees in all).
+/// Tangent of half of Rerun's vertical field of view (55 degrees in all).
 const HALF_HEIGHT: f64 = 0.52;
-/// The same across, of a view that is wider than high.
+/// The same horizontally, for a view that is wider than high.
 const HALF_WIDTH: f64 = 1.5 * HALF_HEIGHT;
-/// Room at the borders, for labels.
+/// Factor on the distance that leaves room for labels at the borders.
 const ROOM: f64 = 1.1;
-/// After so many the target moves by less than a pixel.
+/// Number of iterations: after these the target moves by less than a pixel.
 const CENTRINGS: u32 = 4;
-/// Nothing is looked at from closer than this, m.
+/// Least distance from which anything is looked at, m.
 const CLOSEST_M: f64 = 20.0;
 
-/// The eye that has all of a box in view, from the south and above, so that north is up in the
+/// An eye that has a whole box in view, from the south and above, so that north is up in the
 /// picture.
 pub(crate) fn on(extent: &Extent) -> EyeControls3D {
     let f32s = |point: Point3<f64>| [point.x as f32, point.y as f32, point.z as f32];
@@ -29,17 +29,19 @@ pub(crate) fn on(extent: &Extent) -> EyeControls3D {
         .with_eye_up([0.0_f32, 0.0, 1.0])
 }
 
-/// Where the eye is, and what it looks at.
+/// Where the eye is, and the point that it looks at.
 fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
     let towards_eye = Vector3::new(-0.35, -1.0, 0.75).normalize();
     let right = Vector3::z().cross(&towards_eye).normalize();
     let up = towards_eye.cross(&right);
     let mut target = extent.middle();
     let mut distance = CLOSEST_M;
-    // What is near looks larger, so the middle of the box is not that of the picture: the target is
-    // moved to where the picture's middle is, and the distance found anew.
+    // Near corners look larger, so the centre of the box is not the centre of the picture. The
+    // target is moved to the picture's centre and the distance computed again.
     for _ in 0..CENTRINGS {
-        // A corner is in view if it lies within the field's slope at its distance from the eye.
+        // A corner is in view if its offset across divided by its depth is at most the field's
+        // tangent. The result is the least distance of the eye: offset towards the eye + offset
+        // across / tangent.
         let needed = |corner: Point3<f64>| {
             let from = corner - target;
             let slope =
@@ -47,6 +49,8 @@ fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
             from.dot(&towards_eye) + slope
         };
         distance = extent.corners().map(needed).fold(CLOSEST_M, f64::max);
+        // A corner's tangent from the line of sight along an axis; the depth is kept above a tenth
+        // of the distance.
         let seen = |corner: Point3<f64>, axis: &Vector3<f64>| {
             let from = corner - target;
             from.dot(axis) / (distance - from.dot(&towards_eye)).max(0.1 * distance)
@@ -58,6 +62,7 @@ fn eye_and_target(extent: &Extent) -> (Point3<f64>, Point3<f64>) {
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| {
                     (low.min(s), high.max(s))
                 });
+            // Half-way between the outermost corners as seen, as a length at the target's distance.
             0.5 * (low + high) * distance
         };
         target += middle(&right) * right + middle(&up) * up;

@@ -13,49 +13,51 @@ use crate::extent::Extent;
 use crate::paths::{TIMELINE, image_path};
 use crate::{ViewError, blueprint, colour, draw, ground};
 
-/// Labels that are drawn at their times, of each camera, at most: a picture of ten minutes opens at once.
+/// Most labels of a camera that are drawn, each at its time: so a picture of ten minutes opens at
+/// once.
 const MOST_SHOWN: usize = 3000;
-/// The target's way and what belongs to no camera.
+/// Colour of the target's trajectory and of what belongs to no camera.
 const WAY: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 240, 240));
-/// The log.
+/// Colour of the log.
 const LOG: Color = Color(rerun_types::datatypes::Rgba32::from_rgb(240, 90, 200));
 
-/// A place where a camera's labels have a target, and where it should be seen.
+/// A label of a camera's target, and where the camera should see it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SeenTarget {
     /// Common time.
     pub time: Timestamp,
-    /// Where it was labelled.
+    /// Where the target was labelled.
     pub label: Pixel,
-    /// Where the adjusted flight should be seen.
+    /// Where the target should be seen by the adjusted trajectory.
     pub expected: Pixel,
-    /// Where it was, world, m.
+    /// Where the target was, world, m.
     pub place: Point3<f64>,
 }
 
-/// A calibrated camera and what it saw.
+/// A calibrated camera and its labels.
 pub struct FlightCamera<'a> {
     /// Its name.
     pub name: String,
-    /// Lens and pose.
+    /// Its lens and pose.
     pub camera: &'a Camera,
     /// Covariance of its centre, m^2.
     pub centre_covariance: Matrix3<f64>,
-    /// What it saw, in the order of time.
+    /// Its labels, in the order of time.
     pub seen: Vec<SeenTarget>,
 }
 
-/// A place of a log beside the way.
+/// A place of the log, and the adjusted one at the same time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LoggedPlace {
-    /// Where the log has the target, world, m.
+    /// The target's place by the log, world, m.
     pub logged: Point3<f64>,
-    /// Where the way has it.
+    /// The target's place by the adjusted trajectory, world, m.
     pub place: Point3<f64>,
 }
 
-/// A flight that calibrates cameras: where they stand and how surely, the target's way, the log beside
-/// it, and in each image where labels lie beside where the target should be seen.
+/// A flight that calibrates cameras: the cameras with the accuracy of their positions, the target's
+/// trajectory, the log beside it, and in each image the labels beside where the target should be
+/// seen.
 pub struct FlightPicture<'a> {
     /// The cameras.
     pub cameras: Vec<FlightCamera<'a>>,
@@ -64,7 +66,7 @@ pub struct FlightPicture<'a> {
 }
 
 impl FlightPicture<'_> {
-    /// Draws it all on a stream of [`crate::save`], and waits until it is drawn.
+    /// Draws all of it on a stream of [`crate::save`], and waits until it is drawn.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -99,7 +101,7 @@ impl FlightPicture<'_> {
         stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    /// Where the target was when it was seen by any camera.
+    /// The target's place at each time it was seen by any camera, in the order of time.
     fn way(&self) -> Vec<(Timestamp, Point3<f64>)> {
         let seen = self.cameras.iter().flat_map(|camera| &camera.seen);
         let mut way: Vec<_> = seen.map(|seen| (seen.time, seen.place)).collect();
@@ -171,7 +173,8 @@ impl FlightCamera<'_> {
         Ok(())
     }
 
-    /// A label at its time: beside where the target should be seen, and its residual.
+    /// Draws a label at its time, where the target should be seen, and the residual between them,
+    /// px.
     fn draw_at(
         &self,
         stream: &RecordingStream,
@@ -208,7 +211,7 @@ fn f32s_of(pixel: Pixel) -> [f32; 2] {
     [pixel.x() as f32, pixel.y() as f32]
 }
 
-/// Every n-th of some, so that there are not too many.
+/// Every n-th element, at most [`MOST_SHOWN`] in all.
 fn thinned<T: Copy>(all: &[T]) -> impl Iterator<Item = T> + '_ {
     all.iter().copied().step_by(all.len().div_ceil(MOST_SHOWN).max(1))
 }

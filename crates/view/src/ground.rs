@@ -1,4 +1,4 @@
-//! The ground: a grid of known size under the cameras and tracks, with its scale and the north.
+//! The ground: a grid of known size under cameras and tracks, with its scale and a north arrow.
 
 use nalgebra::Point3;
 use rerun::RecordingStream;
@@ -8,8 +8,8 @@ use rerun_types::components::{Color, Radius};
 use crate::ViewError;
 use crate::extent::Extent;
 
-/// Cells of the grid along its longer side, about: enough to count by, few enough not to hide
-/// anything.
+/// Approximate number of grid cells along its longer side: enough to count by, few enough not to
+/// hide anything.
 const CELLS: f64 = 8.0;
 
 /// The largest of 1, 2 and 5 times a power of ten that is not above a length.

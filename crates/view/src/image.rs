@@ -11,10 +11,10 @@ use crate::draw::{SIGMAS, across_sd};
 use crate::paths::image_path;
 use crate::{ViewError, colour};
 
-/// A ring is at least so large, pixels of the camera: a target of a few pixels must be seen inside
+/// Smallest radius of a ring, pixels of the camera: a target of a few pixels must be visible inside
 /// it.
 const LEAST_RING_PX: f64 = 12.0;
-/// Corners of a ring.
+/// Number of line segments of a ring.
 const CORNERS: usize = 24;
 
 /// The part of a camera's image in which targets were, pixels of the camera.
@@ -25,7 +25,7 @@ pub(crate) struct Region {
 }
 
 impl Region {
-    /// Makes room for a place.
+    /// Enlarges the region to contain a pixel; a pixel that is not finite is ignored.
     pub(crate) fn include(region: &mut Option<Self>, [x, y]: [f64; 2]) {
         let place = Vector2::new(x, y);
         if place.iter().all(|v| v.is_finite()) {
@@ -35,22 +35,23 @@ impl Region {
         }
     }
 
-    /// What to show of a picture of this scale, from a low to a high corner: the region with room
-    /// about it for the rings, in the image.
+    /// Low and high corner of the part of a picture to show, in pixels of the picture, which has
+    /// this scale: the region with room for rings about it, inside the image.
     pub(crate) fn shown(&self, camera: &Camera, scale: f64) -> [[f64; 2]; 2] {
         let size = camera.model().intrinsics().size;
         let side = Vector2::new(f64::from(size.width), f64::from(size.height));
         let room = Vector2::repeat(4.0 * LEAST_RING_PX);
-        // As wide and as high in shares of the image, so that the picture fills its view.
+        // The same share of width and height, so that the part fills its view.
         let share = (self.high - self.low + 2.0 * room).component_div(&side).max().min(1.0);
         let half = 0.5 * share * side;
         let middle = 0.5 * (self.low + self.high);
+        // Moves the centre so that the part stays within the image.
         let middle = middle.sup(&half).inf(&(side - half));
         [middle - half, middle + half].map(|corner| [scale * corner.x, scale * corner.y])
     }
 }
 
-/// The boxes that an agent has drawn round its targets.
+/// Draws the boxes of an agent's targets.
 pub(crate) fn boxes(
     stream: &RecordingStream,
     camera: &str,
@@ -60,7 +61,7 @@ pub(crate) fn boxes(
 ) -> Result<(), ViewError> {
     let boxes = || tracks.iter().filter(|track| track.width > 0.0);
     let scaled = |value: f64| (value * scale) as f32;
-    // Rerun's pixels have their upper left corner at whole numbers.
+    // Rerun counts pixels from the upper left corner of the first, not from its middle.
     let centres = boxes().map(|t| (scaled(t.pixel_x + 0.5), scaled(t.pixel_y + 0.5)));
     let sizes = boxes().map(|t| (scaled(t.width), scaled(t.height)));
     stream.log(
@@ -75,7 +76,7 @@ pub(crate) fn boxes(
     Ok(())
 }
 
-/// Where a camera should see a track.
+/// A ring drawn where a camera should see a track.
 pub(crate) struct Ring {
     /// Centre, pixels of the camera.
     pub(crate) centre: [f64; 2],
@@ -91,15 +92,15 @@ impl Ring {
         }
         let pixel = camera.project(place)?;
         let line = place - camera.pose().position();
-        // A bound on the deviation across the line of sight, in pixels: along it one camera alone
-        // knows nothing.
+        // Bound on the standard deviation across the line of sight, in pixels. The part along the
+        // line is left out: one camera alone knows nothing of it.
         let across = across_sd(track, &line);
         let deviation = across / line.norm() * camera.model().intrinsics().fx;
         let radius = (SIGMAS * deviation).max(LEAST_RING_PX);
         Some(Self { centre: [pixel.x(), pixel.y()], radius, id: track.id })
     }
 
-    /// Beside the ring, for its number.
+    /// Where the ring's number is written: beside the ring.
     fn beside(&self, scale: f64) -> [f32; 2] {
         let [x, y] = self.centre;
         [x + 2.5 * self.radius, y - self.radius].map(|v| (v * scale) as f32)
@@ -116,7 +117,7 @@ impl Ring {
     }
 }
 
-/// The rings in which a camera should see the tracks, with their numbers.
+/// Draws the rings where a camera should see the tracks, with their numbers.
 pub(crate) fn rings(
     stream: &RecordingStream,
     camera: &str,
@@ -177,7 +178,8 @@ mod tests {
         let track = Track { id: 7, covariance: vec![0.01; 36], ..Default::default() };
         let ring = Ring::of(&track, Point3::new(1.0, 0.0, 10.0), &camera()).unwrap();
         assert_eq!(ring.centre, [579.5, 249.5]);
-        // Of 0.173 m in all 0.109 m lie along the line (1, 0, 10): three times 0.134 m at 10 m.
+        // The total deviation is 0.173 m, of which 0.109 m lie along the line (1, 0, 10): 0.134 m
+        // remain, and three times that at 10 m is the radius.
         assert!((ring.radius - 32.05).abs() < 0.05, "{}", ring.radius);
         assert!(Ring::of(&track, Point3::new(1.0, 0.0, -10.0), &camera()).is_none());
     }

@@ -5,7 +5,7 @@ use rerun_types::components::MediaType;
 use crate::ViewError;
 use crate::draw::{ENLARGED, ENLARGED_UP_TO_M, SIGMAS};
 
-/// What the colours and forms of a site's picture mean.
+/// Draws the legend: what the colours and shapes in a site's picture mean.
 pub(crate) fn draw(stream: &RecordingStream) -> Result<(), ViewError> {
     let text = format!(
         "**Orange, blue, green, yellow**: a camera, its sight lines, its boxes and its residuals.\n\n\

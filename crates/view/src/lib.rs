@@ -1,12 +1,10 @@
-//! The picture of a site in Rerun: cameras with their frustums and images,
-//! sight lines, 3D tracks with trails, velocities and covariances, residuals
-//! and latency, on the timeline of capture time.
+//! The picture of a site in Rerun: cameras with their frustums and images, sight lines, 3D tracks
+//! with trails, velocities and covariances, residuals and latency, on a timeline of capture time.
 //!
-//! One [`Picture`] draws live messages and recorded ones alike: it is given
-//! the bytes of the wire. What it draws a second is bounded, so that a viewer
-//! left open does not fill the memory.
+//! A [`Picture`] draws live messages and recorded ones in the same way: it takes the bytes as they
+//! were sent. The rate of drawing is bounded, so that a viewer left open does not fill the memory.
 //!
-//! A recording becomes a picture:
+//! Drawing a recording:
 //!
 //! ```
 //! use crossfix_recording::RecordingReader;

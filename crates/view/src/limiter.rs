@@ -2,14 +2,14 @@ use std::collections::BTreeMap;
 
 use crossfix_message::Timestamp;
 
-/// Lets each thing through at most so many times a second of data time.
+/// Rate limiter: lets each named thing through at most at a given rate, by data time.
 #[derive(Debug, Default)]
 pub(crate) struct Limiter {
     last: BTreeMap<String, Timestamp>,
 }
 
 impl Limiter {
-    /// Whether it is time for `what` again.
+    /// Whether `what` is due again.
     pub(crate) fn allows(&mut self, what: &str, now: Timestamp, rate_hz: f64) -> bool {
         let due = self.last.get(what).is_none_or(|last| {
             let since = now.seconds_since(*last);

@@ -20,52 +20,52 @@ use crate::paths::{TIMELINE, image_path};
 use crate::trail::Trail;
 use crate::{ViewError, ViewerWatch, blueprint, colour, draw, ground, legend};
 
-/// Pictures, sight lines, states and trails drawn a second, each camera and all tracks.
+/// Most drawings per second: a camera's previews, a camera's sight lines, and a track.
 const PREVIEW_RATE_HZ: f64 = 5.0;
 const LINE_RATE_HZ: f64 = 10.0;
 const TRACK_RATE_HZ: f64 = 15.0;
-/// Fusion centres whose problems are kept in mind.
+/// Most fusion centres whose problems are remembered.
 const MOST_CENTRES: usize = 1000;
-/// Sight lines reach this far where no track says how far, m.
+/// Length of sight lines as long as no track tells how far they should reach, m.
 const DEFAULT_REACH_M: f64 = 150.0;
-/// Targets fly about so high above the cameras, m, as long as no track says where.
+/// Height above the cameras where targets are expected, as long as no track shows them, m.
 const AIR_M: f64 = 25.0;
-/// A track that has not been heard of for this long is not drawn any more, s: each is said twice a
-/// second, so the fusion centre that held it is gone.
+/// A track of which nothing was heard for this long is removed, s: each is sent twice a second, so
+/// its fusion centre is gone.
 const GHOST_S: f64 = 3.0;
 
-/// The picture is laid out about tracks that are known better than this, m: one that is far off must
-/// not make all others small.
+/// The picture is laid out about tracks with a smaller standard deviation than this, m: one that is
+/// far off must not make all others small.
 const LAID_OUT_SD_M: f64 = 5.0;
 
-/// What is shown of the cameras' images.
+/// The part of the cameras' images that is shown.
 #[derive(Clone, Copy, Debug)]
 enum Shown {
-    /// All: while more comes, nobody knows where.
+    /// Whole images: while messages still come, it is not known where targets will be.
     WholeImages,
-    /// The parts in which targets were.
+    /// The parts in which targets were seen.
     WhereTargetsWere,
 }
 
 struct CameraView {
     index: u64,
     calibration: Calibration,
-    /// As it looks now: on a mount, as its last frame said.
+    /// The camera as it looks now: on a mount, as its last frame said.
     camera: Camera,
     scale: f64,
-    /// Of the calibration that is drawn.
+    /// Hash of the calibration that is drawn.
     hash: Vec<u8>,
-    /// Where in its images targets were.
+    /// The part of its images in which targets were seen.
     region: Option<Region>,
 }
 
 impl CameraView {
-    /// Turns a camera on a mount to where a frame says that it looked.
+    /// Turns a camera on a mount to the pointing that a frame states.
     fn point(&mut self, stream: &RecordingStream, frame: &BearingFrame) -> Result<(), ViewError> {
         if self.calibration.mount.is_none() {
             return Ok(());
         }
-        // What says nothing of it is the fusion's to report.
+        // A frame without a usable pointing is reported by the fusion.
         let Some(pointed) = self.calibration.pointed(frame.pointing.as_ref()) else {
             return Ok(());
         };
@@ -74,16 +74,16 @@ impl CameraView {
     }
 }
 
-/// Where a track is drawn.
+/// A track as it was drawn last.
 struct DrawnTrack {
     track: Track,
     time: Timestamp,
     place: Point3<f64>,
-    /// When it was last heard of.
+    /// Arrival of the last message about it.
     heard: Timestamp,
 }
 
-/// Draws what goes over the wire.
+/// Draws a site's messages.
 pub struct Picture {
     stream: RecordingStream,
     cameras: BTreeMap<String, CameraView>,
@@ -93,9 +93,9 @@ pub struct Picture {
     arrivals: Arrivals,
     viewer: ViewerWatch,
     earth: Option<Earth>,
-    /// Where confirmed tracks have been.
+    /// Extent of where confirmed tracks have been.
     flown: Extent,
-    /// What the fusion centre has said last that a person should look at.
+    /// The problems that each fusion centre reported last.
     problems: BTreeMap<String, Vec<String>>,
 }
 
@@ -122,8 +122,8 @@ impl Picture {
         })
     }
 
-    /// The same on the Earth: with a map beside the site, whose origin is at the anchor, and with a picture
-    /// of the ground under it.
+    /// Adds a map beside the site, whose origin is at the anchor, and a picture of the ground under
+    /// it.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -136,7 +136,8 @@ impl Picture {
         Ok(Self { earth: Some(earth), ..self })
     }
 
-    /// Draws a message that arrived at `arrival`; what cannot be read is left out and said.
+    /// Draws a message that arrived at `arrival`. One that cannot be read is left out, and its
+    /// error returned.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -162,7 +163,7 @@ impl Picture {
         }
     }
 
-    /// Lays the picture out anew about all that it shows, and waits until everything is drawn.
+    /// Lays the picture out again about all that it shows, and waits until everything is drawn.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -171,8 +172,8 @@ impl Picture {
         self.stream.flush_blocking().map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    /// Waits a moment until everything is drawn, as a viewer that does not look must not hold us
-    /// up.
+    /// Waits until everything is drawn, for `patience` at most, as a viewer that takes nothing must
+    /// not hold us up.
     ///
     /// # Errors
     /// [`ViewError::Flush`].
@@ -182,7 +183,7 @@ impl Picture {
             .map_err(|error| ViewError::Flush(error.to_string()))
     }
 
-    /// Whether the viewer is gone for good; to be asked about once a second.
+    /// Whether the viewer is gone for good; meant to be asked about once a second.
     pub fn has_lost_its_viewer(&self) -> bool {
         self.viewer.look(&self.stream);
         self.viewer.is_gone()
@@ -194,7 +195,7 @@ impl Picture {
     }
 
     fn calibration(&mut self, message: &CameraCalibration) -> Result<(), ViewError> {
-        // An impossible one is the fusion's to report.
+        // An invalid calibration is reported by the fusion.
         let Ok(parsed) = message.parse() else {
             return Ok(());
         };
@@ -227,12 +228,12 @@ impl Picture {
         Ok(())
     }
 
-    /// Lays the picture out about what is known of cameras and tracks by now.
+    /// Lays the picture out about the cameras and tracks known so far.
     fn lay_out(&self, shown: Shown) -> Result<(), ViewError> {
         let mut extent =
             Extent::of(self.cameras.values().map(|view| view.camera.pose().position()));
         if self.flown.is_empty() {
-            // Where targets are likely to be.
+            // No track yet: includes the air where targets are likely to be.
             extent.include(extent.middle() + Vector3::z() * AIR_M);
         } else {
             self.flown.corners().for_each(|corner| extent.include(corner));
@@ -285,7 +286,7 @@ impl Picture {
             return Ok(());
         }
         view.point(&self.stream, frame)?;
-        // As far as the farthest track, so that the crossings are seen.
+        // A little farther than the farthest track, so that the crossings of sight lines are seen.
         let origin = view.camera.pose().position();
         let placed =
             self.drawn.values().filter(|drawn| drawn.track.state() != TrackState::OneCamera);
@@ -342,7 +343,7 @@ impl Picture {
         Ok(())
     }
 
-    /// Draws where each camera should see the tracks.
+    /// Draws the rings where each camera should see the tracks.
     fn rings(&self) -> Result<(), ViewError> {
         for (name, view) in &self.cameras {
             let ring = |drawn: &DrawnTrack| Ring::of(&drawn.track, drawn.place, &view.camera);
@@ -352,17 +353,17 @@ impl Picture {
         Ok(())
     }
 
-    /// Takes away the tracks of which nobody speaks any more while bearings still come. They must
-    /// be old by their arrival, as one camera's clock may be wrong, and in the data, as a
-    /// recording's tracks may have been made long after its bearings.
+    /// Removes tracks of which nothing is heard any more while bearings still come. They must be
+    /// old both by arrival, as one camera's clock may be wrong, and by data time, as a recording's
+    /// tracks may have been made long after its bearings.
     fn clear_ghosts(&mut self, arrival: Timestamp, time: Timestamp) -> Result<(), ViewError> {
         self.clear_if(|drawn| {
             arrival.seconds_since(drawn.heard) > GHOST_S && time.seconds_since(drawn.time) > GHOST_S
         })
     }
 
-    /// Takes away the tracks of which nobody has spoken for a while, in a live picture to which
-    /// nothing comes any more; `now` is the clock that the arrivals were read from.
+    /// Removes tracks of which nothing was heard for a while, in a live picture that may receive
+    /// nothing at all any more; `now` is read from the clock of the arrivals.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -427,7 +428,7 @@ impl Picture {
         Ok(self.stream.log("events", &TextLog::new(text))?)
     }
 
-    /// What a person should look at, when it begins to be so.
+    /// Draws the problems of a fusion centre that a person should look at, when they begin.
     fn health(&mut self, health: &Health) -> Result<(), ViewError> {
         if health.time_ns == 0 {
             return Ok(());

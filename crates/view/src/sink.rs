@@ -10,19 +10,20 @@ use rerun::sink::{FileSink, FileSinkOptions, GrpcSink, GrpcSinkConnectionState};
 use rerun::{RecordingStream, RecordingStreamBuilder, RecordingStreamError, SpawnOptions};
 use thiserror::Error;
 
-/// Bytes on their way to a viewer, as Rerun reckons them (it takes several times as much), before
-/// drawing waits for it: some seconds of a site of three cameras.
+/// Bytes that may be on their way to a viewer before drawing waits for it, as Rerun counts them
+/// (they take several times as much): some seconds of a site of three cameras.
 const MOST_IN_FLIGHT: u64 = 8 << 20;
-/// When a viewer started by us forgets the oldest it was shown; it takes half as much again.
+/// Memory at which a viewer started by us forgets its oldest data; the viewer takes half as much
+/// again.
 const VIEWER_MEMORY: &str = "1GB";
-/// What it keeps a second time, for other viewers that may want to see what it has been sent. Without this it
-/// is a gigabyte.
+/// Memory in which that viewer keeps a second copy for other viewers that may connect to it.
+/// Rerun's default is a gigabyte.
 const FOR_OTHER_VIEWERS: &str = "64MB";
 
-/// What can go wrong with the picture.
+/// What can go wrong with drawing a picture.
 #[derive(Debug, Error)]
 pub enum ViewError {
-    /// Rerun says no.
+    /// Rerun reports an error.
     #[error("Rerun does not take the picture")]
     Rerun(#[source] Box<RecordingStreamError>),
     /// No viewer is installed.
@@ -31,10 +32,10 @@ pub enum ViewError {
          or save the picture with `crossfix view --save FILE.rrd`"
     )]
     NoViewer(#[source] Box<dyn std::error::Error + Send + Sync>),
-    /// Nobody listens at the address.
+    /// No viewer listens at the address.
     #[error("no Rerun viewer listens at {0}")]
     NobodyListens(SocketAddr),
-    /// The file cannot be made.
+    /// The file cannot be created.
     #[error("cannot write {}", path.display())]
     Create {
         /// The file.
@@ -43,7 +44,7 @@ pub enum ViewError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// What was drawn did not all arrive.
+    /// Not everything that was drawn arrived.
     #[error("the picture is not complete: {0}")]
     Flush(String),
 }
@@ -58,19 +59,19 @@ fn builder() -> RecordingStreamBuilder {
     RecordingStreamBuilder::new("crossfix")
 }
 
-/// A picture that is written to an `.rrd` file.
+/// A stream that is written to an `.rrd` file.
 ///
 /// # Errors
-/// [`ViewError::Rerun`] if the file cannot be made.
+/// [`ViewError::Rerun`] if the file cannot be created.
 pub fn save(path: &Path) -> Result<RecordingStream, ViewError> {
     Ok(builder().save(path)?)
 }
 
-/// A picture without an end that is written to an `.rrd` file. It has no index, which Rerun would
-/// keep in memory until the file's end and which grows by a gigabyte an hour.
+/// A stream of unlimited length that is written to an `.rrd` file. The file has no index, which
+/// Rerun would keep in memory until the file's end and which grows by a gigabyte per hour.
 ///
 /// # Errors
-/// [`ViewError`] if the file cannot be made.
+/// [`ViewError`] if the file cannot be created.
 pub fn save_without_end(path: &Path) -> Result<RecordingStream, ViewError> {
     let create = |source| ViewError::Create { path: path.to_owned(), source };
     let sink = FileSink::with_options(path, FileSinkOptions { write_footer: false })
@@ -80,11 +81,11 @@ pub fn save_without_end(path: &Path) -> Result<RecordingStream, ViewError> {
     Ok(stream)
 }
 
-/// A picture in a viewer that listens at an address of this machine or another. A viewer that does
-/// not take the picture makes drawing wait; what waits is bounded.
+/// A stream to a viewer that listens at an address of this or another machine. If the viewer does
+/// not take the data, drawing waits; the waiting data are bounded.
 ///
 /// # Errors
-/// [`ViewError::NobodyListens`]: the stream would wait for ever.
+/// [`ViewError::NobodyListens`] if no viewer listens: the stream would wait for ever.
 pub fn connect(address: SocketAddr) -> Result<RecordingStream, ViewError> {
     TcpStream::connect_timeout(&address, Duration::from_millis(500))
         .map_err(|_| ViewError::NobodyListens(address))?;
@@ -97,12 +98,12 @@ pub fn connect(address: SocketAddr) -> Result<RecordingStream, ViewError> {
         .connect_grpc_opts(format!("rerun+http://{address}/proxy"))?)
 }
 
-/// Whether the viewer at the end of a stream is gone for good: Rerun does not connect again.
+/// Watches whether the viewer at the end of a stream is gone for good: Rerun does not reconnect.
 #[derive(Clone, Debug, Default)]
 pub struct ViewerWatch(Arc<AtomicBool>);
 
 impl ViewerWatch {
-    /// Looks again. The answer comes when the stream's own thread has the time.
+    /// Checks again. The result comes later, when the stream's own thread gets to it.
     pub fn look(&self, stream: &RecordingStream) {
         let gone = Arc::clone(&self.0);
         stream.inspect_sink(move |sink| {
@@ -115,14 +116,14 @@ impl ViewerWatch {
         });
     }
 
-    /// Whether it was gone when it was looked at last.
+    /// Whether it was gone at the last check.
     pub fn is_gone(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// Starts a viewer on this machine, with bounded memory, for this machine only; one that runs
-/// already is used.
+/// Starts a viewer on this machine that only this machine can reach, with bounded memory. A viewer
+/// that already runs is used.
 ///
 /// # Errors
 /// [`ViewError::NoViewer`] if none is installed.
@@ -132,7 +133,7 @@ pub fn spawn_viewer() -> Result<SocketAddr, ViewError> {
         server_memory_limit: FOR_OTHER_VIEWERS.into(),
         wait_for_bind: true,
         hide_welcome_screen: true,
-        // The viewer's own default is all interfaces.
+        // The viewer's default is to listen on all interfaces.
         extra_args: vec!["--bind=127.0.0.1".into()],
         ..SpawnOptions::default()
     };

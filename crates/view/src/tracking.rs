@@ -22,11 +22,11 @@ pub struct ImageBox {
 /// Whether a followed target was seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sight {
-    /// Measured in this image.
+    /// It was measured in this image.
     Seen,
-    /// Predicted.
+    /// Its place is predicted.
     Coasting,
-    /// Searched for.
+    /// It is being searched for.
     Lost,
 }
 
@@ -37,20 +37,20 @@ pub struct FollowedTarget {
     pub number: u64,
     /// Its box.
     pub place: ImageBox,
-    /// Its centre as measured in this image, if it was.
+    /// Its centre as measured in this image, `None` if it was not measured.
     pub measured: Option<[f64; 2]>,
     /// Whether it was seen.
     pub sight: Sight,
-    /// Correlation at the best place.
+    /// Correlation at the best place of this image.
     pub score: f64,
-    /// Probability of the best place.
+    /// Probability that the best place is the target.
     pub certainty: f64,
     /// Normalised innovation squared.
     pub nis: Option<f64>,
 }
 
-/// Draws a tracker's work on one video: the pictures, boxes, measurements, the label where there is
-/// one, and curves of each target's score, certainty and innovation beside them.
+/// Draws an image tracker's work on a video: the images, boxes, measurements and labels, if there
+/// are any, and beside them curves of each target's score, certainty and innovation.
 pub struct TrackingPicture {
     stream: RecordingStream,
 }
@@ -105,7 +105,7 @@ impl TrackingPicture {
         Ok(Self { stream })
     }
 
-    /// Draws one image (JPEG) with all that was followed in it, and where it was labelled.
+    /// Draws one image (JPEG) with all targets that were followed in it, and its label.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.

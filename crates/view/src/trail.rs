@@ -8,15 +8,16 @@ use crate::earth::Earth;
 use crate::limiter::Limiter;
 use crate::{ViewError, draw};
 
-/// A trail is drawn whole each time, and is most of what fills a viewer's memory: with the rate the points of
-/// each go, too.
+/// Rate at which a trail is drawn, Hz. Each time it is drawn whole, which is most of what fills a
+/// viewer's memory; a lower rate also means fewer points per trail.
 const TRAIL_RATE_HZ: f64 = 7.5;
-/// Points of a trail, at its rate: ten seconds.
+/// Points of a trail: ten seconds at its rate.
 const TRAIL_POINTS: usize = 75;
-/// On the map a track's whole way is said each time; between two it goes less than a point of the screen.
+/// Rate at which a track's whole trail is drawn on the map, Hz; between two drawings a track moves
+/// by less than a point of the screen.
 const MAP_RATE_HZ: f64 = 2.0;
 
-/// Where a track has been.
+/// The trail of a track.
 #[derive(Default)]
 pub(crate) struct Trail {
     points: VecDeque<[f32; 3]>,
@@ -24,7 +25,7 @@ pub(crate) struct Trail {
 }
 
 impl Trail {
-    /// Goes on to a track's present place and draws the way to it, if it is time to.
+    /// Adds a track's present place and draws the trail, if that is due.
     pub(crate) fn go_on(
         &mut self,
         stream: &RecordingStream,
@@ -36,7 +37,7 @@ impl Trail {
         if !self.limiter.allows("trail", time, TRAIL_RATE_HZ) {
             return Ok(());
         }
-        // How far away it is one camera alone does not see: its way would be a guess.
+        // One camera alone does not measure the range: its trail would be a guess.
         if track.state() != TrackState::OneCamera {
             self.points.push_back(draw::f32s(&place.coords));
         }

@@ -8,50 +8,51 @@ use rerun_types::components::{Color, FillMode, MediaType, Radius};
 
 use crate::{ViewError, blueprint, colour, draw};
 
-/// A cube is drawn with this share of its side, so that one sees between them.
+/// Side of a drawn cube as a share of the cell's side, so that one sees between the cubes.
 const DRAWN_SHARE: f64 = 0.3;
-/// How little the cubes let through.
+/// Opacity of the cubes, of 255.
 const OPACITY: u8 = 150;
-/// Sides of the scale of colours, pixels.
+/// Width and height of the colour scale's picture, pixels.
 const SCALE_PX: [u32; 2] = [40, 400];
-/// Figures beside the scale.
+/// Number of labelled values beside the scale.
 const TICKS: u32 = 6;
 
-/// A cube of the air and the standard deviation that a target's position would have in it.
+/// A cube of air and the standard deviation that a target's position would have in it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VolumeCell {
-    /// Its middle, world, m.
+    /// Its centre, world, m.
     pub centre: Point3<f64>,
     /// The standard deviation, m.
     pub sd_m: f64,
 }
 
-/// A place with a figure that is coloured by the same scale.
+/// A place with a standard deviation, which is coloured by the same scale.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Landmark {
     /// The place, world, m.
     pub place: Point3<f64>,
-    /// The figure, m.
+    /// The standard deviation, m.
     pub sd_m: f64,
-    /// Words beside it; such a place is drawn larger.
+    /// Text beside it; a place with a text is drawn larger.
     pub label: Option<String>,
 }
 
-/// A site's cameras and how well they can tell positions in the air between them.
+/// A site's cameras and how accurately they measure positions in the air between them.
 pub struct VolumePicture<'a> {
     /// The cameras by name.
     pub cameras: Vec<(String, &'a Camera)>,
-    /// The cubes, in layers of one height, which can be switched on and off.
+    /// The cubes; each height is a layer that can be switched on and off.
     pub cells: Vec<VolumeCell>,
     /// Side of a cube, m.
     pub side_m: f64,
     /// Other places of interest.
     pub landmarks: Vec<Landmark>,
-    /// What it shows, in words (Markdown).
+    /// Description of what is shown (Markdown).
     pub legend: String,
 }
 
-/// From the best to the worst but for a twentieth at either end, in equal factors.
+/// Logarithmic colour scale from the best to the worst standard deviation, without the best and the
+/// worst twentieth of the cells.
 struct Scale {
     best: f64,
     worst: f64,
@@ -71,10 +72,11 @@ impl Scale {
     }
 
     fn colour(&self, sd_m: f64) -> [u8; 3] {
+        // share of the scale = 1 - ln(sd / best) / ln(worst / best): the best is 1, the worst 0
         colour::scale(1.0 - (sd_m / self.best).ln() / (self.worst / self.best).ln())
     }
 
-    /// The figure at a share of the way from the best to the worst.
+    /// The standard deviation at a share of the scale, 0 for the best and 1 for the worst.
     fn at(&self, share: f64) -> f64 {
         self.best * (self.worst / self.best).powf(share)
     }
@@ -85,7 +87,7 @@ fn f32s(point: Point3<f64>) -> [f32; 3] {
 }
 
 impl VolumePicture<'_> {
-    /// Draws it all on a stream of [`crate::save`], and waits until it is drawn.
+    /// Draws all of it on a stream of [`crate::save`], and waits until it is drawn.
     ///
     /// # Errors
     /// [`ViewError`] if the stream does not take it.
@@ -109,7 +111,7 @@ impl VolumePicture<'_> {
     }
 
     fn cubes(&self, stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
-        // Heights to the centimetre.
+        // A layer per height, to the centimetre.
         let mut layers: BTreeMap<i64, Vec<&VolumeCell>> = BTreeMap::new();
         for cell in &self.cells {
             layers.entry((100.0 * cell.centre.z).round() as i64).or_default().push(cell);
@@ -156,7 +158,7 @@ impl VolumePicture<'_> {
     }
 }
 
-/// The scale of colours, the best above, with figures beside it.
+/// Draws the colour scale, with the best at the top and values beside it.
 fn draw_scale(stream: &RecordingStream, scale: &Scale) -> Result<(), ViewError> {
     let [width, height] = SCALE_PX;
     let share = |row: u32| f64::from(row) / f64::from(height - 1);

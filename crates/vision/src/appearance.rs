@@ -1,5 +1,5 @@
-//! What a target looks like: its reference in a size and direction of its own, how large it is and
-//! how it is turned in the image, and how far its reference has drifted from what it was at first.
+//! Appearance of a target: its reference in a size and direction of its own, the target's size and
+//! direction in the image, and how far the reference has drifted from what it was at first.
 
 use crossfix_correlation::{
     FitOptions, Fitter, Freedom, LowPass, LowPassMemory, Plane, Reference, Resampler, View, Window,
@@ -10,31 +10,32 @@ use crate::crop::replace_invalid;
 use crate::reference::Adaptation;
 use crate::{PixelBox, TrackerConfig};
 
-/// Low-passes of which the one is taken that leaves least noise and error together, px.
+/// Widths of the low-pass filters, px; the filter in use is the one that leaves the least noise and
+/// error together.
 const LOW_PASSES: [f32; 5] = [0.0, 0.6, 0.9, 1.2, 1.6];
-/// Share of noise in the reference's energy below which it is taken as it is.
+/// Share of noise in the reference's energy below which the reference is used unfiltered.
 const CLEAR_NOISE_SHARE: f32 = 0.01;
-/// Least low-pass for the comparison with the anchor, px.
+/// Least width of the low-pass for the comparison with the anchor, px.
 const ANCHOR_LOW_PASS: f32 = 0.6;
-/// Share of noise in the anchor's energy above which it is still averaged. Then it stays: whatever
-/// is added to it, it drifts with.
+/// Share of noise in the anchor's energy above which images are still averaged into it. Below that
+/// the anchor stays as it is: with each image that is added it would drift too.
 const ANCHOR_NOISE_SHARE: f32 = 0.02;
-/// Correlation with the anchor below which the target has become another.
+/// Correlation with the anchor below which the target is taken to look different by now.
 const ANCHOR_LEAST_SCORE: f32 = 0.6;
-/// Stiffness of scale and turn in that comparison.
+/// Stiffness of scale and turn in the fit to the anchor.
 const ANCHOR_STIFFNESS: f64 = 0.02;
-/// When so much of the reference is new, what is correlated is made anew: a few images' worth.
-/// Reasoned: with half of it that is done, and costs, twice as often.
+/// Share of new images in the reference at which the working reference is computed again: a few
+/// images' worth. Reasoned: with half of it that is done, and costs, twice as often.
 const MOST_CHANGED: f32 = 0.1;
-/// An image counts as at least this share of what is new: its size and direction are, where nothing
-/// is learned.
+/// Least amount by which an image adds to that share: its size and direction are new, even where
+/// nothing is learned.
 const SHAPE_SHARE: f32 = 0.03;
-/// Least of what a reference's slopes answer to: one of noise alone tells no place.
+/// Floor of the steepness (see [`steepness`]): a reference of noise alone tells no place.
 const LEAST_STEEPNESS: f64 = 0.15;
-/// Scale of a target over its first size.
+/// Bounds of a target's scale, over its first size.
 const SCALE_RANGE: [f64; 2] = [0.25, 4.0];
 
-/// How a reference lies to the anchor: the displacement in its own pixels, log scale and turn.
+/// Drift of a reference against the anchor: the displacement in its own pixels, log scale and turn.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Drift {
     pub(crate) x: f64,
@@ -53,12 +54,12 @@ pub(crate) struct AppearanceScratch {
     view: Plane,
 }
 
-/// The look of one target.
+/// Appearance of one target.
 #[derive(Clone, Debug)]
 pub(crate) struct Appearance {
     /// Sides of the target's box at first, px.
     pub(crate) size: [f64; 2],
-    /// Size over the first size, and direction.
+    /// Size over the first size, and turn, rad.
     pub(crate) scale: f64,
     pub(crate) turn_rad: f64,
     /// The reference, mean removed, in its own size and direction.
@@ -77,14 +78,15 @@ pub(crate) struct Appearance {
     /// See [`Self::steepness`] and [`Self::taken`].
     steepness: [f64; 2],
     taken: f32,
-    /// The share of images in the reference that are not in what is correlated yet, whether that
-    /// has its shape, and whether the reference was like the anchor when it was compared.
+    /// Share of new images in the reference that the working reference does not contain yet;
+    /// whether the working reference has the target's present size and direction; and whether the
+    /// reference was like the anchor when they were compared last.
     changed: f32,
     is_in_shape: bool,
     is_like_anchor: bool,
-    /// The reference that is correlated: low-passed, in the image's size and direction.
+    /// The working reference, which is correlated: low-passed, in the image's size and direction.
     pub(crate) working: Reference,
-    /// The anchor low-passed, and by which low-pass; absent while the anchor changes.
+    /// The low-passed anchor, and the index of its low-pass; `None` while the anchor changes.
     memory: Reference,
     remembered: Option<usize>,
 }
@@ -94,7 +96,7 @@ fn odd(length: f64) -> usize {
     2 * (length / 2.0) as usize + 1
 }
 
-/// A row of the middle of a plane; sides are odd, so that the middles of all are a pixel.
+/// A row of the middle part of a plane; all sides are odd, so that the middles are one pixel.
 fn middle(plane: &Plane, width: usize, height: usize, row: usize) -> &[f32] {
     let [left, top] = [(plane.width() - width) / 2, (plane.height() - height) / 2];
     &plane.row(top + row)[left..left + width]
@@ -109,15 +111,16 @@ fn energy(plane: &Plane) -> f32 {
     plane.samples().iter().map(|s| s * s).sum()
 }
 
-/// What a reference's slopes answer to where the target is displaced, over what they would if it
-/// were the reference: the sums of the products of its slopes G with the target's, on either axis,
-/// over those of G with itself.
+/// Steepness of a target under a reference, per axis: how strongly the reference's slopes respond
+/// to a displacement of the target, over how strongly they would if the target were the reference.
+/// That is the sum of the products of the reference's slopes G with the target's slopes T, over
+/// that of G with itself, divided by the contrast.
 ///
-/// A fit by G in white noise of a variance has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`, T the
-/// target's slopes. The bound `sigma^2 (G'G)^-1` is taken at the contrast with which the reference
-/// fits best, which is as many times the target's own as the target has the reference in it: so
-/// that is divided by. T is known with noise; the means of its products, `answers` a pixel of
-/// slopes and of values, are taken out.
+/// A fit by G in white noise has the variance `sigma^2 (G'T)^-1 G'G (T'G)^-1`. The bound `sigma^2
+/// (G'G)^-1` is taken at the contrast with which the reference fits best, which is as many times
+/// the target's own as the target has the reference in it: hence the division. T is known with
+/// noise only; the means of its products, `answers` per pixel for slopes and for values, are
+/// subtracted.
 fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
     let [noise_answer, value_answer] = answers;
     let product: f64 = reference
@@ -127,6 +130,7 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
         .map(|(a, b)| f64::from(a * b))
         .sum::<f64>();
     let count = target.samples().len() as f64;
+    // The target's contrast: <reference, target> / E, without the noise that both have in common.
     let contrast = ((product - value_answer * count) / f64::from(energy(reference)).max(1e-12))
         .max(LEAST_STEEPNESS);
     let (width, height) = (reference.width(), reference.height());
@@ -154,7 +158,7 @@ fn steepness(reference: &Plane, target: &Plane, answers: [f64; 2]) -> [f64; 2] {
     })
 }
 
-/// How much of white noise's variance a view between the samples keeps.
+/// Share of white noise's variance that is left when an image is sampled between its pixels.
 fn noise_kept(place: ImagePoint) -> f32 {
     let axis = |at: f64| {
         let f = at - at.floor();
@@ -166,7 +170,7 @@ fn noise_kept(place: ImagePoint) -> f32 {
 }
 
 impl Appearance {
-    /// The look of what is in a box of an image with noise of a variance.
+    /// Appearance of what is in a box of an image, given the variance of the noise.
     pub(crate) fn new(
         image: &Plane,
         place: PixelBox,
@@ -213,8 +217,8 @@ impl Appearance {
         appearance
     }
 
-    /// Correlation of two looks with each other, each in its size and direction, their noise taken
-    /// out.
+    /// Correlation coefficient of two appearances, each in its size and direction, their noise
+    /// taken out.
     pub(crate) fn likeness(&self, other: &Self) -> f32 {
         let (one, two) = (self.working.image(), other.working.image());
         let (width, height) = (one.width().min(two.width()), one.height().min(two.height()));
@@ -226,7 +230,7 @@ impl Appearance {
         product / (self.energy() * other.energy() * clear).max(1e-12).sqrt()
     }
 
-    /// The look at first, to go on from.
+    /// The appearance at first (that of the anchor), to go on from.
     pub(crate) fn at_first(&self, config: &TrackerConfig, buffers: &mut AppearanceScratch) -> Self {
         let (own, noise) = (self.anchor.clone(), self.anchor_noise);
         let adaptation = Adaptation::new(config.reference, &own, noise, config.noise_floor as f32);
@@ -253,36 +257,36 @@ impl Appearance {
         self.working.variance() * self.pixels()
     }
 
-    /// Its pixels.
+    /// Number of its pixels.
     pub(crate) fn pixels(&self) -> f32 {
         self.working.image().samples().len() as f32
     }
 
-    /// Variance of the noise in it.
+    /// Variance of the noise in the reference in use.
     pub(crate) fn noise(&self) -> f32 {
         self.adaptation.noise * self.low_passes[self.chosen].noise_gain()
     }
 
-    /// How much steeper the target is than the reference, on either axis: see [`steepness`].
+    /// Steepness of the target under the reference, per axis: see [`steepness`].
     pub(crate) fn steepness(&self) -> [f64; 2] {
         self.steepness
     }
 
-    /// Mean square of what the low-pass has taken from the target.
+    /// Mean square of what the low-pass has removed from the target.
     pub(crate) fn taken(&self) -> f32 {
         self.taken
     }
 
-    /// Share of its energy that is the target's: a noisy reference finds the target fainter than it
-    /// is.
+    /// Share of the reference's energy that is the target's and not noise: a noisy reference finds
+    /// the target fainter than it is.
     pub(crate) fn clear_share(&self) -> f32 {
         let noise = self.noise() * self.pixels();
         (1.0 - noise / self.energy().max(f32::MIN_POSITIVE)).clamp(0.2, 1.0)
     }
 
-    /// Takes the target's image in, with a certainty that it shows the target. Returns its share in
-    /// what measurements refer to: the anchor, or while the target is another than that, the
-    /// reference.
+    /// Takes the target's image in, with the probability that it shows the target (`certainty`).
+    /// Returns the image's share in what measurements refer to: in the anchor, or in the reference
+    /// while that is unlike the anchor.
     pub(crate) fn learn(
         &mut self,
         image: &Plane,
@@ -303,6 +307,7 @@ impl Appearance {
             self.adaptation.take_in(&mut self.own, &view, noise, certainty, interval as f32);
         let mut anchor_share = 0.0;
 
+        // The anchor learns too, until noise is a small share of its energy.
         let noise_share =
             self.anchor_noise * view.samples().len() as f32 / energy(&self.anchor).max(1e-12);
         if noise_share > ANCHOR_NOISE_SHARE {
@@ -324,7 +329,8 @@ impl Appearance {
         if self.is_like_anchor { anchor_share } else { own_share }
     }
 
-    /// Whether what is correlated has the size and direction that the target is believed to have.
+    /// Whether the working reference has the size and direction that the target is believed to
+    /// have.
     pub(crate) fn is_in_shape(&self) -> bool {
         self.is_in_shape
     }
@@ -338,8 +344,8 @@ impl Appearance {
         }
     }
 
-    /// The working reference from the one in its own size and direction: the low-pass of least risk
-    /// (Stein's estimate), scaled and turned.
+    /// Makes the working reference: the reference with the low-pass of least risk (Stein's
+    /// estimate), scaled and turned.
     fn prepare(&mut self, buffers: &mut AppearanceScratch) {
         (self.changed, self.is_in_shape) = (0.0, true);
         let noise = self.adaptation.noise;
@@ -356,12 +362,12 @@ impl Appearance {
                 .zip(filtered.samples())
                 .map(|(a, b)| (a - b) * (a - b))
                 .sum();
-            // Stein's unbiased estimate of the squared error: |own - filtered|^2 + 2 sigma^2 tr(filter)
-            // - n sigma^2, as if the truth were known.
+            // Stein's unbiased estimate of the squared error, as if the truth were known: |own -
+            // filtered|^2 + 2 sigma^2 tr(filter) - n sigma^2.
             let risk = taken + pixels * noise * (2.0 * filter.own_weight() - 1.0);
             if risk < least {
                 (least, self.chosen) = (risk, index);
-                // Of what the filter takes away, white noise makes sigma^2 |1 - filter|^2 per pixel.
+                // White noise makes sigma^2 |1 - filter|^2 per pixel of what the filter takes away.
                 let noise_taken = noise * (1.0 - 2.0 * filter.own_weight() + filter.noise_gain());
                 self.taken = (taken / pixels - noise_taken).max(0.0);
                 self.smooth.copy_from(filtered);
@@ -371,6 +377,7 @@ impl Appearance {
             }
         }
         let filter = &self.low_passes[self.chosen];
+        // What the noise itself adds per pixel to the products of slopes, and of values.
         let answers =
             [filter.cross_gradient_gain(), filter.own_weight()].map(|gain| f64::from(noise * gain));
         self.steepness = steepness(&self.smooth, &self.own, answers);
@@ -389,9 +396,9 @@ impl Appearance {
         });
     }
 
-    /// How the reference has drifted: each image was taken at an estimated place, and their errors
-    /// add up; the anchor, to which almost nothing is added any more, stays. Returns whether they
-    /// are alike at all.
+    /// Fits the reference to the anchor and notes its drift: each image was learned at an estimated
+    /// place, and these errors add up; the anchor, to which almost nothing is added any more,
+    /// stays. Returns whether the two are alike at all.
     fn compare_with_anchor(&mut self, buffers: &mut AppearanceScratch) -> bool {
         let index = self
             .low_passes
@@ -407,6 +414,7 @@ impl Appearance {
         }
         filter.apply(&self.own, memory, filtered);
         self.drift = Drift::default();
+        // Correlation coefficient of anchor and reference, both through the same low-pass.
         let product: f32 =
             self.memory.image().samples().iter().zip(filtered.samples()).map(|(a, b)| a * b).sum();
         let score = product / (energy(self.memory.image()) * energy(filtered)).max(1e-12).sqrt();
@@ -430,7 +438,7 @@ impl Appearance {
         true
     }
 
-    /// A displacement in the reference's own pixels as one in the image.
+    /// Converts a displacement in the reference's own pixels to one in the image.
     pub(crate) fn in_image(&self, drift: Drift) -> [f64; 2] {
         let (cos, sin) = (self.scale * self.turn_rad.cos(), self.scale * self.turn_rad.sin());
         [cos * drift.x - sin * drift.y, sin * drift.x + cos * drift.y]

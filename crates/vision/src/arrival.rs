@@ -1,8 +1,9 @@
-//! Whether what a target's reference is found on has come there, or was there before.
+//! Whether the thing that a target's reference is found on has come to its place, or was there
+//! before.
 //!
-//! A reference alone cannot tell: in a cloud it becomes cloud, and finds it again with certainty.
-//! What tells is the scene's own pictures ([`crate::scene`]): under a target that has come from
-//! elsewhere one of them shows what it hides.
+//! A reference alone cannot tell: on a cloud it becomes cloud, and finds that again with certainty.
+//! The pictures of the scene ([`crate::scene`]) can: under a target that has come from elsewhere
+//! one of them shows what it hides.
 
 use crossfix_correlation::{Plane, Resampler, View};
 
@@ -10,47 +11,48 @@ use crate::ImagePoint;
 use crate::crop::replace_invalid;
 use crate::scene::Picture;
 
-/// What has not changed may seem to have by this share of the reference: registration, compression.
-/// With half of it textured scenes count for targets, with twice as much faint targets for scene.
+/// Standard deviation of the change in contrast of an unchanged scene, in contrasts of the
+/// reference: from registration and compression. With half of it textured scenes count as targets,
+/// with twice as much faint targets as scene.
 const UNCHANGED: f64 = 0.1;
-/// How much of a target's usual contrast the scene itself may have in its place: as much as half,
-/// often.
+/// Standard deviation of the contrast that the scene itself has in a target's place, as a share of
+/// the target's usual contrast: often it is as much as half.
 const SCENE_SHARE: f64 = 0.5;
-/// Standard deviation by which the scenes behind what lies on the lens change its contrast, as a
-/// share of the target's usual one: two scenes, each with a quarter of it. With half of it digits
-/// before clouds count as come, with twice as much a target that comes to where a cloud was counts
-/// as there before.
+/// Standard deviation of the change in contrast of something on the lens, as the scene behind it
+/// changes, as a share of the target's usual contrast: two scenes, each with a quarter of it. With
+/// half of it digits before clouds count as having come, with twice as much a target that comes to
+/// where a cloud was counts as having been there before.
 const BEHIND: f64 = 0.35;
-/// How well the pictures are registered, px per axis.
+/// Standard deviation of the registration of the pictures, px per axis.
 const REGISTERED_PX: f64 = 0.25;
-/// Pixels that are one look: neighbours are blurred and compressed together, ...
+/// Pixels per independent sample ("look"): neighbours are blurred and compressed together, ...
 const PIXELS_A_LOOK: f64 = 4.0;
-/// ... and a target is no more looks than these, however large: its parts change together.
+/// ... and a target has at most this many looks, however large: its parts change together.
 const MOST_LOOKS: f64 = 12.0;
-/// No picture decides by more than this (logarithm of a likelihood ratio): what it does not model
-/// must be able to be.
+/// Most that one picture tells, either way, as a log likelihood ratio: what the model leaves out
+/// must remain possible.
 const MOST: f64 = 8.0;
-/// By how many times the contrast of a scene may change with the light or the exposure. With no
-/// range at all whatever is there counts as come with every step of the light, where there is no
+/// Range of the factor by which light or exposure may change the contrast of a scene. With no range
+/// at all whatever is there counts as having come with every step of the light, where there is no
 /// noise to hide the difference.
 const LIGHTER: [f64; 2] = [0.5, 2.0];
-/// So much of the reference's energy must lie where the target was not before.
+/// Least share of the reference's energy that must lie where the target was not before.
 const LEAST_FREE: f64 = 0.25;
-/// Fewer pixels tell nothing.
+/// Fewest pixels that tell anything.
 const LEAST_PIXELS: f64 = 4.0;
 
-/// The reference in a place, now and in a picture of the scene without the target.
+/// The reference's place now, compared with that in a picture of the scene without the target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Arrival {
-    /// Contrast with which the reference is there now, and was before, over its own.
+    /// Contrast of the reference in its place now, and in the picture, as multiples of its own.
     now: f64,
     before: f64,
-    /// The variance of each by noise.
+    /// Variance of each contrast by the image's noise.
     variance: f64,
-    /// Mean squared change of the pixels over what noise and registration make of an unchanged
-    /// scene.
+    /// Mean squared change of the pixels, over that which noise and registration make of an
+    /// unchanged scene.
     change: f64,
-    /// Looks that this is the mean of.
+    /// Number of independent looks in that mean.
     looks: f64,
 }
 
@@ -61,7 +63,7 @@ pub(crate) struct Comparison {
     before: Plane,
 }
 
-/// What is compared: a reference in a place of an image with noise of a variance.
+/// A reference in a place of an image, with the variance of the image's noise.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Placed<'a> {
     pub(crate) reference: &'a Plane,
@@ -72,34 +74,36 @@ pub(crate) struct Placed<'a> {
 }
 
 impl Arrival {
-    /// Log-likelihood ratio of the target's having come there against what is there having been
+    /// Log-likelihood ratio that the target has come there, against that what is there now was
     /// there before; `usual` is the contrast that the target has otherwise.
     ///
-    /// Before, the scene had any contrast c there, `c ~ N(0, (usual / 2)^2)`, or the one that is
-    /// there now; and where the scene has not changed, no pixel has.
+    /// If the target has come, the scene had any contrast c there before, `c ~ N(0, (usual /
+    /// 2)^2)`. If not, it had the one that is there now, and no pixel has changed.
     pub(crate) fn log_ratio(self, usual: f64) -> f64 {
         let Self { change, looks, .. } = self;
+        // k / 2 (r - 1 - ln r): likelihood ratio of k looks with r times their expected variance.
         let changed = if change > 1.0 { looks / 2.0 * (change - 1.0 - change.ln()) } else { 0.0 };
         (self.contrast_log_ratio(usual, UNCHANGED) + changed.min(MOST)).clamp(-MOST, MOST)
     }
 
-    /// The same against what lies on the lens, or is written into the video: the scene behind it
-    /// has changed.
+    /// The same ratio against something that lies on the lens, or is written into the video: the
+    /// scene behind it has changed, so that changed pixels tell nothing.
     pub(crate) fn on_lens_log_ratio(self, usual: f64) -> f64 {
         self.contrast_log_ratio(usual, BEHIND * usual).clamp(-MOST, MOST)
     }
 
-    /// By the contrasts alone, of which what has not changed may be off by a standard deviation.
+    /// The ratio by the contrasts alone; that of an unchanged scene may be off by `unchanged_sd`.
     fn contrast_log_ratio(self, usual: f64, unchanged_sd: f64) -> f64 {
         let Self { now, before, variance, .. } = self;
         let normal = |off: f64, variance: f64| -0.5 * (off * off / variance + variance.ln());
+        // ln N(before; 0, v + (usual / 2)^2) - ln N(before - now; 0, 2 v + unchanged_sd^2).
         let arrived = normal(before, variance + (SCENE_SHARE * usual).powi(2));
         arrived - normal(before - now, 2.0 * variance + unchanged_sd.powi(2))
     }
 }
 
 impl Comparison {
-    /// Looks at the reference's place in the image.
+    /// Samples the image at the reference's place, for the comparisons to come.
     pub(crate) fn take(&mut self, image: &Plane, placed: Placed<'_>, resampler: &mut Resampler) {
         self.now.reshape(placed.reference.width(), placed.reference.height());
         let ImagePoint { x, y } = placed.place;
@@ -107,9 +111,9 @@ impl Comparison {
         replace_invalid(&mut self.now);
     }
 
-    /// Compares what was looked at with what a picture has in a place. Where the target was `seen`
-    /// in that picture it does not count; `None` if that is nearly everywhere, or the place was
-    /// outside.
+    /// Compares that sample with what a picture has at the place `then`. Pixels where the target
+    /// was `seen` in that picture do not count; `None` if these are nearly all, or the place was
+    /// outside the picture.
     pub(crate) fn with(
         &mut self,
         picture: &Picture,
@@ -129,7 +133,8 @@ impl Comparison {
             View { x: then.x, y: then.y, scale: 1.0, turn_rad: 0.0 },
             &mut self.before,
         );
-        // Where the reference lay when the target was seen in the picture, one pixel about it.
+        // Pixels under the reference where the target was seen in the picture, and one pixel about
+        // it.
         let covered = |at: usize, side: usize, then: f64, seen: f64| {
             (then + at as f64 - (side as f64 - 1.0) / 2.0 - seen).abs() <= side as f64 / 2.0 + 1.0
         };
@@ -141,6 +146,7 @@ impl Comparison {
                 reference.row(y).iter().zip(self.now.row(y)).zip(self.before.row(y)).zip(above);
             let mut left = self.before.row(y)[0];
             for (x, (((reference, now), before), above)) in rows.enumerate() {
+                // Squared slope, by the differences from the left and the upper neighbour.
                 let slope = (before - left).powi(2) + (before - above).powi(2);
                 left = *before;
                 if !(row_covered && seen.is_some_and(|seen| covered(x, width, then.x, seen.x))) {
@@ -184,13 +190,17 @@ impl Sums {
         self.slope_squared += f64::from(slope_squared);
     }
 
-    /// Sum of the squares of what has changed but for the light: its brightness, and its contrast.
+    /// Sum of the squared changes, without those that light can make: of brightness and of
+    /// contrast.
     fn change_squared(&self) -> f64 {
         let n = self.pixels;
+        // Sums of squares and products about the means, so that a change of brightness drops out.
         let now = (self.now_squared - self.now * self.now / n).max(0.0);
         let before = (self.before_squared - self.before * self.before / n).max(0.0);
         let both = self.now_before - self.now * self.before / n;
         let [least, most] = LIGHTER;
+        // The factor of contrast f that fits best, within its range; what remains is |now - f
+        // before|^2.
         let lighter = if before > 0.0 { (both / before).clamp(least, most) } else { 1.0 };
         (now - 2.0 * lighter * both + lighter * lighter * before).max(0.0)
     }
@@ -204,8 +214,10 @@ impl Sums {
         if energy <= (LEAST_FREE * whole).max(f64::from(f32::MIN_POSITIVE)) {
             return None;
         }
+        // Contrast that fits best: sum of (reference - mean) (image), over the reference's energy.
         let contrast = |product: f64, sum: f64| (product - self.reference * sum / n) / energy;
-        // Two differences of noisy pixels are in each slope.
+        // Each squared slope has two differences of noisy pixels in it, each with twice their
+        // variance.
         let slope = (self.slope_squared / n - 4.0 * noise).max(0.0);
         let unchanged =
             (2.0 * noise + slope * REGISTERED_PX.powi(2)).max(f64::from(f32::MIN_POSITIVE));

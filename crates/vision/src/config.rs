@@ -13,55 +13,55 @@ pub struct TrackerConfig {
     pub algorithm: Algorithm,
     /// How the reference follows the target's appearance. Default: the mean of its images.
     pub reference: ReferenceStrategy,
-    /// The region that is searched. Default: four standard deviations of the prediction, and at
-    /// least the papers' three sides.
+    /// The gate, the region in which a target is looked for. Default: four standard deviations of
+    /// the prediction, and at least the papers' three sides.
     pub gate: GateRule,
     /// Whether the reference follows the target's size and direction. Default true.
     pub follow_shape: bool,
-    /// Pixels added to each side of the target's box to make the reference. Default 2: the target's
-    /// edge is most of what is known of its place.
+    /// Pixels added to each side of the target's box to make the reference. Default 2: most of what
+    /// is known of a target's place comes from its edge.
     pub margin_px: f64,
-    /// Least standard deviation of the image's noise: a level. Default 1, a level of 8 bits; the
-    /// noise above it is measured in every image. The per-pixel filters' noises are in this unit.
+    /// Floor of the standard deviation of the image's noise: one level. Default 1, a level of 8
+    /// bits; the noise above it is measured in every image. The per-pixel filters' noises are in
+    /// this unit.
     pub noise_floor: f64,
     /// Standard deviation of the white acceleration of the liveliest target, px/s^2 (Herasymenko
-    /// 2021, eq. 4: the largest acceleration by root 3). Default 900, a pixel per frame squared at 30
-    /// frames per second. How lively one is, from even flight on, is learnt of each; the papers'
-    /// algorithm takes all for the liveliest.
+    /// 2021, eq. 4: the largest acceleration by root 3). Default 900, a pixel per frame squared at
+    /// 30 frames per second. How lively each target is, from even flight on, is learnt from its
+    /// images; the papers' algorithm takes all for the liveliest.
     pub acceleration_sd_px: f64,
     /// Standard deviation of the velocity of a target that is taken up, px/s. Default 120.
     pub start_velocity_sd_px: f64,
     /// Standard deviation of a place that is given (a box, a cue), px. Default 0.1.
     pub given_sd_px: f64,
-    /// How far beside its target a box may be given, standard deviation, px: one that is too large
-    /// or lies beside what stands out there is moved onto it. 0 takes every box as it is. Default
-    /// 4.
+    /// Standard deviation of a given box about its target, px: a box that is too large or lies
+    /// beside what stands out there is moved onto that. 0 takes every box as it is. Default 4.
     pub box_sd_px: f64,
-    /// Standard deviation of the box's centre about the target's own, px: the same in all images of
-    /// a track, and part of every covariance that is answered until somebody says where the target
-    /// is. Default 0.1.
+    /// Standard deviation of the box's centre about the target's own, px: this error is the same in
+    /// all images of a track, and part of every covariance that is answered until somebody says
+    /// where the target is. Default 0.1.
     pub centre_sd_px: f64,
     /// Floor of the prediction's standard deviation, px. Default 0.3.
     pub prediction_floor_px: f64,
-    /// How much of the reference's energy a mismatch with the target may take: its inverse. Default
-    /// 30; at 60 textured background is taken for targets.
+    /// Inverse of the share of the reference's energy that a mismatch with the target may take.
+    /// Default 30; at 60 textured background is taken for targets.
     pub mismatch: f64,
     /// Standard deviation of the contrast from frame to frame, as a share of it. Default 0.5.
     pub contrast_sd: f64,
-    /// Share of the images in which a target can be seen, a blur and a bird before it apart.
-    /// Default 0.95.
+    /// Share of the images in which a target can be seen, apart from a blur or a bird in front of
+    /// it. Default 0.95.
     pub visible_probability: f64,
-    /// Share of the prior that lies anywhere in the gate. Default 0.01; it doubles with every image
+    /// Share of the prior that is uniform over the gate. Default 0.01; it doubles with every image
     /// without the target, up to a half.
     pub anywhere_share: f64,
-    /// How fast the search for a lost target widens, px/s. Default 750.
+    /// Growth of the search area for a lost target, px/s. Default 750.
     pub search_growth_px: f64,
     /// Standard deviation of the velocity of a target found again, px/s. Default 150.
     pub search_velocity_sd_px: f64,
     /// A target found by the detector and not seen for this long is given up, s. Default 0.5.
     /// One taken up by an operator is never given up.
     pub give_up_after_s: f64,
-    /// What [`Algorithm::Paper`] uses.
+    /// Settings of [`Algorithm::Paper`] alone.
     pub paper: PaperConfig,
     /// Finds targets by itself. Absent (default): only given boxes are followed, and found again
     /// where they are lost.
@@ -72,8 +72,8 @@ pub struct TrackerConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Algorithm {
-    /// By the posterior over all placements, with the likelihood of the zero-mean correlation in
-    /// the measured noise, the filters' prediction as prior, and a fit between the pixels.
+    /// By the posterior over all placements: the likelihood of the zero-mean correlation in the
+    /// measured noise, the filters' prediction as prior, and a fit between the pixels.
     #[default]
     Posterior,
     /// To the letter of Herasymenko 2021 and Lytvynets 2020: one peak of one measure in a gate of
@@ -88,13 +88,13 @@ pub enum Algorithm {
 pub enum GateRule {
     /// A rectangle of three times the reference's sides.
     ThreeSided,
-    /// At least that, and wide enough for so many standard deviations of the prediction.
+    /// At least that, and wide enough for this many standard deviations of the prediction.
     Innovation {
         /// Standard deviations. Default 4.
         sigmas: f64,
     },
-    /// As wide as the ellipse `r' D^-1 r <= l^2` that holds the target with a probability
-    /// (Lytvynets 2020, eqs. 4.8 to 4.11); a measurement outside it is none.
+    /// As wide as the ellipse `r' D^-1 r <= l^2` that contains the target with a probability
+    /// (Lytvynets 2020, eqs. 4.8 to 4.11); a measurement outside it is discarded.
     Ellipsoid {
         /// Probability, 0 to 1.
         probability: f64,
@@ -107,13 +107,14 @@ impl Default for GateRule {
     }
 }
 
-/// The choices of the papers' own algorithm.
+/// Settings of the papers' own algorithm.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PaperConfig {
-    /// The measure (Lytvynets 2020, chapter 3). Default: cross-correlation.
+    /// The similarity measure (Lytvynets 2020, chapter 3). Default: cross-correlation.
     pub similarity: Similarity,
-    /// Whether it wraps round the gate. Default circular, as a product of spectra does.
+    /// Whether the correlation wraps round the gate. Default circular, as a product of spectra
+    /// does.
     pub extent: Extent,
     /// Whether the reference is the whole gate about the target. Default true.
     pub whole_gate: bool,
@@ -181,10 +182,10 @@ impl TrackerConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DetectorConfig {
-    /// How often something may be found that is none, 1/min, from 0.000001 to 1000000. Default 1.
+    /// Allowed rate of finds that are no target, 1/min, from 0.000001 to 1000000. Default 1.
     pub false_tracks_a_minute: f64,
-    /// Over how long the background is a mean, s, from 0.1 to 10000. Default 5: clouds are others
-    /// by then, and what hovers for as long is background unless it was found before.
+    /// Averaging time of the background, s, from 0.1 to 10000. Default 5: clouds are others by
+    /// then, and what hovers for that long becomes background unless it was found before.
     pub background_s: f64,
     /// Most targets followed at once, from 1 to 1000. Default 50.
     pub max_targets: usize,
@@ -196,15 +197,15 @@ impl Default for DetectorConfig {
     }
 }
 
-/// A number of the configuration that makes no sense.
+/// A number of the configuration that is outside its range.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[error("`{key}` is {value}: it must be {must}")]
 pub struct ConfigError {
     /// The key.
     pub key: &'static str,
-    /// What it is.
+    /// Its value.
     pub value: f64,
-    /// What it must be.
+    /// Its range.
     pub must: &'static str,
 }
 

@@ -1,15 +1,16 @@
-//! Parts of an image that can be correlated: without broken samples, and with something beyond its
-//! border.
+//! Crops of an image that can be correlated: without broken samples, and continued beyond the
+//! image's border.
 
 use std::ops::Range;
 
 use crossfix_correlation::Plane;
 
-/// No camera is brighter; sums of the squares of more would lose the rest.
+/// Largest brightness of a sample: no camera is brighter, and sums of larger squares would lose the
+/// rest.
 pub(crate) const BRIGHTEST: f32 = 1e6;
 
-/// Makes broken samples (not finite, or beyond every brightness) black: one of them must not spoil
-/// a whole gate.
+/// Makes broken samples (not finite, or brighter than `BRIGHTEST`) black: one of them must not
+/// spoil a whole gate.
 pub(crate) fn replace_invalid(plane: &mut Plane) {
     let broken = |sample: &f32| u32::from(!matches!(sample.abs(), level if level <= BRIGHTEST));
     // Counting is quicker than stopping at the first.
@@ -21,12 +22,13 @@ pub(crate) fn replace_invalid(plane: &mut Plane) {
     }
 }
 
-/// Beyond its border an image goes on as the mean of so many pixels inwards, and of so many on
-/// either side along the border. Single pixels drawn out are stripes of noise, and a reference with
-/// stripes of its own finds itself there; with twice as many the border of a cloud becomes an edge.
+/// Beyond its border an image is continued by the mean of this many pixels inwards, and of this
+/// many on either side along the border. Single pixels drawn out are stripes of noise, and a
+/// reference with stripes of its own finds itself there; with twice as many the border of a cloud
+/// becomes an edge.
 const INWARDS: usize = 4;
 
-/// The part of an image with its upper left corner at a place, which may lie beyond the border.
+/// The part of an image with its upper left corner at a place, which may lie outside the image.
 pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &mut Plane) {
     image.crop_into(corner[0], corner[1], sides[0], sides[1], part);
     replace_invalid(part);
@@ -64,15 +66,15 @@ pub(crate) fn crop(image: &Plane, corner: [isize; 2], sides: [usize; 2], part: &
     }
 }
 
-/// A border of what is inside an image.
+/// One border of the part that is inside an image.
 struct Border {
     is_first: bool,
-    /// What is next to it.
+    /// The columns or rows next to it, inside.
     inwards: Range<usize>,
 }
 
 impl Border {
-    /// What lies beyond it, of so many.
+    /// The columns or rows beyond it, of `all` in the crop.
     fn beyond(&self, all: usize, inside: &Range<usize>) -> Range<usize> {
         if self.is_first { 0..inside.start } else { inside.end..all }
     }
@@ -91,7 +93,7 @@ fn mean(samples: impl ExactSizeIterator<Item = f32>) -> f32 {
     samples.sum::<f32>() / count
 }
 
-/// The means of values and their neighbours.
+/// Running means of values and their neighbours, `INWARDS` on either side.
 fn smoothed(values: &[f32]) -> Vec<f32> {
     let near = |i: usize| i.saturating_sub(INWARDS)..(i + INWARDS + 1).min(values.len());
     (0..values.len()).map(|i| mean(values[near(i)].iter().copied())).collect()

@@ -1,4 +1,4 @@
-//! Figure and ground: the part of an image that stands out from what is about it, brighter or
+//! Figure and ground: the part of an image that stands out from its surroundings, brighter or
 //! darker.
 
 use std::cmp::Ordering;
@@ -11,39 +11,42 @@ use crate::crop::replace_invalid;
 use crate::noise::{OF_MEDIAN, median};
 use crate::{ImagePoint, PixelBox};
 
-/// The figure reaches to where it stands out by less than this share of its top ...
+/// The figure ends where it stands out by less than this share of its highest pixel (its top) ...
 const SHARE_OF_TOP: f32 = 0.3;
-/// ... or by less than so many standard deviations of the ground, but not further up than half of
-/// the top.
+/// ... or by less than this many standard deviations of the ground; but this threshold is at most
+/// half of the top.
 const ABOVE_GROUND: f32 = 4.0;
 const MOST_OF_TOP: f32 = 0.5;
-/// Parts that are apart by less than this share of the longer side are one thing: rotors, legs and
-/// the body.
+/// Gap over which parts count as one thing, as a share of the longer side: rotors, legs and the
+/// body.
 const GAP: f64 = 0.35;
-/// How far a given box may lie beside its target, standard deviations: further off it is another
-/// thing's.
+/// How far a given box may lie beside its target, standard deviations: what is further off is
+/// another thing.
 const FURTHEST: f64 = 2.5;
-/// Windows that its figure is sought in, from as wide as that down to the box itself: what stands
-/// out beside the box (a house below a drone) is in none of the last.
+/// Number of windows in which a box's figure is sought, from one that reaches as far as `FURTHEST`
+/// down to the box itself: what stands out beside the box (a house below a drone) is outside of the
+/// last ones.
 const WINDOWS: u32 = 4;
-/// Least and longest side of such a window, px: a figure has room in it, and a target of 50 px in a
-/// box twice as large; twice as wide a one takes a second.
+/// Least and greatest side of such a window, px: a figure has room in the least, and a target of 50
+/// px in a box twice as large in the greatest; a window twice as wide takes a second.
 const SIDES: RangeInclusive<usize> = 5..=129;
-/// Pixels about a figure that the widest window has beside.
+/// Ground about a figure that the widest window has in addition, px.
 const GROUND_PX: f64 = 2.0;
-/// A figure is taken for the target if its top is so many standard deviations of the noise: in
-/// noise alone the highest of a thousand pixels is 4. With half of it boxes in noise are moved by
-/// noise, with twice as much only boxes on what the eye sees at once are mended.
+/// A figure is taken for the target if its top is at least this many standard deviations of the
+/// noise: in noise alone the highest of a thousand pixels is 4. With half of it boxes in noise are
+/// moved by noise, with twice as much only boxes on what the eye sees at once are corrected.
 const LEAST_TOP: f32 = 9.0;
-/// ... and if this share of all that stands out is its own: else nobody knows which of two was
-/// meant.
+/// ... and if at least this share of all that stands out is the figure's own: else nobody knows
+/// which of two things was meant.
 const LEAST_SHARE: f32 = 0.8;
-/// A box is right as it is if its figure is longer than this share of it, both ways, ...
+/// A box is right as it is if neither it nor its figure is shorter than this share of the other, on
+/// both axes, ...
 const LEAST_FILLED: f64 = 0.6;
-/// ... and lies in its middle to this share of its side, and a pixel: figures are known no better.
+/// ... and if their middles are apart by at most this share of the box's side, and a pixel: figures
+/// are known no better.
 const MOST_OFF: f64 = 0.15;
 
-/// A part of a window that is connected: its corners, the middle of its weights, and their sum.
+/// A connected part of a window: its corners, the middle of its weights, and their sum.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Region {
     low: [usize; 2],
@@ -53,10 +56,11 @@ pub(crate) struct Region {
 }
 
 impl Region {
-    /// Its box, of at least some sides, in the image whose pixel `corner` is the window's first.
+    /// Its box in the image, with sides of at least `least`; `corner` is the place of the window's
+    /// first pixel in the image.
     ///
-    /// It lies about the middle of what stands out, which is the same for cameras on all sides; the
-    /// corners' is not.
+    /// The box is centred on the middle of what stands out, which is the same for cameras on all
+    /// sides; the middle of the corners is not.
     pub(crate) fn place(&self, corner: [isize; 2], least: [f64; 2]) -> PixelBox {
         let Self { low, high, middle, .. } = *self;
         let side = |i: usize| {
@@ -68,16 +72,16 @@ impl Region {
     }
 }
 
-/// How far up what stands out by `top` is the figure, in ground of a standard deviation.
+/// Threshold of a figure with a given top, on ground with standard deviation `spread`.
 fn threshold(top: f32, spread: f32) -> f32 {
     (SHARE_OF_TOP * top).max(ABOVE_GROUND * spread).min(MOST_OF_TOP * top)
 }
 
-/// The figure about a place: all that stands out, and is connected with it over gaps; `None` if it
-/// goes on beyond the window.
+/// The figure about a place (`seed`): all that stands out and is connected with the place over
+/// gaps; `None` if it goes on beyond the window.
 ///
-/// `off` is by how much each pixel differs from a ground of standard deviation `spread`; `gap` is
-/// the least gap, px.
+/// `off` is by how much each pixel differs from the ground, whose standard deviation is `spread`;
+/// `gap` is the least gap, px.
 pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize) -> Option<Region> {
     let threshold = threshold(off.row(seed[1])[seed[0]], spread);
     loop {
@@ -91,14 +95,15 @@ pub(crate) fn figure(off: &Plane, seed: [usize; 2], spread: f32, mut gap: usize)
     }
 }
 
-/// What is above a threshold and connected with a place, over gaps of so many pixels; `None` if it
-/// reaches the border.
+/// What is above a threshold and connected with a place, over gaps of up to `gap` pixels; `None` if
+/// it reaches the window's border.
 fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Option<Region> {
     let (width, height) = (off.width(), off.height());
     let weight = |level: &f32| if *level >= threshold { *level } else { 0.0 };
     let mut weights: Vec<f32> = off.samples().iter().map(weight).collect();
     let (mut low, mut high) = (seed, seed);
     let (mut sum, mut moments) = (0.0, [0.0; 2]);
+    // Flood fill: a pixel's weight is set to 0 when it is taken.
     let mut stack = vec![(seed, std::mem::take(&mut weights[seed[1] * width + seed[0]]))];
     while let Some(([x, y], weight)) = stack.pop() {
         if x.min(y) == 0 || x == width - 1 || y == height - 1 {
@@ -125,8 +130,8 @@ fn connected(off: &Plane, seed: [usize; 2], gap: usize, threshold: f32) -> Optio
     })
 }
 
-/// Means of three by three pixels about those of a part of an image; beyond the border the border
-/// goes on.
+/// Means of three by three pixels over a part of an image; beyond the image's border its border
+/// pixels are repeated.
 pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usize; 2]) -> Plane {
     let mut part = image.crop(corner[0] - 1, corner[1] - 1, width + 2, height + 2);
     replace_invalid(&mut part);
@@ -135,9 +140,9 @@ pub(crate) fn smoothed(image: &Plane, corner: [isize; 2], [width, height]: [usiz
     })
 }
 
-/// By how much each pixel stands out of a window: how far one has to climb, or to descend, at least
-/// on every way from it to the border. What goes on beyond the border (a horizon, a mast) does not
-/// stand out, whatever it is like.
+/// Prominence of each pixel of a window: how far one has to climb, or to descend, at least on every
+/// path from it to the border. What goes on beyond the border (a horizon, a mast) does not stand
+/// out, however bright or dark.
 fn standing_out(window: &Plane) -> Plane {
     let upside_down = Plane::from_fn(window.width(), window.height(), |x, y| -window.row(y)[x]);
     let [dark, bright] = [window, &upside_down].map(depths);
@@ -154,7 +159,7 @@ struct Shore {
 impl Eq for Shore {}
 
 impl Ord for Shore {
-    /// The lowest is the greatest: it is the next to be flooded.
+    /// The lowest pixel is the greatest: it is the next to be flooded.
     fn cmp(&self, other: &Self) -> Ordering {
         other.level.total_cmp(&self.level)
     }
@@ -179,6 +184,8 @@ fn depths(landscape: &Plane) -> Plane {
             shores.push(Shore { level, place: [x, y] });
         }
     }
+    // The lowest shore floods its neighbours: water stands there at its level, or at the ground's
+    // if that is higher.
     while let Some(Shore { level, place: [x, y] }) = shores.pop() {
         for ny in y.saturating_sub(1)..=(y + 1).min(height - 1) {
             for nx in x.saturating_sub(1)..=(x + 1).min(width - 1) {
@@ -193,8 +200,8 @@ fn depths(landscape: &Plane) -> Plane {
     Plane::from_fn(width, height, |x, y| surface.row(y)[x] - landscape.row(y)[x])
 }
 
-/// The box of the target that a given box was meant for: the given one where it fits, and else that
-/// of the one thing that stands out there, if there is one.
+/// The box of the target that somebody meant by a given box: the given one where it fits, and else
+/// that of the one thing that stands out there, if there is one.
 ///
 /// `given_sd` is how well a given box lies on its target, px, and `noise_sd` the standard deviation
 /// of the image's noise.
@@ -206,7 +213,7 @@ pub(crate) fn meant(image: &Plane, given: PixelBox, given_sd: f64, noise_sd: f32
     figures.next().filter(|figure| !fits(given, *figure)).unwrap_or(given)
 }
 
-/// Whether a box lies on its figure.
+/// Whether a box fits its figure well enough to be kept.
 fn fits(given: PixelBox, figure: PixelBox) -> bool {
     let (at, is) = (given.centre(), figure.centre());
     let sides =
@@ -217,8 +224,8 @@ fn fits(given: PixelBox, figure: PixelBox) -> bool {
     })
 }
 
-/// The box of the one thing that stands out in a window that is wider than a given box by so many
-/// pixels on each side.
+/// The box of the one thing that stands out in a window that is wider than the given box by
+/// `beside` pixels on each side.
 fn figure_within(
     image: &Plane,
     given: PixelBox,
@@ -240,10 +247,11 @@ fn figure_within(
     }
     let corner = [0, 1].map(|i| ranges[i].start as isize);
     let off = standing_out(&smoothed(image, corner, [ranges[0].len(), ranges[1].len()]));
-    // The mean of nine pixels has a third of their noise.
+    // The mean of nine pixels has a third of their noise's standard deviation.
     let spread = (OF_MEDIAN * median(&mut off.samples().to_vec())).max(noise_sd / 3.0);
 
-    // Inside of the box everything is as likely to have been meant.
+    // A pixel inside the box is as likely to have been meant as any other there; outside, the
+    // probability falls off with the distance as a Gaussian.
     let beside_box = |i: usize, index: usize| {
         (((ranges[i].start + index) as f64 - at[i]).abs() - sides[i] / 2.0).max(0.0)
     };
@@ -253,6 +261,7 @@ fn figure_within(
     };
     let level = |[x, y]: [usize; 2]| off.row(y)[x];
     let places = (0..off.height()).flat_map(|y| (0..off.width()).map(move |x| [x, y]));
+    // The seed of the figure is the pixel with the largest product of prominence and probability.
     let score = |place: [usize; 2]| level(place) * likely(place);
     let seed = places.max_by(|one, other| score(*one).total_cmp(&score(*other)))?;
     let top = level(seed);
@@ -262,7 +271,8 @@ fn figure_within(
     let region = figure(&off, seed, spread, 1)?;
     let threshold = threshold(top, spread);
     let all: f32 = off.samples().iter().filter(|level| **level >= threshold).sum();
-    // Where the noise ends the figure early, nothing is known of its size.
+    // Where the noise ends the figure early its size is unknown, and is at least that of the given
+    // box.
     let least = if ABOVE_GROUND * spread <= SHARE_OF_TOP * top { [1.0; 2] } else { sides };
     (region.weight >= f64::from(LEAST_SHARE * all)).then(|| region.place(corner, least))
 }

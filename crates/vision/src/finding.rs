@@ -1,4 +1,4 @@
-//! What is new in an image: boxes that somebody gave, and what the detector finds, which may be a
+//! What is new in an image: boxes that somebody gave, and finds of the detector, which may be a
 //! target that was lost.
 
 use crossfix_correlation::Plane;
@@ -13,24 +13,24 @@ use crate::{
     DetectorConfig, ImageTrack, ImageTrackId, ImageTracker, PixelBox, TrackPhase, TrackerConfig,
 };
 
-/// Most things that are followed because they may be a target that is lost: each costs as much as
-/// one. With 20 an image of a panning camera takes up to 42 ms in place of 14, and no more is
-/// found.
-const MOST_CANDIDATES: usize = 6;
-/// A candidate is shown in a lost target's place after so long, s: as long as what a search has
-/// found is on probation. With half of it half a percent more of a still camera's frames are right,
-/// and as many less of a panning one's.
-const CANDIDATE_S: f64 = 0.5;
-/// Its mean side may be so many times longer or shorter: of a drone before trees the brightest part
+/// Most candidates, things that are followed because they may be a lost target: each costs as much
+/// as a target. With 20 an image of a panning camera takes up to 42 ms instead of 14, and no more
 /// is found.
+const MOST_CANDIDATES: usize = 6;
+/// A candidate is shown in a lost target's place after this long, s: as long as what a search has
+/// found is on probation. With half of it half a percent more of a still camera's frames are right,
+/// and as many fewer of a panning one's.
+const CANDIDATE_S: f64 = 0.5;
+/// Largest ratio of a candidate's mean side to the target's, either way: of a drone before trees
+/// only the brightest part is found.
 const STAND_IN_SIZES: f64 = 4.0;
-/// The probability that it is the target, at most: nothing is known for it but that it moves, and
-/// nothing else has been found.
+/// Largest probability that is stated for a candidate being the target: nothing is known for it but
+/// that it moves, and that nothing else has been found.
 const STAND_IN_CERTAINTY: f64 = 0.5;
 
 impl ImageTracker {
-    /// Takes up what somebody gave, and what the detector finds: a target that was lost, or a new
-    /// one.
+    /// Takes up the boxes that somebody gave, and what the detector finds: a target that was lost,
+    /// or a new one.
     pub(crate) fn take_up_new(&mut self, image: &Plane, time: Timestamp, interval: f64) {
         let given = std::mem::take(&mut self.waiting);
         let found = self.detect(image, interval, &given);
@@ -38,7 +38,7 @@ impl ImageTracker {
             let place = self.meant(image, place);
             self.take_up_at(image, place, Origin::Given, time);
         }
-        // What stands in for a target may look like it by now.
+        // A stand-in may look like its target by now.
         for index in 0..self.followed.len() {
             let stand_in = self.followed[index].stand_in;
             let place =
@@ -68,7 +68,7 @@ impl ImageTracker {
         let origin = Origin::Detected {
             first: place.centre(),
             turned: self.scene.turned(),
-            // What may be a lost target has to show by itself that it moves.
+            // A candidate has to show by itself that it moves.
             has_moved: !is_candidate && gone_px > place.width.max(place.height),
             is_candidate,
         };
@@ -96,7 +96,7 @@ impl ImageTracker {
         });
     }
 
-    /// While a target is lost, what else moves may be it, and is shown in its place.
+    /// Shows stand-ins: while a target is lost, something else that moves may be it.
     fn show_stand_ins(&mut self, time: Timestamp) {
         for lost in 0..self.followed.len() {
             let followed = &self.followed[lost];
@@ -115,8 +115,8 @@ impl ImageTracker {
         self.tracks.retain(|track| track.id.0 <= self.next_candidate);
     }
 
-    /// The candidate that stands in for a lost target: the one that did before, or one that does
-    /// for no other.
+    /// The candidate that stands in for a lost target: the one that did before, or one that stands
+    /// in for no other target.
     fn stand_in_of(&self, lost: &Followed, time: Timestamp) -> Option<ImageTrackId> {
         let [width, height] = lost.target.size();
         let fits = |followed: &Followed| {
@@ -137,13 +137,13 @@ impl ImageTracker {
             .map(|followed| followed.id)
     }
 
-    /// The box of the target that a given box was meant for.
+    /// The box of the target that somebody meant by a given box.
     fn meant(&mut self, image: &Plane, place: PixelBox) -> PixelBox {
         let TrackerConfig { algorithm, box_sd_px, noise_floor, .. } = self.config;
         if algorithm == Algorithm::Paper || box_sd_px <= 0.0 {
             return place;
         }
-        // Of what is about it: the ground below a sky has other noise.
+        // The noise is that of the surroundings: the ground below a sky has other noise.
         let PixelBox { x, y, width, height } = place;
         let corner = [x - width, y - height].map(|at| at as isize);
         let sides = [width, height].map(|side| (3.0 * side).ceil().max(9.0) as usize);
@@ -151,7 +151,7 @@ impl ImageTracker {
         meant(image, place, box_sd_px, noise.sqrt())
     }
 
-    /// The detector is there where it is asked for, and while a target is lost.
+    /// Runs the detector where it is configured, and while a target is lost.
     fn call_detector(&mut self) {
         if self.config.detector.is_some() || self.config.algorithm == Algorithm::Paper {
             return;
@@ -167,8 +167,8 @@ impl ImageTracker {
         }
     }
 
-    /// What the detector finds, beside what is followed or taken up by somebody; what it knows for
-    /// the scene is given up.
+    /// What the detector finds beside the targets that are followed or just given; targets that it
+    /// takes for the scene are given up.
     fn detect(&mut self, image: &Plane, interval: f64, given: &[PixelBox]) -> Vec<Found> {
         self.call_detector();
         let Some(detector) = &mut self.detector else { return Vec::new() };
@@ -176,7 +176,7 @@ impl ImageTracker {
         for followed in &mut self.followed {
             let place = box_of(&followed.target);
             let (at, side) = (place.centre(), place.width.max(place.height));
-            // Where a lost one is nobody knows.
+            // Nobody knows where a lost target is.
             if let Origin::Detected { first, turned: then, has_moved, .. } = &mut followed.origin
                 && followed.target.is_seen()
             {
@@ -185,7 +185,7 @@ impl ImageTracker {
                 *has_moved |= gone[0].hypot(gone[1]).min(in_scene[0].hypot(in_scene[1])) > side;
             }
         }
-        // One that is lost is no longer where it is guessed to be: it may be found there, and
+        // A lost target is no longer where it is guessed to be: it may be found there, and
         // something else too.
         let seen = self.followed.iter().filter(|followed| !followed.target.is_searching());
         let known = seen.map(|followed| Known {
@@ -193,7 +193,7 @@ impl ImageTracker {
             place: box_of(&followed.target),
             is_watched: followed.has_moved(),
         });
-        // The number of a track to be is nobody's.
+        // A target to be has no number yet: this one is nobody's.
         let given = given.iter().map(|place| Known {
             id: ImageTrackId(u64::MAX),
             place: *place,
@@ -206,8 +206,8 @@ impl ImageTracker {
         findings.found
     }
 
-    /// Whether what the detector has found is a target that was lost: then that one goes on there,
-    /// the likeliest of them.
+    /// Whether what the detector has found is a target that was lost: then the likeliest such
+    /// target goes on there.
     fn is_lost_one(
         &mut self,
         image: &Plane,

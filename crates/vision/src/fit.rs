@@ -1,4 +1,4 @@
-//! The reference fitted between the pixels, where the target is believed to be: the measurement.
+//! Fit of the reference between the pixels, where the target is believed to be: the measurement.
 
 use crossfix_correlation::{Fit, FitOptions, Freedom};
 use crossfix_filter::AxisMeasurement;
@@ -10,15 +10,16 @@ use crate::scratch::Scratch;
 use crate::state::State;
 use crate::{ImagePoint, TrackerConfig};
 
-/// Floor of a measurement's standard deviation, px: the fit's bias over the phases of a pixel,
-/// which no noise shows.
+/// Floor of a measurement's standard deviation, px: the bias of the fit over the phases of a pixel,
+/// which does not show in the residuals.
 const LEAST_MEASUREMENT_SD: f64 = 0.005;
-/// What noise and the reference do not explain is something else before the target: parts of it, of
-/// so many pixels, change together, and displace the fit as noise of so many times its variance
-/// would.
+/// Residuals beyond those of the noise and of the reference come from something else in front of
+/// the target. They change together over connected parts of this many pixels, and so displace the
+/// fit like noise of this many times their variance.
 const PIXELS_A_PART: f64 = 10.0;
 
-/// A place that is measured no better than this is not known at all, standard deviation, px.
+/// Largest standard deviation of a measurement, px: a place measured no better is unknown, and gets
+/// this one.
 const MOST_MEASUREMENT_SD: f64 = 1e3;
 
 /// A reference fitted to the image at the best placement.
@@ -26,16 +27,16 @@ const MOST_MEASUREMENT_SD: f64 = 1e3;
 pub(crate) struct TargetFit {
     pub(crate) place: ImagePoint,
     pub(crate) covariance: Matrix2<f64>,
-    /// Contrast over the reference's.
+    /// The target's contrast, as a multiple of the reference's.
     pub(crate) contrast: f64,
-    /// Log scale and turn, with their variances.
+    /// Change of log scale and of turn (rad), each with its variance.
     pub(crate) shape: Option<[(f64, f64); 2]>,
-    /// Correlation with the noise taken out.
+    /// Correlation coefficient, with the noise taken out.
     pub(crate) score: f64,
 }
 
 impl TargetFit {
-    /// Where the reference is found, as a measurement of either axis.
+    /// Where the reference is found, as a measurement per axis.
     pub(crate) fn found(&self) -> [AxisMeasurement; 2] {
         let Self { place, covariance, .. } = self;
         [(place.x, covariance.m11), (place.y, covariance.m22)]
@@ -44,7 +45,7 @@ impl TargetFit {
 }
 
 impl State {
-    /// Fits the reference at a placement of the gate.
+    /// Fits the reference at a placement of the gate, given by column and row.
     pub(crate) fn fit_at(
         &mut self,
         column: usize,
@@ -58,8 +59,9 @@ impl State {
         let options = FitOptions { steps: 2, freedom, ..FitOptions::default() };
         let fit =
             scratch.buffers.fitter.fit(&scratch.gate, working, column as f64, row as f64, options);
-        // What of the residuals the image's noise explains, to two of its standard deviations, and
-        // the reference's own noise; the rest is of another kind, and lies in connected parts.
+        // The image's noise, to two standard deviations of its estimate, and the reference's own
+        // noise explain part of the residuals; the rest is of another kind, and lies in connected
+        // parts.
         let (pixels, image_noise) = (fit.pixels as f64, f64::from(self.noise));
         let least_contrast = 0.1 * self.contrast * f64::from(self.appearance.clear_share());
         let contrast = fit.gain.max(least_contrast);
@@ -69,7 +71,7 @@ impl State {
         let unexplained = (fit.residual_variance - explained - expected).max(0.0);
         let noise = image_noise + PIXELS_A_PART * unexplained;
         let covariance = self.covariance(&fit, self.motion.noise_factor() * noise, contrast);
-        // The reference may have moved off its anchor meanwhile.
+        // The reference may have drifted off its anchor meanwhile.
         let drift = self.appearance.in_image(self.appearance.drift);
         let place = ImagePoint { x: origin[0] + fit.x + drift[0], y: origin[1] + fit.y + drift[1] };
         let scaled = noise * (fit.gain / contrast).powi(2);
@@ -77,14 +79,16 @@ impl State {
         let shape = fit.shape_variances(scaled).map(|[scale, turn]| {
             [(fit.log_scale + log_scale, scale), (fit.turn_rad + turn_rad, turn)]
         });
-        // The correlation coefficient sqrt(signal / (signal + what is neither signal nor noise)).
+        // Correlation coefficient sqrt(signal / (signal + rest)), the rest being neither signal nor
+        // noise.
         let energy = fit.gain.max(0.0).powi(2) * f64::from(self.appearance.energy());
         let rest = (pixels * (fit.residual_variance - image_noise)).max(0.0);
         let score = (energy / (energy + rest + 1e-12)).sqrt();
         TargetFit { place, covariance, contrast, shape, score }
     }
 
-    /// What a fit measured, the reference's offset taken out, with all that its covariance must hold.
+    /// Measurement of the target's place by a fit: the reference's offset is taken out, and the
+    /// offset's variance added to the fit's covariance.
     pub(crate) fn measurement(&self, fit: &TargetFit) -> Measurement {
         let [x, y] = self.motion.offset();
         let place = ImagePoint { x: fit.place.x - x.position, y: fit.place.y - y.position };
@@ -94,9 +98,10 @@ impl State {
         }
     }
 
-    /// The covariance of a fit by a reference that is not the target itself: see
+    /// Covariance of a fit by a reference that differs from the target itself: see
     /// [`crate::appearance`]'s `steepness`.
     fn covariance(&self, fit: &Fit, noise: f64, contrast: f64) -> Matrix2<f64> {
+        // The Cramer-Rao bound at `contrast`, which is the fitted gain unless that is too small.
         let Some(bound) = fit.covariance(noise * (fit.gain / contrast).powi(2)) else {
             return Matrix2::identity();
         };

@@ -6,7 +6,7 @@ use nalgebra::Matrix2;
 use crate::scene::Scene;
 use crate::{ImagePoint, TrackerConfig};
 
-/// The frame interval to which shares a frame refer, s.
+/// The frame interval that shares per frame refer to, s.
 pub(crate) const FRAME_INTERVAL: f64 = 1.0 / 30.0;
 
 /// The next image, and what goes with it.
@@ -19,11 +19,11 @@ pub(crate) struct Frame<'a> {
     pub(crate) snapshot: Option<&'a Plane>,
     /// What the scene looked like lately.
     pub(crate) scene: &'a Scene,
-    /// By how much everything in the image has moved since the scene was looked at last, as the
-    /// camera turned, px.
+    /// Shift of everything in the image since the scene was looked at last, as the camera turned,
+    /// px.
     pub(crate) scene_moved: [f64; 2],
-    /// Whether it is the target's turn to be searched for, if it is lost: one a frame, as a search
-    /// costs as much as many targets that are followed.
+    /// Whether it is this target's turn to be searched for, if it is lost: one per frame, as a
+    /// search costs as much as many targets that are followed.
     pub(crate) may_search: bool,
     pub(crate) config: &'a TrackerConfig,
 }
@@ -35,7 +35,7 @@ impl Frame<'_> {
     }
 }
 
-/// A place measured in one image, whatever was known before.
+/// A place measured in one image, without the prediction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measurement {
     /// The target's centre.
@@ -44,7 +44,7 @@ pub struct Measurement {
     pub covariance: Matrix2<f64>,
 }
 
-/// What one step of one target gave.
+/// Result of one step of one target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Step {
     /// The measured place, if the target was seen.
@@ -58,7 +58,7 @@ pub(crate) struct Step {
 }
 
 impl Step {
-    /// The target was not seen; the best place correlates by so much.
+    /// Result if the target was not seen; the best place has this correlation.
     pub(crate) fn unseen(score: f64) -> Self {
         Self { measured: None, score, certainty: 0.0, nis: None }
     }

@@ -14,20 +14,20 @@ use crate::posterior::{Posterior, Prior};
 use crate::scratch::Scratch;
 use crate::state::State;
 
-/// Time constant with which what was hidden, or not, is forgotten, s: about as long as a target
-/// cannot be seen when it cannot. A blur is shorter, a cloud longer. When it was chosen, of ten
-/// seeds' sequences 3.8 % of the frames were lost with half of it in place of 1.7, and with twice
-/// as much, a version earlier, 2.7 in place of 2.2.
+/// Correlation time of being hidden, s: about how long a target stays hidden once it is. A blur is
+/// shorter, a cloud longer. When it was chosen, of ten seeds' sequences 3.8 % of the frames were
+/// lost with half of it instead of 1.7, and with twice as much, a version earlier, 2.7 instead of
+/// 2.2.
 const HIDDEN_S: f64 = 0.05;
-/// Log ratio of a placement outside the image.
+/// Log likelihood ratio of a placement outside the image.
 const IMPOSSIBLE: f32 = -50.0;
 
 /// Placements of a reference about the prediction, and the part of the image that they cover.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Region {
-    /// Placements on either side of the middle one.
+    /// Number of placements on either side of the middle one.
     pub(crate) half: [usize; 2],
-    /// Where the middle of the first placement is, px.
+    /// Place of the first placement's middle in the image, px.
     pub(crate) origin: [f64; 2],
     /// First column and row of the part, and its sides, px.
     pub(crate) corner: [isize; 2],
@@ -66,19 +66,21 @@ impl State {
         })
     }
 
-    /// Share of the prior that lies anywhere: it doubles with every image without the target.
+    /// Share of the prior that is uniform over the gate: it doubles with every image without the
+    /// target, to a half at most.
     pub(crate) fn anywhere(&self, config: &TrackerConfig) -> f64 {
         (config.anywhere_share * f64::from(2_u32.saturating_pow(self.missed))).min(0.5)
     }
 
-    /// Half sides of what counts as one peak of the map of placements.
+    /// Half sides of the neighbourhood that counts as one peak of the map of placements.
     pub(crate) fn peak_half(&self) -> [usize; 2] {
         let reference = self.appearance.working.image();
         [reference.width(), reference.height()].map(|side| (side / 8).max(2))
     }
 
-    /// Half sides of the part of a gate in which the prediction lies, and about it the peak and as
-    /// much of what is none; `None` where that is not much less, or the papers' gate is asked for.
+    /// Half sides of the middle part of a gate: the prediction's spread, a peak about it, and as
+    /// much again that is no peak. `None` where that is not much smaller than the gate, or the
+    /// papers' gate is asked for.
     pub(crate) fn middle_of_gate(
         &self,
         whole: [usize; 2],
@@ -93,8 +95,8 @@ impl State {
         (3 * half[0] * half[1] < 2 * whole[0] * whole[1]).then_some(half)
     }
 
-    /// What is expected of the place by some filters, on the placements of a region; `hidden` is
-    /// how likely the target could not be seen in the image before.
+    /// Prior of the place by the given filters, on the placements of a region; `hidden` is the
+    /// probability that the target was hidden in the image before.
     pub(crate) fn prior(
         &self,
         motion: &Motion,
@@ -105,7 +107,8 @@ impl State {
         let config = frame.config;
         let expected = motion.found();
         let stays_hidden = (-frame.interval / HIDDEN_S).exp();
-        // So that it can be seen in a share of the images as the configuration has it.
+        // A chain of two states, whose share of visible images in the long run is the configured
+        // one.
         let often = config.visible_probability;
         let visible = often + (1.0 - hidden - often) * stays_hidden;
         Prior {
@@ -117,8 +120,8 @@ impl State {
         }
     }
 
-    /// The posterior over the placements in a region, of which the image is left in the scratch's
-    /// gate.
+    /// The posterior over the placements in a region. Leaves the region's image in `scratch.gate`
+    /// and the log likelihood ratios in `scratch.ratios`.
     pub(crate) fn posterior(
         &self,
         frame: Frame<'_>,
@@ -146,7 +149,7 @@ impl State {
     }
 }
 
-/// Placements whose middle lies outside the image are impossible.
+/// Makes placements impossible whose middle lies outside the image.
 fn mask_outside(ratios: &mut Plane, origin: [f64; 2], image: &Plane) {
     let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
     let (width, height) = (ratios.width(), ratios.height());

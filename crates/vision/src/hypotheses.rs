@@ -1,8 +1,8 @@
-//! Several places where a target may be, each with filters of its own, as long as none of them is
+//! Multiple hypotheses of where a target is, each with filters of its own, as long as no place is
 //! sure.
 //!
-//! One Gaussian cannot hold two places: their mean is neither, and in the next image both lie
-//! outside of what it expects.
+//! One Gaussian cannot represent two places: its mean is neither of them, and in the next image
+//! both lie outside of what it predicts.
 
 use crossfix_filter::AxisMeasurement;
 
@@ -14,39 +14,40 @@ use crate::posterior::Posterior;
 use crate::scratch::Scratch;
 use crate::state::State;
 
-/// Certainty of the best place below which the others are kept too.
+/// Certainty of the best place below which the other places are kept too.
 pub(crate) const DOUBT: f64 = 0.9;
-/// Hypotheses that are kept, and places in an image that each of them may go to.
+/// Most hypotheses that are kept, and most places in an image that each of them may go to.
 const MOST: usize = 12;
 const MOST_PEAKS: usize = 4;
-/// A place with less of a hypothesis, and a hypothesis with less of the target, is dropped.
+/// A place with less than this share of its hypothesis is dropped, and a hypothesis of less weight
+/// than this.
 const LEAST: f64 = 0.01;
-/// Hypotheses are one if their places and velocities differ by less than so many standard
+/// Hypotheses are merged if their places and velocities differ by less than this many standard
 /// deviations.
 const SAME: f64 = 2.0;
-/// Squared Mahalanobis distance beyond which a place does not belong to a hypothesis' motion: the
-/// target has been elsewhere.
+/// Squared normalised innovation beyond which a place does not fit a hypothesis' motion: its
+/// filters are restarted there.
 const UNEXPECTED: f64 = 16.0;
-/// A target of which this long no place is sure counts as lost, s, ...
+/// A target counts as lost when no place has been sure for this long, s, ...
 const LOST_S: f64 = 0.4;
-/// ... and is searched for after so long, s: it is fainter than noise for a second as a cloud
-/// passes. With a fifth of it 2.9 % of the frames of nine seeds' sequences are lost in place of
-/// 2.3, with twice as much 2.4.
+/// ... and is searched for after this long, s: as a cloud passes it is fainter than noise for a
+/// second. With a fifth of it 2.9 % of the frames of nine seeds' sequences are lost instead of 2.3,
+/// with twice as much 2.4.
 const LONGEST_S: f64 = 2.0;
 
-/// A place where the target may be, and how it moves then.
+/// A place where the target may be, with the filters of its motion.
 #[derive(Clone, Debug)]
 pub(crate) struct Hypothesis {
     pub(crate) weight: f64,
     pub(crate) motion: Motion,
-    /// How likely it could not be seen in the image before.
+    /// Probability that the target was hidden in the image before.
     pub(crate) hidden: f64,
-    /// Whether it has been seen there in this image, and on which placement of the map.
+    /// The placement of the map on which it has been seen in this image; `None` if it was not seen.
     pub(crate) peak: Option<[usize; 2]>,
 }
 
 impl Hypothesis {
-    /// Where it is believed to be, as long as that is one place.
+    /// The hypothesis of a target whose place is not in doubt yet.
     fn of(state: &State) -> Self {
         Self { weight: 1.0, motion: state.motion.clone(), hidden: state.hidden, peak: None }
     }
@@ -56,8 +57,8 @@ impl Hypothesis {
         [x, y]
     }
 
-    /// Whether two say the same; where it has been seen and where it has been waited for are not
-    /// the same.
+    /// Whether two hypotheses agree in place and velocity. One that has been seen and one that has
+    /// only been predicted do not.
     fn is_like(&self, other: &Self) -> bool {
         let (here, there) = (self.motion.found(), other.motion.found());
         let (one, two) = (self.motion.velocity(), other.motion.velocity());
@@ -72,11 +73,11 @@ impl Hypothesis {
     }
 }
 
-/// The hypotheses of a target; none while it is sure.
+/// The hypotheses of a target; empty while its place is sure.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Hypotheses {
     all: Vec<Hypothesis>,
-    /// For how long none has been sure, s.
+    /// How long no place has been sure, s.
     doubted_s: f64,
 }
 
@@ -86,17 +87,17 @@ impl Hypotheses {
         self.doubted_s = 0.0;
     }
 
-    /// None has been sure in one more image.
+    /// Counts one more image in which no place was sure.
     pub(crate) fn note_doubt(&mut self, interval: f64) {
         self.doubted_s += interval;
     }
 
-    /// Whether no place has been sure for so long that it must be searched for.
+    /// Whether no place has been sure for so long that the target must be searched for.
     pub(crate) fn are_hopeless(&self) -> bool {
         self.doubted_s > LONGEST_S
     }
 
-    /// Whether for long no place has been sure.
+    /// Whether no place has been sure for so long that the target counts as lost.
     pub(crate) fn are_doubted(&self) -> bool {
         self.doubted_s > LOST_S
     }
@@ -111,14 +112,16 @@ impl Hypotheses {
         }
     }
 
-    /// They begin with what is believed, unless there are some.
+    /// Starts with the target's present state as the only hypothesis, unless there are some
+    /// already.
     pub(crate) fn begin(&mut self, state: &State) {
         if self.all.is_empty() {
             self.all.push(Hypothesis::of(state));
         }
     }
 
-    /// Each may have moved by so many pixels, or not.
+    /// Splits each hypothesis into two of half its weight: moved by `by`, px per axis, and not
+    /// moved.
     pub(crate) fn fork(&mut self, by: [f64; 2]) {
         self.all.iter_mut().for_each(|hypothesis| hypothesis.weight *= 0.5);
         let mut moved = self.all.clone();
@@ -126,8 +129,8 @@ impl Hypotheses {
         self.all.extend(moved);
     }
 
-    /// How far they are from a place, mean squares of either axis, px^2: what its variance does not
-    /// hold.
+    /// Mean squared distance of the hypotheses from a place, px^2 per axis: what the likeliest
+    /// one's own variance lacks.
     pub(crate) fn spread(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
@@ -136,7 +139,7 @@ impl Hypotheses {
         })
     }
 
-    /// The furthest of them from a place, px per axis.
+    /// Largest distance of a hypothesis from a place, px per axis.
     pub(crate) fn reach(&self, place: ImagePoint) -> [f64; 2] {
         let at = [place.x, place.y];
         [0, 1].map(|i| {
@@ -145,17 +148,17 @@ impl Hypotheses {
         })
     }
 
-    /// The likeliest.
+    /// The likeliest hypothesis.
     pub(crate) fn best(&self) -> Option<&Hypothesis> {
         self.all.first()
     }
 
-    /// The share of those that have been seen in this image.
+    /// Total weight of the hypotheses that have been seen in this image.
     pub(crate) fn seen_share(&self) -> f64 {
         self.all.iter().filter(|h| h.peak.is_some()).map(|h| h.weight).sum()
     }
 
-    /// The share of those that have been seen about a placement.
+    /// Total weight of the hypotheses that have been seen near a placement in this image.
     pub(crate) fn share_near(&self, [column, row]: [usize; 2], near: [usize; 2]) -> f64 {
         let here = |h: &&Hypothesis| {
             h.peak.is_some_and(|[x, y]| x.abs_diff(column) <= near[0] && y.abs_diff(row) <= near[1])
@@ -163,7 +166,8 @@ impl Hypotheses {
         self.all.iter().filter(here).map(|h| h.weight).sum()
     }
 
-    /// Follows each into the image whose log ratios are in the scratch's map.
+    /// Advances every hypothesis into the image whose log likelihood ratios are in
+    /// `scratch.ratios`.
     pub(crate) fn advance(
         &mut self,
         state: &State,
@@ -174,8 +178,8 @@ impl Hypotheses {
         self.all = kept(self.branches(state, frame, region, scratch));
     }
 
-    /// The likeliest of the hypotheses, with the posterior that it leads to, if all of them lead to
-    /// one place.
+    /// Motion of the likeliest hypothesis and the posterior that it leads to, if nearly all of the
+    /// weight leads to that one place.
     pub(crate) fn one_place(
         &self,
         state: &State,
@@ -206,7 +210,8 @@ impl Hypotheses {
         (there > DOUBT * all).then(|| (self.all[best].motion.clone(), posterior))
     }
 
-    /// Where each hypothesis may have gone, with their weights.
+    /// The successors of all hypotheses, with their weights: for each hypothesis one that is not
+    /// seen, and one per peak of its posterior.
     fn branches(
         &self,
         state: &State,
@@ -219,6 +224,7 @@ impl Hypotheses {
         for hypothesis in &self.all {
             let prior = state.prior(&hypothesis.motion, hypothesis.hidden, region, frame);
             let posterior = scratch.map.of(&scratch.ratios, &prior);
+            // Bayes' rule: the prior weight times the likelihood of the image.
             let weight = hypothesis.weight * posterior.evidence;
             branches.push(Hypothesis {
                 weight: weight * posterior.unseen,
@@ -238,7 +244,9 @@ impl Hypotheses {
                     position: region.origin[i] + part.mean[i],
                     variance: part.variance[i],
                 });
-                if motion.surprise(at) < UNEXPECTED {
+                if motion.nis(at) < UNEXPECTED {
+                    // The peak's moments have the prior in them already, so they replace the
+                    // prediction.
                     motion.condition([0, 1].map(|i| AxisMeasurement {
                         variance: at[i].variance.min(expected[i].variance),
                         ..at[i]
@@ -258,7 +266,8 @@ impl Hypotheses {
     }
 }
 
-/// The hypotheses that are kept of all, the heaviest first, of which the weights sum to 1.
+/// Merges and prunes hypotheses: the heaviest first, with weights that sum to 1 before those below
+/// `LEAST` are dropped.
 fn kept(mut all: Vec<Hypothesis>) -> Vec<Hypothesis> {
     all.sort_by(|one, other| other.weight.total_cmp(&one.weight));
     let mut kept: Vec<Hypothesis> = Vec::with_capacity(MOST);

@@ -1,5 +1,5 @@
-//! Whether what is followed is the target: it has come to where it is, and the scene was there
-//! before.
+//! Identity: whether what is followed is the target, which has come to where it is, or the scene,
+//! which was there before.
 
 use crate::ImagePoint;
 use crate::arrival::Placed;
@@ -10,64 +10,65 @@ use crate::scene::{Picture, Scene};
 use crate::scratch::Scratch;
 use crate::state::State;
 
-/// A target that was found again is believed after so long, s: until then a mistake costs what is
-/// known of where it went, and nothing is learnt of it.
+/// How long a target that was found again must have been seen before it is believed, s: until then
+/// a mistake costs what is known of where it went, and nothing is learnt of it.
 const PROBATION_S: f64 = 0.5;
-/// How often the scene takes the place of a target that is followed, 1/s, and how often that is
-/// over. With ten times the first, certainty falls where nothing is known against the target; with
-/// a tenth, a cloud is followed for seconds.
+/// Rate at which the scene takes the place of a target that is followed, 1/s, and rate at which
+/// that ends. With ten times the first, certainty falls where nothing is known against the target;
+/// with a tenth, a cloud is followed for seconds.
 const GOES_PER_S: f64 = 0.1;
 const COMES_PER_S: f64 = 2.0;
-/// The probability that what a search has found is the target: the search has asked more of it than
-/// of what is followed.
+/// Probability that what a search has found is the target: the search has asked more of it than is
+/// asked of what is followed.
 const FOUND: f64 = 0.9;
-/// Standard deviation of a target's contrast about its usual one, as a share of that: in the third
-/// of a second that a cloud's edge takes.
+/// Standard deviation of a target's contrast about its usual one, as a share of that, within the
+/// third of a second that a cloud's edge takes.
 const CONTRAST_SD: f64 = 0.3;
-/// Standard deviation of the best of many placements in noise, over that of one: a third to a half
-/// of it.
+/// Standard deviation of the largest of many placements' contrasts in noise, over that of one
+/// placement: a third to a half of it.
 const BEST_SD: f64 = 0.5;
-/// With a reference of which less than this share is the target's nobody knows the usual contrast.
+/// Least share of the reference that must be the target's: with less, nobody knows the usual
+/// contrast.
 const CLEAR: f64 = 0.9;
-/// No image tells more than this by its contrast: noise may be other than white.
+/// Most that one image tells by its contrast, log likelihood ratio: noise may be other than white.
 const MOST: f64 = 2.0;
-/// Pictures of the scene that a target remembers its place in: more than there are.
+/// Number of the scene's pictures in which a target remembers its place: more than there are.
 const MOST_PICTURES: usize = 16;
 
-/// What is known of whether it is the target that is followed.
+/// Belief that what is followed is the target.
 #[derive(Clone, Debug)]
 pub(crate) struct Identity {
-    /// The probability.
-    is_there: f64,
-    /// Where the target was seen in the scene's pictures, by their numbers.
+    /// Probability that it is the target.
+    probability: f64,
+    /// Places of the target in the scene's pictures, by the pictures' numbers.
     in_pictures: Vec<(u64, ImagePoint)>,
-    /// How fast it went when it was last seen for sure, px/s, ...
+    /// Speed of the target when it was last seen for sure, px/s, ...
     speed_px_s: f64,
-    /// ... and where that was in the scene: its place in the image and how far the camera had
+    /// ... and its place in the scene then: the place in the image plus how far the camera had
     /// turned, px.
     last_in_scene: Option<[f64; 2]>,
-    /// What was known before it was found again, as long as that is not sure.
+    /// What was known before it was found again, as long as the find is not sure.
     probation: Option<Probation>,
 }
 
-/// What was known of a target before it was found again.
+/// State of a target before it was found again.
 #[derive(Clone, Debug)]
 struct Probation {
     motion: Motion,
     unseen_s: f64,
     last_seen: ImagePoint,
     missed: u32,
-    /// The newest picture of the scene then.
+    /// Number of the newest picture of the scene then.
     picture: u64,
     /// How long it has been seen since, s.
     seen_s: f64,
 }
 
 impl Identity {
-    /// Of a target that somebody has shown.
+    /// Identity of a target that somebody has shown.
     pub(crate) fn new() -> Self {
         Self {
-            is_there: 1.0,
+            probability: 1.0,
             in_pictures: Vec::with_capacity(MOST_PICTURES),
             speed_px_s: 0.0,
             last_in_scene: None,
@@ -75,19 +76,19 @@ impl Identity {
         }
     }
 
-    /// Somebody has said where it is.
-    pub(crate) fn is_given(&mut self) {
-        (self.is_there, self.probation) = (1.0, None);
+    /// Notes that somebody has said where it is.
+    pub(crate) fn set_given(&mut self) {
+        (self.probability, self.probation) = (1.0, None);
         self.in_pictures.clear();
         (self.speed_px_s, self.last_in_scene) = (0.0, None);
     }
 
-    /// Whether it has been found again, and that is not sure.
+    /// Whether it has been found again, and is not believed yet.
     pub(crate) fn is_on_probation(&self) -> bool {
         self.probation.is_some()
     }
 
-    /// Notes where in the scene it was in the image before, if it was seen for sure.
+    /// Notes its place in the scene in the image before, if it was seen for sure.
     pub(crate) fn note_last_place(&mut self, state: &State, frame: Frame<'_>) {
         if state.unseen_s > 0.0 || self.probation.is_some() {
             return;
@@ -97,9 +98,9 @@ impl Identity {
         self.last_in_scene = Some([x + turned[0] + moved[0], y + turned[1] + moved[1]]);
     }
 
-    /// Notes where it was when a picture of the scene was taken, if it was seen.
+    /// Notes its place when a picture of the scene was taken, if it was seen.
     pub(crate) fn note_picture(&mut self, state: &State, number: u64) {
-        // In doubt it is not known where it was.
+        // While it is in doubt, its place is not known.
         if state.unseen_s > 0.0 {
             return;
         }
@@ -113,13 +114,13 @@ impl Identity {
         in_pictures.push((number, state.last_seen));
     }
 
-    /// Log-likelihood ratio of the target's having come to a place against what is there having
-    /// been there before, by the first picture of the scene that tells, and by the first that shows
-    /// whether it turns with the camera; 0 if none does.
+    /// Log-likelihood ratio that the target has come to a place, against that what is there now was
+    /// there before: by the first picture of the scene that tells, and by the first that shows
+    /// whether the thing turns with the camera; 0 if none does.
     ///
-    /// In a picture that was taken while it was lost it was elsewhere if it has moved on since as
-    /// fast as when it was last seen, or as it must have to be here by now; one that hovered, and
-    /// is where it was, may be in all of them.
+    /// In a picture that was taken while it was lost, the target is taken to have been elsewhere if
+    /// it has moved on since, as fast as when it was last seen or as it must have to be here by
+    /// now. A target that hovered, and is where it was, may be in all of the pictures.
     pub(crate) fn arrival_log_ratio(
         &self,
         state: &State,
@@ -160,7 +161,7 @@ impl Identity {
         lens.map_or(scene, |arrival| scene.min(arrival.on_lens_log_ratio(usual)))
     }
 
-    /// How fast a lost target has gone at least to be at a place now, px/s.
+    /// Least speed with which a lost target can have come to a place by now, px/s.
     fn least_speed(&self, state: &State, frame: Frame<'_>, place: ImagePoint) -> f64 {
         let Some([x, y]) = self.last_in_scene else { return 0.0 };
         let turned = frame.scene.turned();
@@ -168,9 +169,9 @@ impl Identity {
         (place.x + turned[0] - x).hypot(place.y + turned[1] - y) / lost_s.max(frame.interval)
     }
 
-    /// The probability that what is followed is the target and neither the scene nor noise: a chain
-    /// of two states that sees whether what is at a place has come there, and stands out as the
-    /// target does.
+    /// Probability that what is followed is the target and neither the scene nor noise: a Markov
+    /// chain of two states. It is updated with whether what is at the place has come there, and
+    /// whether that stands out as the target does.
     pub(crate) fn doubt(
         &mut self,
         state: &State,
@@ -178,20 +179,21 @@ impl Identity {
         fit: TargetFit,
         scratch: &mut Scratch,
     ) -> f64 {
-        // Images that follow each other sooner tell no more together than one.
+        // Images that follow each other sooner tell no more than one would.
         let share = (frame.interval / FRAME_INTERVAL).min(1.0);
         let placements = scratch.ratios.samples().len() as f64;
         let above_noise = above_noise_log_ratio(state, fit.contrast, placements);
         let log_ratio =
             share * (self.arrival_log_ratio(state, frame, fit.place, scratch) + above_noise);
+        // Prediction of the chain towards its stationary share, then Bayes' rule.
         let settled = COMES_PER_S / (COMES_PER_S + GOES_PER_S);
         let kept = (-frame.interval * (GOES_PER_S + COMES_PER_S)).exp();
-        let before = settled + (self.is_there - settled) * kept;
-        self.is_there = before / (before + (1.0 - before) * (-log_ratio).exp());
-        self.is_there
+        let before = settled + (self.probability - settled) * kept;
+        self.probability = before / (before + (1.0 - before) * (-log_ratio).exp());
+        self.probability
     }
 
-    /// A search has found something.
+    /// Begins a probation: a search has found something.
     pub(crate) fn begin_probation(&mut self, state: &State, scene: &Scene) {
         self.probation = Some(Probation {
             motion: state.motion.clone(),
@@ -201,10 +203,10 @@ impl Identity {
             picture: scene.newest(),
             seen_s: 0.0,
         });
-        self.is_there = FOUND;
+        self.probability = FOUND;
     }
 
-    /// Goes on, to the time of the next image, with what was known before it was found again.
+    /// Predicts what was known before it was found again to the time of the next image.
     pub(crate) fn predict_probation(&mut self, frame: Frame<'_>) {
         if let Some(probation) = &mut self.probation {
             probation.motion.predict(frame.interval, frame.sides());
@@ -212,8 +214,8 @@ impl Identity {
         }
     }
 
-    /// What was found again is lost again: it was something else, and what was known before holds.
-    /// False if it was on no probation.
+    /// Ends a probation: what was found again is lost again, so it was something else, and what was
+    /// known before is restored. False if there was no probation.
     pub(crate) fn fail_probation(&mut self, state: &mut State) -> bool {
         let Some(before) = self.probation.take() else { return false };
         (state.motion, state.unseen_s, state.last_seen) =
@@ -223,7 +225,7 @@ impl Identity {
         true
     }
 
-    /// It has been seen for so long, s, weighed by how surely.
+    /// Adds to the time that it has been seen on probation, s, weighted by the certainty.
     pub(crate) fn go_on_with_probation(&mut self, seen_s: f64) {
         if let Some(probation) = &mut self.probation {
             probation.seen_s += seen_s;
@@ -234,8 +236,8 @@ impl Identity {
     }
 }
 
-/// Log-likelihood ratio of a contrast's being the target's, whose usual one is known, against
-/// its being that of the best of so many placements in noise.
+/// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
+/// being the largest of so many placements' in noise.
 fn above_noise_log_ratio(state: &State, contrast: f64, placements: f64) -> f64 {
     let deviation =
         f64::from(state.noise / state.appearance.energy().max(f32::MIN_POSITIVE)).sqrt();
@@ -244,6 +246,7 @@ fn above_noise_log_ratio(state: &State, contrast: f64, placements: f64) -> f64 {
         return 0.0;
     }
     let usual = state.usual_contrast * clear;
+    // The largest of n normal values is about sd sqrt(2 ln n).
     let best_of_noise = deviation * (2.0 * placements.max(2.0).ln()).sqrt();
     let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
     let target = normal(contrast - usual, (CONTRAST_SD * usual).hypot(deviation));

@@ -1,16 +1,17 @@
-//! Exponential and logarithm in single precision that the compiler can run in lanes: no branches,
-//! no calls. Good to 1e-5 of the result, and to 1e-6 of the logarithm.
+//! Exponential and logarithm in single precision that the compiler can vectorise: no branches, no
+//! calls. Good to 1e-5 of the exponential, and to 1e-6 of the logarithm.
 
 use std::ops::{Add, Div, Mul, Sub};
 
-/// `e^x`; below -87 it is 0 to single precision, and -87 is taken.
+/// `e^x`; below -87, where it is 0 to single precision, the value at -87 is taken.
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0) * std::f32::consts::LOG2_E;
-    // Adding and taking off 1.5 2^23 rounds to a whole number.
+    // Adding and subtracting 1.5 2^23 rounds to a whole number.
     const ROUND: f32 = 12_582_912.0;
     let whole = (x + ROUND) - ROUND;
     let t = (x - whole) * std::f32::consts::LN_2;
+    // e^t by its series; then times 2^whole, made of the exponent's bits.
     let series = 1.0
         + t * (1.0
             + t * (0.5 + t * (1.0 / 6.0 + t * (1.0 / 24.0 + t * (1.0 / 120.0 + t / 720.0)))));
@@ -31,15 +32,15 @@ pub(crate) fn ln(x: f32) -> f32 {
     exponent as f32 * std::f32::consts::LN_2 + series
 }
 
-/// Numbers that are calculated together.
+/// Number of values that are computed together.
 pub(crate) const LANES: usize = 8;
 
-/// Eight numbers in one: what is done to it is done to each, by one instruction where there is one.
+/// Eight numbers in one: an operation is done to each, by one instruction where there is one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Lanes(pub(crate) [f32; LANES]);
 
 impl Lanes {
-    /// Eight times the same.
+    /// The same number eight times.
     #[inline(always)]
     pub(crate) fn splat(value: f32) -> Self {
         Self([value; LANES])

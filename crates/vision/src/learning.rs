@@ -1,4 +1,4 @@
-//! What an image teaches of a target: its contrast, size, direction and appearance.
+//! What is learnt of a target from an image: its contrast, size, direction and appearance.
 
 use crate::ImagePoint;
 use crate::fit::TargetFit;
@@ -6,18 +6,18 @@ use crate::frame::{FRAME_INTERVAL, Frame};
 use crate::scratch::Scratch;
 use crate::state::{SEEN, State};
 
-/// Over how long the usual contrast is a mean, s: longer than a cloud takes it.
+/// Averaging time of the usual contrast, s: longer than a cloud takes it away.
 const USUAL_S: f64 = 3.0;
-/// Time constant with which a lost target's contrast is taken for what it usually is again, s:
-/// about a cloud's edge.
+/// Time constant with which the contrast of a lost target returns to its usual one, s: about a
+/// cloud's edge.
 const FADES_S: f64 = 0.5;
-/// Correlations at which an image is not learned at all, and fully.
+/// Correlations up to which an image is not learned at all, and from which on it is learned fully.
 const LEARNING_SCORES: [f64; 2] = [0.35, 0.70];
-/// Certainties below which nothing is learnt of an image, before and after its correlation is
+/// Certainties below which nothing is learnt from an image, before and after its correlation is
 /// weighed in.
 const LEAST_CERTAINTY: [f64; 2] = [0.05, 0.02];
-/// How fast the contrast wanders, a share per frame of a thirtieth of a second, and the floor of its
-/// measurement's standard deviation.
+/// Random walk of the contrast, as a share of it per frame of a thirtieth of a second, and the
+/// floor of its measurement's standard deviation.
 const CONTRAST_WALK: f64 = 0.14;
 const CONTRAST_FLOOR: f64 = 0.1;
 /// Floor of the standard deviation of a measured log scale or turn.
@@ -29,7 +29,8 @@ fn ramp(value: f64, [low, high]: [f64; 2]) -> f64 {
 }
 
 impl State {
-    /// Follows contrast, size, direction and appearance, the more the surer the target was seen.
+    /// Learns contrast, size, direction and appearance from an image, the more the surer the target
+    /// was seen.
     pub(crate) fn learn(
         &mut self,
         frame: Frame<'_>,
@@ -49,6 +50,7 @@ impl State {
             let variance = f64::from(self.noise / self.appearance.energy().max(1e-12))
                 / clear.powi(2)
                 + CONTRAST_FLOOR.powi(2);
+            // Kalman filter of the contrast: P grows by the walk, gain = certainty P / (P + R).
             self.contrast_variance +=
                 (CONTRAST_WALK * self.contrast).powi(2) * interval / FRAME_INTERVAL;
             let gain = certainty * self.contrast_variance / (self.contrast_variance + variance);
@@ -59,7 +61,8 @@ impl State {
         }
         let certainty = certainty * ramp(fit.score, LEARNING_SCORES);
         if certainty >= LEAST_CERTAINTY[1] {
-            // Size and direction take effect with the learning; without it they would run away.
+            // Size and direction take effect only with the learning; without it they would run
+            // away.
             if seen && self.appearance.is_in_shape() {
                 self.follow_shape(fit);
             }
@@ -79,6 +82,7 @@ impl State {
             let (change, variance) = shape[i];
             if variance < 0.1 && change.abs() < limits[i] {
                 let known = &mut self.shape_variances[i];
+                // Kalman gain P / (P + R) of the log scale, then of the turn.
                 let gain = *known / (*known + variance + SHAPE_FLOOR.powi(2));
                 steps[i] = gain * change;
                 *known *= 1.0 - gain;
@@ -87,7 +91,7 @@ impl State {
         self.appearance.reshape(steps[0], steps[1]);
     }
 
-    /// Nothing is known of a lost target's contrast any more but what it usually is.
+    /// Lets a lost target's contrast fade to its usual one: nothing else is known of it any more.
     pub(crate) fn forget_contrast(&mut self, interval: f64) {
         let share = (interval / FADES_S).min(1.0);
         self.contrast += share * (self.usual_contrast - self.contrast);

@@ -94,14 +94,14 @@ pub struct PixelBox {
     pub height: f64,
 }
 
-/// No place of an image is further from its corner, px.
+/// Largest coordinate of a place, px: no place of an image is further from its corner.
 const FARTHEST: f64 = 1e6;
 
 impl ImagePoint {
-    /// Whether the numbers describe a place that an image can have, or that lies not too far off
-    /// it.
+    /// Whether the coordinates are those of a place that an image can have, or that lies not too
+    /// far outside of it.
     pub fn is_possible(&self) -> bool {
-        // A NaN is not.
+        // A NaN is not possible.
         self.x.abs() <= FARTHEST && self.y.abs() <= FARTHEST
     }
 }
@@ -112,7 +112,7 @@ impl PixelBox {
         ImagePoint { x: self.x + (self.width - 1.0) / 2.0, y: self.y + (self.height - 1.0) / 2.0 }
     }
 
-    /// The box of given sides about a place.
+    /// The box of given sides centred on a place.
     pub fn about(centre: ImagePoint, width: f64, height: f64) -> Self {
         Self {
             x: centre.x - (width - 1.0) / 2.0,

@@ -1,14 +1,15 @@
-//! How a target moves in the image, and how far beside it its reference is found.
+//! Motion of a target in the image, with the offset at which its reference is found.
 //!
-//! An axis has three states: position, velocity, and the reference's offset: the reference is found
-//! at the target's place and that offset. The noise of the images that the reference was made of is
-//! in all measurements alike, and an image that is learned at an estimated place takes that
-//! estimate's error along: no mean over images takes these out, and a filter without the offset
-//! believes that it does.
+//! Each axis has three states: position, velocity, and the reference's offset: the reference is
+//! found at the target's position plus that offset. Two errors are common to all measurements: the
+//! noise of the images that the reference was made of, and, for an image that is learned at an
+//! estimated place, the error of that estimate. Averaging over images removes neither; a filter
+//! without the offset state believes that it does, and becomes overconfident.
 //!
-//! How lively a target is nobody knows beforehand. So there is a filter for each of some ways of
-//! moving, from evenly to as lively as anything flies, weighted by how well each has predicted
-//! (interacting multiple models, Solonar 2023, eqs. 10-17; there of a pixel's brightness).
+//! How strongly a target accelerates is not known beforehand. So there is one filter per motion
+//! model ("way of moving"), from constant velocity to the acceleration of the liveliest flying
+//! target, weighted by how well each has predicted (interacting multiple models, Solonar 2023, eqs.
+//! 10-17; there of a pixel's brightness).
 
 use crossfix_filter::{AxisMeasurement, normal_score};
 use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
@@ -16,43 +17,44 @@ use nalgebra::{Matrix2, Matrix3, RowVector3, Vector3};
 use crate::ImagePoint;
 
 const WAYS: usize = 4;
-/// The ways of moving: white acceleration's standard deviation as a share of the liveliest. With a
-/// factor of five between neighbours none predicts much worse than the right one would; the last
-/// flies evenly.
+/// Standard deviation of each motion model's white acceleration, as a share of the largest. With a
+/// factor of five between neighbours the nearest model predicts not much worse than the exact one
+/// would; the last is constant velocity.
 const LIVELINESS: [f64; WAYS] = [1.0, 0.2, 0.04, 0.0];
-/// How often a target goes over to another way, drawn from all alike, 1/s. With a tenth of it the
-/// first images of a turn come as surprises, and when it was chosen 2.3 % of the frames of ten
-/// seeds' sequences were lost with it in place of 1.7; with ten times as much 2.1.
+/// Rate at which a target changes its motion model, 1/s; the new model is drawn from all models
+/// with equal probability. With a tenth of it the first images of a turn come as surprises, and
+/// when it was chosen 2.3 % of the frames of ten seeds' sequences were lost instead of 1.7; with
+/// ten times as much 2.1.
 const CHANGES_PER_S: f64 = 0.5;
-/// Of a target that is taken up or found again nobody knows whether it flies evenly: it is lively
-/// until it has shown that it is not.
+/// Model weights of a target that is taken up or found again: nobody knows whether it flies evenly,
+/// so all weight is on the largest acceleration until the images show otherwise.
 const AT_FIRST: [f64; WAYS] = [1.0, 0.0, 0.0, 0.0];
 
-/// Over how long the measurements' noise is matched to the innovations, s: some hundred of them, so
-/// that chance changes it by a few hundredths. Reasoned: with half of it by half as much again,
-/// with twice as much a target that comes before another sky is believed for seconds as it was
-/// before this one.
+/// Averaging time of the match of the measurement noise to the innovations, s: some hundred
+/// innovations, so that chance changes the noise by a few hundredths. Reasoned: with half of it
+/// chance changes it by half as much again; with twice as much a target that comes before another
+/// sky keeps for seconds the noise that it had before the old one.
 const MATCHED_S: f64 = 3.0;
-/// What was expected counts like innovations of so long, s: the first dozen of them, which tell a
-/// third.
+/// Weight of the expected noise, as a time of innovations, s: it counts as much as the first dozen
+/// innovations, which tell the noise to a third.
 const AT_LEAST_S: f64 = 0.5;
-/// How strongly it is drawn to what was expected, of e times which it is off: where innovations
-/// tell little of the noise, as the target's own motion is most of them, nothing else keeps it.
-/// With three times as much the noise that is found of even and of lively targets changes by less
-/// than 4 %.
+/// How strongly the noise factor is pulled back to the expected noise, per unit of its logarithm.
+/// Where the target's own motion makes up most of the innovations they tell little of the noise,
+/// and nothing else keeps the factor in place. With three times as much the noise found for even
+/// and for lively targets changes by less than 4 %.
 const AS_EXPECTED: f64 = 0.01;
-/// The squared normalised innovation of both axes that one in a hundred exceeds: one image counts
-/// for no more.
+/// Squared normalised innovation of both axes that one image in a hundred exceeds: the noise is
+/// matched to no more than this.
 const OUTLIER: f64 = 9.21;
-/// The noise as it is matched is at most so many times more or less than was expected, variances: a
-/// hundred times in its deviation, from a pixel's hundredth to a pixel.
+/// The matched noise variance is at most this many times larger or smaller than the expected one: a
+/// factor of a hundred in the standard deviation, from a hundredth of a pixel to a pixel.
 const MOST_MATCHED: f64 = 1e4;
 
-/// The states of an axis, by their places.
+/// Indices of the states of an axis.
 const POSITION: usize = 0;
 const VELOCITY: usize = 1;
 const OFFSET: usize = 2;
-/// Where the reference is found: position plus offset.
+/// Measurement matrix H: the reference is found at position plus offset.
 const FOUND_AT: RowVector3<f64> = RowVector3::new(1.0, 0.0, 1.0);
 
 /// Position, velocity and offset on one axis.
@@ -62,47 +64,47 @@ struct Axis {
     covariance: Matrix3<f64>,
 }
 
-/// What the filters of a target believe of its motion.
+/// Interacting multiple model filter of a target's motion in the image.
 #[derive(Clone, Debug)]
 pub(crate) struct Motion {
-    /// The axes of each way of moving.
+    /// State of both axes under each motion model.
     ways: [[Axis; 2]; WAYS],
     weights: [f64; WAYS],
-    /// Variance of the measurements' noise over what it was expected to be, as the innovations have
-    /// it.
+    /// Variance of the measurement noise over the expected one, as matched to the innovations.
     noise_factor: f64,
-    /// Over how long it has been matched, s.
+    /// Time over which it has been matched, s; at most `MATCHED_S`.
     matched_s: f64,
-    /// Time over which was predicted last, s.
+    /// Interval of the last prediction, s.
     interval: f64,
-    /// Mean and covariance over the ways.
+    /// Mean and covariance of the mixture of all models.
     all: [Axis; 2],
-    /// What a pixel of difference between measured and predicted has changed since the last
-    /// prediction, a way and an axis, and that measurement's variances.
+    /// Kalman gain of the update since the last prediction, per model and axis: change of the
+    /// states per pixel between measured and predicted. And the variances of that measurement.
     gains: [[Vector3<f64>; 2]; WAYS],
     measured: [f64; 2],
-    /// The noise's share in that measurement's innovations, by the ways that are likely now.
+    /// Share of the measurement noise in the variance of that measurement's innovation, averaged
+    /// over the models by their weights.
     told: f64,
-    /// Acceleration variances of the ways, px^2/s^4.
+    /// Acceleration variance of each model, px^2/s^4.
     accelerations: [f64; WAYS],
-    /// Variance that the noise of the learned images has in the offset and that is not in the
-    /// covariances yet, in units of one measurement's, which is not known before the first one.
+    /// Variance in the offset from the noise of the learned images that is not yet in the
+    /// covariances, in units of one measurement's variance, which is unknown before the first one.
     untold: f64,
 }
 
-/// What one image says of where the reference is found.
+/// Measurement of where the reference is found in one image, as parts of a mixture.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Evidence {
-    /// The probability that it is at the place that was measured, with that measurement.
+    /// Probability that the reference is at the measured place, and that measurement.
     pub(crate) near: f64,
     pub(crate) at: [AxisMeasurement; 2],
-    /// The same of anywhere else.
+    /// Probability that it is anywhere else, with mean and variance over those places.
     pub(crate) elsewhere: f64,
     pub(crate) elsewhere_at: [AxisMeasurement; 2],
 }
 
 impl Evidence {
-    /// A measurement that is not doubted.
+    /// Evidence of a measurement that is not doubted.
     pub(crate) fn of(at: [AxisMeasurement; 2]) -> Self {
         Self { near: 1.0, at, elsewhere: 0.0, elsewhere_at: at }
     }
@@ -117,9 +119,10 @@ impl Axis {
         }
     }
 
-    /// Moments of a mixture of two.
+    /// Mean and covariance of the mixture of this state, with weight `share`, and another.
     fn mixed(&self, share: f64, other: &Self) -> Self {
         let rest = 1.0 - share;
+        // P = s P1 + (1 - s) P2 + s (1 - s) d d', d the difference of the means.
         let apart = self.mean - other.mean;
         let covariance = self.covariance * share
             + other.covariance * rest
@@ -127,10 +130,11 @@ impl Axis {
         Self { mean: self.mean * share + other.mean * rest, covariance }
     }
 
-    /// Constant velocity with white acceleration that is constant over the interval (Herasymenko
-    /// 2021, eqs. 8 and 10; erratum: its variance).
+    /// Predicts with constant velocity and white acceleration, given by its variance, that is
+    /// constant over the interval (Herasymenko 2021, eqs. 8 and 10; erratum: its variance).
     fn predict(&mut self, interval: f64, acceleration: f64) {
         self.mean[POSITION] += interval * self.mean[VELOCITY];
+        // P = F P F' + G G' sigma_a^2, G = [T^2/2, T, 0]'; F adds T times the velocity.
         let p = &mut self.covariance;
         let along = p.column(VELOCITY) * interval;
         p.set_column(POSITION, &(p.column(POSITION) + along));
@@ -140,15 +144,16 @@ impl Axis {
         *p += driven * driven.transpose() * acceleration;
     }
 
-    /// What a change of where the reference is found says of the states.
+    /// Regression of the states on where the reference is found: `P H' / (H P H')`.
     fn slope(&self) -> Vector3<f64> {
         let with_found = self.covariance * FOUND_AT.transpose();
         with_found / (FOUND_AT * with_found).x.max(f64::MIN_POSITIVE)
     }
 
-    /// Replaces what is known of where the reference is found; the states follow by regression.
+    /// Sets mean and variance of where the reference is found; the states follow by regression.
     fn condition(&mut self, found: AxisMeasurement) {
         let (slope, before) = (self.slope(), self.found());
+        // x += b (z - z0), P += b b' (v - v0), with b the slope and z0, v0 the values so far.
         self.mean += slope * (found.position - before.position);
         self.covariance += slope * slope.transpose() * (found.variance - before.variance);
         self.covariance = (self.covariance + self.covariance.transpose()) / 2.0;
@@ -156,9 +161,9 @@ impl Axis {
 }
 
 impl Motion {
-    /// Of a target whose place, given for both axes, has become its reference's middle: how far it
-    /// is off, the reference is off the other way, so that the reference is found where the target
-    /// is.
+    /// Motion of a target at rest, whose given place, on both axes, has become the middle of its
+    /// reference. The error of the given place is in the position and with the opposite sign in the
+    /// offset, so that it cancels in where the reference is found.
     pub(crate) fn at_rest(
         given: [AxisMeasurement; 2],
         velocity_sd: f64,
@@ -185,10 +190,11 @@ impl Motion {
         }
     }
 
-    /// Starts anew where the reference is found; its offset stays known as it was.
+    /// Restarts at rest where the reference is found; what is known of its offset is kept.
     pub(crate) fn restart(&mut self, found: [AxisMeasurement; 2], velocity_sd: f64) {
         for (axis, AxisMeasurement { position, variance }) in self.all.iter_mut().zip(found) {
             let (offset, known) = (axis.mean[OFFSET], axis.covariance[(OFFSET, OFFSET)]);
+            // position = found - offset, so the offset's error is in it with the opposite sign.
             axis.mean = Vector3::new(position - offset, 0.0, offset);
             axis.covariance =
                 Matrix3::from_diagonal(&Vector3::new(known + variance, velocity_sd.powi(2), known));
@@ -200,8 +206,8 @@ impl Motion {
         (self.gains, self.measured) = ([[Vector3::x(); 2]; WAYS], found.map(|at| at.variance));
     }
 
-    /// Starts from a second place that somebody knows, `interval` seconds after the first one
-    /// (Herasymenko 2021, eqs. 13-14).
+    /// Starts position and velocity from a second place that somebody knows, `interval` seconds
+    /// after the first one (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn start(&mut self, second: [AxisMeasurement; 2], interval: f64) {
         for i in 0..2 {
             let first = self.all[i];
@@ -211,18 +217,20 @@ impl Motion {
                 let axis = &mut way[i];
                 axis.mean[POSITION] = at;
                 axis.mean[VELOCITY] = (at - first.mean[POSITION]) / interval;
-                // The errors of both places, by what they become.
+                // How the error of each place enters position, velocity and offset.
                 let of_first = Vector3::new(0.0, -1.0 / interval, -1.0);
                 let of_second = Vector3::new(1.0, 1.0 / interval, 0.0);
                 axis.covariance = of_first * of_first.transpose() * first_variance
                     + of_second * of_second.transpose() * variance;
+                // The last term of eq. 14: sigma_a^2 T^2 / 4.
                 axis.covariance[(VELOCITY, VELOCITY)] += acceleration * interval * interval / 4.0;
             }
         }
         self.combine();
     }
 
-    /// Starts anew at a place that somebody knows; the reference's offset stays known as it was.
+    /// Restarts at rest at a place that somebody knows; what is known of the reference's offset is
+    /// kept.
     pub(crate) fn restart_at(&mut self, given: [AxisMeasurement; 2], velocity_sd: f64) {
         for (axis, AxisMeasurement { position, variance }) in self.all.iter_mut().zip(given) {
             axis.mean = Vector3::new(position, 0.0, axis.mean[OFFSET]);
@@ -235,7 +243,8 @@ impl Motion {
         self.gains = Default::default();
     }
 
-    /// Takes in where the target is, which somebody knows.
+    /// Kalman update with the target's own place, which somebody knows: H = [1 0 0], without the
+    /// offset.
     pub(crate) fn take_place(&mut self, given: [AxisMeasurement; 2]) {
         for way in &mut self.ways {
             for (axis, given) in way.iter_mut().zip(given) {
@@ -249,8 +258,11 @@ impl Motion {
         self.combine();
     }
 
-    /// Moves on; a target that leaves the picture, of given sides, is waited for at its border.
+    /// Predicts to the next image. A target that leaves the picture, of given sides, is kept at its
+    /// border with velocity zero.
     pub(crate) fn predict(&mut self, interval: f64, sides: [usize; 2]) {
+        // IMM mixing: w = stays w + (1 - stays) / WAYS, the second part drawn from the mixture of
+        // all.
         let stays = (-CHANGES_PER_S * interval).exp();
         let drawn = (1.0 - stays) / WAYS as f64;
         for ((way, weight), acceleration) in
@@ -278,6 +290,7 @@ impl Motion {
     }
 
     fn combine(&mut self) {
+        // Moments of a mixture: x = sum w_i x_i, P = sum w_i (P_i + d_i d_i'), d_i = x_i - x.
         for i in 0..2 {
             let mut mean = Vector3::zeros();
             for (way, weight) in self.ways.iter().zip(self.weights) {
@@ -309,12 +322,12 @@ impl Motion {
         self.all.map(|axis| axis.covariance.fixed_view::<2, 2>(POSITION, POSITION).into_owned())
     }
 
-    /// Where the reference is expected to be found.
+    /// Where the reference is expected to be found, with the variance of that.
     pub(crate) fn found(&self) -> [AxisMeasurement; 2] {
         self.all.map(|axis| axis.found())
     }
 
-    /// How far the reference is found beside the target.
+    /// Offset of where the reference is found from where the target is.
     pub(crate) fn offset(&self) -> [AxisMeasurement; 2] {
         self.all.map(|axis| AxisMeasurement {
             position: axis.mean[OFFSET],
@@ -322,9 +335,9 @@ impl Motion {
         })
     }
 
-    /// Squared normalised innovation of a measurement, of both axes: chi-square with two degrees of
-    /// freedom if all is well.
-    pub(crate) fn surprise(&self, at: [AxisMeasurement; 2]) -> f64 {
+    /// Squared normalised innovation of a measurement, summed over both axes, under the mixture of
+    /// all models: chi-square with two degrees of freedom if the filters are consistent.
+    pub(crate) fn nis(&self, at: [AxisMeasurement; 2]) -> f64 {
         let axis = |i: usize| {
             let mut parts = [(0.0, at[i]); WAYS];
             for ((part, way), weight) in parts.iter_mut().zip(&self.ways).zip(self.weights) {
@@ -336,24 +349,26 @@ impl Motion {
         axis(0) + axis(1)
     }
 
-    /// Variance of the measurements' noise over what it was expected to be.
+    /// Variance of the measurement noise over the expected one.
     pub(crate) fn noise_factor(&self) -> f64 {
         self.noise_factor
     }
 
-    /// Matches the noise to the innovation of the last update, whose square of both axes is given:
-    /// as far as it tells the noise.
-    pub(crate) fn match_noise(&mut self, surprise: f64) {
+    /// Matches the noise to the innovation of the last update, given its normalised square over
+    /// both axes (`nis`), as far as the innovation consists of noise and not of motion.
+    pub(crate) fn match_noise(&mut self, nis: f64) {
         self.matched_s = (self.matched_s + self.interval).min(MATCHED_S);
         let share = (self.interval / (self.matched_s + AT_LEAST_S)).min(1.0);
+        // Relative step: told (nis / 2 - 1), whose mean is 0 if the noise is right, and the pull
+        // back.
         let more =
-            self.told * (surprise.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
+            self.told * (nis.min(OUTLIER) / 2.0 - 1.0) - AS_EXPECTED * self.noise_factor.ln();
         let factor = self.noise_factor * (1.0 + share * more);
         self.noise_factor = factor.clamp(1.0 / MOST_MATCHED, MOST_MATCHED);
     }
 
-    /// Takes the first measurement's variance for what the noise of each learned image has in the
-    /// offset.
+    /// Adds to the offset's variance what the noise of the images learned so far has in it: the
+    /// first measurement's variances stand for the noise of each.
     pub(crate) fn tell_noise(&mut self, variances: [f64; 2]) {
         if self.untold <= 0.0 {
             return;
@@ -366,13 +381,13 @@ impl Motion {
         }
     }
 
-    /// Takes in what an image says of where the reference is found: each axis becomes the mixture
-    /// of near, elsewhere and not seen, by its mean and variance.
+    /// Updates with what an image says of where the reference is found: on each axis that becomes
+    /// the mixture of near, elsewhere and not seen, replaced by its mean and variance.
     pub(crate) fn update(&mut self, evidence: &Evidence) {
         let Evidence { near, at, elsewhere, elsewhere_at } = *evidence;
         self.measured = at.map(|at| at.variance);
-        // L_w = N(z; H x_w, H P_w H' + R): how well each way of moving has predicted what is
-        // measured, by its logarithm so that none underflows.
+        // L_w = N(z; H x_w, H P_w H' + R), the likelihood of the measurement under each model, as a
+        // logarithm so that none underflows.
         let likelihoods = [0, 1, 2, 3].map(|way: usize| {
             let axis = |i: usize| {
                 let prior = self.ways[way][i].found();
@@ -386,7 +401,8 @@ impl Motion {
         let mean: f64 = likelihoods.iter().zip(self.weights).map(|(l, w)| l * w).sum();
         let mut told = [0.0; WAYS];
         for (way, weight) in self.weights.iter_mut().enumerate() {
-            // Bayes' rule for the ways' weights, for as much of the posterior as measured anything.
+            // Bayes' rule for the models' weights; the share of the posterior without a measurement
+            // leaves them as they are.
             if mean > f64::MIN_POSITIVE {
                 *weight *= near * likelihoods[way] / mean + (1.0 - near);
             }
@@ -400,7 +416,8 @@ impl Motion {
                     position: prior.position + gain * (at[i].position - prior.position),
                     variance: (1.0 - gain) * prior.variance,
                 };
-                // ... is one of three parts of a mixture, which is replaced by its mean and variance.
+                // ... is one of three parts of a mixture, which is replaced by its mean and
+                // variance.
                 let parts =
                     [(near, here), (elsewhere, elsewhere_at[i]), (1.0 - near - elsewhere, prior)];
                 let position: f64 = parts.iter().map(|(mass, part)| mass * part.position).sum();
@@ -408,7 +425,8 @@ impl Motion {
                     mass * (part.variance + (part.position - position).powi(2))
                 };
                 let variance = parts.iter().map(spread).sum::<f64>().min(4.0 * prior.variance);
-                // What of the measurement comes into the position itself: the rest is the offset's.
+                // The regression splits the gain over the states: part to the position, the rest to
+                // the offset.
                 self.gains[way][i] = axis.slope() * (near * gain);
                 axis.condition(AxisMeasurement { position, variance });
             }
@@ -419,10 +437,11 @@ impl Motion {
         self.combine();
     }
 
-    /// Replaces what is known of where the reference is found, on both axes.
+    /// Sets mean and variance of where the reference is found, on both axes.
     pub(crate) fn condition(&mut self, found: [AxisMeasurement; 2]) {
         for (way, gains) in self.ways.iter_mut().zip(&mut self.gains) {
             for i in 0..2 {
+                // The gain of an update that takes the variance from v0 to v: K = 1 - v / v0.
                 let gain = (1.0 - found[i].variance / way[i].found().variance).max(0.0);
                 gains[i] = way[i].slope() * gain;
                 way[i].condition(found[i]);
@@ -432,15 +451,16 @@ impl Motion {
         self.combine();
     }
 
-    /// An image has been learned at a place with a share of the reference; it was measured there
-    /// with some variances.
+    /// Updates the offset for an image that has been learned at `place` with a `share` of the
+    /// reference. `variances` are those of the measurement there, `None` where the place was given.
     ///
-    /// It shows the target where its noise v puts it, `x + v - place` beside its middle, so that
-    /// the offset becomes `(1 - share) b + share (place - x - v)`. The estimate of x has taken in
-    /// the same v by its gain.
+    /// With x the target's position, b the offset and v the image's noise, the image shows the
+    /// target at `x + v - place` from its middle, so that the offset becomes `(1 - share) b + share
+    /// (place - x - v)`. The estimate of x has taken in the same v by its gain: both errors are
+    /// correlated.
     pub(crate) fn learn(&mut self, place: ImagePoint, share: f64, variances: Option<[f64; 2]>) {
         let shifted = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, -share, 0.0, 1.0 - share);
-        // What is learned with a variance is told with it.
+        // Where a variance is given the image's noise goes into the covariances below instead.
         let new = if variances.is_none() { share * share } else { 0.0 };
         self.untold = (1.0 - share).powi(2) * self.untold + new;
         let place = [place.x, place.y];
@@ -450,6 +470,8 @@ impl Motion {
                 let off = place[i] - axis.mean[POSITION];
                 axis.mean[OFFSET] += share * (off - axis.mean[OFFSET]);
                 let new = Vector3::new(0.0, 0.0, share);
+                // P = F P F' + (F K n' + n K' F') R + n n' R, n = [0, 0, share]': the same noise v
+                // in both.
                 let known = shifted * gains[i] * new.transpose();
                 axis.covariance = shifted * axis.covariance * shifted.transpose();
                 if let Some(variances) = variances {
@@ -462,7 +484,8 @@ impl Motion {
         self.combine();
     }
 
-    /// Less is known of position and velocity than the filters believe.
+    /// Multiplies the variances of position and velocity by `factor`: less is known of them than
+    /// the filters believe. The offset's variance stays.
     pub(crate) fn inflate(&mut self, factor: f64) {
         let root = factor.sqrt();
         let wider = Matrix3::from_diagonal(&Vector3::new(root, root, 1.0));
@@ -472,7 +495,7 @@ impl Motion {
         self.combine();
     }
 
-    /// Moves the origin of both axes: what was at a place is at that plus `by`, and all else stays.
+    /// Moves the origin of both axes: positions grow by `by`, px, and all else stays.
     pub(crate) fn move_by(&mut self, by: [f64; 2]) {
         for axes in self.ways.iter_mut().chain([&mut self.all]) {
             for (axis, by) in axes.iter_mut().zip(by) {

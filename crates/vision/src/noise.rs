@@ -2,22 +2,24 @@ use crossfix_correlation::Plane;
 
 use crate::crop::BRIGHTEST;
 
-/// Samples that the median is taken of: it is right to a tenth then, and its mean over images to a
+/// Number of samples of the median: it is right to a tenth then, and its mean over images to a
 /// twentieth.
 const SAMPLES: usize = 100;
-/// The response of the mask to white noise: the root of the sum of its squared weights.
+/// Gain of the mask for white noise's standard deviation: the root of the sum of its squared
+/// weights.
 const MASK_GAIN: f32 = 6.0;
 /// Standard deviation of a normal distribution over its median absolute deviation.
 pub(crate) const OF_MEDIAN: f32 = 1.4826;
 
-/// The middle of values in their order, which is lost; 0 of none.
+/// The median of values, whose order is lost; 0 if there are none.
 pub(crate) fn median(values: &mut [f32]) -> f32 {
     let middle = values.len() / 2;
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }
 
-/// Estimates the noise of an image from the image: the second difference of second differences, to
-/// which a smooth scene is zero, and its median, to which edges are outliers.
+/// Estimates the noise of an image from the image itself: the second difference of second
+/// differences, for which a smooth scene is zero, and the median of that, for which edges are
+/// outliers.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct NoiseMeter {
     responses: Vec<f32>,
@@ -29,8 +31,8 @@ impl NoiseMeter {
         self.variance_within(image, [0, 0], [image.width(), image.height()], floor)
     }
 
-    /// The noise's variance in what of a part is in the image, at least `floor^2`. `corner` is its
-    /// first column and row.
+    /// The noise's variance in a part of the image, as far as it lies inside, at least `floor^2`.
+    /// `corner` is the part's first column and row.
     pub(crate) fn variance_within(
         &mut self,
         image: &Plane,
@@ -52,6 +54,7 @@ impl NoiseMeter {
             for place in (0..places).step_by(step) {
                 let (x, y) = (columns.start + place % width, rows.start + place / width);
                 let [a, b, c] = [0, 1, 2].map(|k| &image.row(y + k)[x..x + 3]);
+                // The mask [[1, -2, 1], [-2, 4, -2], [1, -2, 1]].
                 let corners = a[0] + a[2] + c[0] + c[2];
                 let sides = a[1] + b[0] + b[2] + c[1];
                 let response = (corners - 2.0 * sides + 4.0 * b[1]).abs();

@@ -21,7 +21,7 @@ pub(crate) struct PaperTarget {
     /// Absent until the second measurement (Herasymenko 2021, eqs. 13-14).
     axes: Option<[AxisFilter; 2]>,
     first: ImagePoint,
-    /// Where the box's middle lies from the middle of the reference, which is cut at whole pixels.
+    /// Offset of the box's middle from the middle of the reference, which is cut at whole pixels.
     middle: [f64; 2],
 }
 
@@ -66,8 +66,8 @@ impl PaperTarget {
         AxisMeasurement { position, variance: config.paper.measurement_sd_px.powi(2) }
     }
 
-    /// Takes a place from somebody who knows it; after the box alone, the start from two
-    /// measurements (Herasymenko 2021, eqs. 13-14).
+    /// Takes a place from somebody who knows it; after the box alone this starts the filters from
+    /// two measurements (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn take_place(
         &mut self,
         image: &Plane,
@@ -130,7 +130,8 @@ impl PaperTarget {
         let reference = self.reference.image();
         let (width, height) = (reference.width(), reference.height());
         let whole = |at: f64, gate: usize, reference: usize| {
-            // Placed more than half a gate from the middle, it comes in on the other side.
+            // Circular correlation: placed more than half a gate from the middle, the reference
+            // comes in on the other side.
             let off = at - (gate as f64 - reference as f64) / 2.0;
             let wraps = extent == Extent::Circular && off > gate as f64 / 2.0;
             at + (reference as f64 - 1.0) / 2.0 - if wraps { gate as f64 } else { 0.0 }
@@ -159,7 +160,7 @@ impl PaperTarget {
     }
 }
 
-/// Moves both axes on; a target that leaves the picture is waited for at its border.
+/// Predicts both axes; a target that leaves the picture is kept at its border.
 fn predict(axes: &mut [AxisFilter; 2], interval: f64, image: &Plane) {
     for (axis, side) in axes.iter_mut().zip([image.width(), image.height()]) {
         axis.time_update(interval);

@@ -3,23 +3,24 @@ use pulp::{Arch, Simd, WithSimd};
 
 use crate::lanes;
 
-/// What is known of the place before the image is looked at: a Gaussian an axis, and a share that
-/// may be anywhere in the gate.
+/// Prior of the place, before the image is looked at: a Gaussian per axis, and a share that may be
+/// anywhere in the gate.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Prior {
-    /// Column and row of the prediction in the map of placements.
+    /// Column and row of the prediction in the map of placements (positions of the reference in the
+    /// gate).
     pub(crate) centre: [f64; 2],
-    /// Its variances.
+    /// Variances of the prediction, in placements squared.
     pub(crate) variance: [f64; 2],
-    /// The share that may be anywhere.
+    /// Share of the prior that is uniform over the gate.
     pub(crate) anywhere: f64,
     /// Probability that the target can be seen at all.
     pub(crate) visible: f64,
-    /// Half sides of what counts as one peak.
+    /// Half sides of the neighbourhood that counts as one peak.
     pub(crate) near: [usize; 2],
 }
 
-/// A part of the posterior: its mass, its mean and its variance per axis, in placements.
+/// A part of the posterior: its mass, and its mean and variance per axis, in placements.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Part {
     pub(crate) mass: f64,
@@ -27,8 +28,8 @@ pub(crate) struct Part {
     pub(crate) variance: [f64; 2],
 }
 
-/// Where the target is, given the image: near the peak, elsewhere, or not to be seen. The masses
-/// sum to 1.
+/// Posterior of the target's place given the image, in three parts: near the peak, elsewhere in the
+/// gate, or not visible. The masses sum to 1.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Posterior {
     /// Column and row of the peak.
@@ -36,21 +37,22 @@ pub(crate) struct Posterior {
     pub(crate) near: Part,
     pub(crate) elsewhere: Part,
     pub(crate) unseen: f64,
-    /// How likely the image is with this prior, in a unit that is the same for all priors of one
+    /// Likelihood of the image under this prior, in a unit that is the same for all priors of one
     /// map.
     pub(crate) evidence: f64,
 }
 
 impl Posterior {
-    /// What is near the peak is the target with a probability only; else it is not to be seen.
-    pub(crate) fn doubted(&self, is_there: f64) -> Self {
-        let near = Part { mass: self.near.mass * is_there, ..self.near };
+    /// The posterior if what is near the peak is the target with probability `probability` only; the
+    /// rest of that mass goes to `unseen`.
+    pub(crate) fn doubted(&self, probability: f64) -> Self {
+        let near = Part { mass: self.near.mass * probability, ..self.near };
         Self { near, unseen: self.unseen + self.near.mass - near.mass, ..*self }
     }
 }
 
-/// Turns a map of log likelihood ratios into a posterior (the soft weighting of all peaks). Keeps
-/// its memory.
+/// Turns a map of log likelihood ratios into a posterior, in which all peaks count by their weight.
+/// Keeps its memory from call to call.
 #[derive(Debug, Default)]
 pub(crate) struct PosteriorMap {
     weights: Plane,
@@ -60,7 +62,8 @@ pub(crate) struct PosteriorMap {
     sums: Vec<RowSums>,
 }
 
-/// Sums over a row of the map.
+/// Sums over a row of the map: of ratios, of weights, and of weights times column and column
+/// squared; and the largest weight.
 #[derive(Clone, Copy, Debug, Default)]
 struct RowSums {
     ratio: f32,
@@ -88,6 +91,7 @@ impl PosteriorMap {
         self.ratios.reshape(width, height);
         self.sums.clear();
         self.sums.resize(height, RowSums::default());
+        // Ratios are taken relative to the largest, or to 1, so that no exponential overflows.
         let largest = log_ratios.samples().iter().copied().fold(0.0, f32::max);
         let anywhere = (prior.anywhere / (width * height) as f64) as f32;
         Arch::new().dispatch(Weigh {
@@ -102,7 +106,8 @@ impl PosteriorMap {
         let near = self.moments(around(peak, prior.near, [width, height]));
         let total = self.total();
 
-        // Background is as likely as the placements away from the peak make it.
+        // "Not visible" has the likelihood of plain background: the mean ratio of the placements
+        // away from the peak.
         let wide = around(peak, prior.near.map(|n| 2 * n), [width, height]);
         let inside: f64 = wide[1]
             .clone()
@@ -112,6 +117,7 @@ impl PosteriorMap {
         let all: f64 = self.sums.iter().map(|sums| f64::from(sums.ratio)).sum();
         let away = (width * height).saturating_sub(wide[0].len() * wide[1].len()).max(1) as f64;
         let background = ((all - inside) / away).max(f64::from(-largest).exp());
+        // P(unseen) : P(seen) = (1 - visible) background : visible mass.
         let unseen = (1.0 - prior.visible) / prior.visible * background;
         let rest = Part { mass: (total.mass - near.mass).max(0.0), ..without(total, near) };
         let sum = total.mass + unseen;
@@ -125,7 +131,7 @@ impl PosteriorMap {
         }
     }
 
-    /// The placement of most weight.
+    /// The placement with the largest weight.
     fn peak(&self) -> [usize; 2] {
         let (width, height) = (self.weights.width(), self.weights.height());
         let row = (0..height)
@@ -134,8 +140,8 @@ impl PosteriorMap {
         [(0..width).fold(0, |best, x| if line[x] > line[best] { x } else { best }), row]
     }
 
-    /// Takes the best peak off the map of the last posterior, and returns it with its part in units
-    /// of the evidence.
+    /// Removes the largest peak from the map of the last posterior, and returns its placement and
+    /// its part, with the mass in units of the evidence.
     pub(crate) fn take_peak(&mut self, near: [usize; 2]) -> ([usize; 2], Part) {
         let peak = self.peak();
         let [columns, rows] = around(peak, near, [self.weights.width(), self.weights.height()]);
@@ -181,13 +187,13 @@ impl PosteriorMap {
 fn part(mass: f64, first: [f64; 2], second: [f64; 2]) -> Part {
     let mass_or_one = if mass > 0.0 { mass } else { 1.0 };
     let mean = first.map(|f| f / mass_or_one);
-    // A placement stands for a whole pixel.
+    // Each placement stands for a whole pixel, whose uniform distribution has the variance 1/12.
     let variance =
         [0, 1].map(|i| (second[i] / mass_or_one - mean[i] * mean[i]).max(0.0) + 1.0 / 12.0);
     Part { mass, mean, variance }
 }
 
-/// What is left of a whole without a part of it.
+/// The rest of a whole when a part is taken out, by the difference of their moments.
 fn without(whole: Part, taken: Part) -> Part {
     let rest = whole.mass - taken.mass;
     if rest <= 1e-6 * whole.mass {
@@ -205,7 +211,7 @@ fn around(peak: [usize; 2], half: [usize; 2], sides: [usize; 2]) -> [std::ops::R
     [0, 1].map(|i| peak[i].saturating_sub(half[i])..(peak[i] + half[i] + 1).min(sides[i]))
 }
 
-/// Ratios and weights of the whole map, and their sums.
+/// Fills ratios and weights of the whole map, and their sums per row.
 struct Weigh<'a> {
     map: &'a mut PosteriorMap,
     log_ratios: &'a Plane,
@@ -228,6 +234,7 @@ impl WithSimd for Weigh<'_> {
                 ratios.iter_mut().zip(weights.iter_mut()).zip(log_ratios.row(y)).zip(&map.columns);
             for (((ratio, weight), log_ratio), along) in line {
                 *ratio = lanes::exp(log_ratio - largest);
+                // weight = prior x likelihood ratio.
                 *weight = (across * along + anywhere) * *ratio;
             }
             *sums = row_sums(ratios, weights);
@@ -294,7 +301,7 @@ mod tests {
         let map =
             Plane::from_fn(21, 17, |x, y| if y == 8 && (x == 10 || x == 14) { 20.0 } else { -5.0 });
         let posterior = PosteriorMap::default().of(&map, &prior(0.0));
-        // exp(-(4^2) / 8) = 0.135 of the nearer one's.
+        // The farther peak has exp(-4^2 / 8) = 0.135 of the nearer one's mass.
         let share = posterior.elsewhere.mass / posterior.near.mass;
         assert!((share - (-2.0f64).exp()).abs() < 1e-3, "{posterior:?}");
         assert!((posterior.elsewhere.mean[0] - 14.0).abs() < 0.01);

@@ -1,35 +1,35 @@
-//! By how much a picture is shifted against another: the camera's turn, told from targets that
-//! move.
+//! Registration of two pictures: the shift by which the camera has turned, as opposed to targets
+//! that move.
 
 use crossfix_correlation::Plane;
 
-/// Every so many pixels of the smoothed picture are looked at, in rows and columns: those between
-/// tell the same.
+/// Step between the pixels of the smoothed picture that are used, in rows and columns: those
+/// between tell the same.
 pub(crate) const STRIDE: usize = 2;
-/// Steps of the registration, at most, and the step that ends it, pixels.
+/// Most iterations of the registration, and the length of a step that ends it, pixels.
 const STEPS: usize = 6;
 const SETTLED: f32 = 0.003;
-/// A longer step is a mistake, pixels: it is taken so far.
+/// Longest step, pixels: a longer one is a mistake, and is cut to this.
 const LONGEST_STEP: f32 = 2.0;
-/// Levels of brightness that a pixel may differ by before it counts for less: a target that moves
-/// is no turn.
+/// Difference of brightness beyond which a pixel counts for less, levels: a target that moves is no
+/// turn.
 const OUTLYING: f32 = 5.0;
-/// A turn must lessen the misfit by so many times what a pixel has of it. Two smoothed pictures of
-/// noise alone fit by up to 60 times better somewhere near, as only one pixel in eighteen is
-/// independent; with half of it a clear sky turns by chance, with twice as much a turn is told a
-/// frame later.
+/// Least reduction of the misfit by a turn, in units of one pixel's mean misfit. Two smoothed
+/// pictures of noise alone fit better by up to 60 at some shift nearby, as only one pixel in
+/// eighteen is independent; with half of it a clear sky turns by chance, with twice as much a turn
+/// is told a frame later.
 const SIGNIFICANT: f32 = 120.0;
-/// Fewer pixels in common tell no turn.
+/// Fewest pixels in common (sum of their weights) that tell a turn.
 pub(crate) const LEAST_COMMON: f32 = 50.0;
 
-/// The places of a row that, moved by so many, are in the row, and the next one too.
+/// Indices of a row that, moved by `by`, are in the row together with the next index.
 pub(crate) fn overlap(side: usize, by: isize) -> std::ops::Range<usize> {
     let side = side as isize;
     let first = (-by).clamp(0, side);
     first as usize..(side - 1 - by).clamp(first, side) as usize
 }
 
-/// The normal equations of a step of registration, with the change of brightness taken out.
+/// Normal equations of one step of the registration, with the change of brightness taken out.
 #[derive(Clone, Copy, Debug, Default)]
 struct Normal {
     weight: f32,
@@ -41,6 +41,7 @@ struct Normal {
 
 impl Normal {
     fn add(&mut self, [gx, gy]: [f32; 2], off: f32) {
+        // Cauchy's robust weight: 1 / (1 + (off / c)^2).
         let weight = 1.0 / (1.0 + (off / OUTLYING).powi(2));
         self.weight += weight;
         self.slope[0] += weight * gx;
@@ -53,14 +54,14 @@ impl Normal {
         self.slope_off[1] += weight * gy * off;
     }
 
-    /// The step, pixels; `None` where nothing tells it.
+    /// The step that solves the equations, pixels; `None` where they do not determine it.
     fn step(self) -> Option<[f32; 2]> {
         let Self { weight: n, slope: [sx, sy], off, .. } = self;
         if n < LEAST_COMMON {
             return None;
         }
         let [xx, xy, yy] = self.slope_slope;
-        // About the means, so that a change of light is none of the shift ...
+        // About the means, so that a change of light is not taken for a shift ...
         let [xx, xy, yy] = [xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n];
         let [x, y] = [self.slope_off[0] - sx * off / n, self.slope_off[1] - sy * off / n];
         // ... and solved by Cramer's rule: (slope slope') step = slope off.
@@ -71,8 +72,8 @@ impl Normal {
     }
 }
 
-/// The differences of a picture of now from one of then, shifted by so many pixels, with their
-/// places and the slopes of then.
+/// Calls `take` for each pixel in common with its place, the slope of `then`, and the difference of
+/// `now` from `then`, which is shifted by `shift` pixels.
 fn each_off(
     now: &Plane,
     then: &Plane,
@@ -97,30 +98,31 @@ fn each_off(
     }
 }
 
-/// The normal equations for a picture of now against one of then, shifted by so many pixels.
+/// The normal equations of two pictures at a shift, pixels.
 fn normal_at(now: &Plane, then: &Plane, shift: [f32; 2]) -> Normal {
     let mut normal = Normal::default();
     each_off(now, then, shift, |_, slope, off| normal.add(slope, off));
     normal
 }
 
-/// Columns and rows of the tiles of a picture by which a turn is told from a target that moves.
+/// Columns and rows of the tiles into which a picture is divided, to tell a turn from a target that
+/// moves.
 const TILES: [usize; 2] = [12, 9];
-/// A target may be in so many tiles about the one where a turn would lessen the misfit most: 50 px
-/// of a picture of 320x240, and what smoothing makes of them.
+/// Reach of a target about the tile whose misfit a turn would lessen most, tiles: 50 px of a
+/// picture of 320x240, and what smoothing makes of them.
 const AROUND: usize = 2;
 
-/// A turn lessens the misfit by at least this share of all away from where it does most: the ends
-/// of a large target's smoothed picture reach a twentieth that far.
+/// Least share of the whole gain that a turn must bring away from the tiles that gain most: the
+/// edges of a large target's smoothed picture reach a twentieth that far.
 const ELSEWHERE: f32 = 0.1;
 
-/// The squares that are left in each tile, and their weights.
+/// Weighted sum of the squared differences in each tile, and the sum of the weights.
 #[derive(Clone, Copy, Debug)]
 struct Misfits([[(f32, f32); TILES[0]]; TILES[1]]);
 
 impl Misfits {
-    /// Those of a picture of now against one of then, shifted by so many pixels and brighter by so
-    /// much.
+    /// The misfits of two pictures at a shift, pixels, if the newer one is brighter by `brighter`
+    /// levels.
     fn at(now: &Plane, then: &Plane, shift: [f32; 2], brighter: f32) -> Self {
         let sides = [now.width(), now.height()];
         let mut tiles = [[(0.0, 0.0); TILES[0]]; TILES[1]];
@@ -134,8 +136,9 @@ impl Misfits {
         Self(tiles)
     }
 
-    /// Whether they are less than others by more than noise makes them, and elsewhere too than
-    /// about the two tiles that have gained most: there a target may be, and have been.
+    /// Whether these misfits are less than `before` by more than noise makes them, and also away
+    /// from the two tiles that have gained most: a target may be in one of these, and have been in
+    /// the other.
     fn are_better_than(&self, before: &Self) -> bool {
         let whole = self.gain(before, &[]);
         let (squares, weights) = self.sums(&[]);
@@ -148,7 +151,7 @@ impl Misfits {
         self.gain(before, &[first, second]) > ELSEWHERE * whole
     }
 
-    /// Squares and weights of the tiles that are not about some others.
+    /// Sums of squares and of weights over the tiles that are not near `others`.
     fn sums(&self, others: &[[usize; 2]]) -> (f32, f32) {
         let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
         kept.fold((0.0, 0.0), |(squares, weights), [x, y]| {
@@ -156,12 +159,12 @@ impl Misfits {
         })
     }
 
-    /// By how much the squares are less than others, but for the tiles about some.
+    /// Reduction of the squares from `before`, over the tiles that are not near `others`.
     fn gain(&self, before: &Self, others: &[[usize; 2]]) -> f32 {
         gain_of(before.sums(others), self.sums(others))
     }
 
-    /// The tile that has gained most, but for those about some.
+    /// The tile with the largest reduction, of those that are not near `others`.
     fn most_gained(&self, before: &Self, others: &[[usize; 2]]) -> [usize; 2] {
         let gain = |[x, y]: [usize; 2]| gain_of(before.0[y][x], self.0[y][x]);
         let kept = tiles().filter(|tile| !others.iter().any(|other| is_about(*tile, *other)));
@@ -178,15 +181,15 @@ fn is_about([x, y]: [usize; 2], [column, row]: [usize; 2]) -> bool {
     x.abs_diff(column) <= AROUND && y.abs_diff(row) <= AROUND
 }
 
-/// By how much weighed squares have become less, as many pixels as there are now.
+/// Reduction of the mean square, times the present sum of weights.
 fn gain_of(before: (f32, f32), now: (f32, f32)) -> f32 {
     let mean = |(squares, weights): (f32, f32)| squares / weights.max(f32::MIN_POSITIVE);
     (mean(before) - mean(now)) * now.1
 }
 
-/// By how much a picture of now is shifted against one of then, px, from a first guess on (Lucas
-/// and Kanade 1981). `None` where another shift explains no more than noise would, or a target that
-/// moves: a clear sky tells no turn.
+/// Shift of a picture against an older one, px, iterated from a first guess (Lucas and Kanade
+/// 1981). `None` where the shift explains no more than noise would, or than a target that moves: a
+/// clear sky tells no turn.
 pub(crate) fn registered(now: &Plane, then: &Plane, first: [f32; 2]) -> Option<[f32; 2]> {
     if (then.width(), then.height()) != (now.width(), now.height()) {
         return None;

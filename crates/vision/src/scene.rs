@@ -1,8 +1,8 @@
 //! What the scene looks like without the targets: a few pictures of the last seconds, and by how
 //! much the camera has turned since each.
 //!
-//! What a target hides shows in a picture in which it was elsewhere. A place where the image is
-//! what it was then shows the scene and no target, whatever a reference makes of it.
+//! What a target hides shows in a picture in which the target was elsewhere. Where the image is the
+//! same as in such a picture it shows the scene and no target, however well a reference correlates.
 
 use crossfix_correlation::Plane;
 use pulp::{Arch, Simd, WithSimd};
@@ -12,32 +12,32 @@ use crate::crop::replace_invalid;
 use crate::noise::median;
 use crate::registration::{LEAST_COMMON, STRIDE, overlap, registered};
 
-/// Pictures that are kept, the latest, and the time between them, s: they reach back for 3 to 3.6
-/// s. With half of either a slow target covers what it hides in all of them; with more, light and
-/// clouds are others by then.
+/// Number of pictures that are kept, the latest, and the time between them, s: they reach back for
+/// 3 to 3.6 s. With half of either a slow target hides the same part of the scene in all of them;
+/// with more, light and clouds are different by then.
 const PICTURES: usize = 6;
 const SPACING_S: f64 = 0.6;
-/// About how old the picture is against which a change is asked for, s: a target has moved by its
-/// own size by then.
+/// Preferred age of the picture from which a change is computed, s: a target has moved by its own
+/// size by then.
 const CHANGED_S: f64 = 1.0;
-/// Blocks of so many pixels per side are one pixel of the coarse picture by which the camera's turn
-/// is found: in single pixels the noise has more slope than clouds have, and the turn is taken for
-/// nothing.
+/// Side of the blocks that make one pixel of the coarse picture, px; the camera's turn is found in
+/// that. In single pixels the noise has more slope than clouds have, and no turn is noticed.
 const COARSENESS: usize = 8;
-/// How often the coarse picture is smoothed, by a quarter, a half and a quarter of neighbours.
+/// How often the coarse picture is smoothed, each time with weights of a quarter, a half and a
+/// quarter for neighbours.
 const SMOOTHED: usize = 3;
-/// A camera that has turned by less than this since it was looked at stands still, px: twice what
-/// noise makes of it ...
+/// A camera stands still that has turned by less than this since it was last registered, px: twice
+/// what noise makes of it ...
 const STILL_PX: f64 = 0.1;
-/// ... and is looked at again after so long, s, if it is not jerked: with half of it an image costs
-/// 10 us more, of 640x480 30 us.
+/// ... and is registered again after this long, s, unless it is jerked: with half of it an image
+/// costs 10 us more, one of 640x480 30 us.
 const STILL_S: f64 = 0.1;
 
-/// A camera is jerked if what changes from one image to the next is this much more than usual, and
-/// so many levels, ...
+/// The camera is jerked if the change from one image to the next exceeds the usual one by this
+/// factor, and by this many levels, ...
 const JERK: f32 = 1.5;
 const JERK_LEVELS: f32 = 0.25;
-/// ... where this share of what is usual is the last image's.
+/// ... where the usual change is a running mean, in which the last image has this share.
 const USUAL_SHARE: f32 = 0.05;
 
 /// A picture of the scene.
@@ -47,7 +47,7 @@ pub(crate) struct Picture {
     coarse: Plane,
     age_s: f64,
     number: u64,
-    /// What is at (x, y) now was at (x, y) plus this then, px.
+    /// Shift from now to then: what is at (x, y) now was at (x, y) plus this, px.
     shift: [f64; 2],
 }
 
@@ -61,39 +61,40 @@ impl Picture {
         &self.image
     }
 
-    /// Pictures are counted.
+    /// Number of the picture, counted from the first one taken.
     pub(crate) fn number(&self) -> u64 {
         self.number
     }
 
-    /// Where what is at a place now was then.
+    /// Where what is at `place` now was in this picture.
     pub(crate) fn then(&self, place: ImagePoint) -> ImagePoint {
         ImagePoint { x: place.x + self.shift[0], y: place.y + self.shift[1] }
     }
 
-    /// Whether a place was in the picture then.
+    /// Whether a place in this picture's own coordinates lies inside it.
     pub(crate) fn holds(&self, then: ImagePoint) -> bool {
         let inside = |at: f64, side: usize| (0.0..=side as f64 - 1.0).contains(&at);
         inside(then.x, self.image.width()) && inside(then.y, self.image.height())
     }
 }
 
-/// Blocks along a row of which one is looked at: there are hundreds, and half of them has to
-/// change.
+/// Of this many blocks along a row one is looked at: there are hundreds, and a jerk has to change
+/// half of them.
 const GLANCED: usize = 4;
 
-/// A row in some blocks, by which a jerk of the camera is noticed at a tenth of what a look costs.
+/// One row of some blocks, by which a jerk of the camera is noticed at a tenth of the cost of a
+/// registration.
 #[derive(Debug, Default)]
 struct Glance {
-    /// Means of a row of a block.
+    /// Mean of one row of each of these blocks, in the last image.
     means: Vec<f32>,
     changes: Vec<f32>,
-    /// Median change of a mean from image to image, usually, levels.
+    /// Usual median change of these means from image to image, levels.
     usual: f32,
 }
 
 impl Glance {
-    /// Whether most of the image is another than it was in the image before, more than by noise.
+    /// Whether most of the image has changed since the image before, by more than noise.
     fn is_another(&mut self, image: &Plane) -> bool {
         let Self { means, changes, usual } = self;
         let rows = (COARSENESS / 2..image.height()).step_by(COARSENESS);
@@ -129,11 +130,11 @@ pub(crate) struct Scene {
     between: Plane,
     sums: Vec<f32>,
     taken: u64,
-    /// Whether the camera had not turned when it was looked at last, and how long ago that is, s.
+    /// Whether the camera had not turned when it was registered last, and the time since then, s.
     is_still: bool,
     unlooked_s: f64,
     glance: Glance,
-    /// How far the scene had moved when the newest picture was taken, px.
+    /// Shift of the scene since the beginning, when the newest picture was taken, px.
     turned: [f64; 2],
 }
 
@@ -148,8 +149,7 @@ impl Scene {
         self.taken
     }
 
-    /// By how much the scene has moved since the beginning: what is at (x, y) was at (x, y) plus
-    /// this, px.
+    /// Shift of the scene since the beginning: what is at (x, y) was at (x, y) plus this, px.
     pub(crate) fn turned(&self) -> [f64; 2] {
         let since = self.pictures.first().map_or([0.0; 2], |newest| newest.shift);
         [0, 1].map(|i| self.turned[i] + since[i])
@@ -162,9 +162,9 @@ impl Scene {
         (self.glance, self.is_still) = (Glance::default(), false);
     }
 
-    /// Finds out how the camera has turned, by the newest picture: the others turned as much
-    /// against that one as when it was taken. A camera that stood still lately is looked at now and
-    /// then.
+    /// Finds how the camera has turned by registering the image with the newest picture; against
+    /// that one the other pictures are shifted as when it was taken. A camera that stood still
+    /// lately is registered only now and then.
     pub(crate) fn register(&mut self, image: &Plane, interval: f64) {
         self.unlooked_s += interval;
         for picture in &mut self.pictures {
@@ -194,14 +194,14 @@ impl Scene {
         }
     }
 
-    /// Keeps a picture where it is time to, and returns its number.
+    /// Keeps a picture if it is time to, and returns its number.
     pub(crate) fn keep(&mut self, image: &Plane) -> Option<u64> {
         let is_new = self.pictures.first().is_some_and(|newest| newest.age_s < SPACING_S);
         let looked_at = (self.coarse.width() / STRIDE) * (self.coarse.height() / STRIDE);
         if is_new || (looked_at as f32) < LEAST_COMMON {
             return None;
         }
-        // Errors must not add up from picture to picture.
+        // Each picture is registered itself, so that errors do not add up from picture to picture.
         for picture in &mut self.pictures {
             picture.shift = turned(&self.coarse, &picture.coarse, picture.shift);
         }
@@ -220,8 +220,8 @@ impl Scene {
         Some(self.taken)
     }
 
-    /// What has changed since about a second ago: the image less what was there then, 0 where
-    /// nothing is known. False without such a picture.
+    /// Fills `change` with what has changed since about a second ago: the image less what was there
+    /// then, 0 where that is unknown. False without a picture of about that age.
     pub(crate) fn change(&self, image: &Plane, change: &mut Plane) -> bool {
         let of_age =
             |picture: &&Picture| (CHANGED_S / 2.0..=CHANGED_S * 2.0).contains(&picture.age_s);
@@ -233,6 +233,7 @@ impl Scene {
             .min_by(|one, other| off(one).total_cmp(&off(other)));
         let Some(Picture { image: before, shift, .. }) = nearest else { return false };
         let (width, height) = (image.width(), image.height());
+        // The older picture is interpolated linearly between four pixels.
         let whole = shift.map(f64::floor);
         let [right, down] = [0, 1].map(|i| (shift[i] - whole[i]) as f32);
         let [left, top] = whole.map(|s| s as isize);
@@ -256,7 +257,7 @@ impl Scene {
 }
 
 /// By how much the camera has turned between two coarse pictures, px of the image; `before` where
-/// they do not tell.
+/// they determine no turn.
 fn turned(now: &Plane, then: &Plane, before: [f64; 2]) -> [f64; 2] {
     let coarseness = COARSENESS as f64;
     let told = registered(now, then, before.map(|turned| (turned / coarseness) as f32));
@@ -268,8 +269,8 @@ fn coarsened(from: &Plane, to: &mut Plane, sums: &mut Vec<f32>) {
     to.reshape(from.width() / COARSENESS, from.height() / COARSENESS);
     let share = 1.0 / (COARSENESS * COARSENESS) as f32;
     for y in 0..to.height() {
-        // Down the columns first: that is many at a time. Of a picture of less than a block the
-        // last row counts again.
+        // Down the columns first: that is many at a time. A picture lower than a block counts its
+        // last row several times.
         let rows: [&[f32]; COARSENESS] =
             std::array::from_fn(|k| from.row((y * COARSENESS + k).min(from.height() - 1)));
         sums.clear();
@@ -300,7 +301,7 @@ impl WithSimd for ColumnSums<'_> {
     }
 }
 
-/// Smooths a picture, in rows and in columns.
+/// Smooths a picture along rows and columns.
 fn smooth(plane: &mut Plane, between: &mut Plane) {
     let (width, height) = (plane.width(), plane.height());
     if width < 2 {
@@ -314,7 +315,7 @@ fn smooth(plane: &mut Plane, between: &mut Plane) {
             for (out, three) in out[1..].iter_mut().zip(row.windows(3)) {
                 *out = mean(three[0], three[1], three[2]);
             }
-            // Beyond the border the border goes on.
+            // Beyond the border the border pixel is repeated.
             out[0] = mean(row[0], row[0], row[1]);
             out[width - 1] = mean(row[width - 2], row[width - 1], row[width - 1]);
         }
@@ -336,7 +337,8 @@ mod tests {
 
     use super::*;
 
-    /// Clouds seen by a camera that has turned by so many pixels, with noise.
+    /// Clouds seen by a camera that has turned by so many pixels, with noise of a standard
+    /// deviation.
     fn clouds([right, down]: [f64; 2], noise: f32, seed: u64) -> Plane {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let normal = Normal::new(0.0, noise).unwrap();

@@ -7,7 +7,7 @@ use crate::arrival::Comparison;
 use crate::noise::NoiseMeter;
 use crate::posterior::PosteriorMap;
 
-/// What one step of one target writes into, and nobody reads after it.
+/// Buffers of one step of one target, whose contents nobody reads after it.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
     pub(crate) buffers: AppearanceScratch,
@@ -21,7 +21,7 @@ pub(crate) struct Scratch {
     pub(crate) comparison: Comparison,
 }
 
-/// The same for a search.
+/// Buffers of a search.
 #[derive(Debug, Default)]
 pub(crate) struct SearchScratch {
     pub(crate) coarse: Plane,

@@ -1,4 +1,4 @@
-//! Looking for a lost target in a gate that grows, on a picture made coarser.
+//! Search for a lost target in an area that grows, first on a coarser picture.
 
 use std::ops::Range;
 
@@ -17,21 +17,23 @@ use crate::state::State;
 
 /// Least side of the reference on the coarse picture, px: a whole picture of 640x512 takes a few
 /// milliseconds then; with 8 it takes three times as long and finds no more, with 3 it finds what
-/// looks like the target from afar. And the most pixels that are made one, a side.
+/// looks like the target from afar. And the most pixels per side that are averaged into one.
 const COARSE_SIDE: usize = 5;
 const MOST_COARSE: usize = 4;
-/// A found place is believed if its log ratio is at least this, at least `MARGIN` above the next
-/// best place's, and its contrast is by so many nats likelier the target's than that of the best of
-/// so many places of what is searched through. Of the places that a search takes for the target on
-/// the shared and drawn cases half are others' without the last, and with 4 a third; with twice as
-/// much an eighth of the right ones is refused.
+/// A found place is accepted if its log likelihood ratio, less the scene's own there, is at least
+/// `LEAST_RATIO` and at least `MARGIN` above that of the next best place, and if its contrast is by
+/// `ABOVE_CHANCE` nats likelier the target's than the best one's of all places searched. On the
+/// shared and drawn cases half of the places that a search takes for the target are others' without
+/// the last condition, and with 4 a third; with twice as much an eighth of the right ones is
+/// refused.
 pub(crate) const LEAST_RATIO: f32 = 3.0;
 const MARGIN: f32 = 1.0;
 const ABOVE_CHANCE: f64 = 4.0;
-/// No scene looks less like a target than this, in contrasts: the samples' own steps.
+/// Least standard deviation of the scene's contrasts: the steps of the samples make every scene
+/// look like a target by this much.
 const LEAST_LIKENESS: f64 = 1e-3;
-/// Variance of the noise of what has changed over the image's: its own, and what interpolation
-/// leaves of the picture's.
+/// Variance of the noise in the picture of what has changed, over that in the image: the image's
+/// own noise, and what interpolation leaves of the older picture's.
 const NOISE_OF_CHANGE: f32 = 1.6;
 
 /// The best place of a search.
@@ -41,7 +43,7 @@ pub(crate) struct Found {
     pub(crate) accepted: bool,
 }
 
-/// The means of blocks of `side` by `side`.
+/// The means of blocks of `side` by `side` pixels.
 fn coarsened(from: &Plane, side: usize, to: &mut Plane) {
     if side == 1 {
         to.copy_from(from);
@@ -77,15 +79,15 @@ fn coarse_reference(state: &State, coarseness: usize, resampler: &mut Resampler)
     Reference::new(image, window)
 }
 
-/// A reference on a picture made coarser by a whole number.
+/// A reference averaged over blocks of `coarseness` pixels per side.
 struct Coarse {
     reference: Reference,
     coarseness: usize,
 }
 
 impl Coarse {
-    /// Log ratios of every placement whose middle is in the given part of a coarse picture, into
-    /// `scratch.ratios`.
+    /// Log likelihood ratios of every placement whose middle is in the given part of a coarse
+    /// picture, into `scratch.ratios`.
     fn ratios(
         &self,
         state: &State,
@@ -109,7 +111,7 @@ impl Coarse {
         log_ratios(&scratch.statistics, expected, &mut scratch.ratios);
     }
 
-    /// How much what has been correlated last looks like the reference.
+    /// How much the part that has been correlated last looks like the reference.
     fn likeness(&self, scratch: &mut Scratch) -> Likeness {
         let covariances = scratch.statistics.covariance.samples();
         let SearchScratch { contrasts, .. } = &mut scratch.search;
@@ -124,36 +126,37 @@ impl Coarse {
     }
 }
 
-/// How much what is searched through looks like a target: the contrast with which its reference is
-/// found, place by place.
+/// How much the picture that is searched looks like a target: the contrasts with which the target's
+/// reference is found at its places.
 #[derive(Clone, Copy, Debug)]
 struct Likeness {
-    /// Its standard deviation about none.
+    /// Standard deviation of the contrasts about zero.
     deviation: f64,
     places: f64,
 }
 
 impl Likeness {
-    /// Log-likelihood ratio of a contrast's being a target's, whose usual one is known, against the
-    /// best place's of the scene.
+    /// Log-likelihood ratio of a contrast being the target's, whose usual one is known, against it
+    /// being the largest of the scene's places.
     fn log_ratio(self, contrast: f64, usual: f64, contrast_sd: f64) -> f64 {
         let Self { deviation, places } = self;
         let normal = |off: f64, sd: f64| -0.5 * (off / sd).powi(2) - sd.ln();
+        // ln N(c; usual, (sd usual)^2) - ln (places N(c; 0, deviation^2)).
         normal(contrast - usual, contrast_sd * usual) - normal(contrast, deviation) - places.ln()
     }
 }
 
-/// What is searched through.
+/// The picture that is searched.
 #[derive(Clone, Copy, Debug)]
 struct Searched<'a> {
     picture: &'a Plane,
     /// Variance of its noise.
     noise: f32,
-    /// Whether it is what has changed, and not the image.
+    /// Whether it is the picture of what has changed, and not the image.
     is_change: bool,
 }
 
-/// A lost target, as it is searched for.
+/// A lost target, with what is kept for its search.
 pub(crate) struct Sought<'a> {
     pub(crate) state: &'a mut State,
     pub(crate) identity: &'a Identity,
@@ -161,8 +164,9 @@ pub(crate) struct Sought<'a> {
 }
 
 impl Sought<'_> {
-    /// Looks for it: by turns in what has changed, where no cloud is, and in the image, where it may
-    /// hover; and by turns as it looked last and at first, as which it stays if it is found by that.
+    /// Searches for it: by turns in what has changed, where no cloud is, and in the image, where it
+    /// may hover; and by turns with its last appearance and its first, which it keeps if it is
+    /// found by that.
     pub(crate) fn find(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Found {
         let mut change = std::mem::take(&mut scratch.search.change);
         let searches = self.memory.searches;
@@ -217,11 +221,11 @@ impl Sought<'_> {
         let likeness = coarse.likeness(scratch);
         let best = area.best_place(state, self.memory, scratch, config);
 
-        // Once more at full resolution, where the coarse search says.
+        // Once more at full resolution, about the place of the coarse search.
         let reach = (coarseness + 1) as f64;
         let peak = state.best_near(image, noise, best.place, reach, scratch, config);
         if is_change {
-            // Where it is the image says best: the change has the noise of two.
+            // The image itself tells the place best: the change has the noise of two pictures.
             crop(frame.image, peak.corner, peak.sides, &mut scratch.gate);
         }
         let fit = state.fit_at(peak.column, peak.row, peak.origin, scratch, config);
@@ -239,17 +243,17 @@ pub(crate) struct Peak {
     pub(crate) column: usize,
     pub(crate) row: usize,
     pub(crate) log_ratio: f32,
-    /// Contrast over the reference's.
+    /// The target's contrast, as a multiple of the reference's.
     pub(crate) contrast: f64,
-    /// Where the middle of the first placement is, and the part of the image that they cover, px.
+    /// Middle of the first placement, and the part of the image that the placements cover, px.
     pub(crate) origin: [f64; 2],
     pub(crate) corner: [isize; 2],
     pub(crate) sides: [usize; 2],
 }
 
 impl State {
-    /// The best of the placements of its reference within a reach of a place, px, at full resolution;
-    /// the part that they cover is left in the scratch's gate.
+    /// The best placement of the target's reference within `reach` of a place, px, at full
+    /// resolution. Leaves the part of the image that the placements cover in `scratch.gate`.
     pub(crate) fn best_near(
         &self,
         image: &Plane,
@@ -287,7 +291,7 @@ impl State {
         }
     }
 
-    /// Half sides of the search, px: they grow from frame to frame.
+    /// Half sides of the search area, px: they grow with the time since the target was seen.
     pub(crate) fn search_half_sides(&self, image: &Plane, config: &TrackerConfig) -> [f64; 2] {
         let working = self.appearance.working.image();
         let sides = [working.width(), working.height()];
@@ -298,7 +302,7 @@ impl State {
     }
 }
 
-/// The scene's own log ratios, once a loss.
+/// Notes the log likelihood ratios of the scene itself, from the snapshot, once per loss.
 fn remember_background(
     memory: &mut SearchMemory,
     state: &State,
@@ -325,23 +329,23 @@ fn remember_background(
 struct Best {
     /// Its middle, px of the full picture.
     place: [f64; 2],
-    /// Log ratio over the next best's.
+    /// Its log likelihood ratio, less that of the next best place.
     margin: f32,
-    /// Log ratio that the scene had there.
+    /// Log likelihood ratio that the scene itself had there.
     background: f32,
 }
 
-/// Where a target is looked for.
+/// The area in which a target is searched for.
 struct Area {
     /// Columns and rows of the coarse picture.
     ranges: [Range<usize>; 2],
-    /// The prediction, and how far from it is looked, px of the full picture.
+    /// The predicted place, and the half sides of the area about it, px of the full picture.
     predicted: [f64; 2],
     half: [f64; 2],
     /// Sides of the reference, px.
     sides: [usize; 2],
     coarseness: usize,
-    /// Whether it is looked for in what has changed.
+    /// Whether it is searched for in what has changed.
     is_change: bool,
 }
 
@@ -381,6 +385,8 @@ impl Area {
         let (sides, coarseness) = (*sides, *coarseness);
         let side = coarseness as f64;
         let middle = |index: usize| index as f64 * side + (side - 1.0) / 2.0;
+        // Prior: p = (1 - a) N(place; predicted, variances) + a / area, a the share that is
+        // anywhere.
         let variances = state.motion.found().map(|found| found.variance);
         let density = 1.0 / (std::f64::consts::TAU * (variances[0] * variances[1]).sqrt());
         let anywhere = state.anywhere(config);
@@ -406,7 +412,7 @@ impl Area {
             for (x, column) in ranges[0].clone().enumerate() {
                 let ratio = &mut scratch.ratios.row_mut(y)[x];
                 *ratio -= background_at(column, row);
-                // Where even the flat prior cannot reach the best, the logarithm is spared.
+                // If even the largest prior does not reach the best, the logarithm is spared.
                 if f64::from(*ratio) + (density + flat).ln() <= most {
                     continue;
                 }
@@ -419,6 +425,7 @@ impl Area {
             }
         }
         let near = sides.map(|s| ((s / coarseness) / 4).max(2));
+        // The next best place, away from the best, for the margin.
         let mut rival = f32::NEG_INFINITY;
         for y in 0..scratch.ratios.height() {
             for (x, ratio) in scratch.ratios.row(y).iter().enumerate() {

@@ -1,9 +1,9 @@
-//! What is kept of a target for the case that it is lost: what else it is searched for as, and what
-//! the scene itself looks like to its reference.
+//! What is kept of a target in case it is lost: the other appearance with which it is searched for,
+//! and what the scene itself looks like to its reference.
 //!
-//! It is searched for as it looked last, and as it looked at first (the mean of its first images, as
-//! many as it takes to be clear of noise): a reference follows what a target looks like, into the
-//! clouds and trees that it is lost before, too.
+//! A target is searched for as it looked last, and as it looked at first (the mean of its first
+//! images, as many as it takes to be clear of noise): a reference follows what a target looks like,
+//! and so it also becomes like the clouds and trees before which the target is lost.
 
 use crossfix_correlation::Plane;
 
@@ -11,15 +11,17 @@ use crate::TrackerConfig;
 use crate::appearance::{Appearance, AppearanceScratch};
 use crate::state::State;
 
-/// Appearances that correlate less than this are different ones: on the real and drawn cases those of
+/// Correlation below which two appearances are different: on the real and drawn cases those of
 /// targets that have not changed correlate by 0.94 or more, and 0.65 to 0.78 where the last one
 /// finds nothing. With half of it the first one is not searched for.
 const ALIKE: f32 = 0.8;
-/// Until so long after it was seen only its last appearance is searched for, s: before that it has been
-/// hidden, and has turned since it was first seen. With half of it one that turns is found where it
-/// is not, with twice as much one that has fooled its reference is found a second later.
+/// For this long after it was seen a target is searched for by its last appearance alone, s: before
+/// that it has only been hidden, and has turned since it was first seen. With half of it one that
+/// turns is found where it is not, with twice as much one that has fooled its reference is found a
+/// second later.
 const LAST_ALONE_S: f64 = 1.0;
-/// With its first appearance it is seen as it was then; how much that may vary the search knows.
+/// Contrast with the first appearance: the target is as it was then; how much that may vary the
+/// search knows.
 const FIRST_CONTRAST: f64 = 1.0;
 
 /// What the scene itself looks like to a target's reference: the log ratios in a picture in which
@@ -39,31 +41,31 @@ pub(crate) struct SearchMemory {
     other: Option<Box<OtherAppearance>>,
 }
 
-/// Of the last and the first appearance, the one that is not in use.
+/// The appearance that is not in use, of the last and the first.
 #[derive(Clone, Debug)]
 struct OtherAppearance {
     appearance: Appearance,
     contrast: f64,
     usual_contrast: f64,
     background: Option<Background>,
-    /// Whether it is the last one, as the first is in use.
+    /// Whether it is the last one, so that the first is in use.
     is_last: bool,
     is_like_the_first: bool,
 }
 
 impl SearchMemory {
-    /// The target has been seen.
+    /// Forgets what belongs to one loss: the target has been seen.
     pub(crate) fn seen(&mut self) {
         (self.searches, self.background) = (0, None);
     }
 
-    /// The target has been seen for sure.
+    /// Forgets the appearance that is not in use: the target has been seen for sure.
     pub(crate) fn forget_other(&mut self) {
         self.other = None;
     }
 
-    /// Gives a target its first appearance, unless the last is like it or it was seen a moment ago.
-    /// False if it has not.
+    /// Gives the target its first appearance, unless the last one is like it or the target was seen
+    /// a moment ago. Returns whether it has.
     pub(crate) fn take_first(
         &mut self,
         state: &mut State,
@@ -93,7 +95,7 @@ impl SearchMemory {
         true
     }
 
-    /// Gives it its last appearance, if the first is in use.
+    /// Gives the target its last appearance back, if the first is in use.
     pub(crate) fn take_last(&mut self, state: &mut State) {
         if self.other.as_ref().is_some_and(|other| other.is_last) {
             self.exchange(state);

@@ -1,4 +1,4 @@
-//! What the detector finds while a target is lost, compared with what it looked like.
+//! What the detector finds while a target is lost, compared with the target's appearance.
 
 use crate::PixelBox;
 use crate::fit::TargetFit;
@@ -7,25 +7,25 @@ use crate::scratch::Scratch;
 use crate::search::LEAST_RATIO;
 use crate::target::Target;
 
-/// What is found may be so many times larger or smaller than the target was, a side: outlines lose
-/// what is as bright as the sky behind it. With half of it a panning camera's target is right in
-/// 96.5 % of the frames in place of 97.5, and longer taken for something else.
+/// Largest ratio of the sides of what is found to the target's, either way: outlines lose what is
+/// as bright as the sky behind it. With half of it a panning camera's target is right in 96.5 % of
+/// the frames instead of 97.5, and longer taken for something else.
 const SIZES: f64 = 2.5;
-/// Its middle may be this far off, in the larger sides.
+/// How far its middle may be off, in the larger sides.
 const OFF_SIDES: f64 = 0.5;
 
-/// What the detector has found, as a lost target.
+/// A find of the detector that may be a lost target.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sighting {
     fit: TargetFit,
-    /// Logarithm of the likelihood ratio of the target's being there against background.
+    /// Log likelihood ratio of the target being there, against background.
     pub(crate) log_ratio: f32,
     as_at_first: bool,
 }
 
 impl Target {
-    /// Whether what the detector has found in a box may be this one, which is lost: where it can
-    /// have gone to, about as large, and like what it was last or at first.
+    /// The sighting of this target in a box that the detector has found, if it may be the target:
+    /// that is lost, can have gone there, is about as large, and looked like it last or at first.
     pub(crate) fn sighting(
         &mut self,
         frame: Frame<'_>,
@@ -48,7 +48,7 @@ impl Target {
             .max_by(|one, other| one.log_ratio.total_cmp(&other.log_ratio))
     }
 
-    /// Whether it may be where something has been found, and as large.
+    /// Whether the target may be where something has been found, and as large.
     fn may_be(&self, frame: Frame<'_>, found: PixelBox) -> bool {
         let half = self.state.search_half_sides(frame.image, frame.config);
         let (at, predicted) = (found.centre(), self.state.position());
@@ -59,7 +59,8 @@ impl Target {
         is_near && (1.0 / SIZES..=SIZES).contains(&larger)
     }
 
-    /// The best placement of the appearance in use about what has been found, if it is one.
+    /// The best placement of the appearance in use near what has been found, if that may be the
+    /// target.
     fn seen_as_it_looks(
         &mut self,
         frame: Frame<'_>,
@@ -83,7 +84,7 @@ impl Target {
         has_come.then_some(Sighting { fit, log_ratio: peak.log_ratio, as_at_first: false })
     }
 
-    /// Goes on where the detector has found it, on probation.
+    /// Goes on, on probation, where the detector has found the target.
     pub(crate) fn go_on_at(
         &mut self,
         frame: Frame<'_>,

@@ -1,7 +1,8 @@
-//! What is believed of one target: what it looks like, how it moves, how well it can be seen.
+//! What is believed of one target: its appearance, its motion, and how well it can be seen.
 //!
 //! The stages of a step read and change it: the gate (`gate.rs`), the fit (`fit.rs`), learning
-//! (`learning.rs`), and where it is lost the search (`search.rs`). [`crate::target`] puts them together.
+//! (`learning.rs`), and where the target is lost the search (`search.rs`). [`crate::target`] puts
+//! them together.
 
 use crossfix_correlation::Plane;
 use crossfix_filter::AxisMeasurement;
@@ -16,44 +17,44 @@ use crate::{ImagePoint, PixelBox, TrackerConfig};
 
 /// Frames without the target after which it is searched for.
 const SEARCH_AFTER_FRAMES: u32 = 3;
-/// Share of a frame's noise in the running estimate.
+/// Weight of a frame's noise in the running estimate.
 const NOISE_SHARE: f32 = 0.3;
 /// Certainty above which a target counts as seen.
 pub(crate) const SEEN: f64 = 0.5;
-/// How fast the log scale and the turn wander, a frame of a thirtieth of a second, and their largest
-/// variances.
+/// Random walk of the log scale and of the turn, standard deviations per frame of a thirtieth of a
+/// second, and their largest variances.
 const SHAPE_WALK: [f64; 2] = [0.006, 0.02];
 const MOST_SHAPE_VARIANCE: [f64; 2] = [0.09, 0.25];
 
-/// What is believed of a target.
+/// State of the belief about one target.
 #[derive(Clone, Debug)]
 pub(crate) struct State {
     pub(crate) appearance: Appearance,
     pub(crate) motion: Motion,
-    /// How likely it could not be seen in the last image.
+    /// Probability that the target was hidden in the last image.
     pub(crate) hidden: f64,
     /// Variance of the image's noise.
     pub(crate) noise: f32,
     pub(crate) contrast: f64,
     pub(crate) contrast_variance: f64,
-    /// What the contrast is over seconds, as long as the target is seen.
+    /// Mean contrast over seconds in which the target is seen.
     pub(crate) usual_contrast: f64,
     /// Variances of the log scale and of the turn.
     pub(crate) shape_variances: [f64; 2],
-    /// Images since it was last seen, ...
+    /// Number of images since it was last seen, ...
     pub(crate) missed: u32,
     /// ... and the time, s.
     pub(crate) unseen_s: f64,
     pub(crate) last_seen: ImagePoint,
-    /// Whether it has never been seen but where it was given.
+    /// Whether it has not been seen yet but where it was given.
     pub(crate) is_new: bool,
-    /// Where it was in the tracker's snapshot picture.
+    /// Its place in the tracker's snapshot picture.
     pub(crate) in_snapshot: Option<ImagePoint>,
 }
 
 impl State {
-    /// Of a target that somebody shows: the box and a margin become the reference (Lytvynets 2020,
-    /// object model).
+    /// State of a target that somebody shows: the box and a margin become the reference (Lytvynets
+    /// 2020, object model).
     pub(crate) fn new(
         image: &Plane,
         place: PixelBox,
@@ -99,14 +100,14 @@ impl State {
         self.missed >= SEARCH_AFTER_FRAMES
     }
 
-    /// It was seen at a place.
+    /// Notes that it was seen at a place.
     pub(crate) fn seen(&mut self, place: ImagePoint) {
         (self.missed, self.unseen_s, self.hidden) = (0, 0.0, 0.0);
         self.is_new = false;
         self.last_seen = place;
     }
 
-    /// Goes on to the time of the next image.
+    /// Predicts to the time of the next image.
     pub(crate) fn predict(&mut self, frame: Frame<'_>) {
         self.motion.predict(frame.interval, frame.sides());
         self.unseen_s += frame.interval;
@@ -122,7 +123,7 @@ impl State {
             if self.is_new { noise } else { self.noise + NOISE_SHARE * (noise - self.noise) };
     }
 
-    /// What is expected of the target in the image.
+    /// What the likelihood expects of the target in the image.
     pub(crate) fn expectation(
         &self,
         noise: f32,
@@ -133,7 +134,7 @@ impl State {
         let contrast = self.contrast * f64::from(self.appearance.clear_share());
         let variance = (config.contrast_sd * contrast).powi(2) + self.contrast_variance;
         Expectation {
-            // A reference of nothing is found nowhere.
+            // The floor makes sure that a reference of nothing is found nowhere.
             energy: energy.max(1e-3 * pixels * noise),
             pixels,
             noise: noise.max(f32::MIN_POSITIVE),

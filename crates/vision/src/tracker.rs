@@ -11,8 +11,8 @@ use crate::scratch::Scratch;
 use crate::target::Target;
 use crate::{ConfigError, ImagePoint, ImageTrackId, PixelBox, TrackerConfig};
 
-/// Steps longer or shorter than these are taken as these: after a pause nothing is known of a
-/// target anyway, and no camera is that fast.
+/// Bounds of the time between images, s; other intervals are clamped to them: after a longer pause
+/// nothing is known of a target anyway, and no camera is faster.
 const LONGEST_INTERVAL: f64 = 1.0;
 const SHORTEST_INTERVAL: f64 = 1e-4;
 
@@ -25,18 +25,18 @@ pub enum TrackPhase {
     Tracking,
     /// Not measured in this image: a prediction.
     Coasting,
-    /// Not measured for several images, or for long not sure in any place: the prediction is a
-    /// guess, and it is searched for.
+    /// Not measured for several images, or not sure in any place for long: the prediction is a
+    /// guess, and the target is searched for.
     Searching,
 }
 
 /// One target in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageTrack {
-    /// The track. While a target that was given is lost, what else moves may be shown as it, with a
-    /// `certainty` of at most 0.5.
+    /// The track. While a target that was given is lost, something else that moves may be shown
+    /// under its id, with a `certainty` of at most 0.5.
     pub id: ImageTrackId,
-    /// Its life.
+    /// Phase of its life.
     pub phase: TrackPhase,
     /// The filters' estimate of the centre, px.
     pub position: ImagePoint,
@@ -54,8 +54,8 @@ pub struct ImageTrack {
     pub score: f64,
     /// Probability that the target is at the best place and nowhere else.
     pub certainty: f64,
-    /// Normalised innovation squared of both axes, chi-square with two degrees of freedom if all is
-    /// well; absent if nothing was predicted.
+    /// Normalised innovation squared, summed over both axes: chi-square with two degrees of freedom
+    /// if the filters are consistent; absent if nothing was predicted.
     pub nis: Option<f64>,
 }
 
@@ -69,12 +69,12 @@ pub(crate) enum Origin {
         /// Where it was found, and how far the scene had moved then, px.
         first: ImagePoint,
         turned: [f64; 2],
-        /// Whether it has been elsewhere since or before, in the image and in the scene, so that
-        /// the background of its place is known without it: what keeps to its place in the image is
-        /// on the lens, or written into the video.
+        /// Whether it has been elsewhere since or before, both in the image and in the scene, so
+        /// that the background of its place is known without it: what keeps to its place in the
+        /// image is on the lens, or written into the video.
         has_moved: bool,
-        /// Whether it is followed only because a target is lost that it may be: it has no track of
-        /// its own.
+        /// Whether it is followed only because it may be a target that is lost: a candidate has no
+        /// track of its own.
         is_candidate: bool,
     },
 }
@@ -162,13 +162,13 @@ pub(crate) struct Followed {
     pub(crate) origin: Origin,
     pub(crate) target: Follower,
     pub(crate) measured_at: Timestamp,
-    /// When it was searched for last.
+    /// When it was last searched for.
     pub(crate) searched: Option<Timestamp>,
-    /// Where it is in the next image, if somebody said so.
+    /// Its place in the next image, if somebody has told it.
     pub(crate) cue: Option<ImagePoint>,
-    /// Since when it is followed.
+    /// Since when it has been followed.
     pub(crate) since: Timestamp,
-    /// The candidate that is shown in its place, while it is lost.
+    /// The candidate that is shown in its place while it is lost.
     pub(crate) stand_in: Option<ImageTrackId>,
 }
 
@@ -177,18 +177,19 @@ impl Followed {
         matches!(self.origin, Origin::Detected { is_candidate: true, .. })
     }
 
-    /// Whether it has been found, and elsewhere since.
+    /// Whether it was found by the detector, and has been elsewhere since.
     pub(crate) fn has_moved(&self) -> bool {
         matches!(self.origin, Origin::Detected { has_moved: true, .. })
     }
 }
 
-/// A candidate that keeps to its place for so long is none, s: a target that can be told from its
-/// scene has gone further than its size by then if it moves at all. Half of it is little more than
-/// a candidate needs to be shown.
+/// A candidate that keeps to its place for this long is dropped, s: a target that can be told from
+/// its scene has by then gone further than its size, if it moves at all. Half of it is little more
+/// than a candidate needs to be shown.
 const STAYS_S: f64 = 1.5;
 
-/// A picture of a moment ago in which every target was seen: what a lost target is not.
+/// Snapshot: a picture of a moment ago in which every target was seen. It shows what a lost target
+/// is not.
 #[derive(Debug)]
 struct BackgroundSnapshot {
     picture: Plane,
@@ -198,7 +199,8 @@ struct BackgroundSnapshot {
 /// Age at which a snapshot is replaced, s.
 const SNAPSHOT_AGE_S: f64 = 0.5;
 
-/// Images that must agree with each other before the tracker believes them and not the last one.
+/// Refused images in a row that must agree with each other before the tracker believes them and not
+/// the last accepted one.
 const RESYNCHRONISE_AFTER: u32 = 3;
 
 /// When an image was taken, and its sides.
@@ -218,8 +220,8 @@ impl Shot {
 ///
 /// Images must come in the order of their times; one whose time is not after the last one's, or
 /// whose size differs from the last one's, is answered with no tracks and counted. After three of
-/// them that agree with each other, the fourth is taken: after another size, what was followed is
-/// given up.
+/// these that agree with each other, the fourth is accepted; if it has another size, what was
+/// followed is given up.
 #[derive(Debug)]
 pub struct ImageTracker {
     pub(crate) config: TrackerConfig,
@@ -231,11 +233,11 @@ pub struct ImageTracker {
     pub(crate) followed: Vec<Followed>,
     pub(crate) tracks: Vec<ImageTrack>,
     pub(crate) next_id: u64,
-    /// Candidates are counted down from the last number: theirs are never published.
+    /// Candidates are numbered down from the largest number; their numbers are never published.
     pub(crate) next_candidate: u64,
     last: Option<Shot>,
     refused: u64,
-    /// The newest refused image, and how many in a row agreed with each other.
+    /// The newest refused image, and how many refused ones in a row agreed with each other.
     refused_last: Option<(Shot, u32)>,
 }
 
@@ -272,8 +274,8 @@ impl ImageTracker {
     }
 
     /// Tells where a target is in the next image (an operator, a cue): the place is taken instead
-    /// of measured. With the box it is the start from two measurements (Herasymenko 2021, eqs.
-    /// 13-14). A track that is not there, or a place that no image has, is left out.
+    /// of measured. Together with the box it starts the track from two measurements (Herasymenko
+    /// 2021, eqs. 13-14). A track that is not there, or a place that no image has, is ignored.
     pub fn cue(&mut self, id: ImageTrackId, place: ImagePoint) {
         let known = self.followed.iter_mut().find(|followed| followed.id == id);
         if let Some(followed) = known.filter(|_| place.is_possible()) {
@@ -281,8 +283,8 @@ impl ImageTracker {
         }
     }
 
-    /// The camera has been turned since the last image: nothing of it is in the next one where it
-    /// was. What was followed is given up, and the numbers of tracks go on.
+    /// Tells that the camera has been turned since the last image, so that nothing in the next one
+    /// is where it was. What was followed is given up, and the numbers of tracks go on.
     pub fn look_elsewhere(&mut self) {
         self.followed.clear();
         self.tracks.clear();
@@ -292,7 +294,7 @@ impl ImageTracker {
         self.last = None;
     }
 
-    /// Images that were refused.
+    /// Number of images that were refused.
     pub fn refused(&self) -> u64 {
         self.refused
     }
@@ -334,8 +336,8 @@ impl ImageTracker {
             may_search: false,
             config: &self.config,
         };
-        // For one that is stood in for something moves already: what a search finds beside that is
-        // more often the scene.
+        // Where a candidate stands in for a target, something moves already: what a search finds
+        // beside that is more often the scene.
         let turn = self
             .followed
             .iter()
@@ -372,9 +374,9 @@ impl ImageTracker {
         &self.tracks
     }
 
-    /// Whether an image follows the last one. After some that agree with each other and not with
-    /// that one, they are right: a camera has changed its mode, or one clock reading was from the
-    /// future.
+    /// Whether an image is accepted: it follows the last one, or enough refused images agree with
+    /// each other and not with the last one. Those are right: a camera has changed its mode, or one
+    /// clock reading was from the future.
     fn admits(&mut self, shot: Shot) -> bool {
         if self.last.is_none_or(|last| shot.follows(last)) {
             self.refused_last = None;
@@ -393,7 +395,7 @@ impl ImageTracker {
             // Places in pictures of another size mean nothing.
             self.followed.clear();
         }
-        // What was noted in the wrong one's time means nothing either.
+        // Times that the wrong clock reading gave mean nothing either.
         for followed in &mut self.followed {
             (followed.measured_at, followed.since, followed.searched) =
                 (shot.time, shot.time, None);
@@ -405,8 +407,8 @@ impl ImageTracker {
         true
     }
 
-    /// Keeps a picture for later losses: from time to time, while every target is seen, and when
-    /// one is new.
+    /// Keeps a snapshot for later losses, while every target is seen: from time to time, and when a
+    /// target is new.
     fn keep(&mut self, image: &Plane, time: Timestamp) {
         let all_seen = self
             .followed
@@ -434,13 +436,14 @@ impl ImageTracker {
         }
     }
 
-    /// Drops what the detector found and nobody has measured for long, and the younger of two
-    /// tracks of one target.
+    /// Drops targets that the detector found and nobody has measured for long, candidates that stay
+    /// in their place, and of two tracks of one target the candidate, or else the younger (but none
+    /// that was given).
     fn give_up(&mut self, now: Timestamp) {
         let patience = self.config.give_up_after_s;
         self.followed
             .retain(|f| f.origin == Origin::Given || now.seconds_since(f.measured_at) <= patience);
-        // They would take the places of others, and cover a target that hovers there.
+        // Such candidates would take the places of others, and cover a target that hovers there.
         let stays = |f: &Followed| {
             f.is_candidate() && !f.has_moved() && now.seconds_since(f.since) > STAYS_S
         };
@@ -448,7 +451,7 @@ impl ImageTracker {
         let mut index = 0;
         while index < self.followed.len() {
             let (older, rest) = self.followed.split_at(index);
-            // One that is lost is not where it is guessed to be.
+            // A track that is lost is not where it is guessed to be.
             let is_of = |other: &Followed| {
                 !other.target.is_searching() && same(&other.target, &rest[0].target)
             };

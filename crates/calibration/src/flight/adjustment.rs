@@ -1,5 +1,5 @@
-//! The least-squares adjustment of a flight: cameras, clocks, lenses, the target's way and the
-//! log's bias, all at once.
+//! The least-squares adjustment of a flight: cameras, clocks, lenses, the target's trajectory and
+//! the log's bias, all at once.
 
 use super::gauge::Gauge;
 use super::model::{CLOCK, POSE_AND_CLOCK};
@@ -9,15 +9,17 @@ use super::rows::{Cost, Row, Sink};
 use super::state::{CameraPriors, Flight, Priors, State};
 use crate::lens;
 
-/// Prior of what is not known at all: wide against anything that a site has.
+/// Standard deviations of unknowns of which nothing is known beforehand: wide against anything that
+/// a site has.
 const WIDE_ROTATION_RAD: f64 = 10.0;
 const WIDE_M: f64 = 1e4;
 const WIDE_S: f64 = 1e4;
-/// What it is known by where the flight does not tell: nobody knows which camera is a phone. With
-/// the deviation above a phone's clock is 80 ms beside what it is said to be to 9 ms, after a minute
-/// and a half.
+/// Standard deviation of the clock's rate in the stated covariance, where the flight does not tell
+/// the rate: nobody knows which camera is a phone. With [`RATE_SD`](super::state::RATE_SD) a
+/// phone's clock is 80 ms off after a minute and a half, where 9 ms are stated.
 const RATE_KNOWN_BY: f64 = 1e-3;
-/// A sensor is read out in between nothing and a frame's time: so much of it, and give or take.
+/// A sensor is read out within nothing to a whole frame's time: prior mean and standard deviation
+/// of the read-out, as a share of that time.
 const READOUT_SHARE: f64 = 0.5;
 
 struct Linear(NormalEquations);
@@ -30,7 +32,7 @@ impl Sink for Linear {
     }
 }
 
-/// All that the unknowns are held against.
+/// Everything that the unknowns are weighted by.
 #[derive(Clone, Copy)]
 struct Model<'a> {
     flight: Flight<'a>,
@@ -70,7 +72,7 @@ impl State {
         sink.take(&[(vec![(start + CLOCK + 1, rate_sd.recip())], rate / rate_sd)], Tails::Heavy);
     }
 
-    /// What a lens's file says, and how far the lens may be otherwise.
+    /// Prior of the lens: its file's values, and how far the lens may deviate from them.
     fn lens_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
         let values = lens::values(&self.cameras[index].intrinsics);
         let known = lens::values(&priors.lens);
@@ -81,7 +83,7 @@ impl State {
         }
     }
 
-    /// What is known of a camera's pose and clock before anything is seen.
+    /// Prior of a camera's pose and clock before anything is seen.
     fn prior_rows(&self, index: usize, start: usize, priors: &CameraPriors, sink: &mut impl Sink) {
         let camera = &self.cameras[index];
         let mut hold = |unknown: usize, value: f64, sd: f64| {
@@ -95,8 +97,8 @@ impl State {
         hold(CLOCK, 0.0, WIDE_S);
         let readout = READOUT_SHARE * priors.frame_s;
         hold(CLOCK + 2, clock.readout_s - readout, readout);
-        // The wander's mean and slope are the clock's: the wander itself is held to nought as wide
-        // as it may go.
+        // The wander's mean and slope belong to the clock's offset and rate: the wander itself is
+        // pulled to zero, with a deviation as wide as it may reach over the flight.
         let order = self.order();
         let wander = &clock.wander;
         let span = wander.step_s * (wander.values.len() - 1) as f64;
@@ -105,6 +107,7 @@ impl State {
             let term = (order.wander(k, index), scale);
             sink.take(&[(vec![term], value * scale)], Tails::Normal);
         }
+        // Random walk: each step has the variance power x step.
         let step = (priors.wander * wander.step_s).sqrt().recip();
         for (k, pair) in wander.values.windows(2).enumerate() {
             let terms = vec![(order.wander(k, index), -step), (order.wander(k + 1, index), step)];
@@ -113,23 +116,23 @@ impl State {
     }
 }
 
-/// Steps at most; from a start within a metre and a tenth of a second five to eight are enough.
+/// Steps at most; from a start within a metre and a tenth of a second, five to eight are enough.
 const MOST_STEPS: usize = 30;
-/// A step that changes the cost by less than this is the last, in units of log likelihood; ...
+/// A step that changes the cost (see [`Cost`]) by less than this is the last; ...
 pub(super) const SETTLED: f64 = 0.01;
 /// ... and by this while the noise is still being found: with a hundred unknowns, a tenth of a
 /// deviation each.
 pub(super) const NEARLY_SETTLED: f64 = 1.0;
 
-/// A state that no step makes likelier, and how well it is known.
+/// The state of least cost, and its covariance.
 pub(super) struct Adjusted {
     pub(super) state: State,
     pub(super) covariance: Covariance,
     pub(super) cost: f64,
 }
 
-/// Levenberg and Marquardt's way down from a start. `None`: something is tied to nothing, or is not
-/// a number.
+/// Levenberg-Marquardt minimisation from a start. `None`: some unknown is tied to nothing, or a
+/// value is not a number.
 pub(super) fn adjust(
     flight: &Flight<'_>,
     priors: &Priors,
@@ -148,7 +151,8 @@ pub(super) fn adjust(
     let mut of_rows = cost_of_rows(&state);
     let mut cost = of_rows;
     for _ in 0..MOST_STEPS {
-        // A rough start pulls more than what it becomes.
+        // The pull of the jerk's prior is computed again for each step: a rough start's is larger
+        // than that of the state it becomes.
         let pull = state.pull(priors);
         let before = of_rows + state.lean(pull, &seen);
         cost = before;
@@ -171,16 +175,18 @@ pub(super) fn adjust(
         }
     }
 
+    // The covariance is of the undamped equations, with the wider prior of the rates.
     let known = Priors { rate_sd: RATE_KNOWN_BY, ..priors.clone() };
     let solution = linearised(&Model { priors: &known, ..model }, &state).solve(0.0)?;
     Some(Adjusted { state, covariance: solution.covariance()?, cost })
 }
 
-/// A step is damped by this share of each diagonal element at first, ...
+/// Share of each diagonal element that it is enlarged by at first, ...
 const FIRST_DAMPING: f64 = 1e-6;
-/// ... by so many times more where it makes the fit worse, or less where better, ...
+/// ... the factor by which that share grows where a step makes the fit worse, and shrinks where
+/// better, ...
 const DAMPING_STEP: f64 = 10.0;
-/// ... and by this at most.
+/// ... and its largest value.
 const MOST_DAMPING: f64 = 1e3;
 
 fn linearised(model: &Model<'_>, state: &State) -> NormalEquations {

@@ -1,4 +1,5 @@
-//! A site that was put together from what cameras saw is brought to where it stands.
+//! Alignment to the survey: a site reconstructed from what cameras saw is brought to its true
+//! place.
 
 use crossfix_geometry::{Pose, turn_between, turn_vector};
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
@@ -10,7 +11,7 @@ use crate::landmarks::{Landmark, LandmarkError, LandmarkPicture, calibrate_landm
 use crate::lens;
 use crate::survey::{Click, ENOUGH_PLACES, Survey, SurveyedLandmark};
 
-/// A turn, a size and a shift.
+/// Similarity transformation: rotation, scale and shift.
 struct Similarity {
     rotation: Rotation3<f64>,
     scale: f64,
@@ -18,22 +19,22 @@ struct Similarity {
     to: Point3<f64>,
 }
 
-/// A place of the site as cameras saw it, and as the survey has it.
+/// A place of the site as cameras reconstruct it, and as the survey has it.
 type Place = (Point3<f64>, Point3<f64>);
 
-/// What is known here and there: of the site as cameras saw it, and as the survey has it.
+/// What is known in both frames: that of the reconstruction, and that of the survey.
 struct Known {
     places: Vec<Place>,
     rotations: Vec<(Rotation3<f64>, Rotation3<f64>)>,
-    /// Cameras whose own landmarks tell no pose, and why not.
+    /// Why cameras' own landmarks tell no pose.
     untold: Vec<String>,
 }
 
-/// Brings cameras and way to where the survey has them, as near as it says, and says how many times
-/// larger they are there.
+/// Brings cameras and trajectory to where the survey has them, as near as it determines that, and
+/// returns the scale, how many times larger they are there.
 ///
 /// # Errors
-/// It says nothing of the size: what its landmarks lack.
+/// The survey does not determine the size: what its landmarks lack.
 pub(super) fn to_survey(
     state: &State,
     labels: &[CameraLabels],
@@ -50,7 +51,7 @@ pub(super) fn to_survey(
     let rotation = if rotations.is_empty() {
         turn(&arms).filter(|_| places.len() >= ENOUGH_PLACES)
     } else {
-        // Whoever tells a camera's pose tells where its axes point.
+        // A camera's known pose also tells where its axes point.
         let length = arms.iter().map(|(here, _)| here.norm()).fold(1.0, f64::max);
         let axes = [Vector3::x(), Vector3::y(), Vector3::z()].map(|axis| axis * length);
         let turned = rotations.iter().flat_map(|(here, there)| axes.map(|a| (here * a, there * a)));
@@ -69,17 +70,17 @@ fn arms(places: &[Place], from: Point3<f64>, to: Point3<f64>) -> Vec<(Vector3<f6
     places.iter().map(|(here, there)| (here - from, there - to)).collect()
 }
 
-/// Of more places than these, evenly chosen ones make the threes that are tried: 1140.
+/// Of more places than these, evenly chosen ones make the triples that are tried: 1140.
 const TRIED_PLACES: usize = 20;
-/// A place that lies this many times as far beside as half of them do is another's, ...
+/// A place with a misfit this many times the median is wrong, ...
 const FAR: f64 = 4.0;
-/// ... if that is more than this share of how far they are spread: lenses are off by percents as yet.
+/// ... if that is more than this share of their spread: lenses are off by percents at this stage.
 const LEAST_FAR: f64 = 0.05;
-/// And so is a pose that is turned by more than this, rad.
+/// A pose turned by more than this is wrong, too, rad.
 const FAR_TURNED_RAD: f64 = 0.2;
 
 impl Similarity {
-    /// The one that three places show; `None` where they lie on a line.
+    /// The similarity that three places determine; `None` where they lie on a line.
     fn of_three(three: &[Place]) -> Option<Self> {
         let (from, to) = middles(three);
         let rotation = turn(&arms(three, from, to))?;
@@ -96,8 +97,8 @@ impl Similarity {
 }
 
 impl Known {
-    /// Without what is not where the others are: one wrong place among four would turn the site over.
-    /// By the three places whose similarity half of all fit best.
+    /// Removes what is not where the rest is (least median of squares: the triple whose similarity
+    /// half of all places fit best): one wrong place among four would turn the site over.
     fn without_wrong(mut self) -> Self {
         self.leave_turned_out();
         if self.places.len() <= ENOUGH_PLACES {
@@ -130,8 +131,8 @@ impl Known {
         self
     }
 
-    /// Leaves rotations out that are turned far from what most others say of the site's: of a camera that has been
-    /// knocked since.
+    /// Removes rotations that differ far from what most others say of the site's rotation: those of
+    /// cameras that have been knocked since.
     fn leave_turned_out(&mut self) {
         let site = |(here, there): &(Rotation3<f64>, Rotation3<f64>)| there * here.inverse();
         let apart = |a: &Rotation3<f64>, b: &Rotation3<f64>| turn_vector(&(a.inverse() * b)).norm();
@@ -143,8 +144,8 @@ impl Known {
         }
     }
 
-    /// Cameras' surveyed places and earlier poses, landmarks that two cameras see, and cameras whose own
-    /// landmarks tell their pose.
+    /// Collects cameras' surveyed places and earlier poses, landmarks that two cameras see, and
+    /// cameras whose own landmarks tell their pose.
     fn of(state: &State, labels: &[CameraLabels], survey: &Survey) -> Self {
         let mut known = Self { places: Vec::new(), rotations: Vec::new(), untold: Vec::new() };
         for (labels, camera) in labels.iter().zip(&state.cameras) {
@@ -177,10 +178,10 @@ impl Known {
     }
 }
 
-/// A camera's pose by the landmarks in its own picture; none where it has too few.
+/// A camera's pose by the landmarks in its own picture; `None` where it has too few.
 ///
 /// # Errors
-/// Why they do not tell it.
+/// Why the landmarks do not tell it.
 fn by_own_landmarks(camera: &CameraLabels, survey: &Survey) -> Result<Option<Pose>, String> {
     let landmark = |landmark: &SurveyedLandmark| {
         let click = landmark.clicks.iter().find(|click| click.camera == camera.name)?;
@@ -221,7 +222,7 @@ fn middle(places: impl ExactSizeIterator<Item = Point3<f64>>) -> Point3<f64> {
     Point3::from(places.map(|place| place.coords).sum::<Vector3<f64>>() / count)
 }
 
-/// How many times larger the survey is, by at least two places.
+/// Scale from the reconstruction to the survey, by at least two places.
 fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
     let pairs = places.iter().enumerate().flat_map(|(k, a)| {
         places[..k].iter().map(move |b| ((a.0 - b.0).norm(), (a.1 - b.1).norm()))
@@ -230,7 +231,7 @@ fn size(places: &[(Point3<f64>, Point3<f64>)]) -> Option<f64> {
     (here > 0.0 && there > 0.0).then(|| there / here)
 }
 
-/// The same by a taped distance.
+/// The same from a taped distance.
 fn taped(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<f64> {
     survey.distances.iter().find_map(|distance| {
         let [a, b] = distance.between.each_ref().map(|name| {
@@ -241,10 +242,11 @@ fn taped(state: &State, labels: &[CameraLabels], survey: &Survey) -> Option<f64>
     })
 }
 
-/// The turn that brings arms over one another best (Kabsch); `None` where they lie on a line.
+/// The rotation that brings arms over one another best (Kabsch); `None` where they lie on a line.
 fn turn(arms: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Rotation3<f64>> {
-    /// Of the widest spread, this is none.
+    /// A second singular value below this share of the first counts as zero.
     const FLAT: f64 = 1e-3;
+    // H = sum of there here' = U S V': R = U diag(1, 1, det(U V')) V'.
     let sum: Matrix3<f64> = arms.iter().map(|(here, there)| there * here.transpose()).sum();
     let factors = sum.svd(true, true);
     let (u, v_t) = (factors.u?, factors.v_t?);
@@ -256,25 +258,28 @@ fn turn(arms: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Rotation3<f64>> {
     Some(Rotation3::from_matrix_unchecked(u * last * v_t))
 }
 
-/// The turn that makes cameras stand upright whose images' rows are level.
+/// The rotation that makes cameras upright, taking the rows of their images as level.
 fn upright(cameras: &[CameraState]) -> Rotation3<f64> {
     let rows = cameras.iter().map(|camera| camera.rotation * Vector3::x());
     let sum: Matrix3<f64> = rows.map(|row| row * row.transpose()).sum();
+    // Up is across all rows: the direction of their least spread.
     let eigen = sum.symmetric_eigen();
     let across = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
-    // Rows go down in the image.
+    // Image rows count downwards.
     let up: Vector3<f64> = cameras.iter().map(|camera| camera.rotation * -Vector3::y()).sum();
     let up = if across.dot(&up) < 0.0 { -across } else { across };
     turn_between(&Unit::new_normalize(up), &Vector3::z_axis())
         .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
 }
 
-/// The same, turned about the vertical to where arms point, and tipped by what is left.
+/// The same, turned about the vertical to where arms point, and tipped by what remains.
 fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rotation3<f64> {
     let level = |(here, there): &(Vector3<f64>, Vector3<f64>)| {
         let here = upright * here;
         (here.x * there.y - here.y * there.x, here.x * there.x + here.y * there.y)
     };
+    // The heading that maximises the sum of level scalar products: tan = sum of sines / sum of
+    // cosines.
     let (sine, cosine) =
         arms.iter().map(level).fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
     let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)) * upright;
@@ -282,7 +287,7 @@ fn about(arms: &[(Vector3<f64>, Vector3<f64>)], upright: Rotation3<f64>) -> Rota
         let axis = Unit::try_new((turned * here).cross(there), 1e-9)?;
         Some(Rotation3::from_axis_angle(&axis, (turned * here).angle(there)))
     };
-    // Places on one line: the longest arm tells it best.
+    // Places on one line: the longest arm determines the tip best.
     let longest = arms.iter().max_by(|a, b| a.0.norm_squared().total_cmp(&b.0.norm_squared()));
     longest.and_then(tip).map_or(turned, |tip| tip * turned)
 }

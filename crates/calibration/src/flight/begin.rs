@@ -1,4 +1,4 @@
-//! Where the adjustment begins: each camera's pose and clock, and the target's way.
+//! Start of the adjustment: each camera's pose and clock, and the target's trajectory.
 
 use super::align;
 use super::course::Course;
@@ -15,43 +15,42 @@ use crossfix_geometry::turn_vector;
 use crossfix_message::CameraName;
 use nalgebra::{Point3, Rotation3};
 
-/// Labels that lie farther than this beside the log, in the median, are not of it, rad: lens files
-/// and clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
+/// Labels whose median misfit to the log is above this are not of its target, rad: lens files and
+/// clocks that are not known yet leave up to 4 mrad. With half of it phones are refused.
 const MOST_MISFIT_RAD: f64 = 8e-3;
-/// ... and so many deviations of the log's own errors, as they are seen from where the camera
-/// stands.
+/// ... plus this many deviations of the log's own errors, as they are seen from the camera.
 const LOG_DEVIATIONS: f64 = 3.0;
-/// A start that lies farther beside the log than this in the median is held against the mirror image,
-/// rad, ...
+/// A start whose median misfit to the log is above this is compared with the mirror image, rad, ...
 const DOUBTED_RAD: f64 = 2e-3;
-/// ... which is what was flown if it fits so many times better.
+/// ... which is taken to be what was flown if it fits this many times better.
 const CLEARLY_BETTER: f64 = 3.0;
-/// Beyond the labels the way goes on for so long, s: their times may still move.
+/// The trajectory extends beyond the labels by this, s: their times may still move.
 const MARGIN_S: f64 = 2.0;
-/// Two cameras see the target together where they do within this, s: at a knot of the way.
+/// Two cameras see the target together if they do so within this time, s: that of a knot of the
+/// trajectory.
 const TOGETHER_S: f64 = 0.2;
-/// Without a log so many pairs of cameras are begun with, the best by their looks: one that saw a
-/// short or a flat piece of the way leads astray.
+/// Without a log, this many pairs of cameras are tried as a start, those of least doubt: one that
+/// saw a short or a flat piece of the trajectory leads astray.
 const PAIRS_TRIED: usize = 3;
-/// Two ways of standing to each other fit alike where one misses this many times what the other does at most:
-/// the two of a flight in a plane fit to within their noise, ...
+/// Two relative poses fit alike if the misfit of one is at most this many times the other's: the
+/// two of a flight in a plane fit to within their noise, ...
 const ALIKE_TIMES: f64 = 2.0;
-/// ... and are two where cameras are turned otherwise by this, rad: what one way is begun with from two pairs
-/// of cameras differs by less.
+/// ... and are different if cameras are turned differently by more than this, rad: starts from two
+/// pairs of cameras that lead to one solution differ by less.
 const OTHERWISE_RAD: f64 = 0.1;
-/// What labels are taken to err by before anything is known, pixels: a hand's or a tracker's, and
+/// Label errors that are assumed before anything is known, pixels: a hand's or a tracker's, and
 /// what a lens file leaves.
 const FIRST_NOISE: LabelNoise = LabelNoise { white_px: 0.5, lasting_px: 1.4, lasting_s: 0.5 };
-/// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. From too little
-/// it would not be found.
+/// Power of a clock's wander in the first round, s^2/s: a phone's, which is large. Begun with too
+/// small a value it would not be found.
 const FIRST_WANDER: f64 = 2e-5;
 
-/// The cameras that take part, and where they are begun with.
+/// The cameras that take part, and the states they begin with.
 pub(super) struct Begun {
     pub(super) cameras: Vec<CameraLabels>,
     states: Vec<CameraState>,
     course: Course,
-    /// How many labels of a camera are of something else than the target.
+    /// Number of each camera's labels that are of something other than the target.
     pub(super) of_others: Vec<(CameraName, usize)>,
     /// The cameras that take no part.
     pub(super) refused: Vec<(CameraName, Refusal)>,
@@ -63,7 +62,7 @@ impl Begun {
         Self { cameras, states, course, of_others: Vec::new(), refused: Vec::new() }
     }
 
-    /// Each camera against a log.
+    /// Start of each camera against a log.
     pub(super) fn by_log(cameras: &[CameraLabels], log: &FlightLog) -> Result<Self, FlightError> {
         let mut begun = Self::new(Course::of(log).ok_or(FlightError::NoSolution)?);
         for camera in cameras {
@@ -80,7 +79,8 @@ impl Begun {
         Ok(begun)
     }
 
-    /// From two cameras that saw the target together, and the others against what these make of it.
+    /// Start from two cameras that saw the target together, and of the others against the
+    /// trajectory that these two give.
     pub(super) fn by_pairs(
         cameras: &[CameraLabels],
         survey: &Survey,
@@ -108,7 +108,8 @@ impl Begun {
         let state = begun.unknowns(false);
         let aligned = align::to_survey(&state, &begun.cameras, survey);
         let (state, growth) = aligned.map_err(|untold| FlightError::NoSize { untold })?;
-        // From here on the aligned state counts; of what it was begun with only the jerk does.
+        // From here on the aligned state is used; of the start only the jerk is, which grows with
+        // the square of the scale.
         begun.course.jerk *= growth * growth;
         Ok((begun, state))
     }
@@ -131,8 +132,8 @@ impl Begun {
         (self.cameras, self.states) = both.into_iter().unzip();
     }
 
-    /// Leaves labels out that were made where no log and no other camera tells how far off the target
-    /// was: the jerk's prior would draw it up to the camera.
+    /// Removes labels made where neither the log nor another camera tells how far away the target
+    /// was: the jerk's prior would draw the target up to the camera.
     fn leave_lonely_out(&mut self, has_log: bool) {
         let times: Vec<Vec<f64>> = self
             .cameras
@@ -166,7 +167,7 @@ impl Begun {
         }
     }
 
-    /// All unknowns as they are begun with: each camera at its start, the way as the course shows it.
+    /// All unknowns at the start: each camera in its state, the trajectory as the course shows it.
     pub(super) fn unknowns(&self, has_log: bool) -> State {
         let labels = self.cameras.iter().zip(&self.states);
         let times = labels
@@ -182,7 +183,7 @@ impl Begun {
         State { way, cameras: states, bias }
     }
 
-    /// What all is held against at first.
+    /// Priors and noise of the first round.
     pub(super) fn priors(&self) -> Priors {
         let prior = |camera: &CameraLabels| CameraPriors {
             noise: FIRST_NOISE,
@@ -195,7 +196,7 @@ impl Begun {
         Priors { jerk: self.course.jerk, rate_sd: RATE_SD, cameras }
     }
 
-    /// Places the cameras that are not placed yet against what those that are make of the way, until
+    /// Places cameras that have no pose yet against the trajectory that the placed ones give, until
     /// no more fit.
     fn place_the_rest(&mut self, cameras: &[&CameraLabels], sights: &[Sights]) -> Option<()> {
         loop {
@@ -224,7 +225,7 @@ impl Begun {
         }
     }
 
-    /// Whether it fits about as well as the best one, and its cameras stand otherwise to each other.
+    /// Whether it fits about as well as the best start, but with other relative poses.
     fn rivals(&self, best: &Self) -> bool {
         let turn = |begun: &Self, name: &CameraName| {
             let index = begun.cameras.iter().position(|camera| camera.name == *name)?;
@@ -240,12 +241,12 @@ impl Begun {
         self.fits_as(best) && stand_otherwise
     }
 
-    /// Whether it fits about as well as the best one.
+    /// Whether it fits about as well as the best start.
     fn fits_as(&self, best: &Self) -> bool {
         self.cameras.len() == best.cameras.len() && self.misfit() <= ALIKE_TIMES * best.misfit()
     }
 
-    /// The sum of what all cameras' labels lie beside the course.
+    /// Sum of all cameras' median misfits to the course, rad.
     fn misfit(&self) -> f64 {
         let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
             start::misfit_of(camera, state, &self.course)
@@ -254,7 +255,7 @@ impl Begun {
     }
 }
 
-/// Whether a camera has labels of a flight.
+/// Whether a camera has enough labels, and of one flight.
 fn usable(camera: &CameraLabels) -> Result<(), Refusal> {
     let labels = camera.labels.len();
     if labels < LEAST_LABELS {
@@ -283,8 +284,8 @@ fn placed_against(camera: &CameraLabels, course: &Course) -> Result<(CameraState
     Err(Refusal::Misfit { misfit_mrad: misfit * 1e3, would_fit: None })
 }
 
-/// A camera's start against a log, if its mirror image does not fit far better: of a short flight that
-/// may lie near enough to be begun with.
+/// A camera's start against a log, unless the mirror image fits far better: in a short flight the
+/// mirror image may lie near enough to be begun with.
 fn proven(
     camera: &CameraLabels,
     course: &Course,
@@ -300,7 +301,7 @@ fn proven(
     Ok(state)
 }
 
-/// What of a camera's labels is the log's target, and its start: it may have followed others as well.
+/// A camera's labels of the log's target, and its start: it may have followed other things as well.
 fn target_of(
     camera: &CameraLabels,
     course: &Course,
@@ -328,7 +329,7 @@ fn target_of(
     (own, start)
 }
 
-/// Whether a start lies near enough to a course to be begun with.
+/// Whether a start lies near enough to a course.
 fn fits(misfit: f64, state: &CameraState, course: &Course) -> bool {
     let of_errors = LOG_DEVIATIONS * course.errors.sd_m.hypot(course.errors.drift_sd_m);
     misfit <= MOST_MISFIT_RAD + of_errors / course.middle_distance(state.centre)
@@ -346,14 +347,14 @@ fn with_cure(
     Refusal::Misfit { misfit_mrad, would_fit }
 }
 
-/// Two cameras to begin with: where they may stand, and the second's clock.
+/// Two cameras to begin with: their possible poses, and the second's clock.
 struct BeginWith<'a> {
     cameras: [&'a CameraLabels; 2],
-    /// Rotation, centre, and the time by the first's clock less that by the own, s.
+    /// Rotation, centre, and the time by the first's clock less that by the camera's own, s.
     poses: [(Rotation3<f64>, Point3<f64>, f64); 2],
     /// As [`Pair::doubt`].
     doubt: f64,
-    /// Whether an earlier calibration has them so.
+    /// Whether the poses are those of an earlier calibration.
     is_known: bool,
 }
 
@@ -386,8 +387,8 @@ impl<'a> BeginWith<'a> {
     }
 }
 
-/// Of the best pairs the one that most cameras fit, and fit best; where an earlier calibration's poses fit as
-/// well as others, these.
+/// Of the best pairs the one that most cameras fit, and fit best; poses of an earlier calibration
+/// are preferred if they fit about as well.
 fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, FlightError> {
     let sights: Vec<Sights> = cameras.iter().map(|camera| Sights::of(camera)).collect();
     let (mut found, mut known) = (Vec::new(), Vec::new());
@@ -413,7 +414,7 @@ fn best_of_pairs(cameras: &[&CameraLabels], survey: &Survey) -> Result<Begun, Fl
             way.doubt,
             if way.is_known { ", where they were" } else { "" }
         );
-        // Their way is not known yet: the clocks' knots are found with it.
+        // Their trajectory is not known yet: the clocks' knots are made with it.
         let mut begun = Begun::new(Course::nowhere());
         for (camera, pose) in way.cameras.into_iter().zip(way.poses) {
             let state = start::state(camera, &begun.course, pose);

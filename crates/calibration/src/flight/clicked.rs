@@ -1,4 +1,4 @@
-//! Landmarks that were clicked in the cameras' pictures, beside a flight.
+//! Rows of landmarks that were clicked in the cameras' pictures, beside a flight.
 
 use crossfix_message::CameraName;
 use nalgebra::{DMatrix, DVector, Dyn, OMatrix, U3, Vector2};
@@ -10,38 +10,40 @@ use super::state::{Flight, State};
 use crate::landmarks::seen::{self, POSE, Seen};
 use crate::survey::{Click, SurveyedLandmark};
 
-/// How a landmark lies beside where a flight's cameras have it.
+/// A landmark's click, compared with where a flight's calibration has it.
 #[derive(Clone, Debug)]
 pub struct LandmarkMisfit {
-    /// What it is called.
+    /// Its name.
     pub landmark: String,
     /// Whose picture it was clicked in.
     pub camera: CameraName,
-    /// Where it was clicked less where it should be seen, pixels; `None` behind the camera.
+    /// The click less where the landmark should be seen, pixels; `None` behind the camera.
     pub residual_px: Option<Vector2<f64>>,
-    /// The same in deviations of the click and the landmark's place: one an axis where all is as it
-    /// says.
+    /// The same in standard deviations of the click and the landmark's place together: about one
+    /// per axis where the stated deviations hold.
     pub deviations: f64,
 }
 
 impl State {
-    /// A landmark in the pictures. What its place is off by is common to all cameras that see it, so
-    /// its clicks are whitened together.
+    /// Rows of landmarks in the pictures. The error of a landmark's place is common to all cameras
+    /// that see it, so its clicks are whitened together.
     pub(super) fn landmark_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
         for landmark in &flight.survey.landmarks {
             let clicks = self.clicks(flight, landmark);
             if clicks.iter().any(|(.., seen)| seen.is_none()) {
-                // As far off as can be: or it would pay to have it out of sight.
+                // Counted as far off as can be: otherwise moving the landmark out of sight would
+                // lower the cost.
                 sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
             }
             let seen: Vec<(usize, &Click, Seen)> =
                 clicks.into_iter().filter_map(|(k, click, seen)| Some((k, click, seen?))).collect();
-            // Its place may be another's, and a click beside it.
+            // Its place may be another landmark's, or a click may have missed it.
             sink.take(&self.whitened_clicks(&seen).unwrap_or_default(), Tails::Heavy);
         }
     }
 
-    /// A landmark's clicks in the pictures of cameras of the flight, by their numbers, as these see it.
+    /// A landmark's clicks in the pictures of the flight's cameras: each with its camera's index
+    /// and how the state sees it.
     fn clicks<'a>(
         &self,
         flight: &Flight<'_>,
@@ -70,12 +72,14 @@ impl State {
             residual.fixed_rows_mut::<2>(2 * k).copy_from(&seen.residual);
             (2 * k..2 * k + 2).for_each(|row| noise[(row, row)] = click.sd_px.powi(2));
         }
+        // Covariance of all clicks: own noise, and the place's error that all of them share.
         noise += &by_place * by_place.transpose();
         let whitening = noise.cholesky()?.l().try_inverse()?;
         residual = &whitening * residual;
         let row = |row: usize| -> Row {
             let mut terms = Vec::new();
-            // Whitening takes off of each what those before it have told.
+            // The whitening matrix is lower triangular: each row only depends on its own click and
+            // those before.
             for (k, (index, _, seen)) in clicks[..=row / 2].iter().enumerate() {
                 let by = whitening.view((row, 2 * k), (1, 2)) * &seen.by;
                 let unknown =
@@ -88,7 +92,7 @@ impl State {
         Some((0..rows).map(row).collect())
     }
 
-    /// How each click fits.
+    /// The misfit of each click.
     pub(super) fn landmark_misfits(&self, flight: &Flight<'_>) -> Vec<LandmarkMisfit> {
         let misfits = flight.survey.landmarks.iter().flat_map(|landmark| {
             let misfit = |(_, click, seen): (usize, &Click, Option<Seen>)| LandmarkMisfit {

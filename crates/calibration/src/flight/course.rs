@@ -1,4 +1,4 @@
-//! Where the target was before any camera is known: as a log says, or two cameras.
+//! The target's trajectory before all cameras are known: by a log, or by two cameras.
 
 use nalgebra::Point3;
 
@@ -9,12 +9,12 @@ use super::spline::{KNOT_S, Spline, Weights};
 use super::state::{Flight, Priors, RATE_SD, State};
 use crate::survey::Survey;
 
-/// Between samples farther apart than this nobody knows where the target was, s: or so many of the
-/// usual steps between them.
+/// Between samples farther apart than this the target's place counts as unknown, s: or than this
+/// many times the median interval.
 const GAP_S: f64 = 1.0;
 const GAP_STEPS: f64 = 2.5;
 
-/// A way, where it is known.
+/// A trajectory, with the times at which it is known.
 #[derive(Clone, Debug)]
 pub(super) struct Course {
     pub(super) way: Spline,
@@ -26,7 +26,7 @@ pub(super) struct Course {
 }
 
 impl Course {
-    /// By a log alone. `None`: it has no solution.
+    /// From a log alone. `None`: the adjustment has no solution.
     pub(super) fn of(log: &FlightLog) -> Option<Self> {
         const ROUNDS: usize = 12;
         const FIRST_JERK: f64 = 10.0;
@@ -45,7 +45,7 @@ impl Course {
         Some(Self::along(state.way, priors.jerk, log.errors, times_s))
     }
 
-    /// Along a way that is known at these times, in order.
+    /// From a trajectory that is known at these times, in order.
     pub(super) fn along(way: Spline, jerk: f64, errors: LogErrors, times_s: Vec<f64>) -> Self {
         let mut steps: Vec<f64> = times_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
         steps.sort_unstable_by(f64::total_cmp);
@@ -53,7 +53,7 @@ impl Course {
         Self { way, jerk, errors, times_s, gap_s: GAP_S.max(GAP_STEPS * usual) }
     }
 
-    /// The way's weights at a time; `None` where it is not known.
+    /// The spline's weights at a time; `None` where the trajectory is not known.
     pub(super) fn weights(&self, time_s: f64) -> Option<Weights> {
         let next = self.times_s.partition_point(|known| *known < time_s);
         let (before, after) = (self.times_s.get(next.wrapping_sub(1)), self.times_s.get(next));
@@ -66,15 +66,15 @@ impl Course {
         is_known.then(|| self.way.weights(time_s))?
     }
 
-    /// One that is known at no time.
+    /// A course that is known at no time.
     pub(super) fn nowhere() -> Self {
         let errors = LogErrors { sd_m: 1.0, drift_sd_m: 0.0, drift_time_s: 1.0 };
         Self::along(Spline::over(0.0, 1.0), 1.0, errors, Vec::new())
     }
 
-    /// Makes a way go along it: where it is known as it is, straight on from one known place to the
-    /// next, and before and behind staying where it begins and ends. A smooth way through what is not
-    /// known swings far out, and labels there would be left beside it.
+    /// Makes a spline follow the course: as it is where it is known, straight from one known place
+    /// to the next, and constant before its begin and after its end. A smooth trajectory through an
+    /// unknown stretch swings far out, and labels there would be left beside it.
     pub(super) fn lead(&self, way: &mut Spline) {
         let known = |time_s: f64| Some(self.way.place(&self.way.weights(time_s)?).coords);
         let at = |time_s: f64| {
@@ -94,19 +94,19 @@ impl Course {
         way.lead(at);
     }
 
-    /// From when to when, s.
+    /// Range of its times, s.
     pub(super) fn range(&self) -> (f64, f64) {
         self.way.range()
     }
 
-    /// As it looks in a mirror that lies level.
+    /// Its mirror image in a level plane.
     pub(super) fn mirrored(&self) -> Self {
         let mut mirrored = self.clone();
         mirrored.way.coefficients.iter_mut().for_each(|place| place.z = -place.z);
         mirrored
     }
 
-    /// The median distance from a place, m.
+    /// The median distance of the target from a place, m.
     pub(super) fn middle_distance(&self, place: Point3<f64>) -> f64 {
         let known = self.times_s.iter().filter_map(|time_s| self.way.weights(*time_s));
         let mut distances: Vec<f64> =

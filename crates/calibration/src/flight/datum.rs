@@ -1,7 +1,8 @@
-//! What a site is off by as a whole, and what its cameras are off by beside that.
+//! The datum: the error that a site has as a whole, separate from the errors of its single cameras.
 //!
-//! A log of metres puts all cameras of a site aside alike. Tracks within the site do not feel it, and
-//! cameras that were each said to be off by metres of their own would be weighed wrongly.
+//! A log good to metres shifts all cameras of a site alike. That does not affect tracks within the
+//! site, and cameras that were each stated to be off by metres independently would be weighted
+//! wrongly.
 
 use crossfix_message::{Datum, Timestamp};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, Vector3};
@@ -9,29 +10,29 @@ use nalgebra::{DMatrix, DVector, Point3, SMatrix, Vector3};
 use super::model::{CLOCK, CameraState};
 use super::state::State;
 
-/// Without a log the common time is a camera's, whose clock may show anything, s.
+/// Without a log the common time is one camera's, whose clock may show anything: its deviation, s.
 const UNKNOWN_S: f64 = 1e3;
 
-/// How the cameras of a site follow its datum.
+/// How the unknowns of a site's cameras follow its datum.
 pub(super) struct Followers {
     middle: Point3<f64>,
     time_s: f64,
-    /// The cameras' own unknowns (rows) by the datum's ways (columns).
+    /// Derivatives of the cameras' own unknowns (rows) by the datum's components (columns).
     by_datum: DMatrix<f64>,
 }
 
-/// The datum that cameras show, and how well.
+/// The datum as estimated from the cameras, and how well it is known.
 pub(super) struct Shown {
-    /// The ways in which they are off alike, from what they are off by.
+    /// The datum's components (rows) from the cameras' differences (columns).
     gain: DMatrix<f64>,
     /// Information on the datum, ...
     information: DMatrix<f64>,
-    /// ... and the part of the covariance of the cameras' own unknowns that is the datum's.
+    /// ... and the datum's part of the covariance of the cameras' own unknowns.
     of_cameras: DMatrix<f64>,
 }
 
 impl Followers {
-    /// Of all cameras.
+    /// Those of all cameras.
     pub(super) fn of(state: &State) -> Self {
         let count = state.cameras.len().max(1) as f64;
         let centres = state.cameras.iter().map(|camera| camera.centre.coords);
@@ -44,6 +45,8 @@ impl Followers {
         for (camera, start) in state.cameras.iter().zip(&starts) {
             let arm = camera.centre - middle;
             let mut part = by_datum.rows_mut(start - first, CLOCK + 2);
+            // A turn of the site turns each camera (seen in its own axes) and moves its centre by
+            // turn x arm = -[arm]x turn; growth moves it along the arm.
             let turn = camera.rotation.matrix().transpose();
             part.view_mut((0, Datum::TURN), (3, 3)).copy_from(&turn);
             part.view_mut((3, 0), (3, 3)).fill_with_identity();
@@ -56,41 +59,44 @@ impl Followers {
         Self { middle, time_s, by_datum }
     }
 
-    /// Of these unknowns alone.
+    /// The followers among these unknowns alone.
     pub(super) fn rows(&self, rows: &[usize]) -> Self {
         Self { by_datum: self.by_datum.select_rows(rows), ..*self }
     }
 
     /// The datum that cameras show with this information on them.
     ///
-    /// Of all splits into a common part and a rest that is each camera's, this is the one in which the
-    /// two are uncorrelated: `D = (H' N H)^-1` where the cameras follow the datum by H and N is the
-    /// information. Good cameras count for more in it than poor ones.
-    /// `None`: the information is none.
+    /// Of all splits into a common part and a rest per camera, this is the one in which the two are
+    /// uncorrelated: `D = (H' N H)^-1` where the cameras follow the datum by H and N is the
+    /// information. Better known cameras count for more in it than poorly known ones. `None`: there
+    /// is no information.
     pub(super) fn shown(&self, information: &DMatrix<f64>) -> Option<Shown> {
         let weighed = information * &self.by_datum;
         let on_datum = self.by_datum.tr_mul(&weighed);
         let covariance = inverse_of_what_is_shown(&on_datum)?;
+        // D H' N gives the datum from the cameras' differences; H D H' is its part of their
+        // covariance.
         let gain = &covariance * weighed.transpose();
         let of_cameras = &self.by_datum * &covariance * self.by_datum.transpose();
         Some(Shown { gain, information: on_datum, of_cameras })
     }
 
-    /// What is left of the cameras' differences when the datum's part is off.
+    /// The cameras' differences with the datum's part removed.
     pub(super) fn without_datum(&self, shown: &Shown, differences: &DVector<f64>) -> DVector<f64> {
         differences - &self.by_datum * (&shown.gain * differences)
     }
 
-    /// The datum as the site has it, where so much of the information on it is nobody's.
+    /// The site's datum, where `prior_information` of the information on it comes from no measurement.
     pub(super) fn datum(
         &self,
         shown: &Shown,
-        of_nobody: &DMatrix<f64>,
+        prior_information: &DMatrix<f64>,
         is_timeless: bool,
     ) -> Datum {
-        let mut covariance = bounded_inverse(&(&shown.information - of_nobody));
+        let mut covariance = bounded_inverse(&(&shown.information - prior_information));
         if is_timeless {
-            // The way's knots stand at times of their own, which tells a little of nothing.
+            // The spline's knots stand at fixed times, which adds a little information on the
+            // lateness that no measurement gave.
             covariance[(Datum::LATE, Datum::LATE)] += UNKNOWN_S * UNKNOWN_S;
         }
         Datum {
@@ -100,31 +106,32 @@ impl Followers {
         }
     }
 
-    /// Of how many unknowns.
+    /// Number of unknowns.
     pub(super) fn unknowns(&self) -> usize {
         self.by_datum.nrows()
     }
 }
 
 impl Shown {
-    /// The ways in which cameras are off alike, from what they are off by.
+    /// Matrix that gives the datum's components from the cameras' differences.
     pub(super) fn into_gain(self) -> DMatrix<f64> {
         self.gain
     }
 
-    /// The part of the covariance of the cameras' own unknowns that is the datum's.
+    /// The datum's part of the covariance of the cameras' own unknowns.
     pub(super) fn of_cameras(&self) -> &DMatrix<f64> {
         &self.of_cameras
     }
 }
 
-/// What nothing shows has this deviation, and not an infinite one: shift (m), turn (rad), growth,
-/// lateness (s), slowness.
+/// Deviations of components that nothing determines, in the place of infinite ones: shift (m), turn
+/// (rad), growth, lateness (s), slowness.
 const UNKNOWN: [f64; Datum::WAYS] = [300.0, 300.0, 300.0, 3.0, 3.0, 3.0, 3.0, 30.0, 0.1];
 
-/// The inverse of information on a datum, no deviation larger than what is unknown.
+/// Inverse of the information on a datum, with no deviation larger than [`UNKNOWN`].
 fn bounded_inverse(information: &DMatrix<f64>) -> DMatrix<f64> {
     let scale = DMatrix::from_diagonal(&DVector::from_row_slice(&UNKNOWN));
+    // In units of UNKNOWN an eigenvalue below 1 means: known less well than that.
     let scaled = &scale * information * &scale;
     let eigen = ((&scaled + scaled.transpose()) * 0.5).symmetric_eigen();
     let inverse = eigen.eigenvalues.map(|value| value.max(1.0).recip());
@@ -132,8 +139,8 @@ fn bounded_inverse(information: &DMatrix<f64>) -> DMatrix<f64> {
     &axes * DMatrix::from_diagonal(&inverse) * axes.transpose()
 }
 
-/// The inverse where there is information, and nought where there is none: one camera alone has no
-/// size that could be wrong.
+/// Inverse over the components that have information, zero elsewhere: a single camera has no size
+/// that could be wrong.
 fn inverse_of_what_is_shown(information: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let mut inverse = DMatrix::zeros(information.nrows(), information.ncols());
     let shown: Vec<usize> =
@@ -142,7 +149,7 @@ fn inverse_of_what_is_shown(information: &DMatrix<f64>) -> Option<DMatrix<f64>> 
     let part = part.cholesky()?.inverse();
     for (i, &row) in shown.iter().enumerate() {
         for (j, &column) in shown.iter().enumerate() {
-            // From rounding alone it is not quite symmetric.
+            // Rounding leaves it not quite symmetric.
             inverse[(row, column)] = f64::midpoint(part[(i, j)], part[(j, i)]);
         }
     }

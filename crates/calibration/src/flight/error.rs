@@ -8,19 +8,19 @@ use super::would_fit::WouldFit;
 /// Why a flight cannot be adjusted.
 #[derive(Debug, Error)]
 pub enum FlightError {
-    /// The log holds too little.
+    /// The log has too few samples.
     #[error("the log has {samples} samples: a flight needs at least {LEAST_SAMPLES}")]
     ShortLog {
         /// How many there are.
         samples: usize,
     },
-    /// The log is longer than any flight: a time of it is wrong, or it has to be cut.
+    /// The log is longer than any flight: one of its times is wrong, or it has to be cut.
     #[error("the log lasts {hours:.1} h: cut it to the flight, at most {LONGEST_LOG_H} h")]
     LongLog {
         /// How long.
         hours: f64,
     },
-    /// No camera can be calibrated; why not of the first.
+    /// No camera can be calibrated; the reason for the first.
     #[error("no camera can be calibrated: camera `{camera}` {why}")]
     NoCamera {
         /// The camera.
@@ -34,13 +34,13 @@ pub enum FlightError {
          different sides are begun with"
     )]
     NoPair,
-    /// What was seen fits two ways of standing.
+    /// What was seen fits two relative poses of the cameras.
     #[error(
         "the cameras may stand to each other in two ways that fit alike, as the flight lies in a plane: a \
          third camera that saw it, a flight at several heights, or a log of it tells which"
     )]
     TwoWays,
-    /// Nothing says how large the site is.
+    /// Nothing determines the site's size.
     #[error(
         "nothing says how large the site is: --log, --positions of two cameras that saw the flight, \
          --distance between two, or --landmarks: three of them in two cameras' pictures, or four in each \
@@ -59,7 +59,7 @@ pub enum FlightError {
 /// Why one camera cannot be calibrated.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum Refusal {
-    /// It saw too little.
+    /// It has too few labels.
     #[error("has {labels} labels: a calibration needs at least {LEAST_LABELS}")]
     FewLabels {
         /// How many there are.
@@ -79,7 +79,7 @@ pub enum Refusal {
         "has too few labels in the time that the target's way is known, whatever its clock shows"
     )]
     NoTime,
-    /// No pose and offset makes its labels fit the log.
+    /// With no pose and offset do its labels fit the log.
     #[error(
         "lies {misfit_mrad:.1} mrad beside the target's way wherever it stands: {}",
         would_fit.as_ref().map_or_else(
@@ -95,12 +95,14 @@ pub enum Refusal {
     },
 }
 
-/// A flight's equations take memory by its time: an hour of six cameras 0.2 GB, and minutes.
+/// Longest flight, h. The equations take memory in proportion to its time: an hour of six cameras
+/// takes 0.2 GB, and minutes.
 pub(super) const LONGEST_FLIGHT_H: f64 = 1.0;
-/// All of a log's times are tried for each camera's clock: six hours take seconds a camera, and minutes
-/// one that does not fit, as what would make it fit is looked for.
+/// Longest log, h. All of its times are tried for each camera's clock: six hours take seconds per
+/// camera, and minutes for one that does not fit, as a correction that would make it fit is
+/// searched.
 pub(super) const LONGEST_LOG_H: f64 = 6.0;
-/// A log with fewer samples is none.
+/// Least number of samples of a log.
 pub(super) const LEAST_SAMPLES: usize = 20;
-/// A camera with fewer labels has seen nothing.
+/// Least number of labels of a camera.
 pub(super) const LEAST_LABELS: usize = 30;

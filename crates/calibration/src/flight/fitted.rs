@@ -1,4 +1,4 @@
-//! How labels and log lie beside the adjusted way, one by one: for plots and pictures.
+//! Labels and log samples beside the adjusted trajectory, one by one: for plots and pictures.
 
 use crossfix_geometry::Pixel;
 use nalgebra::{Point3, Vector2, Vector3};
@@ -6,7 +6,7 @@ use nalgebra::{Point3, Vector2, Vector3};
 use super::model::FlightLog;
 use super::state::{Flight, State};
 
-/// A label beside where its target should have been seen.
+/// A label, compared with where its target should have been seen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FittedLabel {
     /// Capture time of its frame by the camera's own clock, s.
@@ -15,7 +15,7 @@ pub struct FittedLabel {
     pub time_s: f64,
     /// Where it is in the image.
     pub pixel: Pixel,
-    /// How far it lies from where the target should be seen, pixels.
+    /// The label less where the target should be seen, pixels.
     pub beside_px: Vector2<f64>,
     /// How fast the target crosses the image there, pixels/s.
     pub motion_px_per_s: Vector2<f64>,
@@ -24,15 +24,16 @@ pub struct FittedLabel {
 }
 
 impl FittedLabel {
-    /// How far it lies ahead along the target's motion in the image, s: what a clock that is behind
-    /// would do. `None` where the target crosses less than `least_px_per_s`.
+    /// How far the label lies ahead along the target's motion in the image, as a time, s: what a
+    /// clock that is behind would cause. `None` where the target moves by `least_px_per_s` or less.
     pub fn ahead_s(&self, least_px_per_s: f64) -> Option<f64> {
         let speed = self.motion_px_per_s.norm();
         (speed > least_px_per_s).then(|| self.beside_px.dot(&self.motion_px_per_s) / speed.powi(2))
     }
 
-    /// How far it lies to the right of the target's motion in the image, as the time that the target
-    /// needs for so much, s: no clock does that. `None` as for [`FittedLabel::ahead_s`].
+    /// How far the label lies to the right of the target's motion in the image, as the time that
+    /// the target needs for that distance, s: no clock causes that. `None` as for
+    /// [`FittedLabel::ahead_s`].
     pub fn across_s(&self, least_px_per_s: f64) -> Option<f64> {
         let speed = self.motion_px_per_s.norm();
         let right = Vector2::new(-self.motion_px_per_s.y, self.motion_px_per_s.x);
@@ -40,27 +41,27 @@ impl FittedLabel {
     }
 }
 
-/// A place of the log beside the way.
+/// A sample of the log, compared with the trajectory.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FittedSample {
     /// By the log's clock, s.
     pub time_s: f64,
     /// Where the log has the target, local ENU, m.
     pub logged: Point3<f64>,
-    /// Where the way has it, m.
+    /// Where the trajectory has the target, m.
     pub place: Point3<f64>,
-    /// What the log is taken to be off by there as a whole, m: its bias, which drifts.
+    /// The log's drifting bias at that time, m.
     pub bias: Vector3<f64>,
 }
 
 impl FittedSample {
-    /// What of the difference is the sample's own, m.
+    /// The sample's own error: the difference less the bias, m.
     pub fn residual(&self) -> Vector3<f64> {
         self.place + self.bias - self.logged
     }
 }
 
-/// A camera's labels where the way reaches them, in the order of its own time.
+/// A camera's labels where the trajectory reaches them, in the order of its own time.
 pub(super) fn labels(flight: &Flight<'_>, state: &State, index: usize) -> Vec<FittedLabel> {
     let camera = &state.cameras[index];
     let fitted = |label: &super::Label| {
@@ -79,7 +80,7 @@ pub(super) fn labels(flight: &Flight<'_>, state: &State, index: usize) -> Vec<Fi
     flight.cameras[index].labels.iter().filter_map(fitted).collect()
 }
 
-/// A log's places at times of the way.
+/// A log's samples at times of the trajectory.
 pub(super) fn samples(log: &FlightLog, state: &State) -> Vec<FittedSample> {
     let fitted = |sample: &super::LogSample| {
         let weights = state.way.weights(sample.time_s)?;
@@ -108,7 +109,7 @@ mod tests {
             place: Point3::origin(),
         };
         assert_eq!(label.ahead_s(50.0), Some(0.03));
-        // Rows count downwards: to the right of what moves to the right is below.
+        // Rows count downwards: to the right of motion to the right is below.
         assert_eq!(label.across_s(50.0), Some(0.01));
         assert_eq!(label.ahead_s(150.0), None);
     }

@@ -1,8 +1,9 @@
-//! What no label tells of a site: where it is as a whole, which way round, how large, and when.
+//! The gauge: what no label tells of a site, that is where it is as a whole, its orientation, its
+//! size and its time.
 //!
-//! Without a log the equations leave that open, or as good as. Here the site as a whole is held to
-//! where the adjustment began, loosely: enough for the equations to be solved, and taken off again
-//! from what is said of the datum.
+//! Without a log the equations leave these open, or nearly so. Here the site as a whole is loosely
+//! constrained to where the adjustment began: enough for the equations to be solved; this
+//! information is subtracted again from what is stated of the datum.
 
 use crossfix_message::Datum;
 use nalgebra::{DMatrix, DVector};
@@ -13,23 +14,23 @@ use super::noise::Tails;
 use super::rows::{Row, Sink};
 use super::state::State;
 
-/// The site as a whole is held by these: shift (m), turn (rad), growth, lateness (s). Rounding is at
-/// ten digits below them, far under what cameras are known by beside the datum. The clocks' common
-/// rate has a prior of its own.
+/// Deviations of the constraint on the site as a whole: shift (m), turn (rad), growth, lateness
+/// (s). Rounding errors are ten digits below them, far under the accuracy of the cameras beside the
+/// datum. The clocks' common rate has a prior of its own.
 const HELD: [f64; Datum::WAYS - 1] = [10.0, 10.0, 10.0, 0.1, 0.1, 0.1, 0.1, 1.0];
 
-/// The hold.
+/// The constraint.
 #[derive(Clone, Debug)]
 pub(super) struct Gauge {
     from: State,
-    /// The datum's ways (rows) from the cameras' own unknowns (columns).
+    /// The datum's components (rows) from the cameras' own unknowns (columns).
     gain: DMatrix<f64>,
 }
 
 impl Gauge {
-    /// To a state.
+    /// Constraint to a state.
     pub(super) fn of(from: &State) -> Option<Self> {
-        // A turn counts by what it moves some way off.
+        // A turn is weighted by how far it moves a point at this range.
         const RANGE_M: f64 = 30.0;
         let followers = Followers::of(from);
         let starts = from.starts();
@@ -57,7 +58,7 @@ impl Gauge {
         }
     }
 
-    /// The information on the datum that is the hold's.
+    /// Information on the datum that comes from the constraint.
     pub(super) fn information() -> DMatrix<f64> {
         let held = |way: usize| HELD.get(way).map_or(0.0, |sd| 1.0 / (sd * sd));
         DMatrix::from_diagonal(&DVector::from_fn(Datum::WAYS, |way, _| held(way)))

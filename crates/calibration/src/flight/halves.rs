@@ -1,8 +1,8 @@
-//! Whether the flight's two halves agree as well as both say that they do.
+//! Whether calibrations from the flight's two halves agree as well as both state.
 //!
-//! A covariance is as good as the model that it comes from. Labels that err in ways which the noise
-//! model does not know, or a lens that bends otherwise than its formula, show where the same cameras
-//! are found from either half alone.
+//! A covariance is only as good as its model. Label errors of a kind that the noise model does not
+//! know, or a lens that bends otherwise than its formula, become visible when the same cameras are
+//! calibrated from either half alone.
 
 use nalgebra::{DMatrix, DVector, Matrix2xX, Point3, Vector3};
 
@@ -13,14 +13,15 @@ use super::model::{CameraLabels, CameraState, Label, MOST_OWN, step_between};
 use super::state::{Flight, Priors, State};
 use crate::label_noise::LabelNoise;
 
-/// Of a camera's labels each so manieth is compared: they are many, and neighbours tell the same.
+/// Of a camera's labels one in this many is compared: they are many, and neighbours tell the same.
 const STRIDE: usize = 20;
-/// A half that itself says that it knows a camera's picture worse than so many of its labels' errors
-/// has seen too little to be compared: of a drone that stands on the ground it makes anything.
+/// A half whose own stated deviation in the image is more than this many times the deviation of its
+/// labels has seen too little to be compared: from a drone that stands on the ground anything may
+/// come out.
 const MOST_STATED: f64 = 10.0;
 
-/// For each camera how many times farther its halves lie apart, in the image, than both say; `None`
-/// where one half saw too little.
+/// For each camera the distance between its two halves' results in the image, divided by the
+/// distance that both state; `None` where one half saw too little.
 pub(super) fn ratios(
     flight: &Flight<'_>,
     priors: &Priors,
@@ -58,7 +59,7 @@ fn compared(flight: &Flight<'_>, priors: &Priors, state: &State) -> Option<Vec<O
     Some(ratios)
 }
 
-/// The time before which half of all labels are.
+/// The time that splits all labels in half.
 fn middle(flight: &Flight<'_>, state: &State) -> Option<f64> {
     let of_camera = |(camera, state): (&CameraLabels, &CameraState)| {
         camera.labels.iter().map(|label| state.time_s(label)).collect::<Vec<_>>()
@@ -69,12 +70,12 @@ fn middle(flight: &Flight<'_>, state: &State) -> Option<f64> {
     times.get(times.len() / 2).copied()
 }
 
-/// By what the cameras' own unknowns differ between the halves beside the datum, and what they
-/// should.
+/// Difference between the halves of the cameras' own unknowns, without the datum, and the
+/// covariance that this difference should have.
 struct Apart {
     difference: DVector<f64>,
     covariance: DMatrix<f64>,
-    /// Where each camera's begin.
+    /// Index of each camera's first unknown.
     starts: Vec<usize>,
 }
 
@@ -91,12 +92,13 @@ impl Apart {
         }
         let [a, b] =
             halves.map(|half| half.covariance.others().select_rows(&rows).select_columns(&rows));
+        // The halves' errors are taken to be independent, so their covariances add.
         let covariance = a + b;
         let pairs =
             shown.iter().map(|&k| (&halves[0].state.cameras[k], &halves[1].state.cameras[k]));
         let difference: Vec<f64> = pairs.flat_map(|(a, b)| step_between(a, b)).collect();
         let difference = DVector::from_vec(difference);
-        // The log lies elsewhere in either half: what all cameras have in common is its.
+        // The log's bias differs between the halves: what all cameras have in common is the log's.
         let followers = Followers::of(state).rows(&rows);
         let datum = followers.shown(&covariance.clone().cholesky()?.inverse())?;
         Some(Self {
@@ -124,6 +126,8 @@ impl Apart {
             let Some(by_own) = place.and_then(|place| in_image(camera, label, place)) else {
                 continue;
             };
+            // |J d|^2 against trace(J P J'): what was found against what is stated, summed over
+            // both axes.
             found += (&by_own * difference).norm_squared();
             stated += (&by_own * covariance * by_own.transpose()).trace();
             count += 1.0;
@@ -134,7 +138,7 @@ impl Apart {
     }
 }
 
-/// How a place at rest moves in the image with what is unknown of a camera.
+/// Derivatives of a fixed place's image by the camera's own unknowns.
 fn in_image(camera: &CameraState, label: &Label, place: Point3<f64>) -> Option<Matrix2xX<f64>> {
     let by_own: [_; MOST_OWN] = camera.see(label, place, Vector3::zeros())?.by_own;
     Some(Matrix2xX::from_columns(&by_own[..camera.own()]))

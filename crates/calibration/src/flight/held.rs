@@ -1,16 +1,17 @@
-//! A site that no log places is held where an earlier calibration has it.
+//! Where no log places a site, an earlier calibration of it does.
 
 use super::results::{CameraResult, FlightResult};
 use crate::survey::Survey;
 
-/// No clock is taken to be known better than this at another time than it was calibrated, s: of zeros there
-/// is no mean.
+/// No clock is taken to be known better than this at another time than that of its calibration, s:
+/// a weighted mean of zero deviations does not exist.
 const LEAST_CLOCK_SD_S: f64 = 1e-3;
-/// The lateness among a datum's ways.
+/// Index of the lateness among the datum's components.
 const LATE: usize = 7;
 
-/// Holds a site as a whole where an earlier calibration has it: it may be off by what was said then. Its
-/// common time is that which the cameras' clocks showed by what was known of them.
+/// Keeps a site as a whole where an earlier calibration has it: its datum may be off by what was
+/// stated then. The common time is the one that the cameras' clocks showed by their earlier
+/// calibration.
 pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
     if let (Some(datum), Some(known)) = (&mut result.datum, survey.known_datum()) {
         *datum = known.clone();
@@ -25,9 +26,9 @@ pub(super) fn hold_site(result: &mut FlightResult, survey: &Survey) {
     }
 }
 
-/// By how much the common time is later by what was known of the clocks, and its standard deviation, s: the
-/// middle of what the cameras say, as one may have been set anew. Clocks that no flight has calibrated say
-/// nothing.
+/// How much later the common time is by the earlier calibration of the clocks, and the standard
+/// deviation of that, s: the median of what the cameras state, as one clock may have been set
+/// again. Clocks that no flight has calibrated are not counted.
 fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
     let says = |found: &CameraResult| {
         let known = survey.known(&found.name)?;
@@ -38,13 +39,15 @@ fn later(result: &FlightResult, survey: &Survey) -> Option<(f64, f64)> {
     };
     let mut said: Vec<(f64, f64)> = result.cameras.iter().filter_map(says).collect();
     said.sort_by(|a, b| a.0.total_cmp(&b.0));
+    // Weighted median: the value at which the summed weights 1 / sd^2 reach half of their total.
     let half: f64 = said.iter().map(|(_, sd_s)| sd_s.powi(-2)).sum::<f64>() / 2.0;
     let mut below = 0.0;
     let (middle, _) = *said.iter().find(|(_, sd_s)| {
         below += sd_s.powi(-2);
         below >= half
     })?;
-    // A median's variance is pi / 2 times a mean's, or more where the cameras lie farther apart than they say.
+    // A median's variance is pi / 2 times a mean's, or more where the cameras differ by more than
+    // they state.
     let beside: f64 =
         said.iter().map(|(later_s, sd_s)| ((later_s - middle) / sd_s).abs().min(3.0).powi(2)).sum();
     let spread = (beside / said.len() as f64).max(1.0);

@@ -1,4 +1,4 @@
-//! What an earlier calibration says of cameras.
+//! Priors of cameras from an earlier calibration.
 
 use crossfix_geometry::turn_vector;
 use nalgebra::{DMatrix, DVector, Rotation3};
@@ -10,11 +10,12 @@ use super::state::{Flight, State};
 use crate::calibrated_camera::CalibratedCamera;
 use crate::lens;
 
-/// No pose is said to be known better than this, rad and m: of zeros there is no root.
+/// Least standard deviation of a known pose or lens: a covariance of zeros has no Cholesky factor.
+/// In the unknowns' units (rad and m of a pose).
 const LEAST_SD: f64 = 1e-6;
 
 impl Flight<'_> {
-    /// What an earlier calibration says of a camera, if that is of the same kind of lens.
+    /// An earlier calibration of a camera, if that has the same kind of lens.
     pub(super) fn known(&self, index: usize) -> Option<&CalibratedCamera> {
         let CameraLabels { name, intrinsics, .. } = &self.cameras[index];
         let is_alike = |known: &&CalibratedCamera| {
@@ -25,8 +26,9 @@ impl Flight<'_> {
 }
 
 impl State {
-    /// A camera's pose and lens by an earlier calibration. The pose follows the lens, and what is said of
-    /// it is beside that. The camera may have been moved since, so its tails are heavy.
+    /// Rows of a camera's pose and lens by an earlier calibration. The pose is correlated with the
+    /// lens; the stated pose covariance is what remains once the lens is known. The camera may have
+    /// been moved since, so its tails are heavy.
     pub(super) fn known_rows(
         &self,
         index: usize,
@@ -62,7 +64,8 @@ impl State {
     }
 }
 
-/// From the known pose to the state's: a turn about the camera's axes (rad), and its centre (m).
+/// Step from the known pose to the state's: a turn about the camera's axes (rad), and its centre
+/// (m).
 fn pose_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DVector<f64> {
     let pose = known.camera.pose();
     let turn = Rotation3::from_matrix_unchecked(
@@ -78,7 +81,8 @@ fn lens_step(known: &CalibratedCamera, camera: &super::model::CameraState) -> DV
     DVector::from_iterator(known.len().min(now.len()), now.iter().zip(&known).map(|(a, b)| a - b))
 }
 
-/// What makes errors of a covariance independent and of deviation one.
+/// The matrix that makes errors with this covariance independent with unit variance, L^-1 of
+/// `P = L L'`.
 fn whitening(covariance: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let size = covariance.nrows();
     let least = DMatrix::identity(size, size) * LEAST_SD.powi(2);

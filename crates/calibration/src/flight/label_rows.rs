@@ -1,4 +1,5 @@
-//! What a camera's labels say: where the way is seen, with what two in a row err by alike taken out.
+//! Rows of a camera's labels: where the trajectory is seen, with the error that successive labels
+//! have in common taken out.
 
 use nalgebra::Vector2;
 
@@ -10,10 +11,10 @@ use super::spline::{KNOT_S, SPAN};
 use super::state::{CameraPriors, State};
 use super::unknowns::Touched;
 
-/// Labels farther apart in time than this have errors of their own, s. No more than the distance of
-/// the spline's knots: a row holds five coefficients.
+/// Labels farther apart in time than this are taken to have independent errors, s. At most the
+/// spacing of the spline's knots: a row has room for five coefficients.
 pub(super) const LONGEST_PAIR_S: f64 = KNOT_S;
-/// Unknowns of the target's way that two labels in a row touch: five coefficients.
+/// Unknowns of the target's trajectory that two successive labels touch: five coefficients.
 const OF_A_PAIR: usize = 3 * (SPAN + 1);
 
 impl State {
@@ -29,13 +30,14 @@ impl State {
         for label in &camera.labels {
             let placed = self.placed(index, label);
             let Some(placed) = placed else {
-                // As far off as can be: or it would pay to have it out of sight.
+                // Counted as far off as can be: otherwise moving the target out of sight would
+                // lower the cost.
                 sink.take(&[(Vec::new(), UNSEEN), (Vec::new(), UNSEEN)], Tails::Heavy);
                 before = None;
                 continue;
             };
             let earlier = before.filter(|(time_s, earlier)| {
-                // Rows and a clock that wanders may have put the later label first.
+                // The rolling shutter and a clock that wanders may have put the later label first.
                 let ahead = placed.first.checked_sub(earlier.first);
                 label.time_s - time_s < LONGEST_PAIR_S
                     && ahead.is_some_and(|ahead| ahead <= 1)
@@ -56,8 +58,9 @@ impl State {
         }
     }
 
-    /// How both axes of a label, in pixels, follow what is unknown; `None` where it is not seen.
-    pub(super) fn told_by(&self, index: usize, label: &Label) -> Option<[Vec<Term>; 2]> {
+    /// Derivatives of both axes of a label, in pixels, by the unknowns; `None` where it is not
+    /// seen.
+    pub(super) fn derivatives(&self, index: usize, label: &Label) -> Option<[Vec<Term>; 2]> {
         let placed = self.placed(index, label)?;
         let alone = Whitening { kept: 0.0, sd_px: 1.0 };
         let rows = self.whitened(index, self.starts()[index], &placed, None, alone);
@@ -72,7 +75,7 @@ impl State {
         placed.touched().fit().then_some(placed)
     }
 
-    /// See [`whitened_residual`], with what it hangs on.
+    /// See [`whitened_residual`], with its derivatives by the unknowns.
     fn whitened(
         &self,
         index: usize,
@@ -89,11 +92,13 @@ impl State {
             let mut chain = [0.0; OF_A_PAIR];
             let mut terms: Vec<Term> = Vec::with_capacity(OF_A_PAIR + own + 4);
             let mut own_terms = [0.0; MOST_OWN];
+            // Row = (this label - kept x the label before) / sd_px.
             let parts = [Some((now, 1.0)), before.map(|before| (before, -kept))];
             for (part, share) in parts.into_iter().flatten() {
                 let share = share / sd_px;
                 for (k, weight) in part.weights.iter().enumerate() {
                     for dimension in 0..3 {
+                        // d(pixel) / d(coefficient) = d(pixel) / d(place) x the spline's weight.
                         chain[3 * (part.first - first + k) + dimension] +=
                             part.seen.by_place[(axis, dimension)] * weight * share;
                     }
@@ -115,7 +120,7 @@ impl State {
     }
 }
 
-/// A label's residual and what of the way it hangs on.
+/// A label's residual and the unknowns of the chain that it depends on.
 #[derive(Clone, Copy, Debug)]
 struct Placed {
     first: usize,
@@ -124,7 +129,8 @@ struct Placed {
     wander: [(usize, f64); 2],
 }
 
-/// A label's residual less what of it is the one's before, by the deviation of what is new.
+/// A label's residual less the share `kept` of the residual before it, divided by the deviation of
+/// the remainder.
 fn whitened_residual(
     now: &Placed,
     before: Option<&Placed>,

@@ -1,16 +1,17 @@
-//! A camera's pose from directions and places, without a start: the direct linear transformation.
+//! A camera's pose from directions and places without a first guess: the direct linear
+//! transformation.
 
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, SVector, Vector3};
 
 /// A direction in the camera's frame, and the place that is seen there.
 pub(super) type Seen = (Vector3<f64>, Point3<f64>);
 
-/// Rounds in which pairs that do not fit are weighed less: with half of them a tenth of strays still
-/// bends the solution.
+/// Rounds in which pairs that do not fit are given less weight: with half as many rounds a tenth of
+/// outliers still bends the solution.
 const ROUNDS: usize = 6;
 
-/// A linear map from places to directions, `d ~ M X + m` for any matrix M: of a camera whose lens or log
-/// may be stretched, too.
+/// A linear map from places to directions, `d ~ M X + m` with any matrix M, so that it also fits a
+/// camera whose lens or log is stretched.
 #[derive(Clone, Debug)]
 pub(super) struct Linear {
     /// M, up to its scale.
@@ -19,7 +20,7 @@ pub(super) struct Linear {
 }
 
 impl Linear {
-    /// With the sign by which most places lie ahead.
+    /// The map with the sign that puts most places ahead of the camera.
     fn new(matrix: Matrix3<f64>, shift: Vector3<f64>, pairs: &[Seen]) -> Self {
         let is_ahead =
             |(direction, place): &&Seen| direction.dot(&(matrix * place.coords + shift)) > 0.0;
@@ -28,41 +29,42 @@ impl Linear {
         Self { matrix: matrix * sign, shift: shift * sign }
     }
 
-    /// Angle between a direction and where the map has its place, rad.
+    /// Angle between a direction and the direction in which the map has its place, rad.
     fn misfit(&self, (direction, place): &Seen) -> f64 {
         (self.matrix * place.coords + self.shift).angle(direction)
     }
 
-    /// What most pairs lie below.
+    /// The angle that [`FITTING`] of all pairs lie below, rad.
     pub(super) fn typical_misfit(&self, pairs: &[Seen]) -> f64 {
         typical(pairs.iter().map(|pair| self.misfit(pair)))
     }
 
-    /// The rotation that lies nearest to it, and where its camera stands; `None` if that is a mirror
-    /// image.
+    /// The nearest rotation and the camera's centre; `None` if the map is a mirror image.
     pub(super) fn pose(&self) -> Option<(Rotation3<f64>, Point3<f64>)> {
         let factors = self.matrix.svd(true, true);
+        // M = U S V' is near s R' with the rotation R' = U V' and the scale s = mean of S.
         let camera_from_world = factors.u? * factors.v_t?;
         let size = factors.singular_values.mean();
         if size <= 0.0 || camera_from_world.determinant() < 0.0 {
             return None;
         }
+        // M C + m = 0, so that C = -R m / s.
         let centre = -(camera_from_world.transpose() * self.shift) / size;
         let rotation = Rotation3::from_matrix_unchecked(camera_from_world.transpose());
         Some((rotation, Point3::from(centre)))
     }
 }
 
-/// So many of all pairs must fit: the rest may be of birds. Half of them can be made to fit a wrong
-/// clock by a pose that leaves the other half anywhere.
+/// Share of all pairs that must fit: the rest may be of birds. Half of the pairs can be made to fit
+/// a wrong clock by a pose that leaves the other half anywhere.
 const FITTING: f64 = 0.7;
 
-/// What that share of some numbers lies below; infinite of none.
+/// The number that a share [`FITTING`] of some numbers lies below; infinite for none.
 pub(super) fn typical(numbers: impl Iterator<Item = f64>) -> f64 {
     quantile(numbers, FITTING)
 }
 
-/// What half of some numbers lies below; infinite of none.
+/// The median of some numbers; infinite for none.
 pub(super) fn median(numbers: impl Iterator<Item = f64>) -> f64 {
     quantile(numbers, 0.5)
 }
@@ -74,8 +76,8 @@ fn quantile(numbers: impl Iterator<Item = f64>, share: f64) -> f64 {
     numbers.get(place).copied().unwrap_or(f64::INFINITY)
 }
 
-/// The map that most pairs fit: those that do not, birds among the labels, are weighed less from round
-/// to round.
+/// The map that most pairs fit: outliers, such as birds among the labels, are given less weight
+/// from round to round.
 pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
     let axes = Normalised::of(pairs)?;
     let mut weights = vec![1.0; pairs.len()];
@@ -84,6 +86,7 @@ pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
         let linear = axes.in_space(pairs, &weights)?;
         let misfit = linear.typical_misfit(pairs);
         for (weight, pair) in weights.iter_mut().zip(pairs) {
+            // Cauchy's weights, 1 / (1 + (angle / scale)^2).
             *weight = (1.0 + (linear.misfit(pair) / misfit.max(LEAST_RAD)).powi(2)).recip();
         }
         if best.as_ref().is_none_or(|(least, _)| misfit < *least) {
@@ -93,7 +96,7 @@ pub(super) fn robust(pairs: &[Seen]) -> Option<Linear> {
     best.map(|(_, linear)| linear)
 }
 
-/// Pairs that fit as well as this need no weights, rad.
+/// Misfit below which outliers need no smaller weights, rad.
 const LEAST_RAD: f64 = 1e-5;
 
 /// The direct linear transformation: `d x (M X + m) = 0` for every direction d and place X.
@@ -101,12 +104,14 @@ pub(super) fn in_space(pairs: &[Seen]) -> Option<Linear> {
     Normalised::of(pairs)?.in_space(pairs, &vec![1.0; pairs.len()])
 }
 
-/// The same for places in a plane, as of a flight at one height: the third axis follows from two.
+/// The same for places in a plane, as of a flight at one height: the third axis follows from the
+/// first two.
 pub(super) fn in_plane(pairs: &[Seen]) -> Option<Linear> {
     Normalised::of(pairs)?.in_plane(pairs)
 }
 
-/// Places in axes of their own: about their middle, along their widest spread first, of size one.
+/// Normalised coordinates of places: about their mean, along their principal axes with the widest
+/// spread first, scaled to a spread of one.
 struct Normalised {
     middle: Point3<f64>,
     axes: Matrix3<f64>,
@@ -123,6 +128,7 @@ impl Normalised {
             sum + offset * offset.transpose()
         };
         let spread = pairs.iter().fold(Matrix3::zeros(), spread) / count;
+        // Principal axes, the widest spread first, made right-handed.
         let eigen = spread.symmetric_eigen();
         let mut order = [0, 1, 2];
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
@@ -139,20 +145,22 @@ impl Normalised {
         self.axes.transpose() * (place - self.middle) / self.scale
     }
 
-    /// A map of these axes as one of the world.
+    /// Converts a map of normalised coordinates into one of world coordinates.
     fn in_world(&self, matrix: &Matrix3<f64>, shift: &Vector3<f64>, pairs: &[Seen]) -> Linear {
+        // d ~ M' A' (X - c) / s + m', so that M = M' A' and m = s m' - M c.
         let from_world = matrix * self.axes.transpose();
         let shift = shift * self.scale - from_world * self.middle.coords;
         Linear::new(from_world, shift, pairs)
     }
 
-    /// See [`in_space`]; each pair counts by its weight.
+    /// See [`in_space`]; each pair counts with its weight.
     fn in_space(&self, pairs: &[Seen], weights: &[f64]) -> Option<Linear> {
         let sum: SMatrix<f64, 12, 12> =
             squares(pairs.iter().zip(weights).map(|((direction, place), weight)| {
                 let place = self.place(*place);
                 (direction, [place.x, place.y, place.z, 1.0], *weight)
             }));
+        // The eigenvector of the least eigenvalue minimises the sum of squares at unit length.
         let eigen = sum.try_symmetric_eigen(f64::EPSILON, MOST_ITERATIONS)?;
         let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
         let matrix = Matrix3::from_column_slice(&least.as_slice()[..9]);
@@ -170,12 +178,14 @@ impl Normalised {
             eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
         let (x, y) = (least.fixed_rows::<3>(0).into_owned(), least.fixed_rows::<3>(3).into_owned());
         let shift = least.fixed_rows::<3>(6).into_owned();
+        // The first two columns of a rotation have length one, which sets the scale.
         let size = f64::midpoint(x.norm(), y.norm());
         if size <= 0.0 {
             return None;
         }
         let (x, y, shift) = (x / size, y / size, shift / size);
-        // Both signs of what has none: that of the third axis follows.
+        // The eigenvector's sign is arbitrary: the one with most places ahead is taken, and the
+        // third axis follows from it.
         let ahead = pairs.iter().filter(|(direction, place)| {
             let place = self.place(*place);
             direction.dot(&(x * place.x + y * place.y + shift)) > 0.0
@@ -187,14 +197,15 @@ impl Normalised {
     }
 }
 
-/// The sum of `A'A` of the equations `d x (M h) = 0`, for directions d and homogeneous places h with
-/// their weights: as `A = h' (x) [d]x` it is `h h' (x) [d]x'[d]x`.
+/// The sum of `A'A` of the equations `d x (M h) = 0`, for directions d and homogeneous places h
+/// with their weights: with `A = h' (x) [d]x` each term is `h h' (x) [d]x'[d]x`.
 fn squares<'a, const H: usize, const N: usize>(
     pairs: impl Iterator<Item = (&'a Vector3<f64>, [f64; H], f64)>,
 ) -> SMatrix<f64, N, N> {
     const { assert!(N == 3 * H) };
     let mut sum = SMatrix::<f64, N, N>::zeros();
     for (direction, place, weight) in pairs {
+        // [d]x'[d]x = |d|^2 I - d d'
         let across = (Matrix3::from_diagonal_element(direction.norm_squared())
             - direction * direction.transpose())
             * weight;
@@ -209,5 +220,6 @@ fn squares<'a, const H: usize, const N: usize>(
     sum
 }
 
-/// A symmetric matrix of a dozen rows takes ten or so; one with what is no number would take for ever.
+/// Iterations at most: a symmetric matrix of a dozen rows takes about ten; one with values that are
+/// not numbers would never end.
 const MOST_ITERATIONS: usize = 200;

@@ -1,8 +1,9 @@
-//! Poses, clocks and lenses of cameras from the flight of one target, with a log of it or a survey.
+//! Calibration of cameras' poses, clocks and lenses from the flight of one target, with its log or
+//! with a survey.
 //!
-//! All that is unknown is adjusted at once: each camera's pose, clock and lens, the target's way (a
-//! cubic spline with white jerk) and the log's drifting bias. The log is a measurement and not the
-//! truth: a camera that were held against it alone would take on its errors.
+//! All unknowns are adjusted at once: each camera's pose, clock and lens, the target's trajectory
+//! (a cubic spline with white jerk) and the log's drifting bias. The log is a measurement and not
+//! the truth: a camera fitted to the log alone would take on its errors.
 
 mod adjustment;
 mod align;
@@ -56,10 +57,10 @@ pub use moved::MovedAt;
 pub use results::{CameraResult, ClockKnot, ClockResult, FlightResult, LogFit};
 pub use would_fit::{Axis, WouldFit};
 
-/// Adjusts a flight, with a log of it or with what a survey says.
+/// Adjusts a flight, with its log or with what a survey knows of the site.
 ///
 /// # Errors
-/// [`FlightError`] naming the camera, or what is too little.
+/// [`FlightError`] naming the camera, or which data are too few.
 pub fn calibrate_flight(
     cameras: &[CameraLabels],
     log: Option<&FlightLog>,

@@ -1,4 +1,4 @@
-//! What is measured of a flight, and what is unknown of it.
+//! The measurements of a flight, and its unknowns.
 
 use crossfix_geometry::{Intrinsics, Pixel, turn_vector};
 use crossfix_message::CameraName;
@@ -11,7 +11,7 @@ use crate::lens::{self, LensFreedom};
 pub struct Label {
     /// Capture time of the frame by the camera's own clock, s.
     pub time_s: f64,
-    /// The target's middle in the recorded image.
+    /// The target's centre in the recorded image.
     pub pixel: Pixel,
 }
 
@@ -20,9 +20,9 @@ pub struct Label {
 pub struct CameraLabels {
     /// The camera.
     pub name: CameraName,
-    /// Its lens, by its file.
+    /// Its lens, as its file states it.
     pub intrinsics: Intrinsics,
-    /// What of that may be otherwise.
+    /// How far the lens may deviate from its file.
     pub freedom: LensFreedom,
     /// In order of time.
     pub labels: Vec<Label>,
@@ -42,24 +42,24 @@ pub struct LogSample {
 pub struct FlightLog {
     /// In order of time.
     pub samples: Vec<LogSample>,
-    /// What is wrong of it.
+    /// How far its samples may be off.
     pub errors: LogErrors,
 }
 
-/// What is wrong of a log: each sample by noise of its own, and all by a bias that drifts.
+/// Errors of a log: noise of each sample, and a drifting bias that all samples share.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LogErrors {
     /// Standard deviation of each sample's own error per axis, m.
     pub sd_m: f64,
-    /// Of the bias, m.
+    /// Standard deviation of the bias per axis, m.
     pub drift_sd_m: f64,
-    /// Time over which the bias forgets itself, s.
+    /// Correlation time of the bias, s.
     pub drift_time_s: f64,
 }
 
-/// A camera's clock: `common time = straight + wander(straight)` with `straight = own + offset + rate
-/// (own - reference)`, and a row of the image is read out `read-out (row / height - 1/2)` after the
-/// frame's time.
+/// A camera's clock: `common time = straight + wander(straight)` with
+/// `straight = own + offset + rate (own - reference)`; a row of the image is read out
+/// `read-out (row / height - 1/2)` after the frame's time.
 #[derive(Clone, Debug)]
 pub(crate) struct Clock {
     pub(super) reference_s: f64,
@@ -69,7 +69,7 @@ pub(crate) struct Clock {
     pub(super) wander: Knots,
 }
 
-/// A function of time that is straight between knots.
+/// A function of time that is linear between knots.
 #[derive(Clone, Debug)]
 pub(crate) struct Knots {
     pub(super) start_s: f64,
@@ -78,7 +78,7 @@ pub(crate) struct Knots {
 }
 
 impl Knots {
-    /// The two knots about a time and their weights; before and behind the ends, the end's alone.
+    /// The two knots about a time and their weights; beyond the ends only the end's knot counts.
     pub(super) fn weights(&self, time_s: f64) -> [(usize, f64); 2] {
         let last = self.values.len() - 1;
         let at = ((time_s - self.start_s) / self.step_s).clamp(0.0, last as f64);
@@ -92,7 +92,7 @@ impl Knots {
         self.weights(time_s).iter().map(|&(k, weight)| self.values[k] * weight).sum()
     }
 
-    /// By how much the value grows per second about a time.
+    /// The function's slope at a time, per second.
     fn slope(&self, time_s: f64) -> f64 {
         let at = (time_s - self.start_s) / self.step_s;
         if !(0.0..(self.values.len() - 1) as f64).contains(&at) {
@@ -102,7 +102,7 @@ impl Knots {
     }
 }
 
-/// What is unknown of a camera.
+/// The unknowns of a camera.
 #[derive(Clone, Debug)]
 pub(crate) struct CameraState {
     /// World from camera.
@@ -112,21 +112,22 @@ pub(crate) struct CameraState {
     pub(super) intrinsics: Intrinsics,
 }
 
-/// The unknowns of a camera's pose and clock, in their order: a small rotation about its own axes
-/// (rad), its centre (m), the clock's offset (s), rate and read-out (s). The lens follows.
+/// Number of unknowns of a camera's pose and clock, in their order: a small rotation about its own
+/// axes (rad), its centre (m), the clock's offset (s), rate and read-out (s). The lens follows.
 pub(super) const POSE_AND_CLOCK: usize = 9;
-/// Where the clock begins among them.
+/// Index of the first of the clock's unknowns among these.
 pub(super) const CLOCK: usize = 6;
-/// Pose, clock and the longest lens.
+/// Number of unknowns of pose, clock and the longest lens.
 pub(super) const MOST_OWN: usize = POSE_AND_CLOCK + lens::MOST_LENS_NUMBERS;
 
 impl CameraState {
-    /// Unknowns beside its clock's wander, which is of the time.
+    /// Number of unknowns without the clock's wander, which changes with time and belongs to the
+    /// chain.
     pub(super) fn own(&self) -> usize {
         POSE_AND_CLOCK + lens::numbers(&self.intrinsics)
     }
 
-    /// How far after its frame's time a pixel's row is read out, as a share of the read-out.
+    /// How long after its frame's time a pixel's row is read out, as a share of the read-out.
     pub(super) fn row_share(&self, pixel: Pixel) -> f64 {
         pixel.y() / f64::from(self.intrinsics.size.height) - 0.5
     }
@@ -136,8 +137,8 @@ impl CameraState {
         self.clock.common_s(label.time_s) + self.clock.readout_s * self.row_share(label.pixel)
     }
 
-    /// Where a place is seen, with the derivatives by it and by what is unknown of the camera; the
-    /// clock's unknowns need the target's velocity. `None` behind the camera.
+    /// Where a place is seen, with the derivatives by the place and by the camera's unknowns; the
+    /// clock's unknowns need the target's velocity. `None` if the place is behind the camera.
     pub(super) fn see(
         &self,
         label: &Label,
@@ -156,7 +157,7 @@ impl CameraState {
             by_own[axis] = by_rotation.column(axis).into_owned();
             by_own[axis + 3] = -by_place.column(axis);
         }
-        // The wander is one of the straight time.
+        // The wander is a function of the straight time: d(common) = (1 + slope) d(straight).
         let by_straight =
             by_time * (1.0 + self.clock.wander.slope(self.clock.straight_s(label.time_s)));
         by_own[CLOCK] = by_straight;
@@ -167,7 +168,7 @@ impl CameraState {
         Some(Seen { residual, by_place, by_time, by_own })
     }
 
-    /// Moves it by a step in its own unknowns, in their order.
+    /// Moves the state by a step in the camera's own unknowns, in their order.
     pub(super) fn step(&mut self, step: &[f64]) {
         let own = self.own();
         let vector = |from: usize| Vector3::from_column_slice(&step[from..from + 3]);
@@ -181,7 +182,7 @@ impl CameraState {
 }
 
 impl Clock {
-    /// The common time of a time of its own, s.
+    /// The common time at a time of the camera's own clock, s.
     pub(super) fn common_s(&self, own_s: f64) -> f64 {
         let straight_s = self.straight_s(own_s);
         straight_s + self.wander.at(straight_s)
@@ -193,19 +194,19 @@ impl Clock {
     }
 }
 
-/// What a label differs from where its target should be seen, pixels, with derivatives.
+/// A label's residual (the pixel predicted less the pixel labelled) with its derivatives.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Seen {
     pub(super) residual: Vector2<f64>,
-    /// Per metre of the target's place.
+    /// Derivative by the target's place, pixels per metre.
     pub(super) by_place: nalgebra::Matrix2x3<f64>,
-    /// Per second of the label's time.
+    /// Derivative by the label's time, pixels per second.
     pub(super) by_time: Vector2<f64>,
-    /// By each unknown of the camera but its wander.
+    /// Derivatives by each unknown of the camera except its wander.
     pub(super) by_own: [Vector2<f64>; MOST_OWN],
 }
 
-/// The step in a camera's own unknowns that leads from one state to another.
+/// Step in a camera's own unknowns that leads from one state to another.
 pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
     let turn: Rotation3<f64> = from.rotation.inverse() * to.rotation;
     let mut step: Vec<f64> = turn_vector(&turn).iter().copied().collect();
@@ -218,17 +219,17 @@ pub(super) fn step_between(from: &CameraState, to: &CameraState) -> Vec<f64> {
     step
 }
 
-/// The time between a camera's frames: the median between its labels, s.
+/// Time between a camera's frames: the median between its labels, s.
 pub(super) fn frame_time(camera: &CameraLabels) -> f64 {
     let mut steps: Vec<f64> =
         camera.labels.windows(2).map(|pair| pair[1].time_s - pair[0].time_s).collect();
-    // Several labels may be of one frame.
+    // Several labels may belong to one frame.
     steps.retain(|step| *step > 0.0);
     steps.sort_unstable_by(f64::total_cmp);
     steps.get(steps.len() / 2).copied().unwrap_or_default().max(1e-3)
 }
 
-/// How long times last that are in order.
+/// Duration covered by times that are in order, hours.
 pub(super) fn hours(mut times_s: impl DoubleEndedIterator<Item = f64>) -> f64 {
     let (first, last) = (times_s.next(), times_s.next_back());
     first.zip(last).map_or(0.0, |(first, last)| (last - first) / 3600.0)

@@ -1,23 +1,23 @@
-//! Whether a camera was moved in mid-flight, by its residuals over time.
+//! Detects whether a camera was moved in mid-flight, from its residuals over time.
 
 use nalgebra::Vector2;
 
 use super::fitted::FittedLabel;
 use super::linear::median;
 
-/// Residuals over this time are averaged, s: labels err alike for as long.
+/// Block over which residuals are averaged, s: labels err alike for as long.
 const BLOCK_S: f64 = 1.0;
-/// Each part must have so many of them.
+/// Least number of blocks in each part.
 const LEAST_BLOCKS: usize = 8;
 
-/// A moment before and after which a camera's labels lie beside the way by something else.
+/// A moment at which a camera's mean residual changes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MovedAt {
     /// By the camera's own time, s.
     pub time_s: f64,
     /// By how much the mean residual changes, pixels.
     pub by_px: f64,
-    /// And in deviations of the means over a second.
+    /// The same in standard deviations of a second's mean.
     pub deviations: f64,
 }
 
@@ -36,7 +36,8 @@ fn blocks(labels: &[FittedLabel]) -> Vec<Block> {
     labels.chunk_by(|a, b| number(a) == number(b)).map(block).collect()
 }
 
-/// The medians of some blocks, axis by axis, and the mean distance from them an axis, pixels.
+/// The medians of some blocks' means, axis by axis, and the sum of the absolute deviations from
+/// them, mean of both axes, pixels.
 fn middle(blocks: &[Block]) -> (Vector2<f64>, f64) {
     let axis = |axis: usize| median(blocks.iter().map(|block| block.mean[axis]));
     let middle = Vector2::new(axis(0), axis(1));
@@ -44,10 +45,10 @@ fn middle(blocks: &[Block]) -> (Vector2<f64>, f64) {
     (middle, away / 2.0)
 }
 
-/// The moment that divides residuals, in the order of their times, best into two parts of one median
-/// each, so that a bird at the beginning or the end is no part; `None` of too few.
+/// The moment that best divides residuals, in order of time, into two parts of one median each, so
+/// that a bird at the beginning or the end does not make a part; `None` with too few blocks.
 pub(super) fn likeliest(labels: &[FittedLabel]) -> Option<MovedAt> {
-    /// A normal deviate's standard deviation by the mean of its size.
+    /// Ratio of a normal deviate's standard deviation to its mean absolute value.
     const BY_MEAN: f64 = 1.253;
     let blocks = blocks(labels);
     let last = blocks.len().checked_sub(LEAST_BLOCKS)?;
@@ -71,7 +72,8 @@ mod tests {
 
     use super::*;
 
-    /// Two minutes of labels half a pixel beside, with something added at a time.
+    /// Two minutes of labels with errors of half a pixel, and something added that depends on the
+    /// time.
     fn labels(added: impl Fn(f64) -> f64) -> Vec<FittedLabel> {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut normal = || -> f64 { StandardNormal.sample(&mut random) };

@@ -1,28 +1,28 @@
-//! How labels err: most a little and alike for half a second, some by anything.
+//! Errors of labels: most are small and alike for half a second, some labels may be of anything.
 
 use nalgebra::Vector2;
 
 use crate::label_noise::LabelNoise;
 
-/// Degrees of freedom of the heavy tails: at four, a residual of ten deviations counts a fifth of
-/// one, and clean labels lose a tenth of their weight.
+/// Degrees of freedom of the heavy tails: at four, a residual of ten deviations weighs a
+/// twentieth of one, and clean labels lose a tenth of their weight.
 const FREEDOM: f64 = 4.0;
 
-/// How unlikely a large residual is.
+/// Distribution of residuals, which sets how unlikely a large one is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Tails {
-    /// As a normal deviate's.
+    /// Normal.
     Normal,
-    /// As Student's t: what is measured may be of something else.
+    /// Student's t: the measurement may be of something else.
     Heavy,
-    /// As a normal deviate's as far as usual ones go, and beyond as Student's t: what was known beforehand may
-    /// not hold any more, but where it does it counts once. (At its middle Student's t of n numbers weighs
-    /// them (freedom + n) / freedom times.)
+    /// Normal for usual residuals, and beyond them Student's t: what was known beforehand may no
+    /// longer hold, but where it does it counts once. (For residuals of zero Student's t of n
+    /// numbers weights them (freedom + n) / freedom times.)
     Known,
 }
 
 impl Tails {
-    /// Degrees of freedom of Student's t; `None` is a normal deviate's.
+    /// Degrees of freedom of Student's t; `None` for a normal distribution.
     fn freedom(self) -> Option<f64> {
         match self {
             Self::Normal => None,
@@ -30,12 +30,13 @@ impl Tails {
         }
     }
 
-    /// Whether residuals count as a normal deviate's: the two join where their mean square is one.
+    /// Whether residuals are in the normal part of [`Self::Known`]: both parts join where the mean
+    /// square is one.
     fn is_normal(self, squares: f64, count: usize) -> bool {
         self == Self::Known && squares <= count as f64
     }
 
-    /// What residuals with this sum of squares count.
+    /// Weight of residuals with this sum of squares.
     pub(super) fn weight(self, squares: f64, count: usize) -> f64 {
         if self.is_normal(squares, count) {
             return 1.0;
@@ -58,48 +59,51 @@ impl Tails {
     }
 }
 
-/// No label is nearer to its target's middle than this, pixels: the noise of a camera that alone
-/// holds the track would be found to be nothing.
+/// Least standard deviation of a label, pixels: without it the noise of a camera that alone
+/// determines the trajectory would be found to be zero.
 const LEAST_SD_PX: f64 = 0.1;
-/// Errors that last longer than this are the lens's or the pose's, s.
+/// Errors that last longer than this are ascribed to the lens or the pose, s.
 const LONGEST_S: f64 = 2.0;
-/// Labels over this time are averaged to see how long errors last, s.
+/// Block over which labels are averaged to find how long errors last, s.
 const BLOCK_S: f64 = 1.0;
-/// One label in so many may be of anything: as much of the largest is left out.
+/// One label in this many may be of anything: that share of the largest is left out.
 const ANYTHING: usize = 20;
 
-/// How labels are whitened: a label's error is this share of the one's before, ...
+/// How labels are whitened: a label's error is this share of the previous label's, ...
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Whitening {
     pub(super) kept: f64,
-    /// ... and what is new has this deviation, pixels.
+    /// ... and the remainder has this deviation, pixels.
     pub(super) sd_px: f64,
 }
 
 impl LabelNoise {
-    /// How a label is whitened after one so many seconds before, where frames are `frame_s` apart.
+    /// Whitening of a label that follows another after `before_s` seconds, where frames are
+    /// `frame_s` apart.
     ///
-    /// The sum of a white part and a lasting one would need all labels before to be whitened. The
-    /// last one alone, weighed by its correlation, leaves the difference of two labels what it is;
-    /// its deviation is then made so much larger that the mean of many is not better known than it
+    /// Whitening the sum of a white and a lasting part exactly would need all labels before. Using
+    /// the last one alone, weighted by its correlation, leaves the difference of two labels what it
+    /// is; the deviation is then enlarged until the mean of many labels is not better known than it
     /// is. Between the two it errs towards caution.
     pub(super) fn after(&self, before_s: Option<f64>, frame_s: f64) -> Whitening {
         let variance = self.sd_px().powi(2);
         let kept = before_s.map_or(0.0, |before_s| self.correlation(before_s));
         let caution = self.caution(frame_s);
+        // AR(1): the remainder's variance is (1 - rho^2) times the label's.
         Whitening { kept, sd_px: (variance * (1.0 - kept * kept) * caution).sqrt() }
     }
 
-    /// By how much the variance is made larger so that the mean of many labels, each whitened by the
-    /// one before, is not better known than it is.
+    /// Factor on the variance so that the mean of many labels, each whitened by the one before, is
+    /// not better known than it is.
     pub(super) fn caution(&self, frame_s: f64) -> f64 {
         let of_frame = self.correlation(frame_s);
+        // White-equivalent variance of an AR(1) process: variance (1 + rho) / (1 - rho).
         let averaged = self.sd_px().powi(2) * (1.0 + of_frame) / (1.0 - of_frame);
         (self.white_equivalent_px(frame_s).powi(2) / averaged).max(1.0)
     }
 
-    /// As residuals show it, in order of time; `explained` is the variance (pixels^2, an axis) that
-    /// the fitted way has taken from them.
+    /// Estimates the noise from residuals in order of time; `explained` is the variance (pixels^2,
+    /// per axis) that the fitted trajectory has absorbed.
     pub(super) fn of(residuals: &[(f64, Vector2<f64>)], explained: f64, frame_s: f64) -> Self {
         let residuals = &without_strays(residuals);
         let variance = typical(residuals.iter().map(|(_, residual)| *residual)) + explained;
@@ -107,15 +111,19 @@ impl LabelNoise {
         let steps = residuals.windows(2).filter(|pair| pair[1].0 - pair[0].0 < 1.5 * frame_s);
         let of_steps = typical(steps.map(|pair| pair[1].1 - pair[0].1)) / 2.0;
         let of_means = typical(block_means(residuals).into_iter()) + explained;
-        // Of all that could be, the time after which blocks' means vary as they do.
+        // Lasting variance for a correlation time, by the covariance of successive residuals:
+        // variance - of_steps = lasting x exp(-frame / T).
         let lasting = |lasting_s: f64| {
             let kept = (-frame_s / lasting_s).exp();
             ((variance - of_steps).max(0.0) / kept).min(variance)
         };
+        // Variance of blocks' means: the lasting part by its share, the white part by the number of
+        // labels.
         let means = |lasting_s: f64| {
             let lasting = lasting(lasting_s);
             lasting * share_of_means(lasting_s) + (variance - lasting) * frame_s / BLOCK_S
         };
+        // Bisection for the correlation time with which blocks' means vary as they do.
         let (mut least, mut most) = (frame_s, LONGEST_S.max(2.0 * frame_s));
         for _ in 0..40 {
             let middle = f64::midpoint(least, most);
@@ -130,12 +138,12 @@ impl LabelNoise {
     }
 }
 
-/// Labels are not drawn finer than this, pixels.
+/// Least white noise of labels, pixels: they are not drawn more finely.
 const LEAST_WHITE_PX: f64 = 0.03;
 
-/// The variance of an axis without the largest vectors, for the share that normal deviates have in
-/// those. The median would not do: labels are drawn to half a pixel, and most that lie beside one
-/// another differ by next to nothing.
+/// Variance per axis without the largest vectors, corrected for the share of the variance that
+/// these have under a normal distribution. The median would not do: labels are drawn to half a
+/// pixel, and most of those next to one another differ by next to nothing.
 fn typical(vectors: impl Iterator<Item = Vector2<f64>>) -> f64 {
     let mut squares: Vec<f64> = vectors.map(|vector| vector.norm_squared()).collect();
     squares.sort_unstable_by(f64::total_cmp);
@@ -143,19 +151,20 @@ fn typical(vectors: impl Iterator<Item = Vector2<f64>>) -> f64 {
     if count == 0 {
         return 0.0;
     }
-    // Half of the square is an exponential deviate: above its quantile of 1 - s lie s (1 - ln s) of
-    // its mean.
+    // Half of the squared length is an exponential deviate: its part above the quantile 1 - s
+    // contributes s (1 - ln s) of its mean.
     let share = cut as f64 / count as f64;
     let left = if cut == 0 { 1.0 } else { 1.0 - share * (1.0 - share.ln()) };
     let sum: f64 = squares[..count - cut].iter().sum();
     sum / (2.0 * count as f64 * left)
 }
 
-/// Labels of something else, birds beside the drone: farther off than so many times the median. Of
-/// normal deviates none in 10^14 is; with half as many a hand's slips are left out.
+/// Labels farther off than this many times the median are of something else, such as birds beside
+/// the drone. Of normal deviates none in 10^14 is; with half of it slips of the hand are left out,
+/// too.
 const STRAY: f64 = 7.0;
 
-/// The residuals without those of other things: as many as nearly half of them may be.
+/// The residuals without those of other things, which may be nearly half of all.
 fn without_strays(residuals: &[(f64, Vector2<f64>)]) -> Vec<(f64, Vector2<f64>)> {
     let mut lengths: Vec<f64> = residuals.iter().map(|(_, residual)| residual.norm()).collect();
     lengths.sort_unstable_by(f64::total_cmp);
@@ -174,8 +183,9 @@ fn block_means(residuals: &[(f64, Vector2<f64>)]) -> Vec<Vector2<f64>> {
     residuals.chunk_by(same).filter(spans).map(mean).collect()
 }
 
-/// What of the variance of an error that lasts T is left in the mean over a block of length L: the
-/// mean of `exp(-t / T)` over the block's pairs, `2 T/L (1 - T/L (1 - exp(-L/T)))`.
+/// Share of the variance of an error with correlation time T that is left in the mean over a block
+/// of length L: the mean of `exp(-t / T)` over the block's pairs,
+/// `2 T/L (1 - T/L (1 - exp(-L/T)))`.
 fn share_of_means(lasting_s: f64) -> f64 {
     let ratio = lasting_s / BLOCK_S;
     2.0 * ratio * (1.0 - ratio * (1.0 - (-ratio.recip()).exp()))
@@ -189,7 +199,7 @@ mod tests {
 
     use super::*;
 
-    /// Half a minute of labels, a share of them of something else.
+    /// Half a minute of labels, with a share of labels of something else.
     fn found(strays: f64) -> LabelNoise {
         const FRAME_S: f64 = 1.0 / 30.0;
         let mut random = ChaCha8Rng::seed_from_u64(9);

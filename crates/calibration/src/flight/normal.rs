@@ -1,72 +1,76 @@
-//! Normal equations of a long chain of unknowns, each tied to its neighbours, and a few that are
-//! tied to all: the chain's block is banded and is eliminated by Cholesky.
+//! Normal equations of a long chain of unknowns, each tied to its neighbours, and a few others that
+//! are tied to all: the chain's block is banded and is eliminated by Cholesky.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 
-/// An unknown that has a part in a residual, and the residual's derivative by it.
+/// An unknown that a residual depends on, and the residual's derivative with respect to it.
 pub(super) type Term = (usize, f64);
 
-/// A residual that is one by its deviation, and what it hangs on.
+/// A residual divided by its standard deviation, with the unknowns that it depends on.
 pub(super) type Row = (Vec<Term>, f64);
 
-/// An unknown that has a part in two residuals.
+/// An unknown that two residuals depend on, with both derivatives.
 type TwoTerms = (usize, [f64; 2]);
 
-/// `J'WJ` and `-J'Wr` of weighted residuals, gathered row by row.
+/// Normal equations, `J'WJ` and `-J'Wr` of weighted residuals, summed row by row.
 ///
-/// Unknowns are counted with the chain first.
+/// The unknowns of the chain come first, then the others.
 #[derive(Clone, Debug)]
 pub(super) struct NormalEquations {
-    /// Unknowns of the chain.
+    /// Number of unknowns in the chain.
     chain: usize,
-    /// Its block: `band[k * width + d]` ties unknown k to unknown k - d.
+    /// The chain's block: `band[k * width + d]` is the element of unknowns k and k - d.
     band: Vec<f64>,
     width: usize,
-    /// How the others (rows) are tied to the chain (columns).
+    /// Block of the others (rows) and the chain (columns).
     cross: DMatrix<f64>,
     others: DMatrix<f64>,
     right: DVector<f64>,
-    /// Room for the terms of two rows.
+    /// Buffers for the terms of two rows.
     of_chain: Vec<TwoTerms>,
     of_others: Vec<TwoTerms>,
 }
 
-/// The solution, and what is left of the others' block when the chain is eliminated.
+/// The solution, and the others' block once the chain is eliminated (its Schur complement).
 pub(super) struct Solution {
-    /// A step of all unknowns.
+    /// Step of all unknowns.
     pub(super) step: DVector<f64>,
-    /// Information on the others alone.
+    /// Information on the others, with the chain marginalised out.
     schur: DMatrix<f64>,
-    /// The chain's block's factor, and what it makes of the others' ties to the chain.
+    /// The chain block's factor L, and the cross block B solved by it, `B L'^-1`.
     factor: Vec<f64>,
     cross: DMatrix<f64>,
     width: usize,
 }
 
-/// How well unknowns are known, as far as rows tie them.
+/// Covariance of the unknowns, within the chain only as far as rows tie them.
 pub(super) struct Covariance {
-    /// Of the chain's unknowns with the others held: `band[k * width + d]` is of unknowns k and k + d.
+    /// Covariance of the chain's unknowns with the others fixed: `band[k * width + d]` is the
+    /// element of unknowns k and k + d.
     band: Vec<f64>,
     width: usize,
-    /// How the chain (columns) goes with the others (rows).
+    /// Derivative of the chain (columns) with respect to the others (rows), `-B A^-1`.
     follows: DMatrix<f64>,
-    /// Of the others.
+    /// Covariance of the others.
     others: DMatrix<f64>,
-    /// The information on the others alone.
+    /// Information on the others, with the chain marginalised out.
     information: DMatrix<f64>,
 }
 
 impl Solution {
-    /// By Takahashi's recursion: from `L' Z = L^-1`, whose upper triangle is diagonal, an element of
-    /// `Z = A^-1` within the band hangs on others within it.
+    /// Covariance by Takahashi's recursion: from `L' Z = L^-1`, where `L^-1` has only its diagonal
+    /// in the upper triangle, an element of `Z = A^-1` within the band depends only on others
+    /// within the band.
     pub(super) fn covariance(self) -> Option<Covariance> {
         let Self { schur, factor, mut cross, width, .. } = self;
         let chain = factor.len() / width;
         let mut band = vec![0.0; factor.len()];
-        // The same by the later unknown, the farthest first: a row's neighbours lie beside one another.
+        // A copy of `band`, indexed by the later unknown with the farthest first, so that both
+        // products below run over adjacent memory.
         let mut back = vec![0.0; factor.len()];
         let mut below = vec![0.0; width];
         for row in (0..chain).rev() {
+            // `factor` stores the inverted diagonal, 1 / L[row][row].
             let inverse_diagonal = factor[row * width];
             let reach = width.min(chain - row);
             let below = &mut below[..reach];
@@ -75,15 +79,19 @@ impl Solution {
                 let column = row + ahead;
                 let nearer = &back[(column + 1) * width - ahead..][..ahead];
                 let farther = &band[column * width + 1..][..reach - ahead - 1];
+                // Sum over k > row of L[k][row] Z[k][column], with k before the column and from it
+                // on.
                 let known =
                     dot(&below[1..ahead + 1], &nearer[..ahead]) + dot(&below[ahead + 1..], farther);
                 let diagonal = if ahead == 0 { inverse_diagonal } else { 0.0 };
+                // Z[row][column] = ((L^-1)[row][column] - sum) / L[row][row]
                 let value = (diagonal - known) * inverse_diagonal;
                 band[row * width + ahead] = value;
                 back[column * width + width - 1 - ahead] = value;
             }
         }
         let others = cross.nrows();
+        // `cross` was B L'^-1 and becomes B A^-1.
         backward(&factor, width, cross.as_mut_slice(), others);
         cross.neg_mut();
         let others = Cholesky::new(schur.clone())?.inverse();
@@ -92,7 +100,8 @@ impl Solution {
 }
 
 impl Covariance {
-    /// The variance of a sum of the chain's unknowns, all within the band's width, the others held.
+    /// Variance of a linear combination of the chain's unknowns, all within the band's width, the
+    /// others fixed.
     pub(super) fn variance_held(&self, terms: &[Term]) -> f64 {
         let covariance = |i: usize, j: usize| self.band[i.min(j) * self.width + i.abs_diff(j)];
         let mut sum = 0.0;
@@ -103,7 +112,7 @@ impl Covariance {
         sum
     }
 
-    /// The variance of a sum of unknowns, those of the chain within the band's width.
+    /// Variance of a linear combination of unknowns, those of the chain within the band's width.
     pub(super) fn variance(&self, terms: &[Term]) -> f64 {
         let chain = self.follows.ncols();
         let (of_chain, of_others): (Vec<Term>, Vec<Term>) =
@@ -115,27 +124,29 @@ impl Covariance {
         for (unknown, by) in of_others {
             by_others[unknown - chain] += by;
         }
+        // Law of total variance: c' Z c with the others fixed, plus g' P g, where g is the
+        // combination's total derivative by the others and P their covariance.
         self.variance_held(&of_chain) + by_others.dot(&(&self.others * &by_others))
     }
 
-    /// Of all but the chain.
+    /// Covariance of all unknowns outside the chain.
     pub(super) fn others(&self) -> &DMatrix<f64> {
         &self.others
     }
 
-    /// The information on all but the chain.
+    /// Information on all unknowns outside the chain.
     pub(super) fn information(&self) -> &DMatrix<f64> {
         &self.information
     }
 
-    /// Takes a part of their covariance off that is told of elsewhere.
+    /// Subtracts a part of the others' covariance that is stated elsewhere.
     pub(super) fn take_off(&mut self, part: &DMatrix<f64>) {
         self.others -= part;
     }
 }
 
 impl NormalEquations {
-    /// Of a chain whose unknowns are tied over less than `width`, and of `others`.
+    /// Empty equations of a chain whose unknowns are tied over less than `width`, and of `others`.
     pub(super) fn new(chain: usize, width: usize, others: usize) -> Self {
         Self {
             chain,
@@ -149,13 +160,14 @@ impl NormalEquations {
         }
     }
 
-    /// Takes residuals in with their weight. Terms may name an unknown more than once.
+    /// Adds residuals with their weight. Terms may name an unknown more than once.
     pub(super) fn add(&mut self, rows: &[Row], weight: f64) {
         if let [(first, a), (second, b)] = rows
             && first.len() == second.len()
             && first.iter().zip(second).all(|(first, second)| first.0 == second.0)
         {
-            // Both axes of a label: what there is to look up is looked up once.
+            // Both axes of a label depend on the same unknowns: their indices are looked up once
+            // for both.
             let pairs = first.iter().zip(second);
             return self.add_two(pairs.map(|(a, b)| (a.0, [a.1, b.1])), [*a, *b], weight);
         }
@@ -165,7 +177,7 @@ impl NormalEquations {
         }
     }
 
-    /// Takes two residuals in that hang on the same unknowns.
+    /// Adds two residuals that depend on the same unknowns.
     fn add_two(&mut self, terms: impl Iterator<Item = TwoTerms>, residuals: [f64; 2], weight: f64) {
         let (mut of_chain, mut of_others) =
             (std::mem::take(&mut self.of_chain), std::mem::take(&mut self.of_others));
@@ -205,13 +217,14 @@ impl NormalEquations {
         (self.of_chain, self.of_others) = (of_chain, of_others);
     }
 
-    /// Pushes an unknown: a term of the cost whose derivative by it is minus twice this.
+    /// Adds to the right side: a term of the cost whose derivative with respect to the unknown is
+    /// minus twice this.
     pub(super) fn push(&mut self, unknown: usize, by: f64) {
         self.right[unknown] += by;
     }
 
-    /// Solves them, each diagonal element made larger by a share of itself. `None`: they have no
-    /// solution, as some unknown is tied to nothing.
+    /// Solves the equations, each diagonal element enlarged by the share `damping` of itself.
+    /// `None`: no solution, as some unknown is tied to nothing.
     pub(super) fn solve(mut self, damping: f64) -> Option<Solution> {
         for k in 0..self.chain {
             self.band[k * self.width] *= 1.0 + damping;
@@ -221,13 +234,15 @@ impl NormalEquations {
         }
         self.factor_band()?;
         let Self { chain, ref mut cross, ref mut others, ref right, .. } = self;
+        // ahead = L^-1 b, cross = B L'^-1.
         let mut ahead = right.rows(0, chain).into_owned();
         forward(&self.band, self.width, ahead.as_mut_slice(), 1);
         let count = others.nrows();
         forward(&self.band, self.width, cross.as_mut_slice(), count);
         others.fill_upper_triangle_with_lower_triangle();
-        // S = D - B A^-1 B' with A = L L': the chain is gone.
+        // S = D - B A^-1 B' with A = L L': the Schur complement, in which the chain is eliminated.
         others.gemm(-1.0, cross, &cross.transpose(), 1.0);
+        // S x = c - B A^-1 b for the others, then L' y = L^-1 b - (B L'^-1)' x for the chain.
         let reduced = right.rows(chain, count) - &*cross * &ahead;
         let schur = others.clone();
         let other_step = Cholesky::new(schur.clone())?.solve(&reduced);
@@ -239,19 +254,22 @@ impl NormalEquations {
         Some(Solution { step, schur, factor: self.band, cross: self.cross, width: self.width })
     }
 
-    /// The chain's block becomes its lower triangular factor, whose diagonal is inverted.
+    /// Replaces the chain's block by its lower triangular factor, whose diagonal is stored
+    /// inverted.
     fn factor_band(&mut self) -> Option<()> {
         let width = self.width;
         for row in 0..self.chain {
             let reach = width.min(row + 1);
             for back in (0..reach).rev() {
                 let column = row - back;
-                // Elements left of both, that exist in both rows.
+                // Elements left of both that exist in both rows.
                 let shared = (width - 1 - back).min(column);
                 let own = row * width + back + 1;
                 let their = column * width + 1;
                 let product = dot(&self.band[own..own + shared], &self.band[their..their + shared]);
                 let left = self.band[row * width + back] - product;
+                // L[i][j] = (A[i][j] - sum over k < j of L[i][k] L[j][k]) / L[j][j]; on the
+                // diagonal the root.
                 self.band[row * width + back] = if back > 0 {
                     left * self.band[column * width]
                 } else if left > 0.0 && left.is_finite() {
@@ -265,7 +283,7 @@ impl NormalEquations {
     }
 }
 
-/// Puts terms in the order of their unknowns, each once.
+/// Sorts terms by their unknowns and sums those of the same unknown.
 fn in_order(terms: &mut Vec<TwoTerms>) {
     terms.sort_unstable_by_key(|(unknown, _)| *unknown);
     terms.dedup_by(|next, first| {
@@ -277,7 +295,7 @@ fn in_order(terms: &mut Vec<TwoTerms>) {
     });
 }
 
-/// Solves `L x = b` in place, for so many right sides that lie beside one another.
+/// Solves `L x = b` in place, for `sides` right sides that are interleaved in memory.
 fn forward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
     let rows = values.len() / sides.max(1);
     for row in 0..rows {
@@ -291,7 +309,7 @@ fn forward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
     }
 }
 
-/// Solves `L' x = b` in place, likewise.
+/// Solves `L' x = b` in place, for right sides stored alike.
 fn backward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
     let rows = values.len() / sides.max(1);
     for row in (0..rows).rev() {
@@ -305,7 +323,7 @@ fn backward(band: &[f64], width: usize, values: &mut [f64], sides: usize) {
     }
 }
 
-/// The sum of products, in four sums that a processor can work at side by side.
+/// Scalar product, as four partial sums that a processor can compute in parallel.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let (a, b) = (a.chunks_exact(4), b.chunks_exact(4));
     let rest = a.remainder().iter().zip(b.remainder()).map(|(a, b)| a * b).sum::<f64>();
@@ -316,7 +334,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// Takes a multiple of other values off.
+/// Subtracts a multiple of other values.
 fn less(values: &mut [f64], times: f64, others: &[f64]) {
     if times != 0.0 {
         values.iter_mut().zip(others).for_each(|(value, other)| *value -= times * other);
@@ -345,7 +363,7 @@ mod tests {
             let columns = (first..first + WIDTH).chain([other]);
             let terms: Vec<Term> = columns.map(|c| (c, random.random_range(-1.0..1.0))).collect();
             let residual = random.random_range(-1.0..1.0);
-            // Another row on the same unknowns, and one that names an unknown twice.
+            // Another row with the same unknowns, and one that names an unknown twice.
             let turned = terms.iter().rev().map(|(_, by)| *by).zip(&terms);
             let second: Vec<Term> = turned.map(|(by, (c, _))| (*c, by)).collect();
             let twice: Vec<Term> = terms.iter().chain(&second[..2]).copied().collect();

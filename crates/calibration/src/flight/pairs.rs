@@ -1,7 +1,8 @@
-//! Where to begin without a log: two cameras from what both saw, up to size and place.
+//! Start without a log: the relative pose of two cameras from what both saw, up to scale and place.
 //!
-//! For every offset of their clocks that leaves them enough in common, the essential matrix by eight
-//! points; the offset that fits best tells how the two stand to each other and where the target was.
+//! For every offset of their clocks that leaves them enough labels in common, the essential matrix
+//! by eight points is computed; the offset that fits best gives the relative pose and where the
+//! target was.
 
 use nalgebra::{Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
@@ -10,27 +11,29 @@ use super::model::frame_time;
 use super::plane;
 use crate::lens;
 
-/// Offsets of the clocks are tried in steps of this, s, and then ever finer ones about the best.
+/// Offsets of the clocks are tried in steps of this, s, and then in ever finer ones about the best.
 const STEP_S: f64 = 0.25;
 const FINER: [f64; 3] = [0.05, 0.01, 0.002];
-/// Labels that one try takes.
+/// Labels used in one try.
 const TRIED: usize = 150;
-/// Of these so many must be seen by both cameras, ...
+/// At least this many of them must be seen by both cameras, ...
 const LEAST_COMMON: usize = 40;
-/// ... and so large a share of the smaller one's labels: eight numbers fit any short piece of a way.
+/// ... and this share of the smaller camera's labels: an essential matrix has eight free numbers,
+/// which fit any short piece of a trajectory.
 const LEAST_SHARE: f64 = 0.3;
-/// Of known ways of standing so many sight lines tell whether they meet.
+/// Sight lines needed to tell whether those of a known relative pose meet.
 const LEAST_MET: usize = 15;
-/// A direction between two labels farther apart than this is not known, s: or than so many of its
-/// frames.
+/// Between two labels farther apart than this the direction is taken as unknown, s: or than this
+/// many of the camera's frames.
 const GAP_S: f64 = 0.2;
 const GAP_FRAMES: f64 = 1.5;
-/// Sight lines that meet more sharply than this tell no range, rad.
+/// Sight lines that meet at a smaller angle than this tell no range, rad.
 pub(super) const LEAST_PARALLAX_RAD: f64 = 0.05;
-/// A flight in a plane fits a homography this many times worse than an essential matrix at most, which is of a
-/// whole family then and fits its noise; others fit it hundreds of times worse.
+/// For a flight in a plane the homography's misfit is at most this many times that of the essential
+/// matrix, which is then one of a whole family and fits its noise; for other flights it is hundreds
+/// of times as large.
 const PLANE_TIMES: f64 = 10.0;
-/// Cameras are taken to stand so far apart until something says how far, m.
+/// Distance between two cameras that is assumed until something determines it, m.
 const BASE_M: f64 = 50.0;
 
 /// Directions that a camera saw the target in, by its own clock.
@@ -50,7 +53,7 @@ impl Sights {
         Self { times_s, directions, gap_s }
     }
 
-    /// What several pieces of one camera's labels saw.
+    /// The directions of several pieces of one camera's labels, in order of time.
     pub(super) fn together(pieces: &[&Self]) -> Self {
         let gap_s = pieces.iter().map(|piece| piece.gap_s).fold(0.0, f64::max);
         let seen = |piece: &&Self| {
@@ -62,12 +65,12 @@ impl Sights {
         Self { times_s, directions, gap_s }
     }
 
-    /// How many directions there are.
+    /// Number of directions.
     pub(super) fn len(&self) -> usize {
         self.times_s.len()
     }
 
-    /// The direction at a time; `None` where it was not seen.
+    /// The direction at a time, interpolated between labels; `None` where the target was not seen.
     pub(super) fn at(&self, time_s: f64) -> Option<Vector3<f64>> {
         let next = self.times_s.partition_point(|seen| *seen < time_s);
         let before = next.checked_sub(1)?;
@@ -81,7 +84,7 @@ impl Sights {
         Some((*self.times_s.first()?, *self.times_s.last()?))
     }
 
-    /// Times of labels, evenly spread, at most so many.
+    /// Times and directions of labels, evenly spread, at most `most`.
     fn times(&self, most: usize) -> impl Iterator<Item = (f64, Vector3<f64>)> {
         let stride = self.times_s.len().div_ceil(most).max(1);
         let seen = self.times_s.iter().copied().zip(self.directions.iter().copied());
@@ -89,27 +92,28 @@ impl Sights {
     }
 }
 
-/// How a second camera stands to a first.
+/// Relative pose and clock offset of two cameras.
 #[derive(Clone, Debug)]
 pub(super) struct Pair {
     /// The time by the first's clock less that by the second's, s.
     pub(super) ahead_s: f64,
     pub(super) first_from_second: Rotation3<f64>,
-    /// The second's centre in the first's frame, m if the two stand [`BASE_M`] apart.
+    /// The second's centre in the first's frame, in metres if the two stand [`BASE_M`] apart.
     pub(super) centre: Point3<f64>,
-    /// Median angle by which sight lines miss each other over that by which they meet, and over the
-    /// root of how many there are: what ranges are known by. Less is better.
+    /// Relative uncertainty of ranges: the median angle by which sight lines miss each other,
+    /// divided by the median angle at which they meet and by the root of how many there are. Less
+    /// is better.
     pub(super) doubt: f64,
 }
 
-/// What both see at an offset: directions in the first's frame and in the second's.
+/// Directions that both see at a clock offset, in the first's frame and in the second's.
 fn common(first: &Sights, second: &Sights, ahead_s: f64) -> Vec<[Vector3<f64>; 2]> {
     let both =
         |(time_s, direction): (f64, Vector3<f64>)| Some([direction, second.at(time_s - ahead_s)?]);
     first.times(TRIED).filter_map(both).collect()
 }
 
-/// The essential matrix by eight points, `b' E a = 0`, and the median angle that it leaves.
+/// The essential matrix by eight points, `b' E a = 0`, and the median angle by which it misses.
 fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
     let mut sum = SMatrix::<f64, 9, 9>::zeros();
     for [a, b] in seen {
@@ -119,14 +123,16 @@ fn essential(seen: &[[Vector3<f64>; 2]]) -> (Matrix3<f64>, f64) {
     }
     sum.fill_upper_triangle_with_lower_triangle();
     let eigen = sum.symmetric_eigen();
+    // The eigenvector of the least eigenvalue, columns first as in `outer`.
     let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
     let matrix = Matrix3::from_column_slice(least.as_slice());
     (matrix, misfit(&matrix, seen))
 }
 
-/// The median angle that an essential matrix leaves, rad.
+/// The median angle by which an essential matrix misses, rad.
 fn misfit(matrix: &Matrix3<f64>, seen: &[[Vector3<f64>; 2]]) -> f64 {
     let angle = |[a, b]: &[Vector3<f64>; 2]| {
+        // Angle from the epipolar plane: |b' E a| over the root mean square length of E a and E' b.
         let (of_a, of_b) = (matrix * a, matrix.tr_mul(b));
         let size2 = f64::midpoint(of_a.norm_squared(), of_b.norm_squared());
         b.dot(&of_a).abs() / size2.sqrt().max(1e-12)
@@ -140,8 +146,8 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(f64::INFINITY)
 }
 
-/// How two cameras may stand to each other: of a flight in a plane there are two ways. None where they saw
-/// too little in common.
+/// Possible relative poses of two cameras: a flight in a plane allows two. Empty where they saw too
+/// little in common.
 pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
     let Some((ahead_s, misfit_rad)) = offset(first, second, |seen| essential(seen).1) else {
         return Vec::new();
@@ -151,8 +157,8 @@ pub(super) fn find(first: &Sights, second: &Sights) -> Vec<Pair> {
     in_space.into_iter().chain(in_plane(&seen, ahead_s, misfit_rad)).collect()
 }
 
-/// Two cameras of which it is known how they stand to each other: only their clocks are to be found. None
-/// where what they saw does not fit that, or is too little.
+/// The clock offset of two cameras whose relative pose is known. `None` where what they saw does
+/// not fit that pose, or is too little.
 pub(super) fn known(
     first: &Sights,
     second: &Sights,
@@ -160,6 +166,7 @@ pub(super) fn known(
 ) -> Option<Pair> {
     let second_from_first = (b.0.inverse() * a.0).into_inner();
     let shift = b.0.inverse() * (a.1 - b.1);
+    // E = [t]x R, with the second's frame from the first's: b ~ R a + t.
     let matrix = shift.cross_matrix() * second_from_first;
     let (ahead_s, misfit_rad) = offset(first, second, |seen| misfit(&matrix, seen))?;
     let seen = common(first, second, ahead_s);
@@ -167,7 +174,7 @@ pub(super) fn known(
     Some(Pair::of((second_from_first, unit), &seen, ahead_s, misfit_rad)?.1)
 }
 
-/// The offset of the clocks, s, at which what both see fits best, and by how much it does not.
+/// The clock offset (s) at which what both see fits best, and its misfit.
 fn offset(
     first: &Sights,
     second: &Sights,
@@ -175,7 +182,7 @@ fn offset(
 ) -> Option<(f64, f64)> {
     let ((from, to), (other_from, other_to)) = (first.span()?, second.span()?);
     let fewer = first.times_s.len().min(second.times_s.len());
-    // Of the first's labels that are tried, as many as that share of the fewer.
+    // Of the tried labels of the first, as many as correspond to that share of the fewer labels.
     let share = LEAST_SHARE * fewer as f64 / first.times_s.len() as f64;
     let tried = first.times(TRIED).count();
     let enough = LEAST_COMMON.max((share * tried as f64) as usize);
@@ -209,11 +216,13 @@ fn offset(
     misfit_rad.is_finite().then_some((ahead_s, misfit_rad))
 }
 
-/// The pose of the four that an essential matrix allows, which has most of the target ahead of both.
+/// Of the four poses that an essential matrix allows, the one with most of the target ahead of both
+/// cameras.
 fn decomposed(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Option<Pair> {
+    // E = U diag(1, 1, 0) V': R = U W V' or U W' V' with W a quarter turn about z, and t = +-u3.
     let factors = essential(seen).0.svd(true, true);
     let (mut u, mut v_t) = (factors.u?, factors.v_t?);
-    // nalgebra orders them by size.
+    // nalgebra sorts the singular values, so that the last is the zero.
     if u.determinant() < 0.0 {
         u.neg_mut();
     }
@@ -243,8 +252,8 @@ fn in_plane(seen: &[[Vector3<f64>; 2]], ahead_s: f64, misfit_rad: f64) -> Vec<Pa
 }
 
 impl Pair {
-    /// The median angle by which sight lines of the two pass each other, rad; `None` where too few are of one
-    /// time.
+    /// The median angle by which the two cameras' sight lines pass each other, rad; `None` where
+    /// too few are simultaneous.
     pub(super) fn aside(&self, first: &Sights, second: &Sights) -> Option<f64> {
         let seen = common(first, second, self.ahead_s);
         let second_from_first = self.first_from_second.inverse();
@@ -253,8 +262,8 @@ impl Pair {
         (seen.len() >= LEAST_MET).then(|| misfit(&matrix, &seen))
     }
 
-    /// A second camera that is turned and shifted (by a unit) so against the first, with how many places lie
-    /// ahead of both; `None` if less than half do.
+    /// The pair for a rotation and a unit shift from the first camera to the second, with the
+    /// number of places that lie ahead of both; `None` if less than half do.
     fn of(
         (second_from_first, shift): (Matrix3<f64>, Vector3<f64>),
         seen: &[[Vector3<f64>; 2]],
@@ -270,12 +279,14 @@ impl Pair {
         (2 * ahead >= seen.len()).then_some((ahead, pair))
     }
 
-    /// The angle at which the sight lines of a place meet that lies ahead of both; `None` where they
-    /// meet too sharply to tell.
+    /// The angle at which the sight lines of a place ahead of both meet; `None` where the angle is
+    /// too small to tell.
     fn parallax(&self, [a, b]: &[Vector3<f64>; 2]) -> Option<f64> {
         let b = self.first_from_second * b;
         let (base, cosine) = (self.centre.coords, a.dot(&b));
         let sine2 = 1.0 - cosine * cosine;
+        // The lines' nearest points lie at (base.a - cos base.b) / sin^2 and (cos base.a - base.b)
+        // / sin^2 along a and b: both must be positive.
         let is_ahead = base.dot(a) > base.dot(&b) * cosine && base.dot(a) * cosine > base.dot(&b);
         (is_ahead && sine2 > LEAST_PARALLAX_RAD * LEAST_PARALLAX_RAD).then(|| sine2.sqrt())
     }

@@ -1,4 +1,4 @@
-//! Labels in pieces: what follows one thing through the image.
+//! Splits a camera's labels into pieces that each follow one thing through the image.
 //!
 //! A bird that flies by is seen for a moment, the target for most of the time.
 
@@ -6,23 +6,25 @@ use nalgebra::Vector2;
 
 use super::model::{CameraLabels, Label};
 
-/// From frame to frame nothing moves farther than this share of the image's width: with half of it fast
-/// targets near by fall into pieces, with twice as much a bird goes on where the target was.
+/// From frame to frame nothing moves farther than this share of the image's width: with half of it
+/// fast targets near by fall into pieces, with twice as much a bird continues where the target was.
 const STEP: f64 = 0.03;
-/// A piece ends after so many frames without a label.
+/// A piece ends after this many frames without a label.
 const FRAMES: f64 = 10.0;
-/// The longest pieces that hold this share of all labels are taken: a third may be of other things.
+/// The longest pieces that together have this share of all labels are taken: a third may be of
+/// other things.
 const SHARE: f64 = 0.67;
-/// A piece of fewer labels does not say by itself whether it is of the target.
+/// A piece of fewer labels does not tell by itself whether it is of the target.
 const LEAST: usize = 30;
 
-/// A piece under way: where each of its labels is among all.
+/// A piece under construction: indices of its labels among all.
 struct Piece {
     labels: Vec<usize>,
 }
 
 impl Piece {
-    /// How far a label lies from where the piece has come to, as a share of how far it may.
+    /// Distance of a label from the piece's last one, as a share of the distance allowed; `None` if
+    /// that is exceeded.
     fn away(&self, labels: &[Label], next: &Label, step_px: f64, frame_s: f64) -> Option<f64> {
         let last = &labels[*self.labels.last()?];
         let frames = ((next.time_s - last.time_s) / frame_s).round();
@@ -32,7 +34,7 @@ impl Piece {
     }
 }
 
-/// The labels of the pieces that last longest, in the order of their times.
+/// The labels of the longest pieces, in the order of their times.
 pub(super) fn longest(camera: &CameraLabels, frame_s: f64) -> Vec<Label> {
     let labels = &camera.labels;
     let mut pieces = cut(labels, STEP * f64::from(camera.intrinsics.size.width), frame_s);
@@ -49,7 +51,8 @@ pub(super) fn longest(camera: &CameraLabels, frame_s: f64) -> Vec<Label> {
     taken.into_iter().map(|index| labels[index]).collect()
 }
 
-/// Labels in pieces of one thing each, the longest first, and those of pieces that are too short to say.
+/// Labels in pieces of one thing each, the longest first, and the labels of pieces that are too
+/// short to tell.
 pub(super) fn of_one_thing(camera: &CameraLabels, frame_s: f64) -> (Vec<Vec<Label>>, Vec<Label>) {
     let step_px = STEP * f64::from(camera.intrinsics.size.width);
     let mut pieces: Vec<Vec<Label>> = cut(&camera.labels, step_px, frame_s)
@@ -61,16 +64,17 @@ pub(super) fn of_one_thing(camera: &CameraLabels, frame_s: f64) -> (Vec<Vec<Labe
     (pieces, short.concat())
 }
 
-/// A thing that was lost is the one that comes up next where it was going, within so long, s, ...
+/// A lost thing is taken to be the one that next appears where it was going, within this time, s,
+/// ...
 const LOST_S: f64 = 5.0;
-/// ... within this share of the image's width, and as much again for each second: what turns at arm's length
-/// is missed, and things are few.
+/// ... and within this share of the image's width, plus as much again for each second: what turns
+/// at arm's length is missed, and things are few.
 const ASTRAY: f64 = 0.05;
-/// A thing's speed in the image is that of its first and last so many labels.
+/// The speed of a thing in the image is taken from its first and last labels, this many of each.
 const PACE: usize = 10;
 
-/// Pieces (in their numbers) that go on from one another, as far as can be told by one camera: a thing that
-/// was lost for seconds and found again.
+/// Pieces (by index) that continue one another, as far as one camera can tell: a thing that was
+/// lost for seconds and found again.
 pub(super) fn chains(pieces: &[Vec<Label>], width_px: f64) -> Vec<Vec<usize>> {
     let mut links: Vec<(f64, usize, usize)> = Vec::new();
     for (before, piece) in pieces.iter().enumerate() {
@@ -94,8 +98,8 @@ pub(super) fn chains(pieces: &[Vec<Label>], width_px: f64) -> Vec<Vec<usize>> {
     first.map(chain).collect()
 }
 
-/// How far beside where it was going a thing has come up again, as a share of how far it may; `None` if it
-/// is another.
+/// Distance of a piece's beginning from where another piece was going, as a share of the distance
+/// allowed; `None` if they are of different things.
 fn astray(piece: &[Label], next: &[Label], width_px: f64) -> Option<f64> {
     let (end, start) = (piece.last()?, next.first()?);
     let gap_s = start.time_s - end.time_s;
@@ -106,7 +110,7 @@ fn astray(piece: &[Label], next: &[Label], width_px: f64) -> Option<f64> {
     };
     let from = pace(&piece[piece.len().saturating_sub(PACE)..])?;
     let to = pace(&next[..PACE.min(next.len())])?;
-    // Half of the way at the one pace, and half at the other.
+    // Predicted with the speed before for half of the gap and the speed after for the other half.
     let expected = place(end) + (from + to) * (gap_s / 2.0);
     let beside = (place(start) - expected).norm() / (width_px * ASTRAY * (1.0 + gap_s));
     ((0.0..LOST_S).contains(&gap_s) && beside < 1.0).then_some(beside)

@@ -1,13 +1,13 @@
-//! Two cameras from what both saw of a flight in a plane: any essential matrix of a whole family fits
-//! that, but a homography tells the two poses that can be.
+//! Relative pose of two cameras from a flight in a plane: any essential matrix of a whole family
+//! fits such a flight, but a homography gives the two possible poses.
 
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
-/// Singular values nearer together than this are alike: the cameras stand in one place.
+/// Eigenvalues nearer together than this are equal: the cameras stand in one place.
 const ALIKE: f64 = 1e-6;
 
-/// What takes a first camera's directions to a second's, `b ~ H a`, of places in a plane; and the median
-/// angle that it leaves, rad.
+/// The homography `b ~ H a` from the first camera's directions to the second's, for places in a
+/// plane, and the median angle by which it misses, rad.
 pub(super) fn homography(seen: &[[Vector3<f64>; 2]]) -> Option<(Matrix3<f64>, f64)> {
     let mut sum = SMatrix::<f64, 9, 9>::zeros();
     for [a, b] in seen {
@@ -18,8 +18,8 @@ pub(super) fn homography(seen: &[[Vector3<f64>; 2]]) -> Option<(Matrix3<f64>, f6
     let eigen = sum.symmetric_eigen();
     let least = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
     let matrix = Matrix3::from_column_slice(least.as_slice());
-    // Places lie ahead of both cameras, so that it takes directions to directions and not to their
-    // opposites.
+    // Places lie ahead of both cameras, so the sign is the one that takes directions to directions
+    // and not to their opposites.
     let ahead = seen.iter().filter(|[a, b]| b.dot(&(matrix * a)) > 0.0).count();
     let matrix = if 2 * ahead < seen.len() { -matrix } else { matrix };
     let mut angles: Vec<f64> = seen.iter().map(|[a, b]| (matrix * a).angle(b)).collect();
@@ -27,15 +27,16 @@ pub(super) fn homography(seen: &[[Vector3<f64>; 2]]) -> Option<(Matrix3<f64>, f6
     Some((matrix, *angles.get(angles.len() / 2)?))
 }
 
-/// The second's turn and shift (in units of the plane's distance) that a homography may be of: those of the four
-/// by which all places lie ahead (Ma, Soatto, Kosecka and Sastry 2004, section 5.3.3).
+/// Possible rotation and shift (in units of the plane's distance) of the second camera by a
+/// homography: of the four those with all places ahead (Ma, Soatto, Kosecka and Sastry 2004,
+/// section 5.3.3).
 pub(super) fn poses(
     matrix: &Matrix3<f64>,
     seen: &[[Vector3<f64>; 2]],
 ) -> Vec<(Matrix3<f64>, Vector3<f64>)> {
     let mut values = matrix.singular_values();
     values.as_mut_slice().sort_unstable_by(f64::total_cmp);
-    // H = R + t n'/d has the middle one as its unit.
+    // H = R + t n'/d has the middle singular value one.
     let unit = matrix / values[1];
     let eigen = unit.tr_mul(&unit).symmetric_eigen();
     let mut order = [0, 1, 2];
@@ -49,9 +50,11 @@ pub(super) fn poses(
     let (along, across) =
         ((1.0 - least).max(0.0).sqrt() / scale, (most - 1.0).max(0.0).sqrt() / scale);
     let found = [across, -across].into_iter().flat_map(|across| {
-        // A direction in the plane beside v2 that keeps its length.
+        // A unit vector in the plane spanned by v1 and v3 whose length H keeps, as it does that of
+        // v2.
         let u = v1 * along + v3 * across;
         let normal = v2.cross(&u);
+        // R takes v2, u and their cross product to their images; then t n' = H - R.
         let before = Matrix3::from_columns(&[v2, u, normal]);
         let (hv, hu) = (unit * v2, unit * u);
         let after = Matrix3::from_columns(&[hv, hu, hv.cross(&hu)]);

@@ -1,4 +1,4 @@
-//! What an adjusted flight has shown, with how sure that is.
+//! Results of an adjusted flight, with their uncertainty.
 
 use crossfix_geometry::{Camera, Intrinsics, Pose};
 use crossfix_message::{CameraName, Datum};
@@ -19,53 +19,53 @@ use crate::label_noise::LabelNoise;
 use crate::lens::{self, LensUncertainty};
 use crate::site_file::SiteCalibration;
 
-/// What a flight has shown of one camera.
+/// Result of one camera.
 #[derive(Clone, Debug)]
 pub struct CameraResult {
     /// Whose it is.
     pub name: CameraName,
     /// Lens and pose.
     pub camera: Camera,
-    /// Covariance of the pose with the lens held at what it was found to be: rotation about the
-    /// camera's axes (rad), then position (m).
+    /// Covariance of the pose with the lens fixed at its estimate: rotation about the camera's axes
+    /// (rad), then position (m).
     pub pose_covariance: Matrix6<f64>,
-    /// What is still unknown of the lens.
+    /// Remaining uncertainty of the lens.
     pub lens: LensUncertainty,
     /// Its clock.
     pub clock: ClockResult,
-    /// Its labels' error.
+    /// Error of its labels.
     pub noise: LabelNoise,
     /// Time between its frames, s.
     pub frame_s: f64,
-    /// Range at which it saw the target, in the middle, m.
+    /// Median range at which it saw the target, m.
     pub range_m: f64,
-    /// Labels, those of other things with them.
+    /// Number of labels, including those of other things.
     pub labels: usize,
-    /// Those of them that lie within four deviations.
+    /// Number of labels within four deviations.
     pub used: usize,
-    /// Root mean square of the labels' residuals per axis, of those within four deviations, pixels.
+    /// Root mean square of the residuals of those labels, pixels per axis.
     pub residual_px: f64,
-    /// How many times farther the flight's two halves lie apart in the image than both say: above
-    /// one, the deviations of pose and lens here are made so much larger. Both halves know the same
-    /// lens file and survey, so what is wrong with those does not show. `None`: one half saw too
-    /// little.
+    /// Distance between the results of the flight's two halves in the image, as a multiple of what
+    /// both state: above one, the deviations of pose and lens here are enlarged by it. Both halves
+    /// know the same lens file and survey, so what is wrong with those does not show. `None`: one
+    /// half saw too little.
     pub halves_ratio: Option<f64>,
-    /// The moment at which its residuals change most.
+    /// The moment at which its mean residual changes most.
     pub moved: Option<MovedAt>,
-    /// Its labels where the target's way reaches them, in order of its own time.
+    /// Its labels where the target's trajectory reaches them, in order of its own time.
     pub fitted: Vec<FittedLabel>,
-    /// The focal length against the lens file's.
+    /// The focal length relative to the lens file's.
     pub focal_ratio: f64,
-    /// Its standard deviation.
+    /// Standard deviation of that.
     pub focal_ratio_sd: f64,
 }
 
-/// What a flight has shown of a clock.
+/// Result of a clock.
 #[derive(Clone, Debug)]
 pub struct ClockResult {
     /// Knots, evenly spread over the labels' times.
     pub knots: Vec<ClockKnot>,
-    /// How much more than a second passes in one of its own, and the standard deviation.
+    /// Rate error: how much more than a second passes in one of its own.
     pub rate: f64,
     /// Standard deviation of that.
     pub rate_sd: f64,
@@ -77,7 +77,7 @@ pub struct ClockResult {
     pub readout_sd_s: f64,
 }
 
-/// What a clock is to be corrected by at one of its times.
+/// Correction of a clock at one of its times.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockKnot {
     /// Its own time, s.
@@ -88,36 +88,36 @@ pub struct ClockKnot {
     pub sd_s: f64,
 }
 
-/// What a flight has shown.
+/// Result of a flight.
 #[derive(Clone, Debug)]
 pub struct FlightResult {
-    /// Of each camera that could be calibrated, in the order that they were given in.
+    /// Each camera that could be calibrated, in the order that they were given in.
     pub cameras: Vec<CameraResult>,
-    /// What they may be off by together: the rest here is beside that. `None`: of one camera alone
-    /// nothing is beside it.
+    /// What the cameras may be off by together; their own covariances do not contain it. `None` for
+    /// a single camera, whose covariance has everything.
     pub datum: Option<Datum>,
-    /// The others, and why not.
+    /// The other cameras, and why they were refused.
     pub refused: Vec<(CameraName, Refusal)>,
     /// Power of the target's jerk, m^2/s^5.
     pub jerk: f64,
     /// How the log fits; `None` without one.
     pub log: Option<LogFit>,
-    /// The log's places at times of the way; none without a log.
+    /// The log's samples at times of the trajectory; none without a log.
     pub samples: Vec<FittedSample>,
     /// How each landmark fits, in each camera's picture.
     pub landmarks: Vec<LandmarkMisfit>,
 }
 
-/// How a log fits the way that all have made of it.
+/// How a log fits the adjusted trajectory.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LogFit {
-    /// Its places at times of the way.
+    /// Number of its samples at times of the trajectory.
     pub samples: usize,
-    /// Those of them that lie so far beside the way that they count next to nothing.
+    /// Those of them so far from the trajectory that they count next to nothing.
     pub left_out: usize,
     /// Root mean square of the others' residuals per axis, m.
     pub residual_m: f64,
-    /// What was said to be the standard deviation of each, m per axis.
+    /// Stated standard deviation of each sample, m per axis.
     pub stated_sd_m: f64,
 }
 
@@ -129,12 +129,12 @@ pub(super) fn results(
     let ratios = halves::ratios(flight, priors, &adjusted);
     let followers = Followers::of(&adjusted.state);
     let shown = followers.shown(adjusted.covariance.information())?;
-    let mut of_nobody = adjusted.state.of_linear_jerk(priors);
+    let mut prior_information = adjusted.state.of_linear_jerk(priors);
     if flight.log.is_none() {
-        of_nobody += Gauge::information();
+        prior_information += Gauge::information();
     }
-    let datum = followers.datum(&shown, &of_nobody, flight.log.is_none());
-    // One camera has nothing beside the site: all that it is off by is its own.
+    let datum = followers.datum(&shown, &prior_information, flight.log.is_none());
+    // A single camera has no datum: all that it is off by is its own.
     let datum = (flight.cameras.len() > 1).then_some(datum);
     if datum.is_some() {
         adjusted.covariance.take_off(shown.of_cameras());
@@ -152,7 +152,8 @@ pub(super) fn results(
         let within = |label: &&FittedLabel| label.beside_px.norm() < 4.0 * prior.noise.sd_px();
         let used = fitted.iter().filter(within);
         let squares: Vec<f64> = used.map(|label| square(label.beside_px)).collect();
-        // Cameras that one half saw too little of are no better than the others.
+        // Cameras of which one half saw too little are taken to be as far off as the others on
+        // average.
         let ratio = ratios[index].unwrap_or(typical).max(1.0).powi(2);
         let pose = Pose::new(*camera.rotation.matrix(), camera.centre).ok()?;
         cameras.push(CameraResult {
@@ -198,7 +199,8 @@ fn middle_range(flight: &Flight<'_>, state: &State, index: usize) -> f64 {
     ranges.get(ranges.len() / 2).copied().unwrap_or(1.0)
 }
 
-/// What lies beside the way by more than so many deviations is left out: of normal ones one in 2000.
+/// Samples farther from the trajectory than this many deviations are left out: of normal ones one
+/// in 2000 is.
 const LEFT_OUT: f64 = 4.2;
 
 fn log_fit(log: &FlightLog, samples: &[FittedSample]) -> LogFit {
@@ -217,7 +219,7 @@ fn log_fit(log: &FlightLog, samples: &[FittedSample]) -> LogFit {
     }
 }
 
-/// One camera's part of the covariance of all but the way.
+/// One camera's part of the covariance of all unknowns outside the chain.
 struct Block<'a> {
     covariance: &'a DMatrix<f64>,
     start: usize,
@@ -232,28 +234,30 @@ impl Block<'_> {
         DMatrix::from_fn(n, m, |i, j| self.covariance_of(rows + i, columns + j))
     }
 
-    /// What is unknown of the lens, and how the pose follows it.
+    /// Covariance of the lens, and the pose's regression on it.
     fn lens(&self, lens: usize, ratio: f64) -> Option<LensUncertainty> {
         let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
         let covariance = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        // pose_by_lens = C(pose, lens) C(lens)^-1
         let pose_by_lens = covariance.clone().cholesky()?.solve(&tied.transpose()).transpose();
         Some(LensUncertainty { covariance: covariance * ratio, pose_by_lens })
     }
 
-    /// The pose's covariance where the camera's lens is as it was found: what pose and lens may
-    /// both be off by without a difference in the image is no error of a bearing.
+    /// The pose's covariance with the lens fixed at its estimate: what pose and lens may both be
+    /// off by without a difference in the image is no error of a bearing.
     fn pose_with_lens_held(&self, lens: usize) -> Option<Matrix6<f64>> {
         let pose = self.part(0, 6, 0, 6);
         let tied = self.part(0, 6, POSE_AND_CLOCK, lens);
         let of_lens = self.part(POSE_AND_CLOCK, lens, POSE_AND_CLOCK, lens);
+        // C(pose) - C(pose, lens) C(lens)^-1 C(lens, pose)
         let held = pose - &tied * of_lens.cholesky()?.solve(&tied.transpose());
         let held = (&held + held.transpose()) * 0.5;
         Some(Matrix6::from_column_slice(held.as_slice()))
     }
 }
 
-/// What a clock is to be corrected by is written down each so many seconds: between them one that
-/// wanders by 5 ms in a second is 5 ms off, which its wander says.
+/// Spacing of the stated clock corrections, s: between them a clock that wanders by 5 ms in a
+/// second is 5 ms off, which its stated wander covers.
 const CLOCK_STEP_S: f64 = 5.0;
 
 fn clock_result(
@@ -271,6 +275,7 @@ fn clock_result(
     let steps = ((to - from) / CLOCK_STEP_S).ceil().max(1.0);
     let knot = |k: usize| {
         let time_s = from + (to - from) * k as f64 / steps;
+        // The common time depends on two knots of the wander, on the offset, and on the rate.
         let of_wander = clock.wander.weights(clock.straight_s(time_s));
         let [first, second] = of_wander.map(|(k, weight)| (order.wander(k, index), weight));
         let rate = (start + CLOCK + 1, time_s - clock.reference_s);
@@ -291,7 +296,7 @@ fn clock_result(
 }
 
 impl CameraResult {
-    /// The lens as it was found.
+    /// The lens as estimated.
     pub fn intrinsics(&self) -> &Intrinsics {
         self.camera.model().intrinsics()
     }

@@ -1,20 +1,22 @@
-//! Residuals, each with what it hangs on and how its tails are, and who takes them in.
+//! Residuals, each with the unknowns that it depends on and its kind of tails, and what collects
+//! them.
 
 use super::noise::Tails;
 pub(super) use super::normal::Row;
 
-/// What a label counts, in deviations, that the way does not reach or that lies behind its camera.
+/// Residual, in standard deviations, of a label that the trajectory does not reach or whose target
+/// lies behind the camera.
 pub(super) const UNSEEN: f64 = 1e3;
 
-/// Takes rows in that have their tails in common.
+/// Collects rows that share one kind of tails.
 pub(super) trait Sink {
-    /// Whether it makes anything of what rows hang on.
+    /// Whether it uses the terms of rows, that is the derivatives.
     const TAKES_TERMS: bool = true;
 
     fn take(&mut self, rows: &[Row], tails: Tails);
 }
 
-/// What rows cost together, in units of log likelihood.
+/// The summed cost of rows: twice their negative log likelihood (see [`Tails::loss`]).
 pub(super) struct Cost(pub(super) f64);
 
 impl Sink for Cost {

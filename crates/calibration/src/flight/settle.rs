@@ -1,4 +1,5 @@
-//! Noise, clocks' wander and the target's jerk are found beside the unknowns, round by round.
+//! Estimation of the noise, the clocks' wander and the target's jerk beside the unknowns, round by
+//! round.
 
 use nalgebra::Vector2;
 
@@ -8,14 +9,15 @@ use super::spline::{KNOT_S, THIRD_DIFFERENCE};
 use super::state::{CameraPriors, Flight, Priors, State};
 use crate::label_noise::LabelNoise;
 
-/// Rounds in which deviations and powers are found beside the unknowns.
+/// Rounds in which deviations and powers are estimated beside the unknowns.
 const ROUNDS: usize = 6;
-/// What clocks are usually like, 0.03 ms after a second, is believed as two steps that were seen; the
-/// least is a crystal's.
+/// Prior of a clock's wander, s^2/s: the usual value, 0.03 ms after a second, counts as two steps
+/// that were observed; the least is a crystal's.
 const USUAL_WANDER: f64 = 1e-9;
 const USUAL_STEPS: f64 = 2.0;
 const LEAST_WANDER: f64 = 1e-12;
-/// A round goes on by as much again as it was led, and by this at most.
+/// Extrapolation of the wander from round to round: the value found is multiplied again by the
+/// factor by which it changed, but by this at most.
 const MOST_AHEAD: f64 = 3.0;
 
 /// Adjusts, finds the noise in what is left, and adjusts again.
@@ -43,7 +45,7 @@ pub(super) fn settle(
     Some((adjusted?, priors))
 }
 
-/// Noise, wander and jerk as an adjustment shows them.
+/// Priors with the noise, wander and jerk that an adjustment shows.
 fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
     let state = &adjusted.state;
     let mut cameras = Vec::new();
@@ -53,7 +55,7 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
         let caution = priors.cameras[index].noise.caution(frame_s);
         let explained = explained(flight, adjusted, index, caution);
         let noise = LabelNoise::of(&residuals, explained, frame_s);
-        // Beside a free way one camera's noise may be found to be next to nothing.
+        // Where the trajectory is free, one camera's noise may be found to be next to nothing.
         let before = flight.survey.known(&flight.cameras[index].name).map(|known| known.noise);
         let noise = before.filter(|before| before.sd_px() > noise.sd_px()).unwrap_or(noise);
         let wander = wander(adjusted, index, priors.cameras[index].wander);
@@ -75,7 +77,7 @@ fn learnt(flight: &Flight<'_>, adjusted: &Adjusted, priors: &Priors) -> Priors {
     Priors { jerk: jerk(adjusted), rate_sd: priors.rate_sd, cameras }
 }
 
-/// A camera's residuals with their own times.
+/// A camera's residuals with the times of its own clock.
 pub(super) fn residuals(
     flight: &Flight<'_>,
     state: &State,
@@ -85,16 +87,16 @@ pub(super) fn residuals(
     labels.filter_map(|label| Some((label.time_s, state.see(index, label)?.2.residual))).collect()
 }
 
-/// What of a label's variance the adjustment has taken, pixels^2 an axis, in the mean.
+/// Mean part of a label's variance that the adjustment has absorbed, pixels^2 per axis.
 ///
-/// What way and clock follow from moment to moment they took from labels whose variance had been made
-/// larger ([`LabelNoise::caution`]), so it is that much less. What cameras took is of the mean of many
-/// labels, which is as well known as it says.
+/// What trajectory and clock follow from moment to moment was absorbed from labels whose variance
+/// had been enlarged ([`LabelNoise::caution`]), so it is less by that factor. What the cameras
+/// absorbed comes from the mean of many labels, which is as well known as stated.
 fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize, caution: f64) -> f64 {
     const STRIDE: usize = 20;
     let (mut sum, mut count) = (0.0, 0);
     for label in flight.cameras[index].labels.iter().step_by(STRIDE) {
-        for terms in adjusted.state.told_by(index, label).into_iter().flatten() {
+        for terms in adjusted.state.derivatives(index, label).into_iter().flatten() {
             let chain = adjusted.state.order().chain();
             let of_chain: Vec<Term> =
                 terms.iter().copied().filter(|(unknown, _)| *unknown < chain).collect();
@@ -106,8 +108,8 @@ fn explained(flight: &Flight<'_>, adjusted: &Adjusted, index: usize, caution: f6
     if count == 0 { 0.0 } else { sum / f64::from(count) }
 }
 
-/// The power of a clock's random walk, s^2/s: of its steps' squares, by how many of them the labels
-/// have told (MacKay's fixed point), and of what clocks are like beforehand.
+/// Power of a clock's random walk, s^2/s: from the squares of its steps and the number of steps
+/// that the labels determine (MacKay's fixed point), and from what clocks are usually like.
 fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
     let order = adjusted.state.order();
     let knots = &adjusted.state.cameras[camera].clock.wander;
@@ -116,16 +118,18 @@ fn wander(adjusted: &Adjusted, camera: usize, before: f64) -> f64 {
         let step = [(order.wander(k, camera), -1.0), (order.wander(k + 1, camera), 1.0)];
         let spread = adjusted.covariance.variance(&step);
         squares += (pair[1] - pair[0]).powi(2) / knots.step_s;
+        // Effective number of observed steps: 1 - posterior variance / prior variance, per step.
         told += (1.0 - spread / (before * knots.step_s)).clamp(0.0, 1.0);
     }
     let found = (squares + USUAL_STEPS * USUAL_WANDER) / (told + USUAL_STEPS);
-    // By itself it takes a dozen rounds and more: half of the way is left in each.
+    // The fixed point alone takes a dozen rounds and more, as half of the distance remains after
+    // each.
     let ahead = (found / before).clamp(MOST_AHEAD.recip(), MOST_AHEAD);
     (found * ahead).max(LEAST_WANDER)
 }
 
-/// The power of the jerk that a way shows: what its third differences are, and what they may be
-/// beside (expectation and maximisation).
+/// Power of the jerk that a trajectory shows: its third differences, and their variance
+/// (expectation maximisation).
 pub(super) fn jerk(adjusted: &Adjusted) -> f64 {
     let (way, order) = (&adjusted.state.way, adjusted.state.order());
     let mut sum = 0.0;
@@ -136,5 +140,6 @@ pub(super) fn jerk(adjusted: &Adjusted) -> f64 {
             sum += adjusted.covariance.variance_held(&terms);
         }
     }
+    // The third difference has the variance power x interval^5.
     (sum / (3.0 * way.intervals() as f64) / KNOT_S.powi(5)).max(1e-6)
 }

@@ -1,33 +1,33 @@
-//! The target's way: a uniform cubic B-spline in time, kept smooth by white jerk.
+//! The target's trajectory: a uniform cubic B-spline in time, kept smooth by white jerk.
 
 use nalgebra::{Point3, Vector3};
 
 use super::model::Knots;
 
-/// Time between knots, s. A small drone turns in a second or two; a knot each tenth of one would
-/// cost twice the time and gain nothing, at one each half second turns are cut.
+/// Time between knots, s. A small drone turns in a second or two; a knot each tenth of a second
+/// would cost twice the time and gain nothing, with one each half second turns are cut.
 pub(super) const KNOT_S: f64 = 0.2;
 
-/// Clocks and a log's bias drift from knot to knot of their own, each at so many of the way's: one a
-/// second. Between them a consumer's receiver drifts by 0.1 m and a phone's clock by 2 ms, less than
-/// what is measured in a second; with a knot each 25 s a log of metres was believed where it was
-/// between two.
+/// Clocks and a log's bias drift between knots of their own, one for this many of the trajectory's:
+/// one a second. Between two of them a consumer's receiver drifts by 0.1 m and a phone's clock by
+/// 2 ms, less than what is measured in a second; with a knot each 25 s a log of metres was believed
+/// too much between two knots.
 pub(super) const IN_A_STEP: usize = 5;
 
-/// Coefficients that have a part in one place.
+/// Number of coefficients that the place at one time depends on.
 pub(super) const SPAN: usize = 4;
 
-/// How the place at a time depends on four coefficients.
+/// Weights of four coefficients in the place and velocity at a time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Weights {
     /// The first of the four.
     pub(super) first: usize,
     pub(super) place: [f64; SPAN],
-    /// Of the velocity, 1/s.
+    /// Weights in the velocity, 1/s.
     pub(super) velocity: [f64; SPAN],
 }
 
-/// A way over a range of time.
+/// A trajectory over a range of time.
 #[derive(Clone, Debug)]
 pub(super) struct Spline {
     start_s: f64,
@@ -35,15 +35,16 @@ pub(super) struct Spline {
 }
 
 impl Spline {
-    /// One that stays at the origin from one time to another, and on to a whole number of
-    /// [`IN_A_STEP`] coefficients.
+    /// A trajectory that stays at the origin from one time to another, extended to a whole number
+    /// of [`IN_A_STEP`] coefficients.
     pub(super) fn over(start_s: f64, end_s: f64) -> Self {
         let intervals = ((end_s - start_s) / KNOT_S).ceil().max(1.0) as usize;
         let coefficients = (intervals + SPAN - 1).next_multiple_of(IN_A_STEP).max(2 * IN_A_STEP);
         Self { start_s, coefficients: vec![Vector3::zeros(); coefficients] }
     }
 
-    /// Knots of what drifts beside the way: each stands at the start of [`IN_A_STEP`] intervals.
+    /// Knots of what drifts beside the trajectory: each stands at the start of [`IN_A_STEP`]
+    /// intervals.
     pub(super) fn drift(&self) -> Knots {
         let values = vec![0.0; self.coefficients.len() / IN_A_STEP];
         Knots { start_s: self.start_s, step_s: KNOT_S * IN_A_STEP as f64, values }
@@ -59,6 +60,7 @@ impl Spline {
         let first = at as usize;
         let u = at - first as f64;
         let v = 1.0 - u;
+        // Uniform cubic B-spline basis; u is the share of the interval that has passed.
         let place = [
             v * v * v / 6.0,
             (4.0 - 6.0 * u * u + 3.0 * u * u * u) / 6.0,
@@ -75,7 +77,7 @@ impl Spline {
         Some(Weights { first, place, velocity })
     }
 
-    /// The place at weights that it gave.
+    /// The place for weights that [`Self::weights`] gave.
     pub(super) fn place(&self, weights: &Weights) -> Point3<f64> {
         Point3::from(self.sum(weights.first, &weights.place))
     }
@@ -85,8 +87,8 @@ impl Spline {
         self.sum(weights.first, &weights.velocity)
     }
 
-    /// Third difference of the coefficients from one on: the interval's jerk times the knots'
-    /// distance cubed.
+    /// Third difference of four coefficients from `first` on: the interval's jerk times the knot
+    /// spacing cubed.
     pub(super) fn third_difference(&self, first: usize) -> Vector3<f64> {
         self.sum(first, &THIRD_DIFFERENCE)
     }
@@ -96,21 +98,22 @@ impl Spline {
         terms.map(|(coefficient, weight)| coefficient * *weight).sum()
     }
 
-    /// Takes these places for its coefficients, where there are any.
+    /// Sets its coefficients to these places, where there are any.
     pub(super) fn lead(&mut self, place: impl Fn(f64) -> Option<Vector3<f64>>) {
         for (k, coefficient) in self.coefficients.iter_mut().enumerate() {
-            // A coefficient has its largest part a knot after its first.
+            // A coefficient has its greatest influence one knot after the start of its first
+            // interval.
             let time_s = self.start_s + (k as f64 - 1.0) * KNOT_S;
             *coefficient = place(time_s).unwrap_or(*coefficient);
         }
     }
 
-    /// From when to when, s.
+    /// Its range of time, s.
     pub(super) fn range(&self) -> (f64, f64) {
         (self.start_s, self.start_s + KNOT_S * self.intervals() as f64)
     }
 
-    /// How many intervals it has.
+    /// Number of intervals.
     pub(super) fn intervals(&self) -> usize {
         self.coefficients.len() - (SPAN - 1)
     }

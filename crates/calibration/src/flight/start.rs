@@ -1,4 +1,4 @@
-//! Where to begin: a camera's pose and clock from nothing but its labels and the target's log.
+//! Start with a log: a camera's pose and clock from nothing but its labels and the target's log.
 
 use nalgebra::{DMatrix, Matrix3, Point3, Rotation3, SMatrix, Vector3};
 
@@ -9,30 +9,31 @@ use super::model::{CameraLabels, CameraState, Clock, Label};
 use super::pieces;
 use crate::lens;
 
-/// The clock's offset is tried in steps of this, s: at 10 m/s and 40 m the target is then 0.03 rad
-/// off at most, which a linear solution stands.
+/// Step in which the clock's offset is tried, s: at 10 m/s and 40 m the target is then 0.03 rad off
+/// at most, which a linear solution tolerates.
 const STEP_S: f64 = 0.25;
-/// Labels that one try takes.
+/// Labels used in one try.
 const TRIED: usize = 120;
-/// A try must have so many of them within the log.
+/// At least this many of them must be within the log, ...
 const LEAST_TRIED: usize = 12;
-/// And this share of them.
+/// ... and this share of them.
 const LEAST_SHARE: f64 = 0.4;
-/// A start that lies no farther beside the way than this is not looked for again without birds, rad:
-/// lens files leave up to 4 mrad, and what birds have bent lies tens beside.
+/// A start with a smaller misfit than this is not searched again without birds, rad: lens files
+/// leave up to 4 mrad, and what birds have bent misses by tens of mrad.
 const CLEAR_RAD: f64 = 4e-3;
-/// Of all offsets, the linear solutions of so many are made again without what does not fit them, ...
+/// Of all offsets, this many linear solutions are computed again without the labels that do not
+/// fit, ...
 const CLEANED: usize = 60;
-/// ... and so many are followed up.
+/// ... and this many are refined.
 const FOLLOWED: usize = 12;
 
-/// A pose, and by how much the camera's time is behind the common one.
+/// A possible pose, and how much the camera's clock is behind the common time.
 #[derive(Clone, Debug)]
 struct Candidate {
     rotation: Rotation3<f64>,
     centre: Point3<f64>,
     offset_s: f64,
-    /// What most angles between labels and the log lie below, rad.
+    /// The angle that most misfits between labels and the log lie below ([`linear::typical`]), rad.
     misfit: f64,
 }
 
@@ -40,13 +41,13 @@ struct Candidate {
 #[derive(Clone, Copy, Debug)]
 struct Ray {
     time_s: f64,
-    /// After the frame's time, as a share of the read-out.
+    /// Read-out after the frame's time, as a share of the read-out time.
     row_share: f64,
     direction: Vector3<f64>,
 }
 
-/// A camera's state that fits the log's way, and its median misfit (rad); `None`: no offset makes
-/// enough of its labels fall into the log.
+/// A camera's state that fits the log's trajectory, and its median misfit (rad); `None`: no offset
+/// puts enough of its labels within the log.
 pub(super) fn find(
     camera: &CameraLabels,
     course: &Course,
@@ -56,7 +57,7 @@ pub(super) fn find(
     let by_all = best_of(&all, &all, course, frame_s);
     let is_clear = by_all.as_ref().is_some_and(|found| found.misfit < CLEAR_RAD);
     let by_pieces = || {
-        // Birds bend a linear solution, and not what is refined.
+        // Birds bend a linear solution, but not the robust refinement.
         let pieces = rays(camera, &pieces::longest(camera, frame_s));
         best_of(&pieces, &all, course, frame_s)
     };
@@ -68,21 +69,22 @@ pub(super) fn find(
     Some((state, misfit))
 }
 
-/// Of several things that a camera has followed so many are tried for the target, those that it followed
-/// longest.
+/// Of several things that a camera has followed, this many are tried as the target, those that it
+/// followed longest.
 const THINGS: usize = 6;
-/// A piece whose labels lie within this of the course, in the median, is of the target, rad: from a start by
-/// a piece of a few seconds, and where a lens file is 50 pixels off in a corner, ...
+/// A piece whose median misfit to the course is below this is of the target, rad: first with a
+/// start from a piece of a few seconds, where a lens file may be 50 pixels off in a corner, ...
 const NEAR_RAD: f64 = 0.1;
-/// ... and of a start by all that are near already.
+/// ... then with a start from all pieces that are near already.
 const NEARER_RAD: f64 = 0.02;
 
-/// What is left out is of another thing if the target was seen in the same frame for this share of it: the
-/// parts of a flight that a wrong lens makes fit lie beside the others in time.
+/// What is left out is taken to be of another thing if the target was seen in the same frame for
+/// this share of it: with a wrong lens only parts of a flight fit, but these are not simultaneous
+/// with the rest.
 const AT_ONCE: f64 = 0.5;
 
-/// What of a camera's labels is the target's, where most are of something else: begun with one piece,
-/// joined by those that lie near. `None`: no piece is of the target, or all may be.
+/// A camera's labels of the target, where most are of something else: begun with one piece, joined
+/// by those that lie near. `None`: no piece is of the target, or all may be.
 pub(super) fn among_others(
     camera: &CameraLabels,
     course: &Course,
@@ -107,14 +109,14 @@ pub(super) fn among_others(
     (at_once as f64 > AT_ONCE * left_out as f64).then_some(own)
 }
 
-/// Whether some of the labels, in the order of their times, are of a time.
+/// Whether a time has a label within `within_s`, of labels in order of time.
 pub(super) fn at_once(labels: &[Label], time_s: f64, within_s: f64) -> bool {
     let next = labels.partition_point(|label| label.time_s < time_s - within_s);
     labels.get(next).is_some_and(|label| label.time_s < time_s + within_s)
 }
 
-/// A camera's labels without the pieces that lie far beside the course by a start: they are of something
-/// else.
+/// A camera's labels without the pieces that, by a start, lie far from the course: they are of
+/// something else.
 pub(super) fn without_others(
     camera: &CameraLabels,
     state: &CameraState,
@@ -129,14 +131,14 @@ pub(super) fn without_others(
     of_labels(camera, labels)
 }
 
-/// A camera with other labels than its own.
+/// A camera with other labels in the place of its own.
 pub(super) fn of_labels(camera: &CameraLabels, mut labels: Vec<Label>) -> CameraLabels {
     labels.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
     let CameraLabels { name, intrinsics, freedom, .. } = camera;
     CameraLabels { name: name.clone(), intrinsics: *intrinsics, freedom: *freedom, labels }
 }
 
-/// The best pose over all offsets that begins with a linear solution of some rays, refined by all.
+/// The best pose over all offsets: begun with linear solutions of some rays, refined with all.
 fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<Candidate> {
     let mut found: Vec<Candidate> =
         offsets(some, course)?.flat_map(|offset_s| candidates(some, course, offset_s)).collect();
@@ -150,7 +152,7 @@ fn best_of(some: &[Ray], all: &[Ray], course: &Course, frame_s: f64) -> Option<C
     refined.min_by(|a, b| a.misfit.total_cmp(&b.misfit))
 }
 
-/// All offsets of a clock at which some of its rays fall into the course, s.
+/// All clock offsets at which some of the rays fall into the course, s.
 fn offsets(rays: &[Ray], course: &Course) -> Option<impl Iterator<Item = f64> + use<>> {
     let (first, last) = (rays.first()?.time_s, rays.last()?.time_s);
     let (from, to) = course.range();
@@ -158,7 +160,7 @@ fn offsets(rays: &[Ray], course: &Course) -> Option<impl Iterator<Item = f64> + 
     Some((0..=count).map(move |k| from - last + k as f64 * STEP_S))
 }
 
-/// A camera that stands so, its clock behind by an offset (s).
+/// A camera's state with this pose and with its clock behind by an offset (s).
 pub(super) fn state(
     camera: &CameraLabels,
     course: &Course,
@@ -189,7 +191,7 @@ pub(super) fn misfit_of(camera: &CameraLabels, state: &CameraState, course: &Cou
     linear::median(angles(&pairs, &state.rotation, state.centre))
 }
 
-/// A camera's labels, evenly spread over all of these.
+/// Rays of a camera's labels, at most [`TRIED`], evenly spread.
 fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
     let stride = labels.len().div_ceil(TRIED).max(1);
     let height = f64::from(camera.intrinsics.size.height);
@@ -200,15 +202,15 @@ fn rays(camera: &CameraLabels, labels: &[Label]) -> Vec<Ray> {
     labels.iter().step_by(stride).filter_map(ray).collect()
 }
 
-/// The linear solutions at an offset.
+/// The linear solutions at a clock offset.
 fn candidates(rays: &[Ray], course: &Course, offset_s: f64) -> Vec<Candidate> {
     let Some(pairs) = seen_at(rays, course, offset_s) else { return Vec::new() };
     let maps = [linear::in_space(&pairs), linear::in_plane(&pairs)].into_iter().flatten();
     maps.filter_map(|map| Candidate::of(&map, &pairs, offset_s)).collect()
 }
 
-/// The linear map that fits the labels best over all offsets, whatever its lens and its log's axes, and
-/// by how much it misses them in the median, rad.
+/// The linear map that fits the labels best over all offsets, whatever its lens and its log's axes,
+/// and the misfit that most labels stay below, rad.
 pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(Linear, f64)> {
     let rays = rays(camera, &pieces::longest(camera, frame_time(camera)));
     let maps = offsets(&rays, course)?.filter_map(|offset_s| {
@@ -220,13 +222,13 @@ pub(super) fn mapped(camera: &CameraLabels, course: &Course) -> Option<(Linear, 
     maps.min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// The linear solution at an offset of what fits it.
+/// The linear solution at a clock offset with outliers given less weight.
 fn cleaned(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Candidate> {
     let pairs = seen_at(rays, course, offset_s)?;
     Candidate::of(&linear::robust(&pairs)?, &pairs, offset_s)
 }
 
-/// The directions with what is there at an offset, if there are enough.
+/// Directions with the target's places at a clock offset, if there are enough.
 fn seen_at(rays: &[Ray], course: &Course, offset_s: f64) -> Option<Vec<Seen>> {
     let at = |ray: &Ray| {
         let weights = course.weights(ray.time_s + offset_s)?;
@@ -244,7 +246,7 @@ impl Candidate {
         Some(Self { rotation, centre, offset_s, misfit })
     }
 
-    /// Whether most labels of a piece lie near a course, or at no time of it.
+    /// Whether most labels of a piece lie near a course, or none is within its time.
     fn lies_near(
         &self,
         camera: &CameraLabels,
@@ -261,7 +263,7 @@ impl Candidate {
     }
 }
 
-/// The angles between directions and where a camera that stands so has their places, rad.
+/// Angles between directions and the places as seen by a camera of this pose, rad.
 fn angles(
     pairs: &[Seen],
     rotation: &Rotation3<f64>,
@@ -272,8 +274,8 @@ fn angles(
     })
 }
 
-/// Gauss and Newton's steps of pose, offset and read-out against the log's way, with weights
-/// against outliers; `None` if too few of them fall into the course.
+/// Gauss-Newton refinement of pose and offset against the log's trajectory, with weights against
+/// outliers; `None` if too few rays fall into the course.
 fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Option<Candidate> {
     const STEPS: usize = 25;
     let mut best: Option<Candidate> = None;
@@ -284,6 +286,7 @@ fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Opt
         let mut right = nalgebra::DVector::<f64>::zeros(7);
         let mut seen = Vec::new();
         for ray in rays {
+            // The read-out time is taken to be half of the frame time.
             let time_s = ray.time_s + now.offset_s + 0.5 * frame_s * ray.row_share;
             let Some(weights) = course.weights(time_s) else { continue };
             let (place, velocity) = (course.way.place(&weights), course.way.velocity(&weights));
@@ -291,15 +294,18 @@ fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Opt
             let offset = now.rotation.inverse_transform_vector(&(place - now.centre));
             let range = offset.norm();
             let tangents =
+                // Residual: the predicted direction in the tangent plane of the observed one.
                 crossfix_geometry::tangent_basis(&nalgebra::Unit::new_normalize(ray.direction));
             let seen_at = offset / range;
             let residual = tangents.transpose() * seen_at;
+            // d(offset / range) / d(offset) = (I - s s') / range
             let by_offset = tangents.transpose()
                 * (Matrix3::identity() - seen_at * seen_at.transpose())
                 / range;
             let by_place = by_offset * now.rotation.matrix().transpose();
             let by_rotation = by_offset * offset.cross_matrix();
             let by_time = by_place * velocity;
+            // Cauchy's weights, with the scale of the current misfit.
             let weight = (1.0 + residual.norm_squared() / (scale * scale)).recip();
             let mut rows = SMatrix::<f64, 2, 7>::zeros();
             rows.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
@@ -311,6 +317,7 @@ fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Opt
         if seen.len() < LEAST_TRIED.max((LEAST_SHARE * rays.len() as f64) as usize) {
             break;
         }
+        // A little Levenberg damping.
         for k in 0..7 {
             normal[(k, k)] *= 1.0 + 1e-3;
         }

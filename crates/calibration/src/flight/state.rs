@@ -1,4 +1,4 @@
-//! What is unknown of a flight, and what is known of it before its labels are looked at.
+//! The unknowns of a flight, and what is known of them before its labels are used.
 
 use crossfix_geometry::Intrinsics;
 use nalgebra::{Vector2, Vector3};
@@ -10,10 +10,10 @@ use crate::label_noise::LabelNoise;
 use crate::lens::LensFreedom;
 use crate::survey::Survey;
 
-/// How much too fast or slow a camera's clock runs against the log's: two quartzes, and recorders
-/// that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails. With a wide
-/// one all clocks of a site may be off alike, as a log of metres does not tell: at 2e-4 they were by
-/// 50 ms five minutes later.
+/// Standard deviation of a camera clock's rate error against the log's clock: two quartzes, and
+/// recorders that count. Phones state frame rates that are 2e-3 off, so the prior has heavy tails.
+/// With a wide prior all clocks of a site may be off alike, which a log good to metres does not
+/// show: at 2e-4 they were off by 50 ms five minutes later.
 pub(super) const RATE_SD: f64 = 1e-4;
 
 /// A flight to be adjusted.
@@ -24,23 +24,23 @@ pub(super) struct Flight<'a> {
     pub(super) survey: &'a Survey,
 }
 
-/// What all residuals are held against.
+/// Priors and noise models that all residuals are weighted by.
 #[derive(Clone, Debug)]
 pub(super) struct Priors {
     /// Power of the target's jerk, m^2/s^5.
     pub(super) jerk: f64,
-    /// What a clock's rate may be off by.
+    /// Standard deviation of a clock's rate error.
     pub(super) rate_sd: f64,
-    /// Of each camera.
+    /// Those of each camera.
     pub(super) cameras: Vec<CameraPriors>,
 }
 
 #[derive(Clone, Debug)]
 pub(super) struct CameraPriors {
     pub(super) noise: LabelNoise,
-    /// Of the lens's file.
+    /// The lens as its file states it.
     pub(super) lens: Intrinsics,
-    /// What of it may be otherwise.
+    /// How far the lens may deviate from its file.
     pub(super) freedom: LensFreedom,
     /// Time between frames, s.
     pub(super) frame_s: f64,
@@ -53,17 +53,17 @@ pub(super) struct CameraPriors {
 pub(super) struct State {
     pub(super) way: Spline,
     pub(super) cameras: Vec<CameraState>,
-    /// The log's bias, an axis each; empty without a log.
+    /// The log's bias, one per axis; empty without a log.
     pub(super) bias: Vec<Knots>,
 }
 
 impl State {
-    /// In what order its unknowns stand.
+    /// The order in which the unknowns stand.
     pub(super) fn order(&self) -> Order {
         Order::of(&self.way, self.cameras.len(), self.bias.len())
     }
 
-    /// Where each camera's own unknowns begin, and at last where they end.
+    /// Index of each camera's first own unknown; the last entry is the end of the last camera's.
     pub(super) fn starts(&self) -> Vec<usize> {
         let mut next = self.order().chain();
         let mut starts = vec![next];
@@ -100,7 +100,9 @@ impl State {
         next
     }
 
-    /// What a camera's label differs by, where the way reaches it.
+    /// A label's residual with its derivatives, the spline's weights at its time and the first
+    /// coefficient they belong to; `None` where the trajectory does not reach that time or the
+    /// target lies behind the camera.
     pub(super) fn see(&self, camera: usize, label: &Label) -> Option<(usize, [f64; SPAN], Seen)> {
         let camera = &self.cameras[camera];
         let weights = self.way.weights(camera.time_s(label))?;
@@ -109,7 +111,7 @@ impl State {
     }
 }
 
-/// Half the square of a residual: the mean of both axes, pixels^2.
+/// Half the squared length of a residual: the mean square of both axes, pixels^2.
 pub(super) fn square(residual: Vector2<f64>) -> f64 {
     residual.norm_squared() / 2.0
 }

@@ -1,4 +1,5 @@
-//! What is known of cameras beside what they saw: where they stand, how far apart, that they are level.
+//! Rows of what is known of cameras apart from their labels: where they stand, how far apart, that
+//! they are level.
 
 use nalgebra::{Rotation3, Vector3};
 
@@ -8,8 +9,9 @@ use super::rows::{Row, Sink};
 use super::state::{Flight, State};
 use crate::survey::ENOUGH_PLACES;
 
-/// Whoever sets a camera up holds its picture level to this, rad. It turns a site upright that three
-/// surveyed places do not; with half of it a tripod on a slope would be believed.
+/// Standard deviation of the tilt of a camera's image rows, as people set cameras up, rad. It makes
+/// a site upright where three surveyed places do not; with half of it a tripod on a slope would be
+/// believed.
 const LEVEL_RAD: f64 = 0.1;
 
 impl State {
@@ -22,7 +24,8 @@ impl State {
         sink: &mut impl Sink,
     ) {
         let Some(place) = flight.survey.place(&flight.cameras[index].name) else { return };
-        // Its place is begun with; what is known of the whole pose counts.
+        // An earlier calibration's pose is weighted as a whole in `known_rows`; its place in the
+        // survey only serves the start.
         if flight.known(index).is_some() {
             return;
         }
@@ -56,7 +59,8 @@ impl State {
         }
     }
 
-    /// Cameras are held level, where no log says which way is up.
+    /// Cameras are level to [`LEVEL_RAD`], where neither a log nor enough places say which way is
+    /// up.
     pub(super) fn level_rows(&self, flight: &Flight<'_>, sink: &mut impl Sink) {
         let named = |camera: &&CameraLabels| flight.survey.place(&camera.name).is_some();
         let places = flight.cameras.iter().filter(named).count();

@@ -1,8 +1,9 @@
-//! Which labels are of one target, where cameras followed several things at once and no log tells them apart.
+//! Selects the labels of one target where cameras followed several things at once and no log tells
+//! them apart.
 //!
-//! Two cameras see one thing where the sight lines of a piece of the one's labels meet those of the other's,
-//! by one way of standing to each other and one offset of their clocks. Short pieces of other things do so by
-//! chance; the way of standing that joins most pieces is the true one.
+//! Two cameras see one thing where the sight lines of a piece of one camera's labels meet those of
+//! the other's, with one relative pose and one offset of their clocks. Short pieces of other things
+//! meet by chance; the relative pose that joins most pieces is the true one.
 
 use nalgebra::{Point3, Rotation3};
 
@@ -14,22 +15,22 @@ use super::pairs::{self, Pair, Sights};
 use super::{pieces, start, triangulation};
 use crate::survey::Survey;
 
-/// Where fewer labels than this share were made at once with others, these are birds, which the fits
-/// stand; a target that is followed twice is none of it.
+/// Where fewer labels than this share are simultaneous with others, those are of birds, which the
+/// fits tolerate; a target that is followed twice is none of it.
 const LEAST_AT_ONCE: f64 = 0.02;
-/// Of each camera so many things are begun with, those that it followed longest, ...
+/// This many things are tried per camera, those that it followed longest, ...
 const THINGS: usize = 4;
-/// ... of so many pairs of cameras, those that followed something longest both: each takes seconds of a long
-/// flight, ...
+/// ... of this many pairs of cameras, those of which both followed something longest: each takes
+/// seconds for a long flight, ...
 const PAIRS: usize = 12;
-/// ... and so many pairs of things are joined by others.
+/// ... and this many pairs of things are extended by other pieces.
 const SEEDS: usize = 12;
-/// Sight lines of one thing pass each other by less than this in the median, rad: as lens files leave up to
-/// 4 mrad.
+/// Sight lines of one thing miss each other by less than this in the median, rad: lens files leave
+/// up to 4 mrad.
 const MOST_ASIDE_RAD: f64 = 6e-3;
-/// A piece of which more than this share was made at once with the target's labels is another thing's.
+/// A piece with more than this share of labels simultaneous with the target's is of another thing.
 const MOST_AT_ONCE: f64 = 0.1;
-/// How often two cameras' way of standing is found anew from all that was joined.
+/// How often two cameras' relative pose is computed again from all joined pieces.
 const ROUNDS: usize = 3;
 
 /// A camera's labels in pieces.
@@ -38,7 +39,7 @@ struct Things<'a> {
     frame_s: f64,
     pieces: Vec<Vec<Label>>,
     sights: Vec<Sights>,
-    /// Pieces that go on from one another, the longest first.
+    /// Pieces (by index) that continue one another, the longest chain first.
     chains: Vec<Vec<usize>>,
 }
 
@@ -54,7 +55,7 @@ impl<'a> Things<'a> {
         Self { camera, frame_s, sights, chains, pieces }
     }
 
-    /// The share of labels that were made at once with others.
+    /// The share of labels that are simultaneous with others.
     fn at_once(&self) -> f64 {
         let labels = &self.camera.labels;
         let within_s = 0.5 * self.frame_s;
@@ -62,12 +63,12 @@ impl<'a> Things<'a> {
         pairs.count() as f64 / labels.len().max(1) as f64
     }
 
-    /// How many labels some pieces have.
+    /// Number of labels in some pieces.
     fn labels(&self, taken: &[usize]) -> usize {
         taken.iter().map(|piece| self.pieces[*piece].len()).sum()
     }
 
-    /// What was seen in some pieces.
+    /// Directions of the labels of some pieces.
     fn seen(&self, taken: &[usize]) -> Sights {
         let pieces: Vec<&Sights> = taken.iter().map(|piece| &self.sights[*piece]).collect();
         Sights::together(&pieces)
@@ -79,7 +80,7 @@ impl<'a> Things<'a> {
         start::of_labels(self.camera, labels.collect())
     }
 
-    /// Whether a piece was followed while the others were not.
+    /// Whether a piece was followed at other times than these labels.
     fn is_beside(&self, piece: usize, own: &CameraLabels) -> bool {
         let is_at_once =
             |label: &&Label| start::at_once(&own.labels, label.time_s, 0.5 * self.frame_s);
@@ -88,7 +89,7 @@ impl<'a> Things<'a> {
     }
 }
 
-/// Two cameras, which of their pieces are of one target, and how they stand.
+/// Two cameras, which of their pieces are of one target, and their relative pose.
 struct Joined {
     cameras: [usize; 2],
     pieces: [Vec<usize>; 2],
@@ -96,8 +97,8 @@ struct Joined {
     labels: usize,
 }
 
-/// Each camera's labels of one target that most of them show; as they are where nothing was followed
-/// beside it, or no two cameras tell.
+/// Each camera's labels of the one target that most of them show; all its labels where nothing was
+/// followed beside it, or no two cameras tell.
 pub(super) fn of_one_target(cameras: &[&CameraLabels], survey: &Survey) -> Vec<CameraLabels> {
     let things: Vec<Things<'_>> = cameras.iter().map(|camera| Things::of(camera)).collect();
     let as_they_are = || cameras.iter().map(|camera| (*camera).clone()).collect();
@@ -112,7 +113,7 @@ pub(super) fn of_one_target(cameras: &[&CameraLabels], survey: &Survey) -> Vec<C
     best.labels_of_all(&things)
 }
 
-/// Pairs of things that two cameras followed longest, each taken for one.
+/// Pairs of the things that two cameras followed longest, each pair taken to be one thing.
 fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
     let longest =
         |things: &Things<'_>| things.chains.first().map_or(0, |chain| things.labels(chain));
@@ -143,7 +144,7 @@ fn seeds(things: &[Things<'_>], survey: &Survey) -> Vec<Joined> {
     seeds
 }
 
-/// How two cameras may stand to each other: as an earlier calibration has it, or as what they saw shows.
+/// Possible relative poses of two cameras: from an earlier calibration, or from what they saw.
 fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> Vec<Pair> {
     match cameras.map(|camera| survey.known(&camera.name)) {
         [Some(a), Some(b)] => {
@@ -156,7 +157,7 @@ fn ways(cameras: [&CameraLabels; 2], sights: [&Sights; 2], survey: &Survey) -> V
 }
 
 impl Joined {
-    /// With all pieces that are of the same target; `None` if what it was begun with is not.
+    /// Extended by all pieces of the same target; `None` if too few labels are left.
     fn joined(mut self, things: &[Things<'_>], survey: &Survey) -> Option<Self> {
         for _ in 0..ROUNDS {
             while self.leave_worst_out(things) {}
@@ -185,8 +186,8 @@ impl Joined {
         [0, 1].map(|side| things[self.cameras[side]].own(&self.pieces[side]))
     }
 
-    /// Leaves the piece out that lies farthest beside what the other camera saw of the target; `false` if all
-    /// meet it.
+    /// Removes the piece that misses what the other camera saw of the target most; `false` if none
+    /// misses it.
     fn leave_worst_out(&mut self, things: &[Things<'_>]) -> bool {
         let sights = self.seen(things);
         let mut worst = (MOST_ASIDE_RAD, None);
@@ -205,7 +206,8 @@ impl Joined {
         true
     }
 
-    /// Takes the piece that meets what the other camera saw of the target best; `false` if none does.
+    /// Adds the piece that meets what the other camera saw of the target best; `false` if none
+    /// does.
     fn join_next(&mut self, things: &[Things<'_>]) -> bool {
         let own = self.own(things);
         let sights = self.seen(things);
@@ -228,7 +230,8 @@ impl Joined {
         true
     }
 
-    /// These two cameras' labels of the target, and the others' by where these two saw it.
+    /// These two cameras' labels of the target, and the others' labels that fit where these two saw
+    /// it.
     fn labels_of_all(&self, things: &[Things<'_>]) -> Vec<CameraLabels> {
         let own = self.own(things);
         let sights = self.seen(things);

@@ -1,15 +1,15 @@
-//! Where the target was, from what cameras saw whose poses are known roughly.
+//! Triangulation of the target by cameras whose poses are known roughly.
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::model::{CameraState, FlightLog, LogErrors, LogSample};
 use super::pairs::{LEAST_PARALLAX_RAD, Sights};
 
-/// The target is placed so often, s.
+/// Interval at which the target is placed, s.
 const STEP_S: f64 = 0.1;
-/// Sight lines that pass their common place by more than this are not of one target, rad.
+/// Sight lines that miss their common place by more than this are not of one target, rad.
 const MOST_ASIDE_RAD: f64 = 0.02;
-/// Before lenses and clocks are known none passes nearer than this, rad.
+/// Least misfit assumed while lenses and clocks are not known, rad.
 const LEAST_ASIDE_RAD: f64 = 1e-3;
 
 /// The target's places as a log, by the cameras' common time.
@@ -25,7 +25,7 @@ pub(super) fn log(cameras: &[(&Sights, &CameraState)]) -> FlightLog {
     let placed = (0..steps).filter_map(|k| {
         let time_s = from + k as f64 * STEP_S;
         let seen = |(sights, state): &(&Sights, &CameraState)| {
-            // As yet no clock runs fast or wanders.
+            // At this stage clocks have neither rate nor wander.
             let direction = sights.at(time_s - state.clock.offset_s)?;
             Some((state.centre, state.rotation * direction))
         };
@@ -39,14 +39,15 @@ pub(super) fn log(cameras: &[(&Sights, &CameraState)]) -> FlightLog {
     FlightLog { samples, errors: LogErrors { sd_m, drift_sd_m: 0.0, drift_time_s: 1.0 } }
 }
 
-/// The place that lines (a point and a direction each) pass nearest by, and how far it may be off, m.
-/// `None` where they do not meet, meet behind a camera or too sharply to tell.
+/// The place nearest to all lines (a point and a direction each), and how far it may be off, m.
+/// `None` where they do not meet, or meet behind a camera or at too small an angle to tell.
 pub(super) fn place(lines: &[(Point3<f64>, Vector3<f64>)]) -> Option<(Point3<f64>, f64)> {
     let across = |direction: &Vector3<f64>| Matrix3::identity() - direction * direction.transpose();
     let sum: Matrix3<f64> = lines.iter().map(|(_, direction)| across(direction)).sum();
     let right: Vector3<f64> =
         lines.iter().map(|(centre, direction)| across(direction) * centre.coords).sum();
-    // Two lines that meet at an angle have 1 - cos(angle) as the least of the sum's values.
+    // Normal equations: sum of (I - d d') x = sum of (I - d d') c. Two lines that meet at an angle
+    // have 1 - cos(angle) as the least eigenvalue.
     let least = sum.symmetric_eigenvalues().min();
     if lines.len() < 2 || least < LEAST_PARALLAX_RAD * LEAST_PARALLAX_RAD / 2.0 {
         return None;
@@ -59,5 +60,6 @@ pub(super) fn place(lines: &[(Point3<f64>, Vector3<f64>)]) -> Option<(Point3<f64
         worst = worst.max(aside);
         range_m = range_m.max((place - centre).norm());
     }
+    // The worst misfit in metres, enlarged where the lines meet at small angles.
     (worst < MOST_ASIDE_RAD).then(|| (place, worst * range_m / least.sqrt()))
 }

@@ -1,4 +1,4 @@
-//! What holds the target's way: its jerk, and the log with its bias.
+//! Rows that constrain the target's trajectory: its jerk, and the log with its bias.
 
 use super::model::FlightLog;
 use super::noise::Tails;
@@ -6,14 +6,15 @@ use super::rows::Sink;
 use super::spline::{KNOT_S, SPAN, THIRD_DIFFERENCE};
 use super::state::{Priors, State};
 
-/// A step of the adjustment moves the way by this where nothing else holds it, m: near enough for ten
-/// minutes without a label. With a tenth of it a way that swings out by kilometres in a gap would say
-/// which way round the site is, to 30 mrad.
+/// Deviation of a coefficient's movement in one step of the adjustment where nothing else
+/// constrains the trajectory, m: near enough for ten minutes without a label. With a tenth of it a
+/// trajectory that swings out by kilometres in a gap would determine the site's orientation, to
+/// 30 mrad.
 const REST_M: f64 = 1e5;
 
 impl State {
-    /// White jerk: over an interval its mean has the variance power / interval, so that the third
-    /// difference has power x interval^5.
+    /// White jerk: its mean over an interval has the variance power / interval, so that the third
+    /// difference has the variance power x interval^5.
     pub(super) fn jerk_rows(&self, priors: &Priors, sink: &mut impl Sink) {
         let scale = (priors.jerk * KNOT_S.powi(5)).sqrt().recip();
         let order = self.order();
@@ -27,8 +28,8 @@ impl State {
         }
     }
 
-    /// Where nothing holds the way it stays about where it is: in a gap of minutes white jerk alone
-    /// leaves it to rounding.
+    /// Keeps the trajectory about where it is wherever nothing else constrains it: in a gap of
+    /// minutes white jerk alone leaves it to rounding errors.
     pub(super) fn rest_rows(&self, sink: &mut impl Sink) {
         let order = self.order();
         for k in 0..self.way.coefficients.len() {
@@ -49,6 +50,7 @@ impl State {
                 let chain = (0..SPAN)
                     .map(|k| (order.way(weights.first + k, axis), weights.place[k] * scale));
                 let bias = of_bias.map(|(k, weight)| (order.bias(k, axis), weight * scale));
+                // Residual of a sample: (trajectory + bias - stated place) / sd.
                 let stated = place[axis] + self.bias[axis].at(sample.time_s);
                 (chain.chain(bias).collect(), (stated - sample.position[axis]) * scale)
             });
@@ -57,10 +59,11 @@ impl State {
         self.bias_rows(log, sink);
     }
 
-    /// A bias that forgets itself: `b' = f b + noise`, of the same deviation at all times.
+    /// First-order Gauss-Markov bias: `b' = f b + noise`, with the same deviation at all times.
     pub(super) fn bias_rows(&self, log: &FlightLog, sink: &mut impl Sink) {
         let order = self.order();
         let errors = &log.errors;
+        // f = exp(-step / drift time); the noise has the variance sd^2 (1 - f^2).
         let kept = (-self.bias[0].step_s / errors.drift_time_s).exp();
         let first = errors.drift_sd_m.max(1e-9).recip();
         let next = first / (1.0 - kept * kept).sqrt();

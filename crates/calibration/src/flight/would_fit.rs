@@ -1,4 +1,4 @@
-//! What would make a camera fit that does not: the usual slips.
+//! What would make a camera fit that does not: the usual mistakes.
 
 use std::fmt;
 
@@ -12,33 +12,35 @@ use super::model::CameraLabels;
 use super::model::frame_time;
 use super::start;
 
-/// What fits does so many times better than what was given.
+/// A correction must fit this many times better than what was given.
 const CLEARLY_BETTER: f64 = 3.0;
-/// What is said to fit lies no farther beside the way than this, rad: lens files leave up to 4 mrad.
+/// Largest median misfit of a correction, rad: lens files leave up to 4 mrad.
 const FITS_RAD: f64 = 8e-3;
-/// Another camera's lens fits about as well as any focal length if it misses by no more times as much.
+/// Another camera's lens fits about as well as any focal length if its misfit is at most this many
+/// times as large.
 const LITTLE_WORSE: f64 = 1.5;
-/// A stretch by less than this share is none: lenses move by 2 %, and short flights tell no better.
+/// A stretch by less than this share is not reported: lenses change by 2 %, and short flights tell
+/// no better.
 const LEAST_STRETCH: f64 = 0.05;
-/// Two axes are alike, and at right angles, to this share.
+/// Tolerance of two axes' equality, and of right angles, as a share.
 const ALIKE: f64 = 0.05;
 
-/// What would make a camera fit that does not.
+/// A correction that would make a camera fit.
 #[derive(Clone, Debug, PartialEq)]
 pub enum WouldFit {
-    /// The mirror image of the way: east and north are exchanged, or the height's sign is; what cameras
-    /// see does not tell which.
+    /// The mirror image of the trajectory: east and north are exchanged, or the height's sign is
+    /// wrong; what cameras see does not tell which.
     MirrorImage,
-    /// One axis of the log is so many times as long as it should be against the other two.
+    /// One axis of the log has a wrong scale against the other two.
     Stretched {
         /// Which.
         axis: Axis,
-        /// How many times.
+        /// How many times as long as it should be.
         times: f64,
     },
-    /// A focal length so many times that of the lens's file.
+    /// A focal length other than that of the lens's file.
     Focal {
-        /// How many times.
+        /// How many times that of the file.
         times: f64,
     },
     /// Another camera's lens.
@@ -89,7 +91,7 @@ impl fmt::Display for WouldFit {
     }
 }
 
-/// What makes a camera fit that lies beside the way by an angle, rad.
+/// What makes a camera fit that has this misfit to the course, rad.
 pub(super) fn find(
     camera: &CameraLabels,
     course: &Course,
@@ -101,7 +103,7 @@ pub(super) fn find(
     if start::find(camera, &course.mirrored(), frame_s).is_some_and(|(_, found)| better(found)) {
         return Some(WouldFit::MirrorImage);
     }
-    // Where any linear map fits, the target is the right one.
+    // Where any linear map fits, the labels are of the right target.
     let map = start::mapped(camera, course).filter(|(_, found)| better(*found)).map(|(map, _)| map);
     let stretched = map.as_ref().and_then(stretched);
     if stretched.is_some() {
@@ -118,7 +120,7 @@ pub(super) fn find(
     };
     let lent = others.iter().filter(|other| is_another(other, camera)).filter_map(with_lens);
     let lent = lent.min_by(|a, b| a.0.total_cmp(&b.0));
-    // Another camera's lens may lie near what was zoomed to.
+    // Another camera's lens may be close to the zoomed focal length.
     let zoomed =
         map.as_ref().and_then(zoomed).map(|times| (times, with_focal(camera, course, times)));
     let as_good = |of_lens: f64| {
@@ -130,12 +132,12 @@ pub(super) fn find(
     }
 }
 
-/// Whether a camera has a lens of its own.
+/// Whether another camera has a different lens.
 fn is_another(other: &CameraLabels, camera: &CameraLabels) -> bool {
     other.name != camera.name && other.intrinsics != camera.intrinsics
 }
 
-/// By how much a camera misses the way with another focal length, rad.
+/// A camera's misfit to the course with another focal length, rad.
 fn with_focal(camera: &CameraLabels, course: &Course, times: f64) -> f64 {
     let own = camera.intrinsics;
     let intrinsics = Intrinsics { fx: own.fx * times, fy: own.fy * times, ..own };
@@ -143,9 +145,10 @@ fn with_focal(camera: &CameraLabels, course: &Course, times: f64) -> f64 {
     start::find(&zoomed, course, frame_time(camera)).map_or(f64::INFINITY, |found| found.1)
 }
 
-/// The log's odd axis: a place is seen in M X, so the log's axes are what they should be where M' M is
-/// the identity.
+/// The log's odd axis: a place X is seen along M X, so the log's axes are right where M' M is the
+/// identity (up to scale).
 fn stretched(map: &Linear) -> Option<WouldFit> {
+    // M = s R D^-1 for axes that are stretched by D, so that M' M = s^2 D^-2.
     let inverse = square(&(map.matrix.transpose() * map.matrix))?;
     let lengths = inverse.map(|square| square.sqrt().recip());
     let [axis, one, other] = odd_one(lengths)?;
@@ -154,16 +157,17 @@ fn stretched(map: &Linear) -> Option<WouldFit> {
     ((times - 1.0).abs() > LEAST_STRETCH).then_some(WouldFit::Stretched { axis, times })
 }
 
-/// The lens's focal length against its file's: the image is M X, and M M' is the identity where it is
-/// what it should be.
+/// The focal length relative to the file's: the image is M X, and M M' is the identity (up to
+/// scale) where it is right.
 fn zoomed(map: &Linear) -> Option<f64> {
     let [x, y, ahead] = square(&(map.matrix * map.matrix.transpose()))?;
+    // M = s diag(f, f, 1) R gives M M' = s^2 diag(f^2, f^2, 1).
     let times = ((x * y).sqrt() / ahead).sqrt();
     let is_round = (x / y).ln().abs() < 2.0 * ALIKE;
     (is_round && (times - 1.0).abs() > LEAST_STRETCH).then_some(times)
 }
 
-/// The diagonal of a matrix that has little else.
+/// The diagonal of a matrix that is nearly diagonal.
 fn square(matrix: &Matrix3<f64>) -> Option<[f64; 3]> {
     let diagonal = matrix.diagonal();
     let is_small = |(i, j): (usize, usize)| {
@@ -172,7 +176,7 @@ fn square(matrix: &Matrix3<f64>) -> Option<[f64; 3]> {
     [(0, 1), (0, 2), (1, 2)].into_iter().all(is_small).then_some(diagonal.into())
 }
 
-/// Which of three is unlike the other two, which are alike.
+/// The one of three that differs from the other two, which must be equal; its index comes first.
 fn odd_one(lengths: [f64; 3]) -> Option<[usize; 3]> {
     let apart = |[_, one, other]: [usize; 3]| (lengths[one] / lengths[other]).ln().abs();
     let orders = [[0, 1, 2], [1, 0, 2], [2, 0, 1]];

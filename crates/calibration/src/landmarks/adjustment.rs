@@ -1,4 +1,4 @@
-//! Pose and lens adjusted to clicks, by Levenberg and Marquardt.
+//! Levenberg-Marquardt adjustment of pose and lens to clicks.
 
 use crossfix_geometry::turn_vector;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6};
@@ -7,48 +7,51 @@ use super::LandmarkPicture;
 use super::seen::{self, POSE, Seen, State};
 use crate::lens::{self, LensUncertainty};
 
-/// Steps from a start: from a wrong place by half of the landmarks' range it takes fifteen.
+/// Steps at most: from a place that is wrong by half of the landmarks' range it takes fifteen.
 const STEPS: usize = 40;
-/// Nothing changes any more where the cost falls by less than this.
+/// Relative decrease of the cost below which nothing changes any more.
 const SETTLED: f64 = 1e-9;
-/// Two poses that the clicks tell apart by less than this difference of squares fit alike: three
+/// Two poses fit alike if the clicks tell them apart by less than this difference of squares: three
 /// deviations.
 const ALIKE: f64 = 9.0;
-/// Poses are the same that lie within so many deviations (by the square).
+/// Poses are the same if they are within this many deviations, squared.
 const SAME: f64 = 25.0;
 
-/// A state that fits best of all near it.
+/// State of least cost near a start.
 #[derive(Clone, Debug)]
 pub(super) struct Adjusted {
     pub(super) state: State,
-    /// Sum of the squares, in deviations, of clicks, lens and survey.
+    /// Sum of squared residuals, in deviations, of clicks, lens and survey.
     pub(super) cost: f64,
-    /// Covariance of rotation, centre and lens by what each landmark errs by alone.
+    /// Covariance of rotation, centre and lens from the landmarks' independent errors.
     pub(super) covariance: DMatrix<f64>,
-    /// What the turn of all directions together adds to it.
+    /// Covariance that the common turn of all directions adds.
     by_sky_turn: DMatrix<f64>,
 }
 
 impl Adjusted {
-    /// Whether another pose fits as well, and is another.
+    /// Whether another pose fits as well, and is a different one.
     pub(super) fn is_rivalled_by(&self, other: &Self) -> bool {
         if other.cost > self.cost + ALIKE {
             return false;
         }
         let turned = turn_vector(&(self.state.rotation.inverse() * other.state.rotation)).norm();
         let moved = other.state.centre - self.state.centre;
+        // Mahalanobis distance of the centres, and the turn compared with its variance.
         let place = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         let turns = self.covariance.fixed_view::<3, 3>(0, 0).trace();
         let apart = place.cholesky().map_or(0.0, |factor| moved.dot(&factor.solve(&moved)));
         apart > SAME && turned * turned > SAME * turns
     }
 
-    /// The pose's covariance with the lens held, and the lens with how the pose follows it.
+    /// The pose's covariance with the lens fixed, and the lens's uncertainty with how the pose
+    /// follows it.
     pub(super) fn pose_and_lens(&self) -> Option<(Matrix6<f64>, LensUncertainty)> {
         let all = &self.covariance + &self.by_sky_turn;
         let count = all.nrows() - POSE;
         let tied = all.view((0, POSE), (POSE, count));
         let lens = all.view((POSE, POSE), (count, count)).into_owned();
+        // Regression of the pose on the lens: C(pose, lens) C(lens)^-1.
         let pose_by_lens = lens.clone().cholesky()?.solve(&tied.transpose()).transpose();
         let held = all.view((0, 0), (POSE, POSE)) - &pose_by_lens * tied.transpose();
         let held = (&held + held.transpose()) * 0.5;
@@ -57,7 +60,7 @@ impl Adjusted {
     }
 }
 
-/// The normal equations at a state.
+/// Normal equations at a state.
 struct Equations {
     cost: f64,
     information: DMatrix<f64>,
@@ -72,6 +75,7 @@ impl Equations {
             information: DMatrix::zeros(count, count),
             right: DVector::zeros(count),
         };
+        // Cost r' W r, information J' W J, right side -J' W r.
         for landmark in &picture.landmarks {
             let seen = seen::see(&landmark.at, landmark.pixel, state)?;
             let weight = seen.noise(landmark.click_sd_px).try_inverse()?;
@@ -102,7 +106,7 @@ impl Equations {
         self.right[unknown] -= off * weight;
     }
 
-    /// The step, each unknown's information made larger by a share of itself.
+    /// The step, with each unknown's information enlarged by the share `damping` of itself.
     fn step(&self, damping: f64) -> Option<DVector<f64>> {
         let mut damped = self.information.clone();
         for k in 0..damped.nrows() {
@@ -112,7 +116,8 @@ impl Equations {
     }
 }
 
-/// The factor of a matrix of unknowns whose units differ by many powers of ten.
+/// Cholesky factor of a matrix of unknowns whose units differ by many powers of ten: scaled to a
+/// unit diagonal.
 struct Scaled {
     factor: Cholesky<f64, Dyn>,
     scale: DVector<f64>,
@@ -141,7 +146,7 @@ impl Scaled {
     }
 }
 
-/// The best state near a start; `None` if it leads nowhere, or something is not told at all.
+/// The best state near a start; `None` if none is found, or some unknown is not determined at all.
 pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted> {
     let mut state = start;
     let mut equations = Equations::at(picture, &state)?;
@@ -170,8 +175,8 @@ pub(super) fn adjust(picture: &LandmarkPicture, start: State) -> Option<Adjusted
     is_finite.then_some(Adjusted { state, cost: equations.cost, covariance, by_sky_turn })
 }
 
-/// What a turn of all directions together adds to the unknowns' covariance (consider covariance,
-/// Schmidt): they follow the turn as they follow the clicks that it moves.
+/// Covariance that a common turn of all directions adds to the unknowns (consider covariance,
+/// Schmidt): the unknowns respond to the turn as they respond to the clicks that it moves.
 fn by_sky_turn(
     picture: &LandmarkPicture,
     state: &State,
@@ -183,6 +188,7 @@ fn by_sky_turn(
         let weight = seen.noise(landmark.click_sd_px).try_inverse()?;
         pulled += seen.by.transpose() * weight * seen.by_sky_turn;
     }
+    // P J' W J_turn is the response of the unknowns to the turn.
     let follows = covariance * pulled;
     Some(&follows * picture.sky_turn * follows.transpose())
 }

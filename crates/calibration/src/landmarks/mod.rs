@@ -1,8 +1,8 @@
-//! A camera's pose from one picture: landmarks whose places are known, the sun, stars.
+//! A camera's pose from one picture of landmarks whose places are known, of the sun, or of stars.
 //!
-//! Pose and lens are adjusted to the clicks. A landmark's own error is an error of its click, seen
-//! from where the camera stands; the lens file, and a survey of the camera's place, are measurements
-//! too.
+//! Pose and lens are adjusted to the clicks. A landmark's own error counts as an error of its
+//! click, as seen from where the camera stands; the lens file, and a survey of the camera's place,
+//! are measurements, too.
 
 mod adjustment;
 pub(crate) mod seen;
@@ -20,10 +20,10 @@ use crate::lens::{LensFreedom, LensUncertainty};
 use crate::survey::{ENOUGH_FOR_POSE, LandmarkPlace, SurveyedPlace};
 use adjustment::Adjusted;
 
-/// Something in a picture of which is known where it is.
+/// A landmark of known place or direction in a picture.
 #[derive(Clone, Debug)]
 pub struct Landmark {
-    /// What it is called.
+    /// Its name.
     pub name: String,
     /// Where it was clicked.
     pub pixel: Pixel,
@@ -38,16 +38,16 @@ pub struct Landmark {
 pub struct LandmarkPicture {
     /// Whose picture it is.
     pub camera: CameraName,
-    /// The lens as its file has it.
+    /// The lens as its file states it.
     pub intrinsics: Intrinsics,
-    /// What of it may be otherwise.
+    /// How far the lens may deviate from its file.
     pub freedom: LensFreedom,
-    /// Where the camera stands, if somebody has surveyed it.
+    /// Where the camera stands, if that was surveyed.
     pub place: Option<SurveyedPlace>,
     /// The landmarks.
     pub landmarks: Vec<Landmark>,
-    /// Covariance of what all directions among them may be turned by together, about east, north and up,
-    /// rad^2: of the time at which the sun or stars were seen, say.
+    /// Covariance of the turn that all its directions have in common, about east, north and up,
+    /// rad^2: due to the time at which the sun or stars were seen, for example.
     pub sky_turn: Matrix3<f64>,
 }
 
@@ -90,7 +90,7 @@ pub enum LandmarkError {
         /// Two of the places.
         places: [Point3<f64>; 2],
     },
-    /// No pose fits, or a direction of it is not told at all.
+    /// No pose fits, or a part of the pose is not determined at all.
     #[error(
         "camera `{camera}`: its landmarks tell no pose (are they in one line, or names exchanged?)"
     )]
@@ -104,46 +104,46 @@ fn place(at: Point3<f64>) -> String {
     format!("{:.1}, {:.1}, {:.1} m", at.x, at.y, at.z)
 }
 
-/// What landmarks have told of a camera.
+/// Result of a camera's landmarks.
 #[derive(Clone, Debug)]
 pub struct LandmarkResult {
     /// Whose it is.
     pub name: CameraName,
     /// Lens and pose.
     pub camera: Camera,
-    /// Covariance of the pose with the lens held at what it was found to be: rotation about the
-    /// camera's axes (rad), then position (m).
+    /// Covariance of the pose with the lens fixed at its estimate: rotation about the camera's axes
+    /// (rad), then position (m).
     pub pose_covariance: Matrix6<f64>,
-    /// What is still unknown of the lens.
+    /// Remaining uncertainty of the lens.
     pub lens: LensUncertainty,
-    /// Range of the landmarks, in the middle, m.
+    /// Median range of the landmarks, m.
     pub range_m: f64,
-    /// The focal length against the lens file's.
+    /// The focal length relative to the lens file's.
     pub focal_ratio: f64,
     /// How each landmark fits, in the order that they were given in.
     pub landmarks: Vec<LandmarkFit>,
-    /// Where something is wrong, each landmark without which nothing is.
+    /// Where something is wrong, each landmark without which the rest fits.
     pub suspects: Vec<String>,
-    /// How unlikely it is that clicks, places and lens err by as much as here or more: the chance
-    /// of the sum of their squares.
+    /// Probability that clicks, places and lens err by as much as here or more, by the sum of their
+    /// squares.
     pub chance: f64,
 }
 
 /// How a landmark fits.
 #[derive(Clone, Debug)]
 pub struct LandmarkFit {
-    /// What it is called.
+    /// Its name.
     pub name: String,
-    /// Where it was clicked less where it should be seen, pixels.
+    /// The click less where the landmark should be seen, pixels.
     pub residual_px: Vector2<f64>,
-    /// How far it lies beside where the others and the lens have it, in deviations; `None` where
-    /// they say nothing of that.
+    /// Distance from where the others and the lens have it, in standard deviations; `None` where
+    /// these do not determine that.
     pub deviations: Option<f64>,
 }
 
-/// A camera that may be turned by more than this, rad, is not known to look anywhere.
+/// A camera whose turn is more uncertain than this, rad, has no known pose.
 const MOST_TURN_RAD: f64 = 0.1;
-/// Fits this unlikely are wrong: one in ten thousand pictures.
+/// Fits with a smaller probability than this are wrong: one in ten thousand pictures is by chance.
 const LEAST_CHANCE: f64 = 1e-4;
 
 impl LandmarkResult {
@@ -152,13 +152,14 @@ impl LandmarkResult {
         self.chance < LEAST_CHANCE
     }
 
-    /// Whether the pose is known at all: where nothing tells a turn, or a place, rounding does.
+    /// Whether the pose is determined at all: where nothing determines a turn, or a place, only
+    /// rounding errors do.
     fn is_told(&self) -> bool {
         let part = |from: usize| self.pose_covariance.fixed_view::<3, 3>(from, from).trace().sqrt();
         part(0) < MOST_TURN_RAD && part(3) < self.range_m
     }
 
-    /// The landmark that lies farthest beside where the others have it.
+    /// The landmark farthest, in deviations, from where the others have it.
     pub fn worst(&self) -> Option<&LandmarkFit> {
         self.landmarks
             .iter()
@@ -179,7 +180,8 @@ impl LandmarkResult {
     }
 }
 
-/// Of one whose place is known: one leaves it turning about the line to it.
+/// Least number of landmarks of a camera whose place is known: with one it may turn about the line
+/// to it.
 const LEAST_SURVEYED: usize = 2;
 
 /// Finds a camera's pose and lens by its landmarks.
@@ -193,7 +195,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
     let (given, needed) = if is_surveyed {
         (picture.landmarks.len(), LEAST_SURVEYED)
     } else {
-        // Directions turn the camera and place it nowhere.
+        // Directions determine the rotation but not the place.
         (picture.landmarks.iter().filter(with_places).count(), ENOUGH_FOR_POSE)
     };
     if given < needed {
@@ -219,7 +221,7 @@ pub fn calibrate_landmarks(picture: &LandmarkPicture) -> Result<LandmarkResult, 
     Ok(result)
 }
 
-/// The landmarks without which the others fit.
+/// The landmarks without which the rest fits.
 fn suspects(
     picture: &LandmarkPicture,
     (adjusted, result): (&Adjusted, &LandmarkResult),
@@ -228,7 +230,7 @@ fn suspects(
     let without = |index: usize| {
         let mut rest = picture.clone();
         rest.landmarks.remove(index);
-        // What the wrong one has bent is not to be begun with alone.
+        // Not only the state that the wrong landmark has bent is a start.
         let mut starts = start::starts(&rest).unwrap_or_default();
         starts.push(adjusted.state.clone());
         let adjusted = starts.into_iter().filter_map(|start| adjustment::adjust(&rest, start));
@@ -247,7 +249,8 @@ fn suspects(
     likely.into_iter().filter_map(without).collect()
 }
 
-/// So many landmarks, those that lie farthest beside, are left out in turn: each is a calibration.
+/// Number of landmarks that are left out in turn, those with the largest deviations: each takes a
+/// calibration.
 const MOST_SUSPECTS: usize = 12;
 
 fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResult> {
@@ -265,7 +268,7 @@ fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResu
         })
         .collect();
     ranges.sort_unstable_by(f64::total_cmp);
-    // Two numbers a click; what the lens file says makes up for what is free of it.
+    // Two numbers per click; the lens's free parameters are balanced by as many from its file.
     let measured = 2 * picture.landmarks.len() + if picture.place.is_some() { 3 } else { 0 };
     let chance = ChiSquared::new((measured - 6) as f64).ok()?.sf(adjusted.cost);
     Some(LandmarkResult {
@@ -281,18 +284,19 @@ fn result(picture: &LandmarkPicture, adjusted: &Adjusted) -> Option<LandmarkResu
     })
 }
 
-/// Where only directions were seen, targets are taken to be so far away, m.
+/// Range that is assumed where only directions were seen, m.
 const DISTANT_M: f64 = 1000.0;
 
-/// How a landmark fits, held against what the others leave open (its part of the covariance is in
-/// the residual's).
+/// How a landmark fits, compared with what the others leave open: its own influence on the estimate
+/// is taken out of the residual's covariance.
 fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
     let seen = seen::see(&landmark.at, landmark.pixel, &adjusted.state)?;
     let noise = seen.noise(landmark.click_sd_px);
     let by = &seen.by;
+    // Covariance of the residual after the fit: R - J P J'.
     let explained = by * &adjusted.covariance * by.transpose();
     let left: Matrix2<f64> = noise - explained.fixed_view::<2, 2>(0, 0);
-    // What is left is nothing where this landmark alone tells something.
+    // That covariance is nearly zero where this landmark alone determines something.
     let is_told = left.symmetric_eigenvalues().min() > 1e-3 * noise.trace();
     let weight = left.try_inverse().filter(|_| is_told);
     let squared = weight.map(|weight| seen.residual.dot(&(weight * seen.residual)));
@@ -303,10 +307,10 @@ fn fit(landmark: &Landmark, adjusted: &Adjusted) -> Option<LandmarkFit> {
     })
 }
 
-/// What trackers err by where no flight has shown it: the middle of what hands did on the cameras of
-/// data sets 1 and 3.
+/// Label noise of trackers that is assumed where no flight has shown it: the middle of that of
+/// hand-made labels of the cameras of data sets 1 and 3.
 const USUAL_NOISE: LabelNoise = LabelNoise { white_px: 0.2, lasting_px: 0.5, lasting_s: 1.0 };
-/// Where nobody has said how often a camera takes pictures, s.
+/// Time between frames that is assumed where none is stated, s.
 const USUAL_FRAME_S: f64 = 1.0 / 30.0;
 
 impl From<&LandmarkResult> for CalibratedCamera {

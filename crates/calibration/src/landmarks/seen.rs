@@ -1,4 +1,4 @@
-//! A landmark in a picture.
+//! Predicted image of a landmark, with derivatives.
 
 use crossfix_geometry::{Intrinsics, Pixel};
 use nalgebra::{
@@ -8,7 +8,7 @@ use nalgebra::{
 use crate::lens;
 use crate::survey::LandmarkPlace;
 
-/// Unknowns of a pose: rotation about the camera's axes (rad), then its centre (m).
+/// Number of unknowns of a pose: rotation about the camera's axes (rad), then its centre (m).
 pub(crate) const POSE: usize = 6;
 
 /// A camera's pose and lens.
@@ -29,27 +29,28 @@ impl State {
     }
 }
 
-/// A click against where a state has it.
+/// A click, compared with where a state has the landmark.
 #[derive(Clone, Debug)]
 pub(crate) struct Seen {
-    /// Where it should be less where it is, pixels.
+    /// The predicted pixel less the click, pixels.
     pub(crate) residual: Vector2<f64>,
-    /// By pose and lens.
+    /// Derivatives by pose and lens.
     pub(crate) by: OMatrix<f64, U2, Dyn>,
-    /// By what the landmark's own place or direction may be off by, in deviations.
+    /// Derivatives by the error of the landmark's own place or direction, in its standard
+    /// deviations.
     pub(crate) by_place: Matrix2x3<f64>,
-    /// By a turn of all directions about east, north and up, rad; nothing where it is a place.
+    /// Derivatives by a turn of all directions about east, north and up, rad; zero for a place.
     pub(crate) by_sky_turn: Matrix2x3<f64>,
 }
 
 impl Seen {
-    /// Covariance of the click with what the landmark's own place may be off by, pixels^2.
+    /// Covariance of the click, with that due to the landmark's own place, pixels^2.
     pub(crate) fn noise(&self, click_sd_px: f64) -> Matrix2<f64> {
         self.by_place * self.by_place.transpose() + Matrix2::identity() * click_sd_px.powi(2)
     }
 }
 
-/// A landmark as a state sees it, against where it was clicked; `None` behind the camera.
+/// A landmark as a state sees it, compared with its click; `None` behind the camera.
 pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<Seen> {
     let camera_from_world = state.rotation.inverse();
     let offset = match at {
@@ -60,6 +61,7 @@ pub(crate) fn see(at: &LandmarkPlace, clicked: Pixel, state: &State) -> Option<S
     let by_place: Matrix2x3<f64> = seen.by_point * camera_from_world.matrix();
     let count = lens::numbers(&state.intrinsics);
     let mut by = OMatrix::<f64, U2, Dyn>::zeros(POSE + count);
+    // R <- R exp(d) turns the point in the camera by point x d.
     by.fixed_columns_mut::<3>(0).copy_from(&(seen.by_point * offset.cross_matrix()));
     let (by_place, by_sky_turn) = match at {
         LandmarkPlace::Place { sd_m, .. } => {

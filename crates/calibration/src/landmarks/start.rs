@@ -1,4 +1,4 @@
-//! Where a camera may stand that sees its landmarks as it does.
+//! Possible poses of a camera that sees its landmarks as it does: starts for the adjustment.
 
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, Vector3};
 
@@ -7,15 +7,15 @@ use super::{LandmarkError, LandmarkPicture};
 use crate::lens;
 use crate::survey::LandmarkPlace;
 
-/// Places that are tried lie on so many directions from the landmarks' middle, evenly spread ...
+/// Places are tried in this many directions from the landmarks' mean, evenly spread ...
 const DIRECTIONS: usize = 60;
-/// ... and as far away as things of the landmarks' spread are seen under the clicks' angles, and
-/// nearer and farther: not all are seen from the front.
+/// ... and at these multiples of the distance from which things of the landmarks' spread are seen
+/// under the clicks' angles: nearer and farther, as not all landmarks are seen from the front.
 const DISTANCES: [f64; 5] = [0.4, 0.7, 1.0, 1.4, 2.0];
-/// So many of them are adjusted, those with the least misfit.
+/// Number of these that are adjusted, those with the least misfit.
 const ADJUSTED: usize = 40;
 
-/// Poses to adjust from. Of each place the rotation that fits best is known in closed form.
+/// Poses to adjust from. For each place the rotation that fits best is known in closed form.
 pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkError> {
     let mut clicked = Vec::with_capacity(picture.landmarks.len());
     for landmark in &picture.landmarks {
@@ -48,14 +48,14 @@ pub(super) fn starts(picture: &LandmarkPicture) -> Result<Vec<State>, LandmarkEr
     Ok(tried.into_iter().map(|(_, rotation, place)| state((rotation, place))).collect())
 }
 
-/// Root mean square of the clicks' angles from their middle, rad.
+/// Root mean square of the clicks' angles from their mean direction, rad.
 fn angle_of(clicked: &[(Vector3<f64>, LandmarkPlace)]) -> f64 {
     let middle: Vector3<f64> = clicked.iter().map(|(direction, _)| direction).sum();
     let squares: f64 = clicked.iter().map(|(direction, _)| direction.angle(&middle).powi(2)).sum();
     (squares / clicked.len() as f64).sqrt().max(1e-4)
 }
 
-/// Places round the landmarks, which are seen under an angle.
+/// Places round the landmarks from which their spread is seen under an angle.
 fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
     let known: Vec<Point3<f64>> = picture
         .landmarks
@@ -75,7 +75,7 @@ fn places(picture: &LandmarkPicture, angle: f64) -> Vec<Point3<f64>> {
     DISTANCES.into_iter().flat_map(place).collect()
 }
 
-/// Directions evenly spread over the sphere, along a spiral.
+/// Directions evenly spread over the sphere, along a golden-angle spiral.
 fn spiral(k: usize) -> Unit<Vector3<f64>> {
     let golden = std::f64::consts::PI * (3.0 - 5.0f64.sqrt());
     let up = 1.0 - (2.0 * k as f64 + 1.0) / DIRECTIONS as f64;
@@ -84,8 +84,8 @@ fn spiral(k: usize) -> Unit<Vector3<f64>> {
     Unit::new_normalize(Vector3::new(across * cos, across * sin, up))
 }
 
-/// The rotation that turns what was clicked best towards the landmarks as seen from a place
-/// (Wahba's problem, by singular values), and the squares that it leaves.
+/// The rotation that best turns the clicked directions towards the landmarks as seen from a place
+/// (Wahba's problem, by singular values), with the sum of squares that remains (first).
 fn turned(
     clicked: &[(Vector3<f64>, LandmarkPlace)],
     centre: Point3<f64>,
@@ -98,6 +98,7 @@ fn turned(
         };
         pairs.push((*direction, world.into_inner()));
     }
+    // B = sum of world own' = U S V': R = U diag(1, 1, det(U V')) V'.
     let sum: Matrix3<f64> = pairs.iter().map(|(own, world)| world * own.transpose()).sum();
     let factors = sum.svd(true, true);
     let (u, v_t) = (factors.u?, factors.v_t?);

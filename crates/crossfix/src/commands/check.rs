@@ -112,7 +112,8 @@ fn check_camera(args: &Args) -> anyhow::Result<String> {
     Ok(toml::to_string(&file)?)
 }
 
-/// Where a camera stands and looks, as a person sees whether the pose is the one that was meant.
+/// Where a camera stands and looks, in words that let a person see whether the pose is the intended
+/// one.
 fn view_of(camera: &Camera) -> String {
     let place = camera.pose().position();
     let axis = camera.pose().rotation() * Vector3::z();

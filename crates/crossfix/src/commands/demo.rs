@@ -24,16 +24,17 @@ use crate::shutdown::{LEAVE, Shutdown};
 
 /// The scene that the demo plays, as in `configs/demo`.
 const SCENE: &str = include_str!("../../../../configs/demo/scene.toml");
-/// The camera that is told where to look.
+/// The narrow camera, which is told where to look.
 const NARROW: &str = include_str!("../../../../configs/demo/narrow.toml");
-/// How well the pose of a camera on a mount at rest has been found, mrad and m: as by a flight of ten
-/// minutes. As little as a careful survey knows would make it no better than the wide ones.
+/// Pose SDs (rotation, mrad; position, m) of a camera on a mount, at rest, as found by a flight of
+/// ten minutes. With the accuracy of a careful survey alone it would be no better than the wide
+/// cameras.
 const MOUNTED_POSE_SD: (f64, f64) = (0.1, 0.02);
-/// How long children may take to come up, and to stop.
+/// How long child processes may take to start, and to stop.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Time between the last component's coming up and the first frame, s.
+/// Time from the start of the last component to the first frame, s.
 const RUN_UP_S: f64 = 1.0;
-/// Time that the tracks need to be found: not counted against them, s after the targets appear.
+/// Time granted for finding the tracks, not counted against them, s after the targets appear.
 const SETTLING_S: f64 = 1.5;
 
 /// See it work: a simulated site, real processes, Zenoh, fusion, a recording, and the error.
@@ -70,7 +71,7 @@ pub struct Args {
     json: bool,
 }
 
-/// A process of the demo; it is stopped when this is dropped.
+/// A process of the demo; it is stopped when this value is dropped.
 struct Component {
     name: String,
     child: Child,
@@ -94,7 +95,7 @@ impl Component {
         Ok(Self { name: name.to_owned(), child })
     }
 
-    /// Whether it still runs; an error if it failed.
+    /// Whether the process still runs; an error if it failed.
     fn runs(&mut self, folder: &Path) -> anyhow::Result<bool> {
         match self.child.try_wait()? {
             None => Ok(true),
@@ -108,12 +109,12 @@ impl Component {
         }
     }
 
-    /// Asks it to stop by the end of its stdin.
+    /// Asks the process to stop by closing its stdin.
     fn ask_to_stop(&mut self) {
         drop(self.child.stdin.take());
     }
 
-    /// Asks it to stop, and waits.
+    /// Asks the process to stop, and waits for it.
     fn stop(mut self) -> anyhow::Result<()> {
         self.ask_to_stop();
         let deadline = Instant::now() + PATIENCE;
@@ -130,7 +131,7 @@ impl Component {
 
 impl Drop for Component {
     fn drop(&mut self) {
-        // After `stop` there is nothing left to end; on an error this is the last resort.
+        // After `stop` there is no process left to end; on an error this is the last resort.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -144,15 +145,15 @@ struct Files {
     cameras: BTreeMap<CameraName, PathBuf>,
     recording: PathBuf,
     picture: PathBuf,
-    /// The cameras' streams, where they are network cameras.
+    /// The simulated network cameras, if the demo uses them.
     streams: Option<Streams>,
 }
 
-/// Network cameras.
+/// Simulated network cameras: where their streams are served, and the files for that.
 struct Streams {
     address: SocketAddr,
     scene: PathBuf,
-    /// The recording of what is true.
+    /// The recording of the true positions.
     truth: PathBuf,
 }
 
@@ -211,7 +212,7 @@ enum Ending {
     Interrupted,
 }
 
-/// Starts everything, follows it to its end, stops it.
+/// Starts all components, follows the run to its end, and stops them.
 fn play(
     args: &Args,
     files: &Files,
@@ -245,7 +246,7 @@ fn play(
         let arguments = ["agent", "-c", &text(file), "--wait-for-recorder", "--start-at", &begin];
         agents.push(start(name.as_str(), &arguments)?);
     }
-    // Agents end with their scene; what watches a stream goes on when that has ended.
+    // Agents of a scene end with it; agents that watch a stream go on after it has ended.
     let (mut players, mut watchers) = (agents, Vec::new());
     if let Some(Streams { address, scene, truth }) = &files.streams {
         let (scene, address, truth) = (text(scene), address.to_string(), text(truth));
@@ -281,7 +282,7 @@ fn play(
     }
     bar.finish_and_clear();
     if interrupted {
-        // All at once: who is asked to stop waits for nobody.
+        // All are asked at once, as one that is asked to stop waits for no other.
         players.iter_mut().chain([&mut fusion, &mut recorder]).for_each(Component::ask_to_stop);
     }
     watchers.iter_mut().for_each(Component::ask_to_stop);
@@ -311,8 +312,8 @@ fn progress_bar(duration: f64) -> ProgressBar {
     bar
 }
 
-/// The newest state of every confirmed track as a line of the progress bar; a frame holds only the
-/// tracks that it changes.
+/// The newest state of every confirmed track as a line of the progress bar. A frame holds only the
+/// tracks that it changes, so `tracks` keeps the others.
 fn newest(
     subscription: &crossfix_transport::Subscription,
     tracks: &mut BTreeMap<u64, crossfix_message::Track>,
@@ -343,9 +344,9 @@ fn newest(
     heard.then(|| format!("{} tracks  {}", confirmed.len(), confirmed.join("  ")))
 }
 
-/// A network on this machine's own ports that nobody uses now.
+/// A network on ports of this machine that are free at present.
 fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
-    // All are held until all are known, so that none is given twice.
+    // All ports are kept open until all are known, so that none is assigned twice.
     let mut held = Vec::new();
     let mut endpoint = || -> anyhow::Result<String> {
         let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
@@ -371,7 +372,7 @@ fn free_network(world: &World) -> anyhow::Result<NetworkConfig> {
     })
 }
 
-/// Network cameras at a port of this machine that nobody uses now.
+/// Network cameras on a port of this machine that is free at present.
 fn free_streams(folder: &Path) -> anyhow::Result<Streams> {
     let listener = TcpListener::bind("127.0.0.1:0").context("no free port on 127.0.0.1")?;
     Ok(Streams {
@@ -385,7 +386,7 @@ fn write(path: &Path, text: &str) -> anyhow::Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// The pose of a camera of the scene, as a person would give it.
+/// The pose of a camera of the scene, as a person would write it in its file.
 fn pose_of(camera: &SimulatedCamera) -> PoseConfig {
     let pose = PoseConfig::of(camera.camera().pose());
     if camera.pan_tilt().is_none() {
@@ -446,7 +447,8 @@ fn write_files(
                 source: files.streams.is_none().then_some(ClockSourceName::Simulated),
                 offset_s: clock.offset_s,
                 drift_ppm: clock.drift_ppm,
-                // Of a network camera nobody knows that well how late it reports.
+                // For a network camera nobody knows its reporting delay that well, so the default
+                // applies.
                 sd_s: files.streams.is_none().then_some(1e-4),
             },
             preview: Default::default(),

@@ -17,7 +17,8 @@ use toml_edit::{DocumentMut, Item, Table, value};
 use crate::config::load_network;
 use crate::output;
 
-/// Where certificates and authority are put unless the network file says otherwise.
+/// Folders of certificates and authority, and the name of its key, unless the network file says
+/// otherwise.
 const CERTIFICATES: &str = "certificates";
 const AUTHORITY: &str = "authority";
 const AUTHORITY_KEY: &str = "authority.key";
@@ -77,7 +78,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         write(&security, identity, &issued)?;
         rows.push(row(identity, hosts, &issued));
     }
-    // Last: the network file believes nobody who has not been issued a certificate.
+    // Written last, because from then on the network file admits only components with a
+    // certificate.
     if secured != read(&args.config)? {
         output::write_file(&args.config, &[], secured.as_bytes())?;
     }
@@ -104,7 +106,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The components of a network, with the hosts at which others connect to each.
+/// Components of a network, each with the hosts under which others connect to it.
 fn hosts_of(network: &NetworkConfig) -> BTreeMap<Identity, Vec<String>> {
     let host = |endpoint: &str| host_of(endpoint).to_owned();
     let cameras = network.cameras.iter();
@@ -124,7 +126,7 @@ fn hosts_of(network: &NetworkConfig) -> BTreeMap<Identity, Vec<String>> {
     hosts
 }
 
-/// How long the certificate that a component has here is believed, if there is one.
+/// End of validity of a component's certificate on this host, if there is one.
 fn end_of(network: &NetworkConfig, identity: &Identity) -> Option<SystemTime> {
     let security = network.security.as_ref()?;
     let credentials = Credentials::load(security, identity, SystemTime::now()).ok()?;
@@ -135,8 +137,8 @@ fn read(path: &Path) -> anyhow::Result<String> {
     fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
-/// A network file with `[security]`, if it has none, and with a revocation counted. All else in it stays
-/// as it was written.
+/// Text of a network file with a `[security]` table added if it has none, and with a revocation
+/// counted. All else in it stays as it was written.
 fn secured(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<String> {
     let mut file: DocumentMut =
         read(path)?.parse().with_context(|| format!("{} is no TOML", path.display()))?;
@@ -153,14 +155,14 @@ fn secured(path: &Path, revoked: Option<&Identity>) -> anyhow::Result<String> {
     Ok(file.to_string())
 }
 
-/// What a network file, in a folder, says of certificates.
+/// The security settings of a network file that lies in `folder`.
 fn security_of(text: &str, folder: &Path) -> anyhow::Result<Security> {
     let network: NetworkConfig = crate::config::parse(text, &[])?;
     let security = network.security.context("the network file has no [security]")?;
     Ok(Security { certificates: folder.join(&security.certificates), ..security })
 }
 
-/// The site's authority: the one that there is, or a new one.
+/// The site's authority: the existing one, or a new one.
 fn authority(
     folder: &Path,
     security: &Security,
@@ -200,7 +202,7 @@ fn private_folder(folder: &Path) -> anyhow::Result<()> {
     made.with_context(|| format!("cannot make {}", folder.display()))
 }
 
-/// Writes what only its owner may read.
+/// Writes a file that only its owner may read.
 fn write_private(path: &Path, text: &str) -> anyhow::Result<()> {
     let part = path.with_extension("part");
     let write = || -> std::io::Result<()> {

@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes places as a log that `calibrate flight --log` reads.
+/// Writes positions as a log that `calibrate flight --log` reads.
 fn write_log(path: &Path, samples: &[Sample]) -> anyhow::Result<()> {
     let mut text = String::from("time_s,east_m,north_m,up_m\n");
     for (time_s, place) in samples {

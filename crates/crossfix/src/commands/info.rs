@@ -66,7 +66,7 @@ fn print(info: &RecordingInfo) {
     }
 }
 
-/// Whether what a component counts was lost, or not used.
+/// Whether a component's counter counts messages that were lost or not used.
 fn is_a_loss(counter: &str) -> bool {
     ["received_", "rejected_", "bad_", "unseen_"].iter().any(|kind| counter.starts_with(kind))
 }

@@ -1,4 +1,4 @@
-//! The subcommands, a module each, each thin.
+//! The subcommands, one thin module each.
 
 use clap::Subcommand;
 

@@ -1,8 +1,9 @@
-//! Numbers as people write them on the command line: read, or refused with their range.
+//! Numbers on the command line: parsed, or refused with the permitted range.
 
-/// A time of this century, seconds since the Unix epoch, and what simulations begin with.
+/// Latest time accepted, seconds since the Unix epoch: the end of this century. The earliest is 0,
+/// at which simulations begin.
 const LAST_WALL_TIME: f64 = 4_102_444_800.0;
-/// The fastest that anything is played: a day in a minute and a half.
+/// Highest playing speed: a day takes a minute and a half.
 const MOST_SPEED: f64 = 1000.0;
 
 pub fn number(text: &str) -> Result<f64, String> {
@@ -29,7 +30,7 @@ pub fn not_negative(text: &str) -> Result<f64, String> {
         .and_then(|n| if n >= 0.0 { Ok(n) } else { Err("it must not be negative".to_owned()) })
 }
 
-/// How many times as fast as in life; 0 is as fast as it goes.
+/// Speed relative to real time; 0 is as fast as possible.
 pub fn speed(text: &str) -> Result<f64, String> {
     within(text, 0.0, MOST_SPEED, "")
 }
@@ -39,23 +40,23 @@ pub fn wall_time(text: &str) -> Result<f64, String> {
     within(text, 0.0, LAST_WALL_TIME, " s since the Unix epoch")
 }
 
-/// How often something is said to others, a second.
+/// How often tracks are sent to other programs, per second.
 #[cfg(feature = "centre")]
 pub fn outlet_rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 100.0, " a second")
 }
 
-/// Seconds, an hour at most.
+/// A time in seconds, at most an hour.
 pub fn seconds_of_an_hour(text: &str) -> Result<f64, String> {
     within(text, 0.0, 3600.0, " s")
 }
 
-/// Frames a second.
+/// Frames per second.
 pub fn rate(text: &str) -> Result<f64, String> {
     within(text, 0.001, 10_000.0, " frames a second")
 }
 
-/// So many numbers with commas between them.
+/// `N` numbers with commas between them.
 #[cfg(any(feature = "centre", feature = "viewer"))]
 fn several<const N: usize>(text: &str, example: &str) -> Result<[f64; N], String> {
     let numbers = text.split(',').map(number).collect::<Result<Vec<f64>, String>>()?;
@@ -69,7 +70,7 @@ pub fn triple(text: &str) -> Result<[f64; 3], String> {
     several(text, "-80,-80,10")
 }
 
-/// A place on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
+/// A position on the Earth: degrees of latitude and longitude, metres above the ellipsoid.
 #[cfg(any(feature = "centre", feature = "viewer"))]
 pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
     let [latitude, longitude, height] = triple(text)?;
@@ -77,7 +78,7 @@ pub fn place(text: &str) -> Result<crossfix_geometry::Geodetic, String> {
         .map_err(|error| error.to_string())
 }
 
-/// The edges of a picture of the ground: its south-western and north-eastern corner.
+/// Edges of a picture of the ground: its south-western and north-eastern corners.
 #[cfg(feature = "viewer")]
 pub fn edges(text: &str) -> Result<[crossfix_geometry::Geodetic; 2], String> {
     let [south, west, north, east] = several(text, "48.352,11.783,48.356,11.789")?;

@@ -24,7 +24,8 @@ pub struct Args {
     output: PathBuf,
 }
 
-/// What was read, to be compared: how many messages, and all of them in their order.
+/// Summary of what was read, for comparison: the number of messages, and a hash over all in their
+/// order.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Tally {
     messages: u64,
@@ -39,7 +40,7 @@ impl Tally {
         (self.messages, self.all) = (self.messages + 1, hasher.finish());
     }
 
-    /// What a whole file holds.
+    /// Tally of a complete file.
     fn of(path: &Path) -> anyhow::Result<(Self, ReadReport)> {
         let mut tally = Self::default();
         let report = RecordingReader::open(path)?.for_each(|entry| {
@@ -85,7 +86,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes what can be read of a recording, and whose it is.
+/// Writes what can be read of a recording, and the source it states, to a new file.
 fn rewrite(from: &Path, to: &Path) -> anyhow::Result<(Tally, ReadReport)> {
     let info = RecordingInfo::of(from)?;
     let has_beside = info.foreign > 0;

@@ -33,7 +33,7 @@ pub struct Args {
     stop_with_stdin: bool,
 }
 
-/// Which of the network's routers this one is.
+/// Endpoint of the network's router that this process is.
 fn own_endpoint(network: &NetworkConfig, asked: Option<&String>) -> anyhow::Result<String> {
     if let Some(asked) = asked {
         ensure!(
@@ -57,7 +57,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     tracing::info!("the router of `{}` is up at {endpoint}, run {}", link.site(), link.run());
     service::ready(&format!("routing at {endpoint}"));
-    // It has no health of its own: its log says when its certificate is to be renewed.
+    // A router publishes no health: its log says when its certificate needs renewal.
     let mut certificate = link.certificate().cloned().map(WatchedCertificate::new);
     while !shutdown.requested() {
         std::thread::sleep(POLL);

@@ -149,7 +149,7 @@ fn record(
     Ok(messages)
 }
 
-/// What a camera with perfect clock and tracker but noisy pixels would publish of one frame.
+/// What a camera with a perfect clock and tracker but noisy pixels would publish of one frame.
 fn exposure(
     world: &World,
     camera: &SimulatedCamera,
@@ -202,7 +202,7 @@ fn film(camera: &SimulatedCamera, path: &Path) -> anyhow::Result<()> {
     let mut file = BufWriter::new(std::fs::File::create(path)?);
     let description = camera.description();
     let [width, height] = description.size_px;
-    // Y4M's rate is a fraction.
+    // Y4M writes the rate as a fraction.
     let millihertz = (description.rate_hz * 1000.0).round() as u64;
     writeln!(file, "YUV4MPEG2 W{width} H{height} F{millihertz}:1000 Ip A1:1 Cmono")?;
     for index in 0..camera.frames() {

@@ -19,11 +19,11 @@ use crate::pace::wall_seconds;
 use crate::parts;
 use crate::shutdown::Shutdown;
 
-/// How often is looked whether it is to stop.
+/// How often it is checked whether to stop.
 const POLL: Duration = Duration::from_millis(100);
 /// How long cameras on the network may take to answer a broadcast.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(1);
-/// Different troubles that are told: a camera that fails in more ways has failed.
+/// Most different errors that are listed: a camera that fails in more ways is useless anyway.
 const MOST_TROUBLES: usize = 10;
 
 /// Try a camera: what it sends, how often, and what its clock is worth.
@@ -69,7 +69,7 @@ pub struct Args {
     json: bool,
 }
 
-/// What a camera does.
+/// What was observed of a camera.
 #[derive(Debug, Default, Serialize)]
 pub struct Tried {
     pub url: String,
@@ -78,27 +78,28 @@ pub struct Tried {
     pub frames: u64,
     /// Frames that could not be decoded.
     pub bad_frames: u64,
-    /// Frames that this host was too slow for.
+    /// Frames dropped because this host was too slow.
     pub left_out: u64,
-    /// Until the first image came, s.
+    /// Time until the first image came, s.
     pub first_image_s: f64,
-    /// 1/s.
+    /// Frames per second.
     pub rate_hz: f64,
     /// The longest time between two images, s.
     pub longest_interval_s: f64,
-    /// Until the camera said what its clock shows, s.
+    /// Time until the camera first reported what its clock shows, s.
     pub first_report_s: Option<f64>,
-    /// How long after the time that the camera says an image was here, the median, s: what it takes to
-    /// come here and what the two clocks are apart.
+    /// Median time from the capture time that the camera states to the image's arrival, s: the
+    /// delay on the way plus the difference of the two clocks.
     pub arrival_after_capture_s: Option<f64>,
-    /// By how much the camera's clock is ahead of this host's, where that is too much to be believed, s.
+    /// How far the camera's clock is ahead of this host's, s; only given if that is too much to be
+    /// plausible.
     pub camera_ahead_s: Option<f64>,
-    /// What went wrong.
+    /// Errors that occurred.
     pub troubles: Vec<String>,
 }
 
 impl Tried {
-    /// Takes an image in; returns how long after the time that the camera says it was here, s.
+    /// Takes an image in; returns how long after its stated capture time it arrived, s.
     fn see(&mut self, frame: &Frame, before: Option<&Frame>, begun: Instant) -> Option<f64> {
         (self.width, self.height) = (frame.width, frame.height);
         let arrival = frame.live?;
@@ -156,13 +157,13 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-/// The camera that is to be tried; `None` if none is named.
+/// The camera to be tried; `None` if none is named.
 fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     if let Some(path) = &args.config {
         let file = CameraFile::load(path, &[])?;
         let wrong = || format!("the configuration file {} has an error", path.display());
         let size = match &file.source {
-            // The size of its images is that of the lens.
+            // These cameras are set to the image size of the lens.
             SourceConfig::Usb { .. } | SourceConfig::Gige { .. } => {
                 Some(file.described(path)?.model().intrinsics().size)
             }
@@ -210,7 +211,7 @@ fn camera(args: &Args) -> anyhow::Result<Option<LiveCamera>> {
     Ok(Some(LiveCamera::Stream(RtspCamera::new(options))))
 }
 
-/// Says what a network camera shows, and whether something turns it.
+/// Prints a network camera's streams, and whether it has a mount.
 #[cfg(feature = "onvif")]
 fn describe(service: &str, args: &Args) -> anyhow::Result<()> {
     let service = service.parse().context("this is no address")?;
@@ -229,13 +230,13 @@ fn describe(service: &str, args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Says that this build cannot.
+/// The error of a build without ONVIF.
 #[cfg(not(feature = "onvif"))]
 fn describe(_: &str, _: &Args) -> anyhow::Result<()> {
     Err(parts::is_left_out("network cameras by ONVIF", "onvif"))
 }
 
-/// Says which cameras hang on this host and, where it is to ask, which are on its networks.
+/// Lists the cameras attached to this host and, if asked to search, those on its networks.
 fn list(args: &Args) -> anyhow::Result<()> {
     let own = usb_cameras().into_iter();
     let mut cameras: Vec<Listed> =
@@ -267,14 +268,14 @@ fn list(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A camera of this host, or one that has answered.
+/// A camera of this host, or one on the network that has answered.
 #[derive(Debug, Serialize)]
 struct Listed {
     device: String,
     name: String,
 }
 
-/// Watches a camera for some seconds; returns its last image as well.
+/// Watches a camera for some seconds; returns what was observed, and its last image.
 pub fn try_out(camera: LiveCamera, seconds: f64) -> (Tried, Option<Frame>) {
     let shutdown = Shutdown::listen();
     let mut tried = Tried { url: camera.address(), ..Tried::default() };

@@ -19,7 +19,7 @@ use super::{Kind, SourceConfig};
 use crate::calibrated::Calibrated;
 use crate::recorded;
 
-/// One camera: what it is, where it stands, where its pictures come from, how it follows targets.
+/// One camera: its name, lens and pose, where its pictures come from, and how it follows targets.
 /// Paths are relative to the file.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -28,33 +28,33 @@ pub struct CameraFile {
     pub name: CameraName,
     /// The network's file (TOML).
     pub network: PathBuf,
-    /// The site's calibration (TOML, by crossfix calibrate): lens and pose as it found them stand in the
-    /// place of `intrinsics` and `pose`, and times are corrected by its clock after `clock`.
+    /// The site's calibration (TOML, by crossfix calibrate): its lens and pose replace `intrinsics`
+    /// and `pose`, and times that `clock` has corrected are corrected further by its clock.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<PathBuf>,
-    /// Intrinsics (YAML of OpenCV, ROS or Kalibr: `camchain.yaml#cam1` of several cameras). May be absent
-    /// with a recording, which has its own; if both this and `pose` are there, they replace the recorded
-    /// calibration.
+    /// Intrinsics (YAML of OpenCV, ROS or Kalibr: `camchain.yaml#cam1` picks one of several
+    /// cameras). May be absent with a recording, which has its own; if both this and `pose` are
+    /// there, they replace the recorded calibration.
     pub intrinsics: Option<PathBuf>,
-    /// Where it stands and looks.
+    /// Where the camera stands and looks.
     pub pose: Option<PoseConfig>,
-    /// What turns it, if something does: then it looks for what the fusion centre tells it to look
-    /// for.
+    /// The mount that turns the camera, if it has one: the camera then looks for what the fusion
+    /// centre tells it to look for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mount: Option<MountConfig>,
-    /// Whether it says which of its tracks is what the fusion centre tells it to look for, if nothing
-    /// turns it.
+    /// For a camera without a mount: whether it reports which of its tracks is the target that the
+    /// fusion centre tells it to look for.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub takes_cues: bool,
-    /// Where its pictures come from.
+    /// Where the pictures come from.
     pub source: SourceConfig,
-    /// What its capture times are worth.
+    /// How accurate the capture times are, and how they are corrected.
     #[serde(default)]
     pub clock: ClockConfig,
     /// Small pictures for people.
     #[serde(default)]
     pub preview: PreviewConfig,
-    /// Targets that are taken up in the first image: left, top, width, height in pixels.
+    /// Targets to follow from the first image on: left, top, width, height in pixels.
     #[serde(default)]
     pub boxes: Vec<[f64; 4]>,
     /// How targets are found and followed.
@@ -62,32 +62,35 @@ pub struct CameraFile {
     pub tracker: TrackerConfig,
 }
 
-/// An industrial camera stamps the exposure itself, and is asked for its clock over a quick network, s.
+/// Clock SD of an industrial camera, s: it stamps the exposure itself, and its clock is read over a
+/// quick network.
 const GIGE_CLOCK_SD_S: f64 = 1e-3;
-/// What a driver's times and an exposure that nobody has told are off by, s.
+/// Clock SD of a camera of this host, s: from the driver's times and from an exposure time that
+/// nobody has stated.
 const USB_CLOCK_SD_S: f64 = 0.01;
 
-/// What capture times are worth, and how they are corrected.
+/// How accurate capture times are, and how they are corrected.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClockConfig {
     /// What sets the camera's clock: `ntp`, `ptp`, `gnss`, `host` (nothing does), `simulated`;
-    /// `frame-count` (default of files), where there is none; `camera` (default of streams), where
-    /// nobody has said; `arrival`, where a stream's own times are not to be believed.
+    /// `frame-count` (default of files), where there is no clock; `camera` (default of streams),
+    /// where it is unknown what sets it; `arrival`, where a stream's own times are not to be
+    /// trusted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub source: Option<ClockSourceName>,
-    /// What the camera's clock shows too much at the start, s: of a stream, also how much later than
-    /// the exposure the instant is that the camera reports.
+    /// How far the camera's clock is ahead at the start, s. Of a stream it includes how much later
+    /// than the exposure the instant is that the camera reports.
     pub offset_s: f64,
-    /// How much too fast it runs, millionths.
+    /// How much too fast the clock runs, millionths.
     pub drift_ppm: f64,
-    /// Standard deviation of a corrected capture time, s. Default 0.001, of a stream 0.1: some cameras
-    /// report when an image was sent.
+    /// Standard deviation of a corrected capture time, s. Default 0.001, of a stream 0.1, as some
+    /// cameras report when an image was sent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sd_s: Option<f64>,
 }
 
-/// A clock's source as people write it.
+/// A clock's source as it is written in files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ClockSourceName {
@@ -120,9 +123,9 @@ impl From<ClockSourceName> for ClockSource {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PreviewConfig {
-    /// Pictures a second; 0 is none. Default 4.
+    /// Pictures per second; 0 means none. Default 4.
     pub rate_hz: f64,
-    /// The picture's sides as a fraction of the camera's, 1/n. Default 2, half.
+    /// Divisor of the camera's width and height, 1/n. Default 2, half.
     pub divisor: u32,
 }
 
@@ -133,7 +136,7 @@ impl Default for PreviewConfig {
 }
 
 impl CameraFile {
-    /// Reads the file and makes its paths absolute or relative to where we are.
+    /// Reads the file and resolves its paths against the file's folder.
     pub fn load(path: &Path, sets: &[String]) -> anyhow::Result<Self> {
         let mut file: Self = super::load(path, sets, Kind::Camera)?;
         let folder = path.parent().unwrap_or(Path::new("."));
@@ -158,7 +161,8 @@ impl CameraFile {
             }
         }
         if file.source.is_live() && file.boxes.is_empty() && file.tracker.detector.is_none() {
-            // Nobody knows where targets will be in what has not been filmed yet.
+            // No boxes can be given for a scene that has not been filmed yet, so a detector finds
+            // the targets.
             file.tracker.detector = Some(DetectorConfig::default());
         }
         file.clock.source = Some(file.clock.source.unwrap_or_else(|| file.usual_clock().0));
@@ -166,14 +170,14 @@ impl CameraFile {
         Ok(file)
     }
 
-    /// Checks everything that can be checked without starting, and returns the camera.
+    /// Checks all that can be checked without starting, and returns the camera.
     pub fn camera(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         self.check().and_then(|()| self.source.check_there()).with_context(wrong)?;
         self.described(path)
     }
 
-    /// The camera that the file describes, whether or not its pictures are there yet.
+    /// The camera that the file describes, whether or not its pictures exist yet.
     pub fn described(&self, path: &Path) -> anyhow::Result<Camera> {
         let wrong = || format!("the configuration file {} has an error", path.display());
         self.check().with_context(wrong)?;
@@ -200,7 +204,7 @@ impl CameraFile {
         }
     }
 
-    /// The lens that the file's intrinsics describe, whatever else is there yet.
+    /// The lens that the file's intrinsics describe, whatever else is missing.
     pub fn lens(&self, path: &Path) -> anyhow::Result<Intrinsics> {
         let intrinsics = self.intrinsics.as_ref().with_context(|| {
             format!(
@@ -212,13 +216,13 @@ impl CameraFile {
             .with_context(|| format!("the configuration file {} has an error", path.display()))
     }
 
-    /// What the file declares of its pose's deviations: of the rotation, rad, and the position, m.
+    /// The pose's standard deviations as the file declares them: rotation, rad, and position, m.
     #[cfg(feature = "centre")]
     pub fn declared_pose_sd(&self) -> Option<(f64, f64)> {
         self.pose.as_ref().and_then(PoseConfig::deviations)
     }
 
-    /// The camera as the site's calibration has it, where the file names one.
+    /// The camera as the site's calibration describes it, if the file names one.
     pub fn calibrated(&self) -> anyhow::Result<Option<Calibrated>> {
         let load = |path: &PathBuf| Calibrated::load(path, &self.name).context("key `calibration`");
         self.calibration.as_ref().map(load).transpose()
@@ -259,8 +263,8 @@ impl CameraFile {
         self.source.check_pace()
     }
 
-    /// Checks what needs the lens: that it shows a direction for every pixel, and that boxes are in
-    /// its image.
+    /// Checks what needs the lens: that every pixel has a direction, and that the boxes are in its
+    /// image.
     fn check_lens(&self, camera: &Camera) -> anyhow::Result<()> {
         let ImageSize { width, height } = camera.model().intrinsics().size;
         let (right, bottom) = (f64::from(width) - 1.0, f64::from(height) - 1.0);
@@ -291,8 +295,8 @@ impl CameraFile {
         Ok(())
     }
 
-    /// Opens the pictures and holds them against the lens: what else an agent would find out only
-    /// when it starts.
+    /// Opens the pictures and compares their size with the lens's: errors that an agent would
+    /// otherwise find only when it starts.
     pub fn check_pictures(&self, camera: &Camera) -> anyhow::Result<()> {
         let SourceConfig::Video { path, .. } = &self.source else {
             return Ok(());
@@ -313,8 +317,8 @@ impl CameraFile {
         Ok(())
     }
 
-    /// The message that describes the camera: the recorded one as it is, where it is replayed with
-    /// its own, so that the same bytes give the same tracks.
+    /// The message that describes the camera. A replay without a calibration of its own uses the
+    /// recorded message unchanged, so that the same bytes give the same tracks.
     pub fn calibration(
         &self,
         camera: &Camera,
@@ -337,7 +341,7 @@ impl CameraFile {
         }
     }
 
-    /// Frames a second, where the file or its scene says so.
+    /// Frames per second, if the file or its scene states it.
     #[cfg(feature = "centre")]
     pub fn rate_hz(&self) -> anyhow::Result<Option<f64>> {
         match &self.source {
@@ -354,7 +358,7 @@ impl CameraFile {
         }
     }
 
-    /// What sets the clock that its capture times are by.
+    /// What sets the clock of the capture times.
     pub fn clock_source(&self) -> ClockSource {
         self.clock.source.unwrap_or_else(|| self.usual_clock().0).into()
     }
@@ -364,7 +368,8 @@ impl CameraFile {
         self.clock.sd_s.unwrap_or_else(|| self.usual_clock().1)
     }
 
-    /// What sets the clock of such a source, and its standard deviation, s, where nobody has said.
+    /// Clock source of this kind of source, and its standard deviation, s, where the file does not
+    /// state them.
     fn usual_clock(&self) -> (ClockSourceName, f64) {
         match self.source {
             SourceConfig::Stream(_) | SourceConfig::Gstreamer(_) => {
@@ -376,8 +381,8 @@ impl CameraFile {
         }
     }
 
-    /// The camera that it watches live, if it watches one. One of this host is set to the size, or left as it
-    /// is set.
+    /// The live camera that it watches, if any. A camera of this host is set to `size`, or left as
+    /// it is set.
     pub fn live(&self, size: Option<ImageSize>) -> anyhow::Result<Option<LiveCamera>> {
         let by_arrival = self.clock_source() == ClockSource::Arrival;
         let by_arrival_sd_s = by_arrival.then(|| self.clock_sd_s());
@@ -412,7 +417,7 @@ impl CameraFile {
         })
     }
 
-    /// The boxes of targets to take up.
+    /// The boxes of targets to follow from the first image on.
     pub fn boxes(&self) -> impl Iterator<Item = PixelBox> {
         self.boxes.iter().map(|&[x, y, width, height]| PixelBox { x, y, width, height })
     }
@@ -430,7 +435,7 @@ fn recorded_calibration(recording: &Path, name: &CameraName) -> anyhow::Result<C
     found.with_context(|| format!("the calibration of camera `{name}` in {}", recording.display()))
 }
 
-/// Reads a lens file; of a file of several cameras, Kalibr's, the one behind `#`.
+/// Reads a lens file. Of a file of several cameras (Kalibr's) the one named after `#` is taken.
 fn read_lens(path: &Path) -> anyhow::Result<Intrinsics> {
     let named = path.to_str().filter(|_| !path.exists()).and_then(|path| path.rsplit_once('#'));
     let file = named.map_or(path, |(file, _)| Path::new(file));

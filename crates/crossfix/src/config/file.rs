@@ -4,13 +4,13 @@ use std::path::Path;
 use anyhow::{Context, anyhow, bail};
 use serde::de::DeserializeOwned;
 
-/// Names within this edit distance, relative to their length, are taken for a slip of the finger.
+/// Names more similar than this (Jaro-Winkler similarity, 0 to 1) are taken for a typing error.
 const SIMILAR: f64 = 0.6;
 
 /// Reads a TOML file into a configuration; `sets` are `key=value` overrides with dotted keys.
 ///
-/// The error names the file, the line, the key and, for an unknown key, the nearest known one.
-/// A file of another kind than is wanted is named as what it is.
+/// The error names the file, the line, the key and, for an unknown key, the nearest known one. If
+/// the file is of another kind than `wanted`, the error says which.
 pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> anyhow::Result<T> {
     let text = std::fs::read_to_string(path)
         .with_context(|| format!("cannot read the configuration file {}", path.display()))?;
@@ -26,7 +26,7 @@ pub fn load<T: DeserializeOwned>(path: &Path, sets: &[String], wanted: Kind) -> 
     })
 }
 
-/// What a configuration file is of.
+/// Kind of a configuration file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     Camera,
@@ -38,7 +38,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// What a file is by its keys; `None` if they say nothing.
+    /// Kind of a file by its keys; `None` if they do not tell.
     pub fn of(keys: &toml::Table) -> Option<Self> {
         let has = |names: &[&str]| names.iter().any(|name| keys.contains_key(*name));
         if has(&["form"]) {
@@ -88,7 +88,7 @@ pub fn parse<T: DeserializeOwned>(text: &str, sets: &[String]) -> anyhow::Result
 fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
     let (key, value) =
         set.split_once('=').ok_or_else(|| anyhow!("`--set {set}` is not of the form key=value"))?;
-    // A value that is no TOML is taken as text, so that nobody has to quote twice.
+    // A value that is not valid TOML is taken as text, so that nobody has to quote twice.
     let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
         .ok()
         .and_then(|mut parsed| parsed.remove("value"))
@@ -107,8 +107,8 @@ fn apply(table: &mut toml::Table, set: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A parser's message, which shows the line, without what logs in: all between `//` and `@`, and what
-/// is given as a password.
+/// A parser's message, which shows the faulty line, without credentials: without all between `//`
+/// and `@`, and without what is given as a password.
 fn without_passwords(message: &str) -> String {
     let of_line = |line: &str| {
         let mut line = line.to_owned();
@@ -126,7 +126,7 @@ fn without_passwords(message: &str) -> String {
     message.lines().map(of_line).collect::<Vec<_>>().join("\n")
 }
 
-/// The parser's message with the nearest known key, where it names an unknown one.
+/// The parser's message; if it names an unknown key, with the nearest known one.
 fn explain(error: &toml::de::Error) -> anyhow::Error {
     let message = without_passwords(&error.to_string());
     let quoted: Vec<&str> = error.message().split('`').skip(1).step_by(2).collect();

@@ -5,30 +5,32 @@ use crossfix_fusion::{Bearings, Clocks, EventTime, FusionConfig, Initiation, Tra
 use crossfix_message::{AreaName, CameraName};
 use serde::{Deserialize, Serialize};
 
-/// The fusion centre's file: its network, whom it listens to, and how it fuses.
+/// The fusion centre's file: its network, the cameras it listens to, and how it fuses.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionFile {
     /// The network's file (TOML), relative to this one. Needed by `fuse`, not by `replay --fuse`.
     pub network: Option<PathBuf>,
-    /// Which of the network's areas it is the fusion centre of. Absent where the network has none.
+    /// The network's area of which this is the fusion centre. Absent where the network has no
+    /// areas.
     pub area: Option<AreaName>,
-    /// The cameras that are listened to. Absent: all of the network's, or of its area's.
+    /// The cameras to listen to. Absent: all of the network's, or of its area's.
     pub cameras: Option<Vec<CameraName>>,
-    /// See the fusion's documentation; every key has a default.
+    /// How frames are put into the order of their times; see the fusion's documentation. Every key
+    /// has a default.
     pub event_time: EventTime,
-    /// What a bearing's covariance is worth.
+    /// How far a bearing's stated covariance is trusted.
     pub bearings: Bearings,
     /// How new tracks are found.
     pub initiation: Initiation,
-    /// How tracks are kept up.
+    /// How tracks are maintained.
     pub tracking: Tracking,
     /// How the cameras' clocks are estimated.
     pub clocks: Clocks,
 }
 
 impl FusionFile {
-    /// Reads a file, or takes the defaults, with overrides.
+    /// Reads a file, or takes the defaults, with overrides applied.
     pub fn load(path: Option<&Path>, sets: &[String]) -> anyhow::Result<Self> {
         let Some(path) = path else {
             return super::parse("", sets);
@@ -42,7 +44,7 @@ impl FusionFile {
         Ok(file)
     }
 
-    /// The part that the fusion itself takes.
+    /// The part of the file that configures the fusion itself.
     pub fn fusion(&self) -> FusionConfig {
         FusionConfig {
             event_time: self.event_time.clone(),

@@ -1,4 +1,4 @@
-//! Cameras that look where they are told.
+//! Mounts: cameras that turn to where they are told to look.
 
 use std::path::PathBuf;
 
@@ -16,50 +16,53 @@ use super::CameraFile;
 #[cfg(feature = "onvif")]
 use super::stream::login;
 
-/// No mount knows its angles better, mrad: a tenth of an arc second.
+/// Least SD of a mount's angles that is accepted, mrad: a fifth of an arc second; no mount knows
+/// its angles better.
 const LEAST_SD_MRAD: f64 = 0.001;
 
-/// What turns a camera about its own centre. Its pose is that with both angles at zero.
+/// A mount that turns a camera about its own centre. The camera's pose is that with both angles at
+/// zero.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MountConfig {
-    /// How far it turns to the left: least and most, degrees. -360 to 360.
+    /// Range of azimuth, positive to the left: least and most, degrees. -360 to 360.
     pub azimuth_deg: [f64; 2],
-    /// How far it turns upwards: least and most, degrees. -90 to 90.
+    /// Range of elevation, positive upwards: least and most, degrees. -90 to 90.
     pub elevation_deg: [f64; 2],
-    /// Standard deviation of each angle that it says, mrad: of an error that stays the same until it
-    /// turns again. 0.001 to 500.
+    /// Standard deviation of each angle that the mount reports, mrad. The error stays the same
+    /// until the mount turns again. 0.001 to 500.
     pub angle_sd_mrad: f64,
-    /// How it is told where to turn, if it is a network camera's.
+    /// How the mount is commanded, if it is a network camera's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub onvif: Option<OnvifConfig>,
 }
 
-/// A mount that is turned by ONVIF, which says where it points as numbers from -1 to 1.
+/// A mount controlled by ONVIF, which reports where it points as numbers from -1 to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OnvifConfig {
-    /// Its device service, as `crossfix sources --lan` lists it: http://HOST/onvif/device_service.
+    /// The camera's device service, as `crossfix sources --lan` lists it:
+    /// http://HOST/onvif/device_service.
     pub url: Url,
-    /// Who asks.
+    /// User name to log in with.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
     /// The file whose first line is the password.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub password_file: Option<PathBuf>,
-    /// The azimuths at which it says that its pan is -1 and 1, degrees. Azimuths count to the left, most
-    /// cameras' pans to the right. -720 to 720.
+    /// Azimuths at which the mount reports a pan of -1 and of 1, degrees. Azimuths count to the
+    /// left, most cameras' pans to the right. -720 to 720.
     pub pan_deg: [f64; 2],
-    /// The elevations at which it says that its tilt is -1 and 1, degrees. -360 to 360.
+    /// Elevations at which the mount reports a tilt of -1 and of 1, degrees. -360 to 360.
     pub tilt_deg: [f64; 2],
-    /// The zoom for which the lens is calibrated, 0 to 1: it is kept there. Absent: the zoom at which
-    /// it is found.
+    /// The zoom for which the lens is calibrated, 0 to 1: the zoom is kept there. Absent: the zoom
+    /// at which the camera is found.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zoom: Option<f64>,
 }
 
 impl OnvifConfig {
-    /// Who asks, if it wants to know.
+    /// The login, if the camera wants one.
     #[cfg(feature = "onvif")]
     pub fn login(&self) -> anyhow::Result<Option<Login>> {
         login("mount.onvif.", self.user.as_deref(), self.password_file.as_deref())
@@ -92,7 +95,7 @@ impl OnvifConfig {
 }
 
 impl MountConfig {
-    /// Of a camera of a scene.
+    /// The mount of a scene's camera.
     #[cfg(feature = "centre")]
     pub fn of(mount: &SceneMount) -> Self {
         let SceneMount { azimuth_deg, elevation_deg, angle_sd_mrad, .. } = *mount;
@@ -104,7 +107,7 @@ impl MountConfig {
         }
     }
 
-    /// Its geometry, by the camera's pose at rest.
+    /// The mount's geometry, given the camera's pose at rest.
     fn pan_tilt(&self, rest: Pose) -> anyhow::Result<PanTilt> {
         ensure!(
             (LEAST_SD_MRAD..=500.0).contains(&self.angle_sd_mrad),
@@ -137,12 +140,13 @@ impl CameraFile {
         self.takes_cues || self.mount.is_some()
     }
 
-    /// What turns the camera, if something does, by its pose at rest.
+    /// The geometry of the camera's mount, if it has one, given the camera's pose at rest.
     pub fn pan_tilt(&self, rest: &Pose) -> anyhow::Result<Option<PanTilt>> {
         self.mount.as_ref().map(|mount| mount.pan_tilt(*rest)).transpose()
     }
 
-    /// A calibration of the camera, with what the file says of its mount and of cues.
+    /// A calibration message of the camera, with the file's statements on its mount and on cues
+    /// added.
     pub fn with_mount(
         &self,
         message: CameraCalibration,

@@ -4,29 +4,29 @@ use crossfix_message::{MOST_POSITION_SD, MOST_ROTATION_SD};
 use nalgebra::{Matrix3, Point3};
 use serde::{Deserialize, Serialize};
 
-/// Where a camera stands and how it is turned.
+/// Position and orientation of a camera.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PoseConfig {
-    /// The camera's centre, local ENU, m.
+    /// Camera centre, local ENU, m.
     pub position_m: [f64; 3],
-    /// A level camera whose axis goes through this point, m. Either this or `rotation`.
+    /// A point on the camera's optical axis, m; the camera is level. Either this or `rotation`.
     pub look_at_m: Option<[f64; 3]>,
     /// The rotation world_from_camera, row by row: its columns are the camera's axes (x right,
     /// y down, z forward) in the world.
     pub rotation: Option<[[f64; 3]; 3]>,
-    /// Standard deviation of the rotation about each axis, mrad. 0 to 1000. With `position_sd_m`;
-    /// absent: a careful survey's (1 mrad, 5 cm) is assumed, and how good the pose is is learnt
-    /// from the sight lines.
+    /// Standard deviation of the rotation about each axis, mrad. 0 to 1000. To be given together
+    /// with `position_sd_m`. Absent: that of a careful survey (1 mrad, 5 cm) is assumed, and the
+    /// pose's true accuracy is learnt from the sight lines.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rotation_sd_mrad: Option<f64>,
-    /// Standard deviation of the centre along each axis, m. 0 to 1000.
+    /// Standard deviation of the camera centre along each axis, m. 0 to 1000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub position_sd_m: Option<f64>,
 }
 
 impl PoseConfig {
-    /// A pose by its rotation.
+    /// A pose written as a rotation and a position.
     pub fn of(pose: &Pose) -> Self {
         let m = pose.rotation().matrix();
         let row = |r: usize| [m[(r, 0)], m[(r, 1)], m[(r, 2)]];
@@ -40,12 +40,13 @@ impl PoseConfig {
         }
     }
 
-    /// How sure the pose is: rotation, rad, and position, m; `None` where nobody has said.
+    /// Standard deviations of the pose: rotation, rad, and position, m; `None` where they are not
+    /// given.
     pub(super) fn deviations(&self) -> Option<(f64, f64)> {
         Some((self.rotation_sd_mrad? * 1e-3, self.position_sd_m?))
     }
 
-    /// Both deviations are given or neither, and each is one.
+    /// Checks that both deviations are given or neither, and that each is in range.
     fn check_deviations(&self) -> anyhow::Result<()> {
         let most = [MOST_ROTATION_SD * 1e3, MOST_POSITION_SD];
         let given = [self.rotation_sd_mrad, self.position_sd_m];
@@ -68,7 +69,7 @@ impl PoseConfig {
                 Pose::looking_at(position, Point3::from(target)).context("key `look_at_m`")
             }
             (None, Some(rows)) => {
-                // nalgebra takes columns.
+                // nalgebra's From takes columns, so the rows are transposed.
                 Pose::new(Matrix3::from(rows).transpose(), position).context(
                     "key `rotation` (rows of world_from_camera; its columns are the camera's x right, y down, z forward)",
                 )

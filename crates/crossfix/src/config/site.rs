@@ -25,7 +25,7 @@ pub fn load_network(path: &Path) -> anyhow::Result<NetworkConfig> {
     Ok(network)
 }
 
-/// Where on the Earth a network's site is, if it says.
+/// Where on the Earth a network's site is, if its file says so.
 pub fn anchor_of(network: &NetworkConfig) -> anyhow::Result<Option<Geodetic>> {
     let place = |anchor: Anchor| {
         Geodetic::from_degrees(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m)
@@ -33,7 +33,7 @@ pub fn anchor_of(network: &NetworkConfig) -> anyhow::Result<Option<Geodetic>> {
     network.anchor.map(place).transpose().context("section [anchor]")
 }
 
-/// The TOML files of a folder by name, with their keys.
+/// The TOML files of a folder with their keys, in order of name.
 fn toml_files(folder: &Path) -> anyhow::Result<Vec<(PathBuf, toml::Table)>> {
     let cannot_list = || format!("cannot list {}", folder.display());
     let mut files = Vec::new();
@@ -58,7 +58,7 @@ fn is_camera(keys: &toml::Table) -> bool {
     Kind::of(keys) == Some(Kind::Camera)
 }
 
-/// The camera files of a folder, whether or not the rest of the site is there yet.
+/// The camera files of a folder, whether or not the rest of the site exists yet.
 pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
     let files = toml_files(folder)?.into_iter().filter(|(_, keys)| is_camera(keys));
     let load = |(path, _): (PathBuf, toml::Table)| {
@@ -74,11 +74,12 @@ pub fn load_cameras(folder: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>>
 pub struct Site {
     pub cameras: BTreeMap<CameraName, CheckedCamera>,
     pub fusion: Vec<PathBuf>,
-    /// Whose certificates are in the network's folder of them, and for how many days they are good.
+    /// Identities whose certificates are in the network's folder, with the days each is still
+    /// valid.
     pub certificates: BTreeMap<Identity, u64>,
 }
 
-/// A camera's file that is good by itself.
+/// A camera file that has passed the checks that need no other file.
 pub struct CheckedCamera {
     pub path: PathBuf,
     pub camera: Camera,
@@ -139,14 +140,14 @@ impl Site {
         Ok(())
     }
 
-    /// Checks the certificates that are here: a host has its own only.
+    /// Checks the certificates that are on this host, which normally has only its own.
     fn add_certificates(&mut self, network: &NetworkConfig) -> anyhow::Result<()> {
         let Some(security) = &network.security else { return Ok(()) };
-        // None are here before they were made.
+        // There are none before they have been made.
         let entries = std::fs::read_dir(&security.certificates).into_iter().flatten().flatten();
         let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
         let identities = names.filter_map(|name| name.strip_suffix(".pem")?.parse().ok());
-        // One of a camera that has been taken away is nobody's trouble.
+        // The certificate of a camera that has been removed since does no harm.
         let is_known = |identity: &Identity| match identity {
             Identity::Camera(camera) => network.cameras.contains_key(camera),
             _ => true,
@@ -161,7 +162,7 @@ impl Site {
         Ok(())
     }
 
-    /// What the cameras are together.
+    /// Checks the cameras against each other and their networks.
     fn check_cameras(&self) -> anyhow::Result<()> {
         for checked in self.cameras.values() {
             for camera in checked.network.cameras.keys() {
@@ -205,7 +206,7 @@ fn check_fusion(path: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The known name that is most like a wrong one, as a question.
+/// The known name most similar to a wrong one, as a question.
 #[cfg(feature = "centre")]
 fn nearest<'a>(wrong: &str, known: impl Iterator<Item = &'a str>) -> String {
     let likeness = |name: &&str| strsim::jaro_winkler(wrong, name);

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{GstreamerConfig, StreamConfig};
 
-/// The last second of this century: what begins later begins in error.
+/// The last second of this century: a later start is taken for an error.
 const LAST_START_S: f64 = 4_102_444_800.0;
 
 /// Where pictures, or bearings made elsewhere, come from.
@@ -23,7 +23,7 @@ pub enum SourceConfig {
         /// Frame rate of image folders, 1/s, 0.001 to 10000. Default 30.
         #[serde(default = "thirty")]
         rate_hz: f64,
-        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
+        /// Speed of playing relative to real time, up to 1000; 0 is as fast as possible. Default 1.
         #[serde(default = "one")]
         speed: f64,
     },
@@ -35,39 +35,42 @@ pub enum SourceConfig {
         #[serde(default)]
         publish_truth: bool,
     },
-    /// A network camera's live stream.
+    /// The live stream of a network camera.
     Stream(StreamConfig),
     /// A camera of this host, as Linux shows it.
     Usb {
         /// Its device, `/dev/video0`; `crossfix sources` lists them.
         device: PathBuf,
-        /// Frames a second; the most that it has at the size of the intrinsics where it is not said.
+        /// Frames per second. Absent: the highest rate that the camera offers at the size of the
+        /// intrinsics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         rate_hz: Option<f64>,
-        /// From the middle of the exposure to the driver's time, s, -10 to 10. Default: nothing where the
-        /// driver says when the exposure began, half of a frame's interval where it does not.
+        /// Time from the middle of the exposure to the driver's time stamp, s, -10 to 10. Default:
+        /// 0 where the driver says when the exposure began, half a frame interval where it does
+        /// not.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         latency_s: Option<f64>,
     },
     /// An industrial camera on the network, GigE Vision.
     Gige {
-        /// Where it is, `10.0.0.7`; `crossfix sources --lan` lists them.
+        /// Its address, `10.0.0.7`; `crossfix sources --lan` lists them.
         address: Ipv4Addr,
-        /// Frames a second; as it is set where it is not said.
+        /// Frames per second. Absent: as the camera is set.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         rate_hz: Option<f64>,
-        /// From the middle of the exposure to the camera's time, s, -10 to 10. Default: minus half the
-        /// exposure that the camera says, as its time is that of the exposure's start.
+        /// Time from the middle of the exposure to the camera's time stamp, s, -10 to 10. Default:
+        /// minus half the exposure time that the camera reports, as it stamps the start of the
+        /// exposure.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         latency_s: Option<f64>,
     },
-    /// What GStreamer can show, in builds with the feature `gstreamer`.
+    /// A GStreamer pipeline, in builds with the feature `gstreamer`.
     Gstreamer(GstreamerConfig),
     /// The recorded bearings of this camera.
     Recording {
         /// The recording (MCAP).
         path: PathBuf,
-        /// How much faster than in life it is played, to 1000; 0 is as fast as it goes. Default 1.
+        /// Speed of playing relative to real time, up to 1000; 0 is as fast as possible. Default 1.
         #[serde(default = "one")]
         speed: f64,
     },
@@ -82,7 +85,7 @@ fn thirty() -> f64 {
 }
 
 impl SourceConfig {
-    /// Checks what it is played with.
+    /// Checks the source's start, frame rate and speed.
     pub(super) fn check_pace(&self) -> anyhow::Result<()> {
         let (rate_hz, start_s, speed) = match *self {
             Self::Video { rate_hz, start_s, speed, .. } => (rate_hz, start_s, speed),
@@ -117,7 +120,7 @@ impl SourceConfig {
         Ok(())
     }
 
-    /// Checks that it is there.
+    /// Checks that the source's files exist.
     pub(super) fn check_there(&self) -> anyhow::Result<()> {
         let (key, file) = match self {
             Self::Video { path, .. } | Self::Recording { path, .. } => ("source.path", path),
@@ -131,7 +134,7 @@ impl SourceConfig {
         Ok(())
     }
 
-    /// Whether it is played as fast as it goes.
+    /// Whether it is played as fast as possible.
     pub fn is_unpaced(&self) -> bool {
         match *self {
             Self::Video { speed, .. } | Self::Recording { speed, .. } => speed == 0.0,
@@ -143,7 +146,7 @@ impl SourceConfig {
         }
     }
 
-    /// Whether it is a camera that is watched live.
+    /// Whether it is a live camera.
     pub fn is_live(&self) -> bool {
         matches!(self, Self::Stream(_) | Self::Usb { .. } | Self::Gige { .. } | Self::Gstreamer(_))
     }

@@ -4,14 +4,14 @@ use anyhow::{Context, anyhow, bail, ensure};
 use crossfix_video::{GstreamerOptions, Latency, Login, RtspOptions, RtspTransport, StreamAddress};
 use serde::{Deserialize, Serialize, Serializer};
 
-/// A network camera's live stream.
+/// The live stream of a network camera.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StreamConfig {
-    /// Where it is, `rtsp://HOST/PATH`; a user and a password may stand before the host,
+    /// The stream's address, `rtsp://HOST/PATH`; a user and a password may stand before the host,
     /// `rtsp://USER:PASSWORD@HOST/PATH`.
     pub url: StreamUrl,
-    /// Who asks for it, if not in `url`.
+    /// User name to log in with, if it is not in `url`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
     /// The file whose first line is the password, if it is not in `url`.
@@ -20,20 +20,20 @@ pub struct StreamConfig {
     /// `tcp` (default) or `udp`.
     #[serde(default)]
     pub transport: StreamTransport,
-    /// What it takes from the exposure to the arrival, s, for images that are timed by their arrival:
-    /// until the camera has said what its clock shows, and for good with the clock `arrival`. 0 to 10.
+    /// Time from the exposure to the arrival, s, for images that are timed by their arrival: those
+    /// before the camera has said what its clock shows, and all with the clock `arrival`. 0 to 10.
     /// Default 0.1.
     #[serde(default = "usual_latency_s")]
     pub latency_s: f64,
 }
 
-/// The address of a stream; whoever may ask for it is shown nowhere. One that is none is kept as what
-/// is wrong with it: a parser's error would show the line.
+/// Address of a stream; its login is never shown. A malformed address is kept as a message saying
+/// what is wrong, since a parser's error would show the line and with it the password.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(from = "String")]
 pub struct StreamUrl(Result<(StreamAddress, Option<Login>), String>);
 
-/// How a stream comes: within the connection, or in datagrams.
+/// Transport of a stream: within the RTSP connection (TCP), or in datagrams (UDP).
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StreamTransport {
@@ -62,7 +62,7 @@ impl Serialize for StreamUrl {
 }
 
 impl StreamConfig {
-    /// A stream that anybody may watch.
+    /// A stream that needs no login.
     #[cfg(all(feature = "centre", feature = "viewer"))]
     pub fn open_to_all(url: String) -> Self {
         Self {
@@ -83,8 +83,8 @@ impl StreamConfig {
         self.address().map(drop)
     }
 
-    /// How to watch it; with a standard deviation, s, if its images are to be timed by their arrival and
-    /// what the camera says of its clock is not to be believed.
+    /// Options for opening the stream. `by_arrival_sd_s`, s, is given if its images are to be timed
+    /// by their arrival and the camera's own clock is not to be trusted.
     pub(super) fn options(&self, by_arrival_sd_s: Option<f64>) -> anyhow::Result<RtspOptions> {
         let (address, login) = self.address()?;
         Ok(RtspOptions {
@@ -116,7 +116,8 @@ impl StreamConfig {
     }
 }
 
-/// Who asks, with the password in the first line of a file, by keys that begin so.
+/// Login of a user with the password in the first line of a file; `prefix` begins the keys that
+/// errors name.
 pub fn login(
     prefix: &str,
     user: Option<&str>,
@@ -133,28 +134,29 @@ pub fn login(
     }
 }
 
-/// A pipeline of GStreamer's.
+/// A GStreamer pipeline.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GstreamerConfig {
-    /// Elements with `!` between them, as `gst-launch-1.0` takes them, up to the decoded video, without a
-    /// sink. It is shown in logs: who asks stands in `user` and `password_file`.
+    /// Elements with `!` between them, as `gst-launch-1.0` takes them, up to the decoded video,
+    /// without a sink. The text is shown in logs, so the login belongs into `user` and
+    /// `password_file`.
     pub pipeline: String,
-    /// Who asks: `user-id` of the element with `name=camera`.
+    /// User name to log in with: `user-id` of the element with `name=camera`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
     /// The file whose first line is the password, `user-pw` of that element.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub password_file: Option<PathBuf>,
-    /// As a stream's.
+    /// As [`StreamConfig::latency_s`].
     #[serde(default = "usual_latency_s")]
     pub latency_s: f64,
 }
 
-/// Properties of elements with such names hold what is nobody's to read.
+/// Element properties whose names contain one of these are kept secret.
 const SECRETS: [&str; 5] = ["-pw", "pass", "secret", "token", "key="];
 
-/// Whether a word of a pipeline gives a property that is to be kept secret.
+/// Whether a word of a pipeline sets a property that must be kept secret.
 fn is_secret(word: &str) -> bool {
     let name = word.split_inclusive('=').next().unwrap_or(word).to_lowercase();
     name.ends_with('=') && SECRETS.iter().any(|secret| name.contains(secret))
@@ -183,7 +185,7 @@ impl GstreamerConfig {
         Ok(())
     }
 
-    /// How to watch it; as [`StreamConfig::options`].
+    /// Options for opening it; as [`StreamConfig::options`].
     pub(super) fn options(&self, by_arrival_sd_s: Option<f64>) -> anyhow::Result<GstreamerOptions> {
         Ok(GstreamerOptions {
             pipeline: self.pipeline.clone(),

@@ -1,4 +1,4 @@
-//! Files of cameras and networks that somebody has mistyped, or never meant as one.
+//! Files of cameras and networks with typing errors, or that were never meant to be such files.
 
 use crossfix_geometry::ImageSize;
 use proptest::prelude::*;
@@ -6,7 +6,7 @@ use proptest::sample::{Index, select};
 
 use super::*;
 
-/// Cameras of each kind.
+/// Camera files of each kind.
 const CAMERAS: &[&str] = &[
     include_str!("../../../../configs/site/north.toml"),
     include_str!("../../../../configs/drone-tracking/sonyG.toml"),
@@ -59,7 +59,7 @@ pipeline = "videotestsrc ! video/x-raw"
 "#,
 ];
 
-/// Networks with all that one can have.
+/// Network files with every kind of entry.
 const NETWORKS: &[&str] = &[
     include_str!("../../../../configs/site/network.toml"),
     r#"
@@ -82,7 +82,7 @@ cameras = ["north", "east"]
 "#,
 ];
 
-/// What people and accidents put in the place of a value.
+/// Wrong values as people and accidents write them.
 const ODD: &[&str] = &[
     "nan",
     "-inf",
@@ -103,7 +103,7 @@ const ODD: &[&str] = &[
     "=",
 ];
 
-/// Everything that is done with a file of a kind before anything is opened.
+/// Reads and checks a file as far as that goes without opening a source.
 fn read(kind: Kind, text: &str) -> anyhow::Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("file.toml");

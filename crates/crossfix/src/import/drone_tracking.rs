@@ -24,8 +24,9 @@ const SYNC_RATE: f64 = 59.94006;
 /// Rate of the RTK samples, Hz.
 const RTK_RATE: f64 = 5.0;
 
-/// Standard deviation of the fitted places, m per axis: the poses' residual is declared as their
-/// rotation's, and refitted centres of the same cameras agree to 3 to 7 cm (the data's README).
+/// Standard deviation of the fitted camera positions, m per axis: the poses' residual is declared
+/// as their rotation's, and refitted centres of the same cameras agree to 3 to 7 cm (the data's
+/// README).
 const FITTED_POSITION_SD_M: f64 = 0.05;
 
 /// What to read.
@@ -34,8 +35,8 @@ pub struct Selection<'a> {
     pub cameras: &'a [String],
     pub split: &'a str,
     pub part: Part,
-    /// As the cameras recorded it: times by their own counts of frames, lenses by their files, no
-    /// poses.
+    /// Data as the cameras recorded them: times by their own counts of frames, lenses by their
+    /// files, no poses.
     pub is_raw: bool,
 }
 
@@ -50,15 +51,15 @@ pub enum Part {
     All,
 }
 
-/// What was read.
+/// What was read from the data set.
 pub struct Flight {
     pub entries: Vec<Entry>,
-    /// The drone's places by RTK, with all that is wrong of them.
+    /// The drone's positions by RTK, errors included.
     pub log: Vec<Sample>,
 }
 
-/// Standard deviation of a raw label, pixels: what is found of these cameras. It is only said where
-/// nobody has calibrated them.
+/// Standard deviation of a raw label, pixels, as found for these cameras. It is only stated where
+/// the cameras have not been calibrated.
 const RAW_LABEL_SD_PX: f64 = 1.0;
 
 #[derive(Debug, Deserialize)]
@@ -92,14 +93,14 @@ struct LensFile {
     resolution: [u32; 2],
 }
 
-/// One row of a label file: a frame, and where the drone is in it, if it is.
+/// One row of a label file: a frame, and the drone's pixel if the drone is in it.
 struct Label {
     frame: u64,
     pixel: Option<Pixel>,
 }
 
 impl FittedCamera {
-    /// RTK seconds of a frame whose target lies at a fraction of the image's height.
+    /// RTK time, s, of a frame whose target lies at a fraction of the image's height.
     fn rtk_seconds(&self, frame: u64, height_fraction: f64, fps: f64) -> f64 {
         let own = match (self.sync_alpha, self.sync_beta) {
             (Some(alpha), Some(beta)) => (frame as f64 - beta) / alpha / SYNC_RATE,
@@ -149,7 +150,7 @@ impl Part {
     }
 }
 
-/// The lens file of a camera: two cameras were used with two settings.
+/// The lens file of a camera: two of the cameras were used with two settings.
 fn lens_path(dir: &Path, name: &str, dataset: u32) -> PathBuf {
     let file = match (name, dataset) {
         ("sonyG", 1 | 2) => "sonyG_1",
@@ -221,7 +222,7 @@ fn read_labels(path: &Path) -> anyhow::Result<Vec<Label>> {
         .collect()
 }
 
-/// What the labels of a camera are read with.
+/// What is needed to read the labels of one camera.
 struct CameraSource<'a> {
     site: &'a SiteName,
     fitted: &'a FittedCamera,
@@ -230,7 +231,7 @@ struct CameraSource<'a> {
 }
 
 impl CameraSource<'_> {
-    /// Its calibration, and its bearings of the frames whose RTK seconds are wanted.
+    /// The camera's calibration, and its bearings of the frames whose RTK time is wanted.
     fn entries(
         &self,
         labels: &[Label],
@@ -252,8 +253,8 @@ impl CameraSource<'_> {
             let own_s = label.frame as f64 / self.lens.fps;
             let time = Timestamp::from_seconds(if self.is_raw { own_s } else { seconds });
             let track = label.pixel.map(|pixel| bearing_track(&model, pixel, self.label_sd_rad()));
-            // In the corner of a wide lens the model may have no inverse: one such label is no
-            // reason to do without all others.
+            // In the corner of a wide lens the model may have no inverse: such a label is skipped,
+            // and the others are still used.
             let track = track.and_then(|track| {
                 without_direction += u64::from(track.is_err());
                 track.ok()
@@ -356,10 +357,10 @@ fn truth(
     entries
 }
 
-/// A place and when (s) the drone was there.
+/// A time (s) and the drone's position then.
 pub type Sample = (f64, Point3<f64>);
 
-/// The RTK samples with their rows' numbers, in order of time.
+/// The RTK samples with their row numbers, in order of time.
 fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
     let text = read_text(path)?;
     let rows = text
@@ -369,7 +370,7 @@ fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
         })
         .filter(|row| row.len() >= 3);
     let sample = |(k, row): (usize, Vec<f64>)| {
-        // Four columns: an index first.
+        // Rows of four columns begin with an index.
         let offset = usize::from(row.len() > 3);
         let place = Point3::new(row[offset], row[offset + 1], row[offset + 2]);
         (k, (k as f64 / RTK_RATE, place))
@@ -377,11 +378,12 @@ fn rtk_samples(path: &Path) -> anyhow::Result<Vec<(usize, Sample)>> {
     Ok(rows.enumerate().map(sample).collect())
 }
 
-/// The velocity at the second of three samples: that of the parabola through them, which where they
-/// are as far apart is the difference of the outer two.
+/// Velocity at the second of three samples: that of the parabola through them. With equal spacing
+/// this is the difference of the outer two over the time between them.
 fn velocity_between(before: &Sample, at: &Sample, after: &Sample) -> Vector3<f64> {
     let (back, on) = (at.0 - before.0, after.0 - at.0);
     let (came, goes) = ((at.1 - before.1) / back, (after.1 - at.1) / on);
+    // v = (v_before dt_after + v_after dt_before) / (dt_before + dt_after)
     (came * on + goes * back) / (back + on)
 }
 

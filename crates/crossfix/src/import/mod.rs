@@ -9,7 +9,7 @@ use anyhow::Context;
 use crossfix_message::{Key, Timestamp};
 use crossfix_recording::Entry;
 
-/// An entry of data that were not recorded live: it arrived when it was made.
+/// An entry of data that were not recorded live: its arrival time is its data time.
 pub fn imported(key: Key, time: Timestamp, data: Vec<u8>) -> Entry {
     Entry { key, data_time: time, arrival: time, data }
 }

@@ -64,7 +64,8 @@ pub fn read(dir: &Path) -> anyhow::Result<Vec<Entry>> {
     Ok(entries)
 }
 
-/// The format has no lens: one that sees everything the camera reports, 1000 pixels a radian.
+/// A calibration with a substitute lens, as the format has none: one that sees everything the
+/// camera reports, 1000 pixels per radian.
 fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry> {
     let name = name_of(camera.id)?;
     let rows = Matrix3::from(camera.R_world_from_cam).transpose();
@@ -79,7 +80,7 @@ fn calibration(site: &SiteName, camera: &ScenarioCamera) -> anyhow::Result<Entry
         cy: 1499.5,
         distortion: Distortion::None,
     };
-    // The format's poses are the truth.
+    // The format's poses are exact, so their deviations are zero.
     let message = CameraCalibration::new(&name, &Camera::new(intrinsics, pose)?, Timestamp::EPOCH)
         .with_pose_sd(0.0, 0.0);
     Ok(imported(
@@ -94,7 +95,8 @@ fn bearings(dir: &Path, site: &SiteName) -> anyhow::Result<Vec<Entry>> {
     for row in read_csv::<DetectionRow>(&dir.join("detections.csv"))? {
         let direction: WireVector = turned(Vector3::new(row.ux, row.uy, row.uz)).into();
         tracks.entry((row.cam, row.scan)).or_default().push(BearingTrack {
-            // The detections of a scan are not tracks: their numbers mean nothing in the next.
+            // The detections of a scan are not tracks: each gets a number that is not used again in
+            // the next scan.
             track_id: row.scan * 1000 + row.det,
             bearing: Some(direction),
             covariance_xx: row.sigma_rad.powi(2),

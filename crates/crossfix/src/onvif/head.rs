@@ -1,8 +1,8 @@
-//! What turns a network camera, and where it says that it points.
+//! A network camera's mount, and where it reports that it points.
 //!
-//! A mount by ONVIF is told a place and goes there in its own time; asked, it says where it is and
-//! whether it moves, a network's delay later. So what it says is where an image was taken only if it
-//! has stood still for as long as an image takes to come, and while it does not, nothing is.
+//! An ONVIF mount is told a position and goes there in its own time; asked, it reports where it is
+//! and whether it moves, a network delay later. So its report is valid for an image only if it has
+//! stood still for as long as an image takes to arrive; until then no image has a known direction.
 
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -20,27 +20,30 @@ use crate::config::OnvifConfig;
 use crate::repeats::Repeats;
 use crate::seeker::{Mount, Pointed};
 
-/// How often it is asked where it is. Twice as often burdens a camera's small host; half as often
-/// makes each turn a tenth of a second longer.
+/// Interval at which the mount is asked for its position. Asking twice as often burdens a camera's
+/// small processor; half as often makes each turn a tenth of a second longer.
 const ASKED_EVERY: Duration = Duration::from_millis(100);
-/// How long an image takes to come at most: from the exposure through encoder, network and decoder.
-/// With less than a camera takes, images of a turn are taken for those of where it ended.
+/// Longest time from an exposure through encoder, network and decoder to its image here. If a
+/// camera takes longer, images of a turn are attributed to the place where the turn ended.
 const IMAGE_COMES_WITHIN: Duration = Duration::from_millis(500);
-/// What it said so long ago is where it was.
+/// A report older than this no longer tells where the mount is.
 const SAID_HOLDS: Duration = Duration::from_secs(1);
-/// If it has not moved by then, it goes no farther.
+/// If the mount has not moved this long after an order, it is taken to have gone as far as it can.
 const BEGINS_WITHIN: Duration = Duration::from_secs(1);
-/// A mount that has refused to turn is not asked to for so long, so that its camera sees meanwhile.
+/// A mount that has refused to turn is not asked again for this long, so that its camera can see
+/// meanwhile.
 const ASKED_TO_TURN_AGAIN: Duration = Duration::from_secs(5);
-/// It has arrived, or stands still, within so many deviations of its angles.
+/// Positions within this many SDs of the angles count as the same: it has arrived, or stands still.
 const SAME_SDS: f64 = 3.0;
-/// Zooms farther apart are not the same: a hundredth is one of focal length, too, on most lenses.
+/// Zooms that differ by more than this are different: on most lenses a hundredth is also one of
+/// focal length.
 const SAME_ZOOM: f32 = 0.01;
-/// It is asked again after a failure, at first and at last: some lock who errs too often.
+/// First and longest pause before a failed request is repeated: some cameras lock out a client that
+/// fails too often.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
-/// What a mount's angles are by the positions that it says, each from -1 to 1.
+/// Angles of a mount as a function of the positions that it reports, each from -1 to 1.
 #[derive(Clone, Copy, Debug)]
 struct Scale {
     /// Azimuth at a pan of -1 and 1, rad.
@@ -65,25 +68,25 @@ impl Scale {
     }
 }
 
-/// Where a head was told to turn.
+/// Where a mount was told to turn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Order {
     to: ScanAngles,
-    /// Since when it knows; `None` while it has not been told.
+    /// When the mount was told; `None` while it has not been.
     sent: Option<Instant>,
 }
 
-/// Where a head points, by what it has said.
+/// Where a mount points, by its reports.
 #[derive(Clone, Copy, Debug)]
 struct Head {
-    /// Angles that differ by less are the same, rad.
+    /// Angles that differ by no more than this count as the same, rad.
     same_rad: f64,
-    /// What it said last, and when.
+    /// The last report, and when it came.
     said: Option<(ScanAngles, Instant)>,
     /// Where it has stood still, and since when.
     still: Option<(ScanAngles, Instant)>,
     order: Option<Order>,
-    /// When it refused to turn last.
+    /// When it last refused to turn.
     refused: Option<Instant>,
 }
 
@@ -102,24 +105,24 @@ impl Head {
         self.order = Some(Order { to, sent: None });
     }
 
-    /// Whether it has not refused to turn of late.
+    /// Whether it has not refused to turn recently.
     fn obeys(&self, now: Instant) -> bool {
         self.refused.is_none_or(|refused| now.duration_since(refused) > ASKED_TO_TURN_AGAIN)
     }
 
-    /// It does not turn there: it goes on where it is.
+    /// Notes that the mount refused to turn: it goes on observing where it is.
     fn refuse(&mut self, now: Instant) {
         (self.order, self.refused) = (None, Some(now));
     }
 
-    /// It has been told to turn, unless it is to turn elsewhere by now.
+    /// Notes that the mount has been told to turn, unless a newer order has replaced this one.
     fn told(&mut self, to: ScanAngles, now: Instant) {
         if let Some(order) = self.order.as_mut().filter(|order| order.to == to) {
             order.sent = Some(now);
         }
     }
 
-    /// It says where it is, and whether it moves.
+    /// Takes in a report of where the mount is, and whether it moves.
     fn hear(&mut self, angles: ScanAngles, moves: bool, now: Instant) {
         let same = |other: ScanAngles| {
             (angles.azimuth - other.azimuth).abs() <= self.same_rad
@@ -132,14 +135,14 @@ impl Head {
         self.said = Some((angles, now));
         let Some(Order { to, sent: Some(sent) }) = self.order else { return };
         if !stays {
-            // It may stop short of where it was told to go: the wait begins anew where it stops.
+            // It may stop short of its goal: the wait begins again where it stops.
             self.order = Some(Order { to, sent: Some(now) });
         } else if same(to) || now.duration_since(sent) > BEGINS_WITHIN {
             self.order = None;
         }
     }
 
-    /// It says nothing, or its lens is another.
+    /// Forgets the reports: the mount no longer answers, or its lens has been zoomed.
     fn lose(&mut self) {
         (self.said, self.still) = (None, None);
     }
@@ -163,43 +166,43 @@ struct Shared(Arc<Mutex<Head>>);
 
 impl Shared {
     fn with<T>(&self, act: impl FnOnce(&mut Head) -> T) -> T {
-        // Whoever panics has not left it half told.
+        // A panic cannot leave the value half written.
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
-/// How a mount is reached.
+/// How to reach a mount, and how to interpret its answers.
 struct Reach {
     address: Url,
     login: Option<Login>,
     scale: Scale,
-    /// That of the lens: as it is declared, or else as the mount says it first.
+    /// Zoom of the calibrated lens: as declared, or else as the mount first reports it.
     zoom: Option<f32>,
 }
 
 impl Reach {
-    /// Whether somebody has made the lens another than that which is calibrated.
+    /// Whether the zoom differs from that of the calibrated lens.
     fn is_zoomed(&mut self, said: Option<f32>) -> bool {
         let Some(said) = said else { return false };
         (said - *self.zoom.get_or_insert(said)).abs() > SAME_ZOOM
     }
 }
 
-/// A mount that is turned by ONVIF, and asked where it points ten times a second. It is asked again
-/// for as long as it lives, whatever becomes of it.
+/// A mount controlled by ONVIF, and asked where it points ten times a second. Failures do not end
+/// this: it is asked again as long as the value lives.
 #[derive(Debug)]
 pub struct OnvifMount {
     shared: Shared,
-    /// Ends the thread when it is dropped.
+    /// Ends the thread when dropped.
     stop: Option<oneshot::Sender<Infallible>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl OnvifMount {
-    /// Begins to ask it.
+    /// Starts asking the mount.
     ///
     /// # Errors
-    /// If the password cannot be read, or the host has no threads left.
+    /// If the password cannot be read, or the host cannot start another thread.
     pub fn start(config: &OnvifConfig, angle_sd_rad: f64) -> anyhow::Result<Self> {
         let radians = |degrees: [f64; 2]| degrees.map(f64::to_radians);
         let reach = Reach {
@@ -214,7 +217,7 @@ impl OnvifMount {
         let asked = shared.clone();
         let thread = std::thread::Builder::new().name("mount".to_owned()).spawn(move || {
             runtime.spawn(ask_for_ever(asked, reach));
-            // What is under way ends with the runtime.
+            // Requests in progress end with the runtime.
             let _ = runtime.block_on(stopped);
         });
         let thread = thread.context("no thread for the mount")?;
@@ -226,7 +229,7 @@ impl Drop for OnvifMount {
     fn drop(&mut self) {
         self.stop = None;
         if let Some(thread) = self.thread.take() {
-            // It has said what it had to say.
+            // The thread has reported its errors itself.
             let _ = thread.join();
         }
     }
@@ -246,7 +249,7 @@ impl Mount for OnvifMount {
     }
 }
 
-/// Asks a mount for ever, ever less often while it does not answer.
+/// Asks a mount for ever, with growing pauses while it does not answer.
 async fn ask_for_ever(shared: Shared, mut reach: Reach) {
     let mut repeats = Repeats::default();
     let mut pause = FIRST_PAUSE;
@@ -263,7 +266,7 @@ async fn ask_for_ever(shared: Shared, mut reach: Reach) {
     }
 }
 
-/// Asks a mount where it points, and tells it where to turn, until it does not answer.
+/// Asks a mount where it points, and tells it where to turn, until it stops answering.
 async fn ask(
     shared: &Shared,
     reach: &mut Reach,

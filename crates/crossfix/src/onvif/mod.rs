@@ -1,4 +1,4 @@
-//! Network cameras by ONVIF: what they are called, where their streams are, and what turns them.
+//! Network cameras by ONVIF: their names, their streams, and their mounts.
 
 mod head;
 #[cfg(test)]
@@ -17,17 +17,17 @@ use url::Url;
 pub use head::OnvifMount;
 use transport::ToCamera;
 
-/// A camera answers within this, or it is not there, s.
+/// A camera that does not answer within this time is taken to be absent.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(3);
-/// Of a camera's own words so many letters are shown.
+/// Most characters of a camera's own text that are shown.
 const MOST_LETTERS: usize = 200;
 
-/// A camera that has been asked what it is.
+/// A camera that has answered what services it has.
 struct Device {
     client: OnvifClient,
     /// Its media service.
     media: Option<Url>,
-    /// The service of what turns it.
+    /// The service of its mount (PTZ).
     head: Option<Url>,
     address: Url,
 }
@@ -39,19 +39,19 @@ pub struct Described {
     pub name: String,
     /// Its pictures.
     pub streams: Vec<Stream>,
-    /// Where its mount says that it points, pan and tilt from -1 to 1, if it has one that says it.
+    /// Pan and tilt that its mount reports, each from -1 to 1, if it has one that reports them.
     pub position: Option<[f32; 2]>,
 }
 
-/// One of the ways in which a camera shows its pictures.
+/// One of the streams that a camera offers.
 #[derive(Debug, PartialEq, serde::Serialize)]
 pub struct Stream {
-    /// What the camera calls it.
+    /// The camera's name of the stream's profile.
     pub profile: String,
     pub url: String,
 }
 
-/// Lets a future end on this thread.
+/// Runs a future to its end on this thread.
 fn wait<T>(what: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
     runtime()?.block_on(what)
 }
@@ -61,10 +61,10 @@ fn runtime() -> anyhow::Result<Runtime> {
     built.context("cannot begin to ask cameras")
 }
 
-/// The device services of cameras that answer on this host's networks, each with its name.
+/// The device services of the cameras that answer on this host's networks, each with its name.
 ///
 /// # Errors
-/// If nobody can be asked.
+/// If the query cannot be sent.
 pub fn cameras(answered_within: Duration) -> anyhow::Result<Vec<(String, String)>> {
     const NAME: &str = "onvif://www.onvif.org/name/";
     let found = wait(async { Ok(oxvif::discovery::probe_result(answered_within).await?) })?;
@@ -76,7 +76,7 @@ pub fn cameras(answered_within: Duration) -> anyhow::Result<Vec<(String, String)
     Ok(named.collect())
 }
 
-/// What a camera says of itself.
+/// A camera's description of itself.
 ///
 /// # Errors
 /// If it does not answer, or refuses.
@@ -105,14 +105,14 @@ pub fn describe(address: &Url, login: Option<&Login>) -> anyhow::Result<Describe
 }
 
 impl Device {
-    /// Asks a camera what it is.
+    /// Asks a camera what services it has.
     async fn connect(address: &Url, login: Option<&Login>) -> anyhow::Result<Self> {
         let named = !address.username().is_empty() || address.password().is_some();
         ensure!(!named, "who asks does not belong into its address, which is shown");
         let mut client =
             OnvifClient::new(address.as_str()).with_transport(Arc::new(ToCamera::new(login)?));
         if let Some(login) = login {
-            // Who asks is proved with the time, by the camera's clock.
+            // The login's proof includes the time by the camera's clock.
             let ahead_s = match answered(client.get_system_date_and_time()).await {
                 Ok(time) => time.utc_offset_secs(),
                 Err(error) => return Err(error.context("it does not say what time it has")),
@@ -126,7 +126,7 @@ impl Device {
         Ok(Self { client, media, head, address: address.clone() })
     }
 
-    /// The service that turns it, and the profile by which it is asked.
+    /// The mount's service, and the profile to name in requests to it.
     async fn profile_of_head(&self) -> anyhow::Result<(Url, String)> {
         let (Some(head), Some(media)) = (&self.head, &self.media) else {
             bail!("nothing turns the camera at {}", self.address);
@@ -138,8 +138,8 @@ impl Device {
     }
 }
 
-/// A service as it is reached from here: cameras say addresses that are true where they are, and who
-/// asks is to be told to no other host.
+/// A service's address as it is reached from here: cameras state addresses that are valid in their
+/// own network, and the login must not be sent to any other host.
 fn reached(service: &str, address: &Url) -> Option<Url> {
     let mut service = Url::parse(service).ok()?;
     service.set_scheme(address.scheme()).ok()?;
@@ -148,7 +148,7 @@ fn reached(service: &str, address: &Url) -> Option<Url> {
     Some(service)
 }
 
-/// What a camera answers in time, with its own words where it refuses.
+/// A camera's answer, if it comes in time; if it refuses, an error with its own words.
 async fn answered<T>(asked: impl Future<Output = Result<T, OnvifError>>) -> anyhow::Result<T> {
     match tokio::time::timeout(ANSWERS_WITHIN, asked).await {
         Ok(Ok(answer)) => Ok(answer),
@@ -157,7 +157,7 @@ async fn answered<T>(asked: impl Future<Output = Result<T, OnvifError>>) -> anyh
     }
 }
 
-/// The beginning of what a camera says, in one line.
+/// The beginning of a camera's text, in one line.
 fn printable(text: &str) -> String {
     let shown = text.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
     shown.take(MOST_LETTERS).collect()

@@ -1,4 +1,5 @@
-//! A network camera on a mount, as far as its device, media and mount services are asked.
+//! A simulated network camera on a mount, with the parts of the device, media and mount services
+//! that are used.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -13,26 +14,26 @@ use sha1::{Digest, Sha1};
 
 pub const USER: &str = "eye";
 pub const PASSWORD: &str = "hunter2";
-/// It turns so fast, of its range a second.
+/// Turning rate, in units of the position range (-1 to 1) per second.
 const RATE: f64 = 0.8;
-/// It begins to turn so long after it was told.
+/// Delay from the order to the start of the turn.
 const BEGINS_AFTER: Duration = Duration::from_millis(150);
 
-/// What it answers in the place of what it is asked.
+/// Reply that the stub gives instead of the proper answer.
 #[derive(Clone, Debug)]
 pub enum Reply {
     Body(String),
     Redirect(String),
 }
 
-/// Where the mount is and goes.
+/// Where the mount is and where it goes.
 #[derive(Clone, Debug)]
 pub struct State {
     from: [f64; 2],
     to: [f64; 2],
     told: Instant,
     pub zoom: f64,
-    /// Whether it says where it is.
+    /// Whether it reports where it is.
     pub says: bool,
     /// Whether it refuses to turn.
     pub refuses: bool,
@@ -54,7 +55,7 @@ impl State {
     }
 }
 
-/// The camera, until it is dropped.
+/// The simulated camera, which runs until it is dropped.
 pub struct Stub {
     pub state: Arc<Mutex<State>>,
     pub port: u16,
@@ -63,7 +64,7 @@ pub struct Stub {
 }
 
 impl Stub {
-    /// On a port of this host; 0 is any.
+    /// Starts on a port of this host; 0 is any.
     pub fn start(port: u16) -> Self {
         let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
         let port = listener.local_addr().unwrap().port();
@@ -84,7 +85,7 @@ impl Stub {
                 if ends.load(Ordering::Relaxed) {
                     return;
                 }
-                // Who asks is answered once on each connection.
+                // Each connection gets one answer.
                 let _ = answer(&stream, &shared);
             }
         });
@@ -142,7 +143,7 @@ fn answer(stream: &TcpStream, state: &Mutex<State>) -> std::io::Result<()> {
     )
 }
 
-/// What stands between an element's tags, whatever its prefix.
+/// The text between an element's tags, whatever its namespace prefix.
 fn element<'a>(text: &'a str, name: &str) -> Option<&'a str> {
     let begin = [">", " "].iter().filter_map(|end| text.find(&format!(":{name}{end}"))).min()?;
     let inside = &text[begin..][text[begin..].find('>')? + 1..];
@@ -156,7 +157,7 @@ fn attribute(text: &str, element: &str, name: &str) -> Option<f64> {
     value[..value.find('"')?].parse().ok()
 }
 
-/// Whether the request proves that who asks knows the password (WS-Security, `PasswordDigest`).
+/// Whether the request proves knowledge of the password (WS-Security, `PasswordDigest`).
 fn knows_password(request: &str) -> bool {
     let proof = || {
         let nonce = STANDARD.decode(element(request, "Nonce")?).ok()?;
@@ -193,7 +194,7 @@ fn reply(request: &str, state: &Mutex<State>) -> (&'static str, String) {
     }
     let mut state = state.lock().unwrap();
     let (name, body) = if asks("GetCapabilities") {
-        // As many do, it says an address that is true nowhere.
+        // Like many cameras, it states an address that is valid nowhere.
         let at = |service: &str| format!("<XAddr>http://0.0.0.0/onvif/{service}</XAddr>");
         let [media, ptz] = ["media", "ptz"].map(at);
         let body = format!("<Capabilities><Media>{media}</Media><PTZ>{ptz}</PTZ></Capabilities>");

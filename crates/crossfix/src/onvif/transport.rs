@@ -1,5 +1,5 @@
-//! Questions to a camera over HTTP, no further than a camera is to be trusted: it sends nobody
-//! elsewhere, and its answers are short and not deep.
+//! HTTP requests to a camera, which is trusted as little as possible: redirects are not followed,
+//! and its answers must be short and not deeply nested.
 
 use anyhow::Context;
 use async_trait::async_trait;
@@ -9,11 +9,11 @@ use oxvif::transport::{Transport, TransportError};
 use reqwest::redirect::Policy;
 use reqwest::{Client, Response};
 
-/// The longest answer of a camera that is read, bytes: profiles of the most talkative are a fifth of
-/// it. With half of it some would be refused; without a bound a camera fills the memory.
+/// Longest answer of a camera that is read, bytes: the most talkative camera's profiles are a fifth
+/// of it. With half of it some would be refused; without a bound a camera could fill the memory.
 const LONGEST: usize = 256 << 10;
-/// The deepest nesting of an answer: ONVIF's own is fifteen or so. What reads it takes a part of the
-/// stack for each.
+/// Deepest nesting of an answer: ONVIF's own is about fifteen. The parser uses some stack for each
+/// level.
 const DEEPEST: usize = 64;
 
 /// HTTP to a camera.
@@ -23,12 +23,12 @@ pub struct ToCamera {
 }
 
 impl ToCamera {
-    /// As somebody, or as nobody.
+    /// A client with a login, or without one.
     ///
     /// # Errors
     /// If this host has no certificates of authorities.
     pub fn new(login: Option<&Login>) -> anyhow::Result<Self> {
-        // Who asks is proved in every question: no other host is to be told it.
+        // Every request carries the login's proof, which no other host may see: no redirects.
         let client = Client::builder().redirect(Policy::none()).build();
         let client =
             client.context("nobody can be asked by HTTP: are ca-certificates installed?")?;
@@ -63,12 +63,12 @@ impl Transport for ToCamera {
         if depth(&text) > DEEPEST {
             return Err(refused("its answer is too deep".to_owned()));
         }
-        // Those with a fault say why.
+        // Answers with a fault say why.
         if matches!(status, 200 | 400 | 500) { Ok(text) } else { Err(refused(text)) }
     }
 }
 
-/// An answer, if it is no longer than it should be.
+/// The text of an answer, if it is no longer than allowed.
 async fn read(mut answer: Response) -> Result<Option<String>, TransportError> {
     let mut bytes = Vec::new();
     while let Some(chunk) = answer.chunk().await? {
@@ -86,7 +86,7 @@ fn depth(text: &str) -> usize {
     let mut rest = text;
     while let Some(begin) = rest.find('<') {
         rest = &rest[begin..];
-        // What is written in these is no element, whatever it looks like.
+        // Text inside these is not an element, whatever it looks like.
         let aside = [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>"), ("<!", ">"), ("</", ">")];
         if let Some((begin, end)) = aside.iter().find(|(begin, _)| rest.starts_with(begin)) {
             open = open.saturating_sub(usize::from(*begin == "</"));
@@ -104,7 +104,7 @@ fn depth(text: &str) -> usize {
     deepest
 }
 
-/// Where a tag ends that begins here: at a `>` that stands in no quotes.
+/// Where the tag that begins here ends: at a `>` outside quotes.
 fn end_of_tag(text: &str) -> usize {
     let mut quote = None;
     for (at, letter) in text.char_indices() {
@@ -127,7 +127,7 @@ mod tests {
         assert_eq!(depth("<?xml version='1.0'?><a><b/><c x='1'><d>t</d></c><!-- <z> --></a>"), 3);
         assert_eq!(depth(&"<a>".repeat(1000)), 1000);
         assert_eq!(depth("no element"), 0);
-        // What only looks like an end is none.
+        // What only looks like an end tag is none.
         for hides in
             ["<b x=\"/>/></a></a>\"/>", "<!-- </a></a> -->", "<![CDATA[</a></a>]]>", "<?x </a> ?>"]
         {

@@ -1,18 +1,18 @@
-//! Where a target should be, by a cue, and how far a track is from there.
+//! Predicted place of a target by a cue, and the distance of a track from it.
 
 use crossfix_geometry::{Bearing, tangent_basis, turn_between, turn_vector};
 use crossfix_message::{BearingTrack, Cue, Expected, Timestamp};
 use nalgebra::{Matrix2, Rotation3, SymmetricEigen, Unit, Vector2, Vector3};
 
-/// Where something should be at a time, in the camera's frame at rest.
+/// Predicted direction at a time, with covariance, in the camera's frame at rest.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Place {
     pub(super) direction: Unit<Vector3<f64>>,
-    /// Along the tangents of the direction, rad^2.
+    /// Covariance along the tangents of the direction, rad^2.
     pub(super) covariance: Matrix2<f64>,
 }
 
-/// The longer axis of where something may be, and its deviation, rad.
+/// Long axis of the error ellipse, and its standard deviation, rad.
 pub(super) fn long_axis(place: &Place) -> (Vector3<f64>, f64) {
     let axes = SymmetricEigen::new(place.covariance);
     let (index, variance) = axes.eigenvalues.argmax();
@@ -20,7 +20,8 @@ pub(super) fn long_axis(place: &Place) -> (Vector3<f64>, f64) {
     (axis, variance.max(0.0).sqrt())
 }
 
-/// How far a track is from where something should be, squared in the deviations of both.
+/// Squared Mahalanobis distance of a track from the predicted place, d^2 = e' (P + R)^-1 e;
+/// `turned` rotates the camera's frame to its frame at rest.
 pub(super) fn squared_distance(
     expected: &Place,
     turned: &Rotation3<f64>,
@@ -29,10 +30,12 @@ pub(super) fn squared_distance(
     let own = Unit::try_new(Vector3::from(track.bearing?), 1e-6)?;
     let direction = turned * own;
     let tangents = tangent_basis(&expected.direction).transpose();
+    // Error e: the turn from prediction to track, as a vector in the prediction's tangents, rad.
     let turn = turn_between(&expected.direction, &direction)?;
     let offset: Vector2<f64> = tangents * turn_vector(&turn).cross(&expected.direction);
     let [xx, xy, yy] = [track.covariance_xx, track.covariance_xy, track.covariance_yy];
-    // The track's tangents as they lie in those of the expectation.
+    // The track's tangents, carried back to the prediction and expressed in its tangents: R' = T R
+    // T'.
     let carried = turn.inverse() * (turned.matrix() * tangent_basis(&own));
     let to_expected = tangents * carried;
     let own = to_expected * Matrix2::new(xx, xy, xy, yy) * to_expected.transpose();
@@ -40,7 +43,7 @@ pub(super) fn squared_distance(
     (squared >= 0.0).then_some(squared)
 }
 
-/// Where a cue has its target at a time: between what it says of the times about it.
+/// A cue's prediction at a time, interpolated between the times that it states.
 pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
     let seconds = |one: &Expected| Timestamp::from_nanos(one.time_ns).seconds_since(time);
     let after = cue.ahead.iter().position(|one| seconds(one) >= 0.0);
@@ -49,7 +52,8 @@ pub(super) fn place_at(cue: &Cue, time: Timestamp) -> Option<Place> {
     let (from, to) = (read(one)?, read(other.unwrap_or(one))?);
     let (from_s, to_s) = (seconds(one), other.map_or(0.0, seconds));
     let share = if to_s > from_s { -from_s / (to_s - from_s) } else { 0.0 };
-    // What is earlier than it says is as it says.
+    // Before the cue's first time its first prediction is used; after its last, extrapolated by
+    // half a step.
     let share = share.clamp(0.0, 1.5);
     let turn = turn_between(&from.direction, &to.direction)?;
     let part = Rotation3::new(turn_vector(&turn) * share);

@@ -23,7 +23,7 @@ fn mount() -> PanTilt {
     PanTilt::new(rest, [-3.0, 3.0], [-0.3, 1.4]).unwrap()
 }
 
-/// A cue of track 7 that turns to the left, of a time; `sds` along both tangents, rad.
+/// A cue of track 7, which turns to the left, at a time; `sds` along both tangents, rad.
 fn cue(time_s: f64, azimuth: f64, rate: f64, sds: [f64; 2]) -> CueFrame {
     let ahead = [0.0, 0.25, 0.5, 1.0, 2.0].map(|ahead_s| {
         let paper = ScanAngles { azimuth: azimuth + rate * ahead_s, elevation: 0.2 }.bearing();
@@ -40,7 +40,7 @@ fn cue(time_s: f64, azimuth: f64, rate: f64, sds: [f64; 2]) -> CueFrame {
     CueFrame { cues: vec![cue], ..Default::default() }
 }
 
-/// A track that a head at angles sees where angles of the frame at rest are.
+/// A track at these angles of the frame at rest, as seen by a head at `at`.
 fn track(id: u64, at: ScanAngles, azimuth: f64, elevation: f64) -> BearingTrack {
     let paper = ScanAngles { azimuth, elevation }.bearing().into_inner();
     let direction = crossfix_geometry::camera_from_paper(paper);
@@ -68,8 +68,8 @@ fn it_turns_ahead_of_the_target_and_stares_while_that_crosses_the_view() {
     let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
     assert!(aim.azimuth > 0.82 && aim.azimuth < 0.88, "{aim:?}");
     assert!((aim.elevation - 0.2).abs() < 1e-4);
-    // On the way it is told nothing else, but where the target is quite elsewhere; and there it
-    // stays until the target is past.
+    // On the way it gets no new order unless the target is somewhere quite different; once there it
+    // stays until the target has passed.
     let half = ScanAngles { azimuth: 0.4, elevation: 0.1 };
     assert_eq!(seeker.look(seconds(1.1), Pointed::Turning(half), &[]).aim, None);
     seeker.hear(cue(1.1, -0.8, 0.05, [1e-3; 2]));
@@ -101,7 +101,8 @@ fn a_track_is_taken_over_when_it_has_been_where_the_cue_is_for_three_images() {
     assert_eq!(look(&mut seeker, &[bird, target]), None);
     assert_eq!(look(&mut seeker, &[bird, target]), None);
     assert_eq!(look(&mut seeker, &[bird, target]), Some((3, 7)));
-    // One that passes as near is no rival any more; one that was there from the first is.
+    // Once the target is recognised, another that passes as near is no rival; one there from the
+    // start is.
     let rival = track(5, at, 0.4998, 0.2);
     assert_eq!(look(&mut seeker, &[rival, target]), Some((3, 7)));
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
@@ -128,7 +129,7 @@ fn a_stripe_is_looked_along_from_its_middle_to_both_ends() {
     sorted.sort_by(f64::total_cmp);
     // No gaps: the view is 160 mrad high.
     assert!(sorted.windows(2).all(|two| two[1] - two[0] < 0.16), "{sorted:?}");
-    // What is seen on it is stared at.
+    // A track seen during the search is stared at.
     let seen = track(9, at, at.azimuth, at.elevation);
     let looks = (0..60).map(|k| 20.0 + 0.1 * f64::from(k));
     let orders: Vec<Orders> = looks
@@ -169,7 +170,7 @@ fn old_and_impossible_cues_move_nothing() {
 fn a_camera_that_stands_still_takes_over_what_it_sees_and_turns_nothing() {
     let wide = Intrinsics { fx: 1000.0, fy: 1000.0, ..*model().intrinsics() };
     let mut seeker = Seeker::new(&CameraModel::new(wide).unwrap(), None, 0.0);
-    // Another target is nearer, and beside its image.
+    // Another target's cue is first, but outside the image.
     let mut cues = cue(1.0, 1.5, 0.0, [1e-3; 2]);
     cues.cues.push(cue(1.0, 0.02, 0.0, [1e-3; 2]).cues.remove(0));
     cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
@@ -182,7 +183,8 @@ fn a_camera_that_stands_still_takes_over_what_it_sees_and_turns_nothing() {
     assert_eq!((taken.image_track_id, taken.of.as_ref().unwrap().track_id), (3, 8));
 }
 
-/// A detector misses an image, and the mount does not obey: it stays on what it has found.
+/// A detector misses an image, or the mount does not obey: the seeker stays on the target it has
+/// found.
 #[test]
 fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody_heeds() {
     let stripe = |t: f64| {
@@ -202,7 +204,7 @@ fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody
         assert_eq!(orders.aim, None, "{k}");
         assert_eq!(orders.taken_over.is_some(), k >= 2 && !missed, "{k}");
     }
-    // Out of the middle, and it may not turn.
+    // The target is off the middle, but the head may not turn.
     let aside = ScanAngles { azimuth: 0.3 - 0.06, elevation: 0.2 };
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
     seeker.hold(true);
@@ -220,7 +222,7 @@ fn what_is_found_is_not_left_for_one_image_without_it_nor_for_orders_that_nobody
     assert!(orders.aim.is_some());
 }
 
-/// The angles that a mount says are off by a good deal more than the cue is.
+/// The mount's angles are wrong by much more than the cue's SD.
 #[test]
 fn what_the_angles_are_off_by_widens_the_gate() {
     for (angle_sd_rad, taken) in [(0.0, false), (3e-3, true)] {
@@ -234,7 +236,8 @@ fn what_the_angles_are_off_by_widens_the_gate() {
     }
 }
 
-/// A mount that turns by so much a second, and stands still for so long before it says so.
+/// Where a head stared that turns at `slow_rad_per_s`, and reports having settled `settles_s` after
+/// it stood still.
 fn stares(slow_rad_per_s: f64, settles_s: f64) -> Vec<f64> {
     let mut seeker = Seeker::new(&model(), Some(mount()), 0.0);
     let (mut at, mut to, mut arrives) = (REST, REST, 0.0);
@@ -270,14 +273,14 @@ fn a_slow_head_stares_as_long_at_each_view_of_a_stripe_as_a_quick_one() {
 fn what_the_mount_does_not_reach_is_left_for_what_it_does() {
     let reach = mount();
     let mut seeker = Seeker::new(&model(), Some(reach), 0.0);
-    // Behind it, as near as it comes to it, another in reach.
+    // The first target is behind the mount's range, the second one within.
     let mut cues = cue(1.0, 3.12, 0.02, [1e-3; 2]);
     cues.cues.push(cue(1.0, 1.0, 0.02, [1e-3; 2]).cues.remove(0));
     cues.cues[1].of = Some(Cued { track_id: 8, ..Default::default() });
     seeker.hear(cues);
     let aim = seeker.look(seconds(1.0), Pointed::Settled(REST), &[]).aim.unwrap();
     assert!((0.9..1.1).contains(&aim.azimuth), "{aim:?}");
-    // At the end of the reach, where the mount says a little else than what it was told.
+    // At the end of its range the mount reports slightly different angles than it was told.
     let mut seeker = Seeker::new(&model(), Some(reach), 0.0);
     let mut turns = 0;
     let mut at = REST;
@@ -316,7 +319,7 @@ fn a_track_is_preferred_to_what_one_camera_saw_unless_that_is_found() {
         seeker.hear(both(1.4));
         let aim = seeker.look(seconds(1.4), Pointed::Settled(at), tracks).aim;
         assert_eq!(aim.is_some_and(|aim| aim.azimuth < 0.0), leaves, "{aim:?}");
-        // What it has found becomes a track beside another: it stays on it.
+        // The found target becomes a track, and there is another: the seeker stays on its own.
         if !leaves {
             let mut cues = cue(1.5, -0.5, 0.0, [1e-3; 2]);
             cues.cues.push(cue(1.5, 0.301, 0.0, [1e-3; 2]).cues.remove(0));
@@ -336,12 +339,12 @@ fn while_nobody_knows_where_it_points_nothing_is_taken_over_and_nothing_turned()
         (0..9)
             .all(|_| { seeker.look(seconds(1.1), Pointed::Unknown, &[seen]) == Orders::default() })
     );
-    // Who it is of is copied into every frame.
+    // The target's name is copied into every frame, so an overlong one is refused.
     let mut long = cue(1.0, 0.02, 0.0, [1e-3; 2]);
     long.cues[0].of = Some(Cued { camera: "x".repeat(1 << 20), ..Default::default() });
     seeker.hear(long);
     assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
-    // Of a future that is not near.
+    // A cue from too far in the future.
     seeker.hear(cue(9.0, 0.02, 0.0, [1e-3; 2]));
     assert_eq!(seeker.look(seconds(1.1), Pointed::Settled(REST), &[seen]), Orders::default());
 }

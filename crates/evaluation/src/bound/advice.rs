@@ -7,21 +7,22 @@ use serde::Serialize;
 use super::plan::{Observer, accuracy, prior};
 use super::{Assumptions, FisherInformation, PlannedCamera, Volume};
 
-/// Radii of the candidates' rings over the median distance of the cameras from the volume's middle.
+/// Radii of the candidates' rings, relative to the cameras' median distance from the volume's
+/// middle.
 const RINGS: [f64; 5] = [0.5, 0.75, 1.0, 1.25, 1.5];
-/// Candidates of a ring.
+/// Candidates per ring.
 const DIRECTIONS: u32 = 24;
-/// Most cubes that a candidate is judged by; of more, every n-th.
+/// Largest number of cubes that a candidate is judged by; of more cubes every n-th is taken.
 const SAMPLE: usize = 2000;
 
-/// How good a set of cameras is over a volume.
+/// Quality of a set of cameras over a volume.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Score {
     /// Median of the position's standard deviation, m, over *all* of the volume: where there is no
-    /// fix, or a worse one, the volume's diagonal counts.
+    /// fix, or a worse one, the volume's diagonal is counted.
     pub median_sd_m: f64,
-    /// The geometric mean of the same, m: what decides between equal medians. The arithmetic one
-    /// would count the bad fixes of two cameras side by side as well nigh as good as a good one.
+    /// The geometric mean of the same, m, which decides between equal medians. The arithmetic mean
+    /// would count the bad fixes of two cameras side by side as nearly as good as a good fix.
     pub mean_sd_m: f64,
     /// Share of the volume with a fix.
     pub fixed: f64,
@@ -39,19 +40,19 @@ pub struct Candidate {
 /// Where one more camera would help most.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Advice {
-    /// The camera that one more is like: its intrinsics, rate and clock.
+    /// Name of the camera whose intrinsics, rate and clock the additional one has.
     pub like: String,
     /// What each candidate looks at, ENU, m.
     pub look_at_m: [f64; 3],
-    /// The score of the cameras as they are.
+    /// The score of the present cameras.
     pub now: Score,
     /// The candidates, the best first.
     pub candidates: Vec<Candidate>,
 }
 
 impl Advice {
-    /// The best candidates that stand at least so far apart, m: neighbours are as good as each
-    /// other.
+    /// The best `count` candidates that are at least `apart_m` apart, m: neighbours are about
+    /// equally good.
     pub fn best_apart(&self, count: usize, apart_m: f64) -> Vec<Candidate> {
         let mut best: Vec<Candidate> = Vec::new();
         for candidate in &self.candidates {
@@ -76,7 +77,7 @@ fn score(deviations: &mut [f64], fixed: usize) -> Score {
     }
 }
 
-/// A cube of the sample with what the cameras know of it.
+/// A cube of the sample with the present cameras' information on a target in it.
 struct Known {
     point: Point3<f64>,
     cameras: usize,
@@ -84,7 +85,7 @@ struct Known {
 }
 
 fn known(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Known> {
-    // As if the candidate were the last of the list.
+    // Phases as if the candidate were the last of the list.
     let phase = |index: usize| index as f64 / (cameras.len() + 1) as f64;
     let observers: Vec<Observer> = cameras
         .iter()
@@ -125,10 +126,10 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-/// Tries one more camera, like the first, at places on rings round the volume at the cameras'
+/// Tries one additional camera, like the first, at places on rings round the volume at the cameras'
 /// median height, aimed at the volume's middle. Ground and obstacles are not known.
 ///
-/// None if there is no camera.
+/// `None` if there is no camera.
 pub fn advise(
     cameras: &[PlannedCamera],
     volume: &Volume,
@@ -171,8 +172,8 @@ pub fn advise(
     Some(Advice { like: like.name.clone(), look_at_m: middle.into(), now, candidates })
 }
 
-/// A camera's pose covariance where another stands and looks elsewhere: what its place is off by follows where
-/// it looks, as its turn does.
+/// A camera's pose covariance, transferred to another pose: the position's errors turn with the
+/// direction in which it looks, as the rotation's do.
 fn carried(like: &PlannedCamera, other: &Camera) -> Matrix6<f64> {
     let turn = other.pose().rotation() * like.camera.pose().rotation().inverse();
     let mut carry = Matrix6::identity();
@@ -259,7 +260,8 @@ mod tests {
 
     #[test]
     fn where_little_is_fixed_at_all_a_camera_beside_another_is_not_the_best() {
-        // The site to copy and a target that a camera sees 97 m far: no two see it in one place.
+        // The site to copy, and a target that a camera sees up to 97 m away: no two see it in one
+        // place.
         let size = ImageSize { width: 1920, height: 1080 };
         let lens = Intrinsics {
             size,

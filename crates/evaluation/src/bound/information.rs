@@ -7,11 +7,12 @@ use nalgebra::{
     Matrix2, Matrix2x3, Matrix2x6, Matrix3x2, Matrix6, Point3, Rotation3, Unit, Vector3, Vector6,
 };
 
-/// Information whose scaled eigenvalues fall below this share of the mean is singular but for
-/// rounding.
+/// Least eigenvalue of scaled information (its diagonal is one, so that they have the mean one):
+/// below it the information is singular but for rounding.
 const SINGULAR: f64 = 1e-12;
 
-/// A sight line to a target: its direction, the tangents across it, its length. World, metres.
+/// Geometry of a sight line to a target: its direction, the tangents across it, its length. World,
+/// metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LineGeometry {
     direction: Unit<Vector3<f64>>,
@@ -22,15 +23,15 @@ pub struct LineGeometry {
 impl LineGeometry {
     /// The line from a camera's centre to a target, with the world's tangents ([`tangent_basis`]).
     ///
-    /// `None` if they are in one place, or nowhere.
+    /// `None` if they are in one place, or a coordinate is not finite.
     pub fn between(camera: Point3<f64>, target: Point3<f64>) -> Option<Self> {
         let (direction, range_m) = Unit::try_new_and_get(target - camera, 1e-9)?;
         let tangents = tangent_basis(&direction);
         range_m.is_finite().then_some(Self { direction, tangents, range_m })
     }
 
-    /// A measured line, with the tangents in which its covariance is, to a target at a range in
-    /// metres.
+    /// The line of a measured bearing, with the tangents that its covariance refers to, to a target
+    /// at a range in metres.
     ///
     /// `None` if the range is not a positive number.
     pub fn of(line: &SightLine, range_m: f64) -> Option<Self> {
@@ -43,13 +44,13 @@ impl LineGeometry {
         self.range_m
     }
 
-    /// Bearing by displacement across the line, `E' / r`, rad/m.
+    /// Derivative of the bearing by a displacement of the target, `E' / r`, rad/m.
     fn by_displacement(&self) -> Matrix2x3<f64> {
         self.tangents.transpose() / self.range_m
     }
 
-    /// Bearing by the camera's errors: a turn (rad) of the direction, `E' [u]x`, and a displacement
-    /// (m).
+    /// Derivative of the bearing by the camera's errors: a turn u of the direction (rad),
+    /// `E' [u]x`, and a displacement (m).
     fn by_errors(&self) -> Matrix2x6<f64> {
         let turn = self.tangents.transpose() * self.direction.cross_matrix();
         let displacement = self.by_displacement();
@@ -60,12 +61,12 @@ impl LineGeometry {
     }
 }
 
-/// The noise of one bearing, independent of the next one's: the inverse of its covariance, 1/rad^2.
+/// Noise of one bearing, independent between bearings: the inverse of its covariance, 1/rad^2.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BearingNoise(Matrix2<f64>);
 
 impl BearingNoise {
-    /// Noise of a covariance, rad^2, in the tangents of its line.
+    /// Noise with a covariance, rad^2, in the tangents of its line.
     ///
     /// `None` if it is not positive definite.
     pub fn new(covariance: &Matrix2<f64>) -> Option<Self> {
@@ -74,7 +75,7 @@ impl BearingNoise {
         inverse.iter().all(|v| v.is_finite()).then_some(Self(inverse))
     }
 
-    /// Noise of one standard deviation, rad, on both tangents.
+    /// Noise with one standard deviation, rad, on both tangents.
     ///
     /// `None` if it is not a positive number.
     pub fn isotropic(sd_rad: f64) -> Option<Self> {
@@ -82,8 +83,8 @@ impl BearingNoise {
     }
 }
 
-/// When bearings along one line were measured, s from the reference time (before it is negative):
-/// their number, the sum and the sum of squares.
+/// Times of the bearings along one line, in seconds from the reference time (negative before it):
+/// their number, sum and sum of squares.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TimeOffsets {
     count: f64,
@@ -101,11 +102,11 @@ impl FromIterator<f64> for TimeOffsets {
     }
 }
 
-/// What is known of a target's position and velocity at a reference time.
+/// Fisher information on a target's position and velocity at a reference time.
 ///
-/// A bearing at time `dt` from it, along a line of tangents E and range r, with noise R, adds
-/// `H' R^-1 H`, `H = [E'/r, E' dt/r]`. The inverse of the sum is the Cramer-Rao bound: no unbiased
-/// estimator of `[p, v]` has a smaller covariance.
+/// A bearing at time `dt` from the reference time, along a line with tangents E and range r, with
+/// noise R, adds `H' R^-1 H`, `H = [E'/r, E' dt/r]`. The inverse of the sum is the Cramer-Rao
+/// bound: no unbiased estimator of `[p, v]` has a smaller covariance.
 ///
 /// ```
 /// use crossfix_evaluation::bound::{BearingNoise, FisherInformation, LineGeometry};
@@ -129,7 +130,7 @@ impl FromIterator<f64> for TimeOffsets {
 pub struct FisherInformation(Matrix6<f64>);
 
 impl FisherInformation {
-    /// Nothing but a prior on the velocity: its standard deviation, m/s per axis.
+    /// Information of a prior on the velocity alone: its standard deviation, m/s per axis.
     pub fn velocity_prior(sd_mps: f64) -> Self {
         let known = sd_mps.powi(-2);
         Self(Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, known, known, known)))
@@ -140,9 +141,10 @@ impl FisherInformation {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }
 
-    /// Adds bearings that differ in nothing but their times.
+    /// Adds bearings that differ only in their times.
     pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
         let across = line.by_displacement();
+        // Sum over dt of [E'/r, E' dt/r]' R^-1 [E'/r, E' dt/r].
         let position = across.transpose() * noise.0 * across;
         for (row, column, weight) in [
             (0, 0, times.count),
@@ -160,10 +162,11 @@ impl FisherInformation {
         &self.0
     }
 
-    /// The bound: the covariance of `[p, v]`, m and m/s; `None` if some direction is not known at
-    /// all.
+    /// The Cramer-Rao bound: the covariance of `[p, v]`, m and m/s; `None` if some direction is not
+    /// determined at all.
     pub fn covariance(&self) -> Option<Matrix6<f64>> {
-        // Positions and velocities have scales of their own: a unit diagonal makes them alike.
+        // Positions and velocities have different units: scaling to a unit diagonal makes them
+        // comparable.
         let scale = self.0.diagonal().map(|v| v.sqrt().recip());
         if !scale.iter().all(|v| v.is_finite()) {
             return None;
@@ -186,55 +189,56 @@ impl AddAssign<&FisherInformation> for FisherInformation {
     }
 }
 
-/// Errors that all bearings of one camera share for as long as the target is looked at: more
-/// bearings do not average them away.
+/// Errors that all bearings of one camera share for as long as the target is observed: more
+/// bearings do not average them out.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CommonErrors {
     /// A root D of the covariance D D' of the camera's turn about the world's axes (rad) and its
-    /// displacement against the target (m).
+    /// displacement relative to the target (m).
     root: Matrix6<f64>,
 }
 
 impl CommonErrors {
-    /// Errors of a pose: its covariance, rotation about the camera's axes (rad) before position (m).
+    /// Errors of a pose with this covariance: rotation about the camera's axes (rad) before
+    /// position (m).
     pub fn of_pose(world_from_camera: &Rotation3<f64>, covariance: &Matrix6<f64>) -> Self {
         let mut turned = Matrix6::identity();
         turned.fixed_view_mut::<3, 3>(0, 0).copy_from(world_from_camera.matrix());
         Self { root: turned * root(covariance) }
     }
 
-    /// The same deviation about each axis (rad), and along each (m).
+    /// Errors with one deviation about each axis (rad), and one along each (m).
     pub fn isotropic(rotation_sd_rad: f64, displacement_sd_m: f64) -> Self {
         let sd = |k| if k < 3 { rotation_sd_rad } else { displacement_sd_m };
         Self { root: Matrix6::from_diagonal(&Vector6::from_fn(|k, _| sd(k))) }
     }
 
-    /// With errors beside these, of which they know nothing.
+    /// These errors and others that are independent of them.
     pub fn and(&self, other: &Self) -> Self {
         let sum = |errors: &Self| errors.root * errors.root.transpose();
         Self { root: root(&(sum(self) + sum(other))) }
     }
 
-    /// What a wrong clock (s) does: it shows a target of `speed_mps` where it was or will be; for a
-    /// direction of flight that nobody knows beforehand, a displacement of `speed * clock / root 3`
-    /// on each axis.
+    /// Errors due to a wrong clock (s): it shows a target of `speed_mps` where it was or will be;
+    /// as the direction of flight is not known beforehand, a displacement of
+    /// `speed * clock / root 3` on each axis.
     pub fn of_clock(clock_sd_s: f64, speed_mps: f64) -> Self {
         Self::isotropic(0.0, speed_mps * clock_sd_s / 3.0_f64.sqrt())
     }
 }
 
-/// The symmetric root of a covariance, of which a part may be nothing.
+/// The symmetric root of a covariance, which may be singular.
 fn root(covariance: &Matrix6<f64>) -> Matrix6<f64> {
     let eigen = covariance.symmetric_eigen();
     let roots = eigen.eigenvalues.map(|variance| variance.max(0.0).sqrt());
     eigen.eigenvectors * Matrix6::from_diagonal(&roots) * eigen.eigenvectors.transpose()
 }
 
-/// The information of one camera's bearings about a target *and* about the camera's own errors.
+/// Information of one camera's bearings on a target *and* on the camera's own errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CameraInformation {
     target: FisherInformation,
-    /// Between `[p, v]` and the errors (rotation, displacement).
+    /// Block of `[p, v]` (rows) and the errors (columns: rotation, displacement).
     cross: Matrix6<f64>,
     errors: Matrix6<f64>,
 }
@@ -245,7 +249,7 @@ impl CameraInformation {
         self.add_all(line, noise, &[dt_s].into_iter().collect());
     }
 
-    /// Adds bearings that differ in nothing but their times.
+    /// Adds bearings that differ only in their times.
     pub fn add_all(&mut self, line: &LineGeometry, noise: &BearingNoise, times: &TimeOffsets) {
         self.target.add_all(line, noise, times);
         let by_errors = line.by_errors();
@@ -258,14 +262,14 @@ impl CameraInformation {
         self.errors += by_errors.transpose() * weighted * times.count;
     }
 
-    /// What remains about the target where the camera's errors are not known but for their priors.
+    /// Information on the target with the camera's errors marginalised out, given their priors.
     ///
-    /// The Schur complement `A - B (C + P^-1)^-1 B'`, written with a root D of `P = D D'`,
-    /// `B D (I + D' C D)^-1 D' B'`, so that errors of zero are allowed.
+    /// The Schur complement `A - B (C + P^-1)^-1 B'`, written with a root D of `P = D D'` as
+    /// `A - B D (I + D' C D)^-1 D' B'`, so that errors of zero are allowed.
     pub fn marginal(&self, errors: &CommonErrors) -> FisherInformation {
         let root = &errors.root;
         let unexplained = Matrix6::identity() + root.transpose() * self.errors * root;
-        // At least the identity: it has an inverse unless a number is not finite.
+        // It is at least the identity, so it has an inverse unless a number is not finite.
         let Some(factor) = unexplained.cholesky() else {
             return FisherInformation::default();
         };
@@ -288,8 +292,8 @@ mod tests {
         covariance.fixed_view::<3, 3>(0, 0).into_owned()
     }
 
-    /// Two cameras at 100 m from the target whose lines cross at an angle; SD of the range along
-    /// the first.
+    /// Standard deviation of the range along the first of two cameras at 100 m from the target,
+    /// whose lines cross at an angle.
     fn range_sd(angle: f64, first_sd: f64, second_sd: f64) -> f64 {
         let towards = [Vector3::x(), Vector3::new(angle.cos(), angle.sin(), 0.0)];
         let mut information = FisherInformation::velocity_prior(1.0);
@@ -303,12 +307,12 @@ mod tests {
 
     #[test]
     fn the_range_along_a_known_line_is_one_over_the_sine() {
-        // (12) of the fusion paper: sigma_r = sigma_e / |sin alpha|, where the first line is exact.
+        // Klochko 2020, eq. 12: sigma_r = sigma_e / |sin alpha|, where the first line is exact.
         for angle in [0.1, 0.5, 1.0, std::f64::consts::FRAC_PI_2, 2.5] {
             let expected = 0.1 / angle.sin();
             let sd = range_sd(angle, 1e-5, 0.1);
             assert!((sd / expected - 1.0).abs() < 1e-4, "{angle}: {sd} against {expected}");
-            // With noise on both lines the second one's place is unsure across itself as well.
+            // With noise on both lines the second line's place across itself is uncertain as well.
             let both = range_sd(angle, 0.1, 0.1);
             assert!((both / (expected * (1.0 + angle.cos().powi(2)).sqrt()) - 1.0).abs() < 1e-6);
         }
@@ -328,8 +332,8 @@ mod tests {
         }
     }
 
-    /// The orthogonal geometry of the fusion notes: mean bound of five periods at camera 1's last
-    /// time.
+    /// Mean bound of five periods at camera 1's last time, in the orthogonal geometry of the fusion
+    /// notes.
     fn orthogonal_bound(delays: [f64; 3]) -> (f64, f64) {
         const RUNS: usize = 2000;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -376,8 +380,8 @@ mod tests {
         }
     }
 
-    /// Three orthogonal cameras at 100 m, each with `count` bearings of 1 mrad, and errors in
-    /// common.
+    /// Position deviation by three orthogonal cameras at 100 m, each with `count` bearings of
+    /// 1 mrad and with common errors.
     fn position_sd(count: usize, errors: &CommonErrors) -> f64 {
         let mut information = FisherInformation::velocity_prior(15.0);
         for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
@@ -394,7 +398,7 @@ mod tests {
     fn more_bearings_do_not_average_a_pose_error_away() {
         let none = CommonErrors::default();
         assert!((position_sd(400, &none) / position_sd(40_000, &none) - 10.0).abs() < 0.1);
-        // Each axis is seen by two cameras: the floor is root(3/2) of one camera's error at 100 m.
+        // Each axis is seen by two cameras: the limit is root(3/2) of one camera's error at 100 m.
         for errors in [CommonErrors::isotropic(5e-4, 0.0), CommonErrors::isotropic(0.0, 0.05)] {
             let sd = position_sd(1_000_000, &errors);
             assert!((sd / (0.05 * 1.5_f64.sqrt()) - 1.0).abs() < 0.01, "{sd}");
@@ -416,10 +420,10 @@ mod tests {
             for dt in [-0.9, -0.4, 0.0] {
                 camera.add(&line, &noise, dt);
             }
-            // Something is known of the target besides, or the whole would have no inverse.
+            // A prior on the target, as the whole would have no inverse without it.
             let known = Matrix6::from_diagonal(&Vector6::new(0.1, 0.1, 0.1, 0.01, 0.01, 0.01));
             let mut whole = nalgebra::SMatrix::<f64, 12, 12>::zeros();
-            // A pose's own: turns about its axes and displacements, two of them tied.
+            // A pose's own errors: turns about its axes and displacements, two of them correlated.
             let pose: Rotation3<f64> = Rotation3::new(about.into());
             let sd: Vector6<f64> = [rotation, 2.0 * rotation, rotation, shift, shift, 3.0 * shift].into();
             let mut covariance = Matrix6::from_diagonal(&sd.component_mul(&sd));

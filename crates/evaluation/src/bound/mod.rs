@@ -1,4 +1,4 @@
-//! How well a site's cameras can tell where a target is and how fast it flies: the Cramer-Rao bound
+//! How well a site's cameras can determine a target's position and velocity: the Cramer-Rao bound
 //! of their bearings, over a volume.
 
 mod advice;

@@ -1,4 +1,4 @@
-//! The bound over a volume, for cameras in their places.
+//! The bound over a volume, for cameras at given places.
 
 use crossfix_geometry::{Camera, PixelCovariance};
 use nalgebra::{Matrix6, Point3};
@@ -9,41 +9,41 @@ use super::{
     Volume,
 };
 
-/// A fix whose worst axis is more than so many times its best one is degenerate.
+/// A fix is degenerate if its worst axis has a deviation more than this many times its best one's.
 pub const DEGENERATE_RATIO: f64 = 10.0;
 
-/// A camera that stands somewhere, or might.
+/// A camera at a place where it stands or might stand.
 #[derive(Clone, Debug)]
 pub struct PlannedCamera {
     /// Its name.
     pub name: String,
     /// Its model and place.
     pub camera: Camera,
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: f64,
-    /// Standard deviation of its capture times, the same for all of a window, s.
+    /// Standard deviation of its clock, whose error is the same throughout a window, s.
     pub clock_sd_s: f64,
-    /// Standard deviation of a place in its images, pixels per axis, independent from frame to frame.
+    /// Standard deviation of a pixel measurement, pixels per axis, independent from frame to frame.
     pub pixel_sd_px: f64,
-    /// What its bearings of one target err by alike for about as long as a window, standard deviation,
-    /// rad per axis: a tracker sits beside a target's middle for a while.
+    /// Standard deviation of the error that its bearings of one target have in common for about as
+    /// long as a window, rad per axis: a tracker sits beside a target's middle for a while.
     pub lasting_noise_rad: f64,
     /// Covariance of its pose: rotation about its own axes (rad), then position (m).
     pub pose_covariance: Matrix6<f64>,
-    /// What its lens may turn the bearings of a place in the image by, rad per axis.
+    /// Standard deviation of a bearing due to the lens, rad per axis.
     pub lens_sd_rad: f64,
 }
 
 impl PlannedCamera {
-    /// What all of its bearings of one target have in common: pose, lens, clock (of a target that flies
-    /// at a speed) and the noise that lasts.
+    /// Errors that all of its bearings of one target have in common: pose, lens, clock (for a
+    /// target at this speed) and the lasting noise.
     fn errors(&self, speed_mps: f64) -> CommonErrors {
         CommonErrors::of_pose(self.camera.pose().rotation(), &self.pose_covariance)
             .and(&CommonErrors::isotropic(self.lens_sd_rad.hypot(self.lasting_noise_rad), 0.0))
             .and(&CommonErrors::of_clock(self.clock_sd_s, speed_mps))
     }
 
-    /// The same camera if pose, lens and clock were known exactly.
+    /// The same camera with pose, lens and clock known exactly.
     #[must_use]
     pub fn exact(&self) -> Self {
         let pose_covariance = Matrix6::zeros();
@@ -51,7 +51,7 @@ impl PlannedCamera {
     }
 }
 
-/// What is to be seen, and how large it must be for that.
+/// A target's size, and the size in the image that it must have to be seen.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct TargetSize {
     /// The target's size, m.
@@ -60,49 +60,49 @@ pub struct TargetSize {
     pub least_px: f64,
 }
 
-/// What is taken for granted.
+/// What a plan assumes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Assumptions {
-    /// How long a target has been seen, s; it flies straight for so long.
+    /// How long a target has been seen, s; it flies straight for that time.
     pub window_s: f64,
-    /// How fast a target flies, m/s: what an error of the clock is worth.
+    /// A target's speed, m/s, which turns an error of the clock into one of position.
     pub speed_mps: f64,
-    /// What is known of a target's velocity beforehand: standard deviation, m/s per axis; none is
-    /// nothing.
+    /// Prior of a target's velocity: standard deviation, m/s per axis; `None`: nothing is known.
     pub velocity_prior_sd_mps: Option<f64>,
-    /// How small a target must be seen; none is however small.
+    /// The size from which a target is seen; `None`: however small it is.
     pub target: Option<TargetSize>,
-    /// Farther than this no camera sees a target, m.
+    /// Range beyond which no camera sees a target, m.
     pub max_range_m: Option<f64>,
 }
 
 impl Assumptions {
-    /// As far as a camera sees the target, m; none is without limit.
+    /// The range up to which a camera sees the target, m; `None`: without limit.
     pub fn reach_m(&self, camera: &Camera) -> Option<f64> {
         let lens = camera.model().intrinsics();
         let focal = (lens.fx * lens.fy).sqrt();
+        // A target of size s at a range r spans f s / r pixels.
         let by_size = self.target.map(|target| target.size_m * focal / target.least_px);
         [by_size, self.max_range_m].into_iter().flatten().reduce(f64::min)
     }
 }
 
-/// How well a target is known.
+/// Accuracy of a target's state.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Accuracy {
-    /// Standard deviation of the position in space, root of the trace, m.
+    /// Standard deviation of the position in space, root of the covariance's trace, m.
     pub position_sd_m: f64,
-    /// The same along the axis that is known best, m.
+    /// Standard deviation along the axis that is known best, m.
     pub best_axis_sd_m: f64,
-    /// The same along the axis that is known worst, m.
+    /// Standard deviation along the axis that is known worst, m.
     pub worst_axis_sd_m: f64,
-    /// That axis, ENU, upwards.
+    /// That worst axis, ENU, pointing upwards.
     pub worst_axis: [f64; 3],
-    /// Standard deviation of the velocity in space, root of the trace, m/s.
+    /// Standard deviation of the velocity in space, root of the covariance's trace, m/s.
     pub velocity_sd_mps: f64,
 }
 
 impl Accuracy {
-    /// What a covariance of `[p, v]` (m, m/s) says.
+    /// Accuracy by a covariance of `[p, v]` (m, m/s).
     pub fn of(covariance: &Matrix6<f64>) -> Self {
         let position = covariance.fixed_view::<3, 3>(0, 0).into_owned();
         let eigen = position.symmetric_eigen();
@@ -124,17 +124,16 @@ impl Accuracy {
     }
 }
 
-/// What is predicted for one cube.
+/// Prediction for one cube.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Cell {
-    /// The layer it lies in, from below.
+    /// Index of its layer, from below.
     pub layer: usize,
     /// Its middle, ENU, m.
     pub centre_m: [f64; 3],
-    /// The cameras that see it, by their places in the list.
+    /// The cameras that see it, by their indices in the list.
     pub cameras: Vec<usize>,
-    /// How well a target there is known; none if fewer than two cameras see it, or two along one
-    /// line.
+    /// Accuracy of a target there; `None` if fewer than two cameras see it, or only along one line.
     pub accuracy: Option<Accuracy>,
 }
 
@@ -148,8 +147,8 @@ pub(super) struct Observer<'a> {
 }
 
 impl<'a> Observer<'a> {
-    /// A camera whose newest bearing is `phase` of its interval old; at least one lies in the
-    /// window.
+    /// A camera whose newest bearing is `phase` of its frame interval old; at least one bearing is
+    /// in the window.
     pub(super) fn new(
         planned: &'a PlannedCamera,
         phase: f64,
@@ -166,7 +165,7 @@ impl<'a> Observer<'a> {
         }
     }
 
-    /// What it says of a target at a point; none if it does not see it.
+    /// Information of its bearings of a target at a point; `None` if it does not see that.
     pub(super) fn information(&self, point: Point3<f64>) -> Option<FisherInformation> {
         let range = (point - self.camera.pose().position()).norm();
         if range > self.reach_m {
@@ -180,25 +179,26 @@ impl<'a> Observer<'a> {
     }
 }
 
-/// What is known before anything is seen.
+/// Information before anything is seen.
 pub(super) fn prior(assumptions: &Assumptions) -> FisherInformation {
     assumptions
         .velocity_prior_sd_mps
         .map_or_else(FisherInformation::default, FisherInformation::velocity_prior)
 }
 
-/// The accuracy of what so many cameras know together.
+/// The accuracy of what this number of cameras know together.
 pub(super) fn accuracy(cameras: usize, information: &FisherInformation) -> Option<Accuracy> {
-    // One camera and a prior on the velocity can have an inverse by rounding, but no fix.
+    // For one camera with a prior on the velocity rounding can give an inverse, but there is no
+    // fix.
     let covariance = if cameras < 2 { None } else { information.covariance() };
     covariance.as_ref().map(Accuracy::of)
 }
 
 /// The bound in each cube of a volume, of the state at the end of the window: what a tracker can
-/// say now.
+/// know at that time.
 ///
-/// A target flies straight, its direction from the cameras taken as constant over the window. The
-/// cameras are not synchronised: their phases are spread evenly.
+/// A target flies straight; its direction from the cameras is taken as constant over the window.
+/// The cameras are not synchronised: their phases are spread evenly.
 pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumptions) -> Vec<Cell> {
     let phase = |index: usize| index as f64 / cameras.len() as f64;
     let observers: Vec<Observer> = cameras
@@ -221,8 +221,8 @@ pub fn predict(cameras: &[PlannedCamera], volume: &Volume, assumptions: &Assumpt
     volume.centres().map(cell).collect()
 }
 
-/// The smallest target, m, that two cameras see at a point when it must span so many pixels; none
-/// if fewer than two have the point in their images.
+/// The smallest target, m, that two cameras see at a point when it must span `least_px` pixels;
+/// `None` if fewer than two have the point in their images.
 pub fn smallest_target(
     cameras: &[PlannedCamera],
     point: Point3<f64>,
@@ -293,7 +293,7 @@ mod tests {
         let without = Assumptions { velocity_prior_sd_mps: None, ..assumptions() };
         let accuracy = cell(&cameras, target, &without).accuracy.unwrap();
         // North and east are seen by one camera each, up by both: sigma = 0.5 px / 1000 px * 100 m.
-        // A straight line through n points, read at the last: sigma^2 (4n - 2) / (n (n + 1)).
+        // Variance of a line through n points, read at the last: sigma^2 (4n - 2) / (n (n + 1)).
         let n = 30.0;
         let single = 0.05_f64.powi(2) * (4.0 * n - 2.0) / (n * (n + 1.0));
         let sd = (2.5 * single).sqrt();
@@ -340,7 +340,7 @@ mod tests {
         let accuracy = cell(&cameras, target, &assumptions()).accuracy.unwrap();
         assert!(accuracy.is_degenerate());
         assert!(accuracy.worst_axis[0].abs() > 0.999, "{accuracy:?}");
-        // 1 / sin of 3.4 degrees, over root 2 times what lies across.
+        // 1 / sin of 3.4 degrees, over root 2 times the deviation across.
         let ratio = accuracy.worst_axis_sd_m / accuracy.best_axis_sd_m;
         assert!((ratio - 100.0 / 3.0).abs() < 1.0, "{ratio}");
     }
@@ -366,8 +366,8 @@ mod tests {
         let floor = 0.15 / 3.0_f64.sqrt() * 2.5_f64.sqrt();
         let by_clocks = sd(|camera| camera.clock_sd_s = 0.01);
         assert!((by_clocks / floor.hypot(exact) - 1.0).abs() < 0.01);
-        // A turn about the optical axis moves nothing on it, one about the camera's y axis moves it
-        // sideways: cameras have axes of their own.
+        // A turn about the optical axis moves no target on it, one about the camera's y axis moves
+        // it sideways: the turns are about each camera's own axes.
         let about_axis = sd(|camera| camera.pose_covariance[(2, 2)] = 1e-6);
         assert!((about_axis / exact - 1.0).abs() < 1e-6);
         let sideways = sd(|camera| camera.pose_covariance[(1, 1)] = 1e-6);

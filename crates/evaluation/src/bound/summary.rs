@@ -1,4 +1,4 @@
-//! The cubes of a volume in few figures.
+//! Summary figures of a volume's cubes.
 
 use std::collections::BTreeMap;
 
@@ -6,33 +6,33 @@ use serde::Serialize;
 
 use super::{Accuracy, Assumptions, Cell, PlannedCamera, Volume, predict};
 
-/// A layer of the volume, or all of it.
+/// Figures of a layer of the volume, or of all of it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Summary {
-    /// Its middle's height, ENU, m.
+    /// Height of its middle, ENU, m.
     pub altitude_m: f64,
-    /// Cubes.
+    /// Number of cubes.
     pub cells: usize,
     /// Share of the cubes with a fix.
     pub fixed: f64,
     /// Median of the position's standard deviation, m, where there is a fix.
     pub position_sd_median_m: Option<f64>,
-    /// 90 % of the cubes with a fix are at least as good, m.
+    /// Value that 90 % of the fixes do not exceed, m: that of the position's standard deviation.
     pub position_sd_90_m: Option<f64>,
     /// Median of the velocity's standard deviation, m/s, where there is a fix.
     pub velocity_sd_median_mps: Option<f64>,
-    /// Share of the cubes with a fix in which it is degenerate.
+    /// Share of the fixes that are degenerate.
     pub degenerate: Option<f64>,
 }
 
-/// The value below which a share of the sorted values lies.
+/// The value that a share of the sorted values does not exceed.
 fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     let index = (share * sorted.len() as f64).ceil() as usize;
     sorted.get(index.saturating_sub(1)).copied()
 }
 
 impl Summary {
-    /// The figures of some cubes.
+    /// Figures of some cubes.
     pub fn of<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> Self {
         let cells: Vec<&Cell> = cells.into_iter().collect();
         let fixes: Vec<&Accuracy> =
@@ -59,7 +59,7 @@ impl Summary {
     }
 }
 
-/// The figures of each layer, from below.
+/// Figures of each layer, from below.
 pub fn layers(cells: &[Cell]) -> Vec<Summary> {
     let mut layers: BTreeMap<usize, Vec<&Cell>> = BTreeMap::new();
     for cell in cells {
@@ -68,30 +68,30 @@ pub fn layers(cells: &[Cell]) -> Vec<Summary> {
     layers.into_values().map(Summary::of).collect()
 }
 
-/// What one camera does for the others.
+/// Contribution of one camera.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Contribution {
     /// The camera.
     pub name: String,
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: f64,
-    /// Standard deviation of its capture times, s.
+    /// Standard deviation of its clock, s.
     pub clock_sd_s: f64,
-    /// As far as it sees the target, m; none is without limit.
+    /// The range up to which it sees the target, m; `None`: without limit.
     pub reach_m: Option<f64>,
     /// Standard deviation of one bearing on the optical axis, rad.
     pub bearing_sd_rad: f64,
-    /// Of its rotation, rad per axis, ...
+    /// Standard deviation of its rotation, rad per axis, ...
     pub rotation_sd_rad: f64,
     /// ... and its position, m per axis (root mean square).
     pub position_sd_m: f64,
     /// Share of the volume that it sees.
     pub sees: f64,
-    /// The figures of the volume without it.
+    /// Figures of the volume without it.
     pub without: Summary,
 }
 
-/// What each camera does for the others: what it sees, and what would be left without it.
+/// Contribution of each camera: what it sees, and what would be left without it.
 pub fn contributions(
     cameras: &[PlannedCamera],
     volume: &Volume,

@@ -1,40 +1,40 @@
-//! The part of the air that is looked at, cut into cubes.
+//! The volume of air that a plan is made for, cut into cubes.
 
 use crossfix_geometry::Camera;
 use nalgebra::{Matrix3, Point3, Vector3};
 use thiserror::Error;
 
-/// Most cubes of a volume: a cube costs some microseconds a camera.
+/// Largest number of cubes of a volume: a cube takes some microseconds per camera.
 const MOST_CELLS: f64 = 100_000.0;
-/// Cubes along the longest side where nobody says how large they are.
+/// Number of cubes along the longest side where their size is not given.
 const DEFAULT_CELLS_ALONG: f64 = 12.0;
-/// Axes nearer to parallel than this cross nowhere: the least eigenvalue of `sum (I - uu')`, a
-/// camera.
+/// Least eigenvalue of `sum (I - uu')` over the cameras' optical axes u, per camera: below it the
+/// axes are too nearly parallel to cross.
 const PARALLEL: f64 = 1e-3;
-/// Half the default volume's width over the median distance of the cameras from where their axes
-/// cross.
+/// Half the default volume's width, relative to the median distance of the cameras from where their
+/// axes cross.
 const DEFAULT_REACH: f64 = 0.5;
 
 /// What is wrong with a volume.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum VolumeError {
-    /// A corner is nowhere, or not beyond the other one.
+    /// A corner is not finite, or the second is not beyond the first.
     #[error(
         "the volume from {min:?} to {max:?} m is empty: each number of the second must be larger"
     )]
     Empty {
         /// The low corner.
         min: [f64; 3],
-        /// The high one.
+        /// The high corner.
         max: [f64; 3],
     },
-    /// A cube's side that is none.
+    /// A cube's side that is not a positive length.
     #[error("the step is {step_m} m: it must be a positive number of metres")]
     Step {
         /// The side.
         step_m: f64,
     },
-    /// More cubes than anybody will wait for.
+    /// Too many cubes.
     #[error("{cells:.0} cells are more than 100 000: take a larger step than {step_m} m")]
     TooMany {
         /// How many.
@@ -42,7 +42,7 @@ pub enum VolumeError {
         /// The side.
         step_m: f64,
     },
-    /// There is no obvious volume.
+    /// No volume is obvious.
     #[error("the cameras' optical axes do not cross in front of them: say which volume you mean")]
     NoCrossing,
 }
@@ -56,11 +56,12 @@ pub struct Volume {
 }
 
 impl Volume {
-    /// The cubes of side `step_m` that cover the box between two corners, m; without a side, one
-    /// that is a round number and cuts the longest edge into about twelve.
+    /// The cubes of side `step_m` that cover the box between two corners, m; without a side, of a
+    /// round side that cuts the longest edge into about twelve.
     ///
     /// # Errors
-    /// [`VolumeError`] if the box is empty, the step no length, or the cubes too many.
+    /// [`VolumeError`] if the box is empty, the step is not a positive length, or there are too
+    /// many cubes.
     pub fn new(
         min: Point3<f64>,
         max: Point3<f64>,
@@ -74,7 +75,7 @@ impl Volume {
         if !(step_m > 0.0 && step_m.is_finite()) {
             return Err(VolumeError::Step { step_m });
         }
-        // What is over by a rounding error needs no cube of its own.
+        // An excess of a rounding error needs no cube of its own.
         let counts = sides.map(|side| (side / step_m - 1e-6).ceil().max(1.0));
         let cells: f64 = counts.product();
         if cells > MOST_CELLS {
@@ -83,10 +84,11 @@ impl Volume {
         Ok(Self { min, step_m, cells: [counts.x, counts.y, counts.z].map(|count| count as usize) })
     }
 
-    /// A box round the point where the cameras' optical axes cross, half as wide as the cameras
-    /// stand apart, from the lowest camera's height upwards.
+    /// A box round the point where the cameras' optical axes cross; it reaches half of the cameras'
+    /// median distance from that point to each side, but not below the lowest camera's height
+    /// (corners are rounded).
     ///
-    /// # Errors
+    /// [`VolumeError::NoCrossing`] where the axes do not cross in front of the cameras.
     /// [`VolumeError::NoCrossing`] where they cross nowhere in front of them.
     pub fn where_axes_cross(cameras: &[Camera], step_m: Option<f64>) -> Result<Self, VolumeError> {
         let middle = crossing(cameras).ok_or(VolumeError::NoCrossing)?;
@@ -94,7 +96,7 @@ impl Volume {
             cameras.iter().map(|camera| (middle - camera.pose().position()).norm()).collect();
         distances.sort_by(f64::total_cmp);
         let median = distances.get(distances.len() / 2).copied().ok_or(VolumeError::NoCrossing)?;
-        // Round corners are easier to talk about.
+        // Round corners are easier to read.
         let round = round_number(DEFAULT_REACH * median / 12.0);
         let half = Vector3::repeat((DEFAULT_REACH * median / round).round() * round);
         let middle = (middle / round).map(f64::round) * round;
@@ -130,7 +132,7 @@ impl Volume {
         (self.max() - self.min).norm()
     }
 
-    /// The cubes' middles, layer by layer from below, with the number of the layer.
+    /// The cubes' middles, layer by layer from below, with the index of the layer.
     pub fn centres(&self) -> impl Iterator<Item = (usize, Point3<f64>)> + '_ {
         let [columns, rows, layers] = self.cells;
         let at = move |cell: [usize; 3]| {
@@ -141,7 +143,7 @@ impl Volume {
     }
 }
 
-/// The nearest of 1, 2, 5, 10, ... to a number, by their ratio.
+/// The nearest of 1, 2, 5, 10, ... to a number, by ratio.
 fn round_number(value: f64) -> f64 {
     let power = 10.0_f64.powf(value.log10().floor());
     let near = |factor: &f64| (value / (factor * power)).ln().abs();
@@ -149,11 +151,13 @@ fn round_number(value: f64) -> f64 {
     factor.unwrap_or(1.0) * power
 }
 
-/// The point nearest to all optical axes (least squares), if there is one in front of all cameras.
+/// The point nearest to all optical axes (least squares), if they cross and it is in front of all
+/// cameras.
 fn crossing(cameras: &[Camera]) -> Option<Point3<f64>> {
     let (mut across, mut places) = (Matrix3::zeros(), Vector3::zeros());
     for camera in cameras {
         let axis = camera.pose().rotation() * Vector3::z();
+        // Normal equations: sum of (I - u u') x = sum of (I - u u') c
         let projection = Matrix3::identity() - axis * axis.transpose();
         across += projection;
         places += projection * camera.pose().position().coords;
@@ -211,7 +215,7 @@ mod tests {
         assert!((volume.middle() - Point3::from(target)).xy().norm() < volume.step_m());
         assert!(volume.min().z < 50.0 && volume.max().z > 90.0, "{volume:?}");
         assert!(volume.min().z >= 0.0);
-        // Side by side, and back to back.
+        // Cameras side by side, and back to back.
         for (first, second) in
             [([0.0, 99.0, 3.0], [10.0, 99.0, 3.0]), ([0.0, -99.0, 3.0], [10.0, 9.0, 3.0])]
         {

@@ -7,15 +7,16 @@ use super::ValidationOptions;
 use super::runs::{self, Noise};
 use super::table::{Limit, Row, Table, mean};
 
-/// Frames of an experiment, and their interval, s.
+/// Number of frames of an experiment, and their interval, s.
 const FRAMES: usize = 1000;
 const INTERVAL: f64 = 0.04;
 /// Weight of the old value in exponential smoothing.
 const MEMORY: f64 = 0.9;
-/// Runs of a pixel for each one of the tracker.
+/// Number of runs for each run of the tracker.
 const CHEAP: usize = 2;
 
-/// A cell of the experiment: rate of the jumps, 1/s; their SD and that of the noise, levels.
+/// Parameters of an experiment: rate of the brightness jumps, 1/s; SD of the jumps and of the
+/// noise, levels.
 #[derive(Clone, Copy)]
 struct Cell {
     rate: f64,
@@ -23,7 +24,7 @@ struct Cell {
     noise: f64,
 }
 
-/// Mean absolute errors (Solonar 2023, eqs. 17-19) of the filter and of the smoothing, in one run.
+/// Mean absolute errors (Solonar 2023, eqs. 17-19) of the filter and of the smoothing in one run.
 fn errors(seed: u64, run: usize, cell: Cell) -> [f64; 2] {
     let mut random = Noise::new(seed, run);
     let mut truth = 128.0;

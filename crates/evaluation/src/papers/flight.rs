@@ -1,4 +1,4 @@
-//! Pictures of a silhouette that flies, and a tracker that follows it.
+//! Pictures of a flying silhouette, and a tracker that follows it.
 
 use crossfix_correlation::Plane;
 use crossfix_message::Timestamp;
@@ -10,14 +10,14 @@ use super::runs::Noise;
 
 /// Time between images in the papers ("tact"), s.
 pub(crate) const TACT: f64 = 1.0 / 30.0;
-/// Standard deviation of the places that a tracker is given about the true ones, px.
+/// Standard deviation of the places given to a tracker, about the true ones, px.
 const GIVEN_SD: f64 = 0.02;
 /// Sides of the pictures, px.
 const SIDE: usize = 640;
 /// Frames of a flight (Herasymenko 2021, section 3).
 pub(crate) const FRAMES: usize = 20;
 
-/// Positions of the papers' target: from (100, 100) at 10 px per tact on each axis, white
+/// Places of the papers' target: from (100, 100) at 10 px per tact on each axis, with white
 /// acceleration of SD `sigma_a` px/tact^2.
 pub(crate) fn texts_path(noise: &mut Noise, frames: usize, sigma_a: f64) -> Vec<[f64; 2]> {
     let (mut position, mut velocity) = ([100.0; 2], [10.0; 2]);
@@ -33,7 +33,7 @@ pub(crate) fn texts_path(noise: &mut Noise, frames: usize, sigma_a: f64) -> Vec<
     path
 }
 
-/// How the silhouette is put into the picture.
+/// How the silhouette is drawn into the picture.
 #[derive(Clone, Debug)]
 pub(crate) enum Stamp {
     /// The box alone, its mean replaced by a pedestal, at whole pixels (errata, "Noisy reference").
@@ -43,7 +43,7 @@ pub(crate) enum Stamp {
 }
 
 impl Stamp {
-    /// The texts' crop of a silhouette.
+    /// A silhouette's crop as the papers paste it.
     pub(crate) fn pasted(silhouette: &Silhouette, pedestal: f32) -> Self {
         let mut crop = silhouette.canvas(0);
         let mean = crop.iter().sum::<f32>() / crop.len() as f32;
@@ -52,7 +52,7 @@ impl Stamp {
     }
 }
 
-/// A picture that is painted again and again: noise is drawn only where a gate can reach.
+/// A picture that is painted repeatedly: noise is drawn only where a gate can reach.
 pub(crate) struct Canvas {
     image: Plane,
     reach: [usize; 2],
@@ -60,14 +60,14 @@ pub(crate) struct Canvas {
 }
 
 impl Canvas {
-    /// For targets of given sides.
+    /// A picture for targets of given sides.
     pub(crate) fn new(sides: [usize; 2]) -> Self {
         let image = Plane::from_fn(SIDE, SIDE, |_, _| 0.0);
         Self { image, reach: sides.map(|side| 3 * side + 40), painted: None }
     }
 
-    /// Paints a picture: noise of SD `sigma_n` about a place, and there the stamp `strength` times,
-    /// then everything brighter by `light`.
+    /// Paints a picture: the stamp `strength` times at a place, about which everything becomes
+    /// brighter by `light` and gets noise of SD `sigma_n`.
     pub(crate) fn paint(
         &mut self,
         stamp: Option<&Stamp>,
@@ -104,7 +104,7 @@ impl Canvas {
 
     fn paste(&mut self, crop: &[f32], width: usize, at: [f64; 2]) {
         let height = crop.len() / width;
-        // At whole pixels, as near to the place as they are.
+        // At whole pixels, the nearest to the place.
         let start = |at: f64, side: usize| (at - (side as f64 - 1.0) / 2.0).round() as isize;
         let (left, top) = (start(at[0], width), start(at[1], height));
         for (i, value) in crop.iter().enumerate() {
@@ -128,16 +128,16 @@ pub(crate) struct Follower {
     sigma_a: f64,
 }
 
-/// How one picture's track lies to the truth.
+/// Errors of one picture's track, with the covariances that the filter stated.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Outcome {
     /// Prediction less truth, px.
     pub(crate) prediction: [f64; 2],
-    /// Variance of the prediction as the filter has it, an axis.
+    /// Variance of the prediction as the filter states it, per axis.
     pub(crate) prediction_variance: [f64; 2],
     /// Estimate less truth, px.
     pub(crate) estimate: [f64; 2],
-    /// Its variance as the filter has it.
+    /// Variance of the estimate as the filter states it, per axis.
     pub(crate) estimate_variance: [f64; 2],
     /// Normalised innovation squared of both axes, if there was a measurement.
     pub(crate) nis: Option<f64>,
@@ -146,7 +146,7 @@ pub(crate) struct Outcome {
 }
 
 impl Follower {
-    /// A tracker of a configuration for brightness from 0 to 1.
+    /// A tracker with a configuration, for brightness from 0 to 1.
     pub(crate) fn new(config: TrackerConfig, sides: [usize; 2]) -> Option<Self> {
         let sigma_a = config.acceleration_sd_px;
         let tracker = ImageTracker::new(TrackerConfig {
@@ -159,8 +159,8 @@ impl Follower {
         Some(Self { tracker, frame: 0, size: sides.map(|s| s as f64), last: None, sigma_a })
     }
 
-    /// Takes the next picture with the true place and velocity (px/s); in the first two the tracker
-    /// is given the place, and there is no outcome.
+    /// Processes the next picture; `truth` and `velocity` (px/s) are the true ones. In the first
+    /// two pictures the tracker is given the place, and there is no outcome.
     pub(crate) fn step(
         &mut self,
         image: &Plane,
@@ -196,6 +196,7 @@ impl Follower {
         let of = |p: ImagePoint| [p.x, p.y];
         let (was, speed, is, is_speed) =
             (of(before.position), of(before.velocity), of(now.position), of(now.velocity));
+        // Constant-velocity prediction F P F' + G G' sigma_a^2.
         let f = Matrix2::new(1.0, TACT, 0.0, 1.0);
         let g = Vector2::new(TACT * TACT / 2.0, TACT) * self.sigma_a;
         let (known, knows) = (before.covariances?, now.covariances?);

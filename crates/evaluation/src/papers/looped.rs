@@ -1,5 +1,5 @@
 //! The reference strategies in the tracking loop: a flight of 100 frames of the 25x15 silhouette at
-//! sigma_n 0.25 whose light, visibility and direction change.
+//! sigma_n 0.25, with changes of light, visibility and direction.
 
 use crossfix_simulation::Silhouette;
 use crossfix_vision::{ImmConfig, ReferenceStrategy, TrackerConfig};
@@ -12,17 +12,18 @@ use super::table::{Limit, Row, Table, mean, root_mean_square, share};
 const SIDES: [usize; 2] = [25, 15];
 const SIGMA_N: f64 = 0.25;
 const FRAMES: usize = 100;
-/// A flight of this experiment is five times as long as the papers'.
+/// The runs are divided by this: a flight of this experiment is five times as long as the papers'.
 const RUNS_SHARE: usize = 4;
 
-/// What happens to the target.
+/// What happens to the target in a flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Scene {
     name: &'static str,
     light: bool,
     occlusion: bool,
     turn: bool,
-    /// What is asked of the default, px, and what the errata's best strategy has.
+    /// Largest error allowed for the default strategy, px, beside what the errata's best strategy
+    /// has.
     asked: f64,
 }
 
@@ -34,14 +35,14 @@ const SCENES: [Scene; 5] = [
     Scene { name: "all together", light: true, occlusion: true, turn: true, asked: 0.9 },
 ];
 
-/// Where the target is at a frame: a Lissajous figure within the picture, accelerations below
+/// The target's place at a frame: a Lissajous figure within the picture, with accelerations below
 /// 0.9 px/frame^2.
 fn place(frame: usize, phases: [f64; 2]) -> [f64; 2] {
     let t = frame as f64 * std::f64::consts::TAU;
     [320.0 + 80.0 * (t / 60.0 + phases[0]).sin(), 320.0 + 60.0 * (t / 47.0 + phases[1]).sin()]
 }
 
-/// RMSE in the picture while the target can be seen, and whether it was lost at the end.
+/// RMSE in the picture while the target is visible, and whether it was lost at the end.
 fn fly(
     options: ValidationOptions,
     run: usize,
@@ -62,7 +63,7 @@ fn fly(
             strength = 0.7 + 0.6 * noise.uniform() as f32;
             level = 0.4 * (noise.uniform() as f32 - 0.5);
         }
-        // Ten frames hidden, twice.
+        // Hidden for ten frames, twice.
         let hidden = scene.occlusion && (30..40).contains(&(frame % 45));
         let stamp = stamps.get(if scene.turn { frame } else { 0 }).filter(|_| !hidden);
         let image = canvas.paint(stamp, truth, (strength, level), SIGMA_N, &mut noise);
@@ -94,7 +95,7 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
         [0.22, 0.24, 0.26, 0.44, 0.91],
         [0.27, 0.38, 0.30, 0.55, 1.89],
     ];
-    // Half a degree per frame.
+    // The target turns by half a degree per frame.
     let silhouette = Silhouette::new(SIDES[0], SIDES[1]);
     let stamps: Vec<Stamp> = (0..FRAMES)
         .map(|frame| Stamp::Drawn(silhouette.turned(1.0, (0.5 * frame as f64).to_radians())))

@@ -1,5 +1,5 @@
-//! Probability of losing the target, and how long it is kept (Herasymenko 2021, Fig. 7 and 8;
-//! Lytvynets 2020, tables 3 and 4).
+//! Probability of losing the target, and number of frames for which it is kept (Herasymenko 2021,
+//! Fig. 7 and 8; Lytvynets 2020, tables 3 and 4).
 
 use crossfix_simulation::Silhouette;
 use crossfix_vision::TrackerConfig;
@@ -41,8 +41,8 @@ const TEMPLATES: [Template; 3] = [
     },
 ];
 
-/// Frames that a target was kept in each run: the first whose prediction is off by more than the
-/// box on either axis ends it.
+/// Number of frames for which the target was kept in each run: the first frame whose prediction is
+/// off by more than the box on either axis ends it.
 fn kept(
     options: ValidationOptions,
     stamp: &Stamp,
@@ -76,7 +76,7 @@ fn frames(kept: &[usize]) -> (f64, f64) {
     mean(&kept.iter().map(|frames| *frames as f64).collect::<Vec<_>>())
 }
 
-/// What an independent implementation of the papers' algorithm reaches (errata).
+/// Loss that an independent implementation of the papers' algorithm reaches (errata).
 fn expected_lost(sides: [usize; 2], sigma_n: f64) -> Option<Limit> {
     let near = |value, tolerance| Some(Limit::Near { value, tolerance });
     match (sides[0], (sigma_n * 10.0).round() as u32) {
@@ -117,11 +117,12 @@ pub(super) fn paper_tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-/// What is asked of the default, by the template's columns and tenths of sigma_n.
+/// Largest loss allowed for the default tracker: the template's columns, tenths of sigma_n, and the
+/// limit.
 const ASKED: [(usize, u32, f64); 6] =
     [(10, 3, 0.01), (10, 4, 0.02), (10, 5, 0.05), (10, 6, 0.2), (25, 6, 0.01), (25, 8, 0.02)];
 
-/// The same flights with the default tracker, silhouettes between the pixels.
+/// The same flights with the default tracker, and silhouettes drawn at subpixel places.
 pub(super) fn default_tables(options: ValidationOptions) -> Vec<Table> {
     let mut rows = Vec::new();
     for Template { sides, lost: paper, .. } in &TEMPLATES {

@@ -1,5 +1,5 @@
-//! The papers' tables and figures made again, each figure beside the paper's: the image tracker of
-//! Herasymenko 2021 and Lytvynets 2020, the adaptive reference of Solonar 2023, the fusion of
+//! The papers' tables and figures computed again, each figure beside the paper's: the image tracker
+//! of Herasymenko 2021 and Lytvynets 2020, the adaptive reference of Solonar 2023, the fusion of
 //! Klochko 2020 and the manoeuvres of Kalinov 2019.
 
 mod brightness;
@@ -15,12 +15,12 @@ mod table;
 
 pub use table::{Limit, Row, Table, Verdict};
 
-/// How much is simulated.
+/// Extent of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ValidationOptions {
-    /// Monte Carlo runs of each experiment; the papers have 1000.
+    /// Number of Monte Carlo runs per experiment; the papers have 1000.
     pub runs: usize,
-    /// Seed of all of them.
+    /// Seed of all runs.
     pub seed: u64,
 }
 
@@ -30,7 +30,7 @@ impl Default for ValidationOptions {
     }
 }
 
-/// One experiment: its name, and what makes its tables.
+/// One experiment: its name, and the function that computes its tables.
 struct Experiment {
     name: &'static str,
     make: fn(ValidationOptions) -> Vec<Table>,
@@ -61,8 +61,8 @@ const TRACKER: [Experiment; 7] = [
     Experiment { name: "reference strategies in the loop", make: looped::tables },
 ];
 
-/// Makes the tables of the image tracker of those experiments whose name holds `only`. `progress`
-/// is told the number of experiments done, how many there are, and the name of the next.
+/// Computes the image tracker's tables, of the experiments whose name contains `only`. `progress`
+/// is told the number of experiments done, the number of all, and the name of the next.
 pub fn validate_tracker(
     options: ValidationOptions,
     only: &str,
@@ -71,7 +71,7 @@ pub fn validate_tracker(
     make(&TRACKER, options, only, progress)
 }
 
-/// Makes the tables of the fusion of those experiments whose name holds `only`; `progress` as in
+/// Computes the fusion's tables, of the experiments whose name contains `only`; `progress` as in
 /// [`validate_tracker`].
 pub fn validate_fusion(
     options: ValidationOptions,

@@ -1,4 +1,4 @@
-//! The Kalman filters: honesty of the covariance, and the curves of Herasymenko 2021, Fig. 6.
+//! The Kalman filters: consistency of the covariance, and the curves of Herasymenko 2021, Fig. 6.
 
 use crossfix_filter::{AxisFilter, AxisMeasurement};
 use crossfix_simulation::Silhouette;
@@ -10,10 +10,10 @@ use super::flight::{Canvas, FRAMES, Follower, Outcome, Stamp, TACT, texts_path};
 use super::runs::{self, Noise};
 use super::table::{Limit, Row, Table, mean, root_mean_square};
 
-/// Runs of the filter alone for each one of the tracker: they cost nothing.
+/// Number of runs of the filter alone for each run of the tracker: they take next to no time.
 const CHEAP: usize = 20;
 
-/// NEES of the filter on its own model; tolerance +-0.1.
+/// NEES of the filter on its own model; required within 0.1 of 2.
 fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
     let samples = runs::all(CHEAP * options.runs, |run| {
         let mut noise = Noise::new(options.seed, run);
@@ -41,8 +41,8 @@ fn filter_nees(options: ValidationOptions, sigma_a: f64) -> (f64, f64) {
     mean(&samples)
 }
 
-/// How a target flies: with white acceleration of an SD, px/tact^2, for so many frames, of which
-/// the first few do not count.
+/// Motion of a target: white acceleration with an SD, px/tact^2, for a number of frames, the first
+/// `skipped` outcomes of which do not count.
 #[derive(Clone, Copy)]
 struct Flight {
     name: &'static str,
@@ -51,11 +51,12 @@ struct Flight {
     skipped: usize,
 }
 
-/// The texts' flight, and one that is straight, from when a second has shown that it is.
+/// The papers' flight, and a straight one, counted from when a second has shown that it is
+/// straight.
 const TEXTS: Flight = Flight { name: "texts", sigma_a: 1.0, frames: FRAMES, skipped: 0 };
 const STRAIGHT: Flight = Flight { name: "straight", sigma_a: 0.0, frames: 50, skipped: 30 };
 
-/// The outcomes of every frame of runs that the tracker kept.
+/// The outcomes of every frame, of runs in which the tracker kept the target.
 fn outcomes(
     options: ValidationOptions,
     flight: Flight,
@@ -72,7 +73,8 @@ fn outcomes(
         let mut outcomes = Vec::new();
         for (frame, place) in path.iter().enumerate() {
             let image = canvas.paint(Some(&stamp), *place, (1.0, 0.0), sigma_n, &mut noise);
-            // The velocity at the end of the tact: the mean over it is the difference of places.
+            // The velocity at the end of the tact: the difference of places is the mean over the
+            // tact.
             let velocity = velocity_at(&path, frame);
             outcomes.extend(follower.step(image, *place, velocity, &mut noise));
         }
@@ -98,7 +100,8 @@ fn velocity_at(path: &[[f64; 2]], frame: usize) -> [f64; 2] {
     velocity.map(|v| v / TACT)
 }
 
-/// The mean over all frames and runs; the runs are independent, the frames of a run are not.
+/// The mean over all frames and runs, with its error from the runs' means: the runs are
+/// independent, the frames of a run are not.
 fn over_runs(runs: &[Vec<Outcome>], of: impl Fn(&Outcome) -> Option<f64>) -> (f64, f64) {
     let each: Vec<f64> =
         runs.iter().map(|run| mean(&run.iter().filter_map(&of).collect::<Vec<_>>()).0).collect();
@@ -119,8 +122,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-/// Consistency of the default tracker: squared innovations and errors over their variances, in
-/// cells with noise of their own.
+/// Consistency of the default tracker: squared innovations (NIS) and errors (NEES) over their
+/// variances, each cell with its own random numbers.
 fn honesty(options: ValidationOptions) -> Table {
     let mut rows = Vec::new();
     for flight in [TEXTS, STRAIGHT] {

@@ -1,4 +1,4 @@
-//! Accuracy of one measurement (Herasymenko 2021, Fig. 5), beside the Cramer-Rao bound.
+//! Accuracy of a single measurement (Herasymenko 2021, Fig. 5), beside the Cramer-Rao bound.
 
 use crossfix_correlation::{FitOptions, Fitter, LowPass, LowPassMemory, Plane, Reference, Window};
 use crossfix_simulation::{Silhouette, TEMPLATE_SIZES};
@@ -9,17 +9,17 @@ use super::table::{Limit, Row, Table, root_mean_square};
 
 /// Margin of the reference, px.
 const MARGIN: usize = 3;
-/// Low-pass of a clean reference, px: without one the silhouettes' edges, which are finer than a
-/// pixel, pull the fit towards whole pixels.
+/// Width of the low-pass for a clean reference, px: without one the silhouettes' edges, which are
+/// finer than a pixel, pull the fit towards whole pixels.
 const CLEAN_LOW_PASS: f32 = 0.45;
-/// Runs of a fit for each one of the tracker.
+/// Number of fits here for each run of the tracker.
 const CHEAP: usize = 20;
-/// The bound for noise of SD 1 (errata), x and y, of the sizes in their order.
+/// The bound for noise of SD 1 (errata), x and y, for the sizes in their order.
 const ERRATA_BOUNDS: [[f64; 2]; 4] =
     [[0.195, 0.155], [0.255, 0.197], [0.281, 0.241], [0.502, 0.392]];
 
-/// The bound for noise of SD 1: `sqrt(diag J^-1)`, J the sum of the gradient's outer products, here
-/// with contrast and brightness known.
+/// The Cramer-Rao bound for noise of SD 1: `sqrt(diag J^-1)`, J the sum of the gradient's outer
+/// products, here with contrast and brightness known.
 fn bound(silhouette: &Silhouette) -> [f64; 2] {
     const STEP: f64 = 0.05;
     let [width, height] = silhouette.sides().map(|side| side as i32 / 2 + 5);
@@ -39,15 +39,16 @@ fn bound(silhouette: &Silhouette) -> [f64; 2] {
         }
     }
     let determinant = xx * yy - xy * xy;
+    // Diagonal of the inverse of the 2 x 2 matrix.
     [(yy / determinant).sqrt(), (xx / determinant).sqrt()]
 }
 
-/// Low-pass of a noisy reference, px: the wider, the more noise.
+/// Width of the low-pass for a noisy reference, px: the more noise, the wider.
 fn noisy_low_pass(sigma_n: f64) -> f32 {
     (0.75 + 0.5 * sigma_n) as f32
 }
 
-/// A picture of the silhouette with its middle off the picture's by (dx, dy).
+/// A picture of the silhouette, whose middle is off the picture's by (dx, dy).
 fn picture(silhouette: &Silhouette, margin: usize, [dx, dy]: [f64; 2]) -> Plane {
     let [width, height] = silhouette.sides().map(|side| side + 2 * margin);
     let mut image = Plane::from_fn(width, height, |_, _| 0.0);
@@ -56,7 +57,7 @@ fn picture(silhouette: &Silhouette, margin: usize, [dx, dy]: [f64; 2]) -> Plane 
     image
 }
 
-/// The error of one fit, px, after the low-pass, and the contrast that it had or was given.
+/// The error of one fit, px, after the low-pass, and the contrast that was fitted or given.
 fn error(
     image: &Plane,
     reference: &Plane,
@@ -74,7 +75,7 @@ fn error(
     ([fit.x - start - offset[0], fit.y - start - offset[1]], fit.gain)
 }
 
-/// The largest error on an axis without noise, over the phases of a pixel.
+/// The largest error on an axis without noise, over the target's phases within a pixel.
 fn worst_bias(silhouette: &Silhouette, axis: usize) -> f64 {
     (0..400)
         .map(|phase| {
@@ -86,7 +87,8 @@ fn worst_bias(silhouette: &Silhouette, axis: usize) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// The errors of fits to pictures at any phase, less the bias there, which has a row of its own.
+/// The errors of fits to pictures at random phases, less the bias at that phase, which has a row of
+/// its own.
 fn fits(
     options: ValidationOptions,
     silhouette: &Silhouette,
@@ -104,8 +106,8 @@ fn fits(
             noise.add_to(reference.samples_mut(), sigma_n as f32);
         }
         let low_pass = if noisy { noisy_low_pass(sigma_n) } else { CLEAN_LOW_PASS };
-        // The bias at this phase has a row of its own.
-        // The bound has the contrast known.
+        // The bias at this phase is subtracted: it has a row of its own. The contrast is given, as
+        // the bound assumes it known.
         let (bias, contrast) = error(&clean[0], &clean[1], low_pass, None, offset);
         let ([x, y], _) = error(&image, &reference, low_pass, Some(contrast), offset);
         [x - bias[0], y - bias[1]]
@@ -127,14 +129,16 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                     let (deviation, standard_error) = root_mean_square(&of);
                     let kind = if noisy { "noisy reference" } else { "clean reference" };
                     let series = format!("{name} {label}, {kind}");
-                    // (16): 2 sigma over the side. The text: below a pixel.
+                    // Herasymenko 2021, eq. 16: 2 sigma over the side. The paper claims it to be
+                    // below a pixel.
                     let normalised = 2.0 / size[axis] as f64;
                     accuracy.push(Row::new(
                         &series,
                         sigma_n,
                         (deviation * normalised, standard_error * normalised),
                     ));
-                    // Two noisy pictures tell their offset root 2 less well than one.
+                    // Two noisy pictures determine their offset root 2 less well than one noisy and
+                    // one clean.
                     let best =
                         bound[axis] * sigma_n * if noisy { std::f64::consts::SQRT_2 } else { 1.0 };
                     let asked = Limit::AtMost(if noisy { 1.35 } else { 1.10 });

@@ -1,5 +1,5 @@
-//! Monte Carlo runs on all cores. A run is a function of its seed, so that the cores change
-//! nothing.
+//! Monte Carlo runs on all cores. A run is a function of its seed, so the number of cores does not
+//! change the results.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -11,7 +11,7 @@ use rand_distr::{Distribution, StandardNormal};
 pub(crate) struct Noise(ChaCha8Rng);
 
 impl Noise {
-    /// Those of a run of an experiment.
+    /// The random numbers of one run of an experiment.
     pub(crate) fn new(seed: u64, run: usize) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(run as u64);
@@ -51,7 +51,7 @@ pub(crate) fn all<T: Send>(count: usize, run: impl Fn(usize) -> T + Sync) -> Vec
             }
         };
         let threads: Vec<_> = (0..workers).map(|_| scope.spawn(work)).collect();
-        // A run that panics has failed: so has the whole.
+        // If a run panics, the whole experiment does.
         threads
             .into_iter()
             .flat_map(|thread| {

@@ -1,6 +1,6 @@
 use serde::Serialize;
 
-/// What a figure must be.
+/// Requirement on a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Limit {
@@ -19,39 +19,39 @@ pub enum Limit {
     },
 }
 
-/// Whether a figure is what it must be.
+/// Whether a figure meets its requirement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// It is.
+    /// It does.
     Pass,
-    /// It is not.
+    /// It does not.
     Fail,
-    /// Nothing is asked of it.
+    /// It has none.
     Information,
 }
 
 /// A figure beside the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
-    /// What it is of: the curve.
+    /// Name of the curve.
     pub series: String,
-    /// Where on the curve.
+    /// Abscissa on the curve.
     pub x: f64,
     /// The paper's figure, if it prints one.
     pub paper: Option<f64>,
     /// An independent reference implementation's figure, if there is one.
     pub reference: Option<f64>,
-    /// What is asked.
+    /// The requirement, if there is one.
     pub limit: Option<Limit>,
-    /// Ours.
+    /// Our figure.
     pub ours: f64,
     /// Its Monte Carlo standard error; 0 where nothing is random.
     pub standard_error: f64,
 }
 
 impl Row {
-    /// A row with ours alone.
+    /// A row with our figure alone.
     pub fn new(series: impl Into<String>, x: f64, (ours, standard_error): (f64, f64)) -> Self {
         Self {
             series: series.into(),
@@ -78,14 +78,14 @@ impl Row {
         self
     }
 
-    /// With what is asked.
+    /// With a requirement.
     #[must_use]
     pub fn limit(mut self, limit: Limit) -> Self {
         self.limit = Some(limit);
         self
     }
 
-    /// Whether ours is what is asked.
+    /// Whether our figure meets the requirement.
     pub fn verdict(&self) -> Verdict {
         let good = match self.limit {
             None => return Verdict::Information,
@@ -116,13 +116,14 @@ pub struct Table {
 }
 
 impl Table {
-    /// Rows that fail.
+    /// Number of rows that fail.
     pub fn failures(&self) -> usize {
         self.rows.iter().filter(|row| row.verdict() == Verdict::Fail).count()
     }
 }
 
-/// The mean of samples with its standard error; of none it is not a number, which no limit passes.
+/// The mean of samples with its standard error; without samples it is not a number, which meets no
+/// limit.
 pub(crate) fn mean(samples: &[f64]) -> (f64, f64) {
     let count = samples.len() as f64;
     let mean = samples.iter().sum::<f64>() / count;
@@ -135,13 +136,15 @@ pub(crate) fn root_mean_square(samples: &[f64]) -> (f64, f64) {
     let squares: Vec<f64> = samples.iter().map(|s| s * s).collect();
     let (square, error) = mean(&squares);
     let root = square.sqrt();
+    // By linearisation: d(root) = d(square) / (2 root).
     (root, if root > 0.0 { error / (2.0 * root) } else { 0.0 })
 }
 
-/// The root of the ratio of two means of squares over the same runs, with its standard error.
+/// The root of the ratio of two mean squares over the same runs, with its standard error.
 pub(crate) fn root_ratio(squares: &[f64], other_squares: &[f64]) -> (f64, f64) {
     let (above, below) = (mean(squares).0, mean(other_squares).0);
     let root = (above / below).sqrt();
+    // By linearisation; both means are of the same runs, so their errors are correlated.
     let off: Vec<f64> =
         squares.iter().zip(other_squares).map(|(a, b)| a / above - b / below).collect();
     (root, root / 2.0 * mean(&off).1)

@@ -1,4 +1,4 @@
-//! How a camera stands, and from when on.
+//! A camera's calibrations, and from when on each holds.
 
 use std::collections::BTreeMap;
 
@@ -8,18 +8,18 @@ use nalgebra::{Matrix6, Point3};
 
 use crate::uncertainty::{CameraUncertainty, LastingNoise, PoseUncertainty};
 
-/// Calibrations of a camera that wait for their time. One that is moved by hand has one at most; of
-/// a clock that runs wild, those that lie farthest in the future are forgotten.
+/// Most calibrations of a camera that wait for their time. A camera that is moved by hand has one
+/// at most; of a clock that runs wild, those that lie farthest in the future are forgotten.
 const MAX_UPCOMING: usize = 8;
 
 /// A camera as its calibration describes it.
 #[derive(Clone, Debug)]
 pub(crate) struct KnownCamera {
-    /// On a mount, with both angles at zero; of [`Self::pointed`], as it points.
+    /// With both angles of its mount at zero; in what [`Self::pointed`] returns, as it points.
     pub(crate) camera: Camera,
-    /// What turns it, if something does.
+    /// The mount that turns it, if there is one.
     pub(crate) mount: Option<PanTilt>,
-    /// Whether it looks for what it is told to look for.
+    /// Whether it looks for what it is told to look for (takes cues).
     pub(crate) takes_cues: bool,
     /// Whether it is being turned, so that it measures nothing.
     pub(crate) is_turning: bool,
@@ -27,14 +27,14 @@ pub(crate) struct KnownCamera {
     pub(crate) pose_covariance: Matrix6<f64>,
     /// The part of its bearings' noise that lasts.
     pub(crate) lasting: LastingNoise,
-    /// What its clock wanders by, beside offset and drift: s^2/s.
+    /// Random walk of its clock, beside offset and drift, s^2/s.
     pub(crate) clock_walk: f64,
-    /// Whether somebody has said how sure the pose is.
+    /// Whether somebody has stated the uncertainty of the pose.
     pub(crate) is_declared: bool,
 }
 
 impl KnownCamera {
-    /// Whether its pose, or what is known of it, is another.
+    /// Whether its pose, or what is known of the pose, differs from another's.
     pub(crate) fn is_elsewhere(&self, other: &Self) -> bool {
         let (one, two) = (self.camera.pose(), other.camera.pose());
         one.position() != two.position()
@@ -64,9 +64,9 @@ impl KnownCamera {
 
 /// A camera as it stands at the exposure that is handled, and as it will stand later.
 ///
-/// A frame waits for others that were captured before it. If its camera is calibrated anew
-/// meanwhile, it must still be read with the calibration that held when it was captured, or a
-/// recording would give other tracks than the flight did.
+/// A frame waits for others that were captured before it. If its camera is calibrated again
+/// meanwhile, the frame must still be read with the calibration that held when it was captured, or
+/// a recording would give other tracks than the flight did.
 #[derive(Clone, Debug)]
 pub(super) struct Calibrations {
     now: KnownCamera,
@@ -74,12 +74,12 @@ pub(super) struct Calibrations {
 }
 
 impl Calibrations {
-    /// By the first calibration, which holds for all that was captured before it, too.
+    /// Starts with the first calibration, which also holds for all that was captured before it.
     pub(super) fn first(known: KnownCamera) -> Self {
         Self { now: known, upcoming: BTreeMap::new() }
     }
 
-    /// Takes a calibration in that holds from a capture time on.
+    /// Takes in a calibration that holds from a capture time on.
     pub(super) fn expect(&mut self, valid_from: Timestamp, known: KnownCamera) {
         self.upcoming.insert(valid_from, known);
         if self.upcoming.len() > MAX_UPCOMING {
@@ -97,7 +97,7 @@ impl Calibrations {
         self.upcoming.range(..=time).next_back().map_or(&self.now, |(_, known)| known)
     }
 
-    /// Goes on to a time; says whether the camera stands elsewhere from now on.
+    /// Moves on to a time; returns whether the camera stands elsewhere from now on.
     pub(super) fn advance(&mut self, time: Timestamp) -> bool {
         let mut has_moved = false;
         while let Some(entry) = self.upcoming.first_entry().filter(|entry| *entry.key() <= time) {
@@ -148,7 +148,7 @@ mod tests {
         assert_eq!(x(camera.now()), 1.0);
         assert!(camera.advance(at(20.0)));
         assert_eq!(x(camera.now()), 2.0);
-        // Said again: nothing moves.
+        // The same calibration once more: nothing moves.
         camera.expect(at(20.0), standing_at(2.0));
         assert!(!camera.advance(at(20.1)));
     }

@@ -1,4 +1,4 @@
-//! All that is known of the cameras: how each stands, and how far it is believed.
+//! Everything that is known of the cameras: how each stands, and how far it is believed.
 //!
 //! | of a camera | learnt from | file |
 //! |---|---|---|
@@ -6,21 +6,21 @@
 //! | how good its pose is | how well its lines meet the others' | `pose_scale.rs` |
 //! | whether it has been moved | the same, over a minute | `watch.rs` |
 //! | how noisy its bearings are | third differences of its own bearings | `noise.rs` |
-//! | how much it reports that is nobody's | what no track takes | `strangers.rs` |
+//! | its clutter: bearings of no target | what no track takes | `clutter.rs` |
 //! | what stands in its view for good | what it reports in one place | `rooted.rs` |
 //! | where its mount points | its frames | `pointing.rs` |
 //! | whether it is left out | lines beside what others see, frames out of time | `standing.rs` |
 //!
-//! Its clock is not here: clocks are known against each other, and what is learnt of one is tied to
-//! all (`crate::clocks`).
+//! Clocks are not kept here: they are known relative to each other, and what is learnt of one is
+//! correlated with all (`crate::clocks`).
 
 mod calibration;
+mod clutter;
 mod noise;
 mod pointing;
 mod pose_scale;
 mod rooted;
 mod standing;
-mod strangers;
 mod watch;
 
 use std::collections::BTreeMap;
@@ -32,36 +32,36 @@ use crossfix_message::ClockSource;
 
 use crate::Exposure;
 use calibration::Calibrations;
+use clutter::ClutterRate;
 use noise::WhiteNoise;
 use pose_scale::PoseScale;
 use rooted::View;
 use standing::Standing;
-use strangers::Strangers;
 use watch::Watch;
 
 pub(crate) use calibration::KnownCamera;
+pub(crate) use clutter::view_sr;
 pub(crate) use noise::LastThree;
 pub(crate) use pointing::Pointed;
 pub(crate) use pose_scale::Sample;
 pub(crate) use rooted::Rooted;
 pub use standing::CameraStanding;
 pub(crate) use standing::{Fitting, Fittings};
-pub(crate) use strangers::view_sr;
 pub use watch::PoseFinding;
 
-/// A camera whose noise is so many times (variance) what it reports is doubted.
+/// A camera whose noise variance is this many times the reported one is doubted.
 const DOUBTED_NOISE: f64 = 2.0;
 /// A clock whose variance (logarithm) and offset (in its deviations) change by less than this
 /// changes no track.
 const NOTICED_CLOCK: f64 = 0.1;
-/// By how much larger in variance another clock is taken to be than the one before: so much that
-/// what a track holds of the one says nothing of the other.
+/// Variance ratio that another clock has to the one before: so large that what a track has learnt
+/// of the one says nothing of the other.
 const ANOTHER_CLOCK: f64 = 1e24;
 /// A clock whose deviation is less than this is right, s: times are counted in nanoseconds, and
-/// what is known of a clock must not be divided by next to nothing.
+/// nothing must be divided by so small a deviation.
 const RIGHT_CLOCK_S: f64 = 1e-9;
 
-/// The clock that the tracks know of: what sets it, its deviation and its offset, s.
+/// The clock as the tracks were told of it: its source, its deviation and its offset, s.
 #[derive(Clone, Copy, Debug)]
 struct ToldClock {
     source: ClockSource,
@@ -69,12 +69,12 @@ struct ToldClock {
     offset_s: f64,
 }
 
-/// A clock that is known otherwise than it was.
+/// Change of what is known of a clock.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ClockChange {
-    /// By how much it is found to be ahead, in its deviations so far.
+    /// By how much the clock is found to be ahead, in its deviations so far.
     pub(crate) ahead: f64,
-    /// By how much its variance has changed.
+    /// Ratio of its variance now to that before.
     pub(crate) ratio: f64,
 }
 
@@ -82,18 +82,18 @@ pub(crate) struct ClockChange {
 #[derive(Clone, Debug)]
 pub(crate) struct CameraState {
     calibrations: Calibrations,
-    /// Where its mount pointed in its newest exposure, and the camera as that turned it.
+    /// Where its mount pointed in its newest exposure, and the camera turned there.
     pointed: Option<(Pointed, KnownCamera)>,
     pose_scale: PoseScale,
     noise: WhiteNoise,
-    strangers: Strangers,
+    clutter: ClutterRate,
     view: View,
     told_clock: Option<ToldClock>,
-    /// Beside targets that three others see, ...
+    /// By the targets that three others see.
     standing: Standing,
-    /// ... that two others see, ...
+    /// By the targets that two others see.
     misfits: Standing,
-    /// ... and how its frames' times fit.
+    /// By the times of its frames.
     punctuality: Standing,
 }
 
@@ -104,7 +104,7 @@ impl CameraState {
             calibrations: Calibrations::first(known),
             pointed: None,
             noise: WhiteNoise::default(),
-            strangers: Strangers::default(),
+            clutter: ClutterRate::default(),
             view: View::new(rooted_s),
             told_clock: None,
             standing: Standing::default(),
@@ -113,18 +113,18 @@ impl CameraState {
         }
     }
 
-    /// As it stands and points at the exposure that is handled.
+    /// The camera as it stands and points at the exposure that is handled.
     pub(crate) fn known(&self) -> &KnownCamera {
         self.pointed.as_ref().map_or_else(|| self.calibrations.now(), |(_, known)| known)
     }
 
-    /// As it stands, with the angles of a mount at zero.
+    /// The camera with the angles of its mount at zero.
     pub(crate) fn at_rest(&self) -> &KnownCamera {
         self.calibrations.now()
     }
 
-    /// Takes in where it pointed in an exposure; returns whether its mount has turned it since the
-    /// one before.
+    /// Takes in where the camera pointed in an exposure; returns whether its mount has turned it
+    /// since the exposure before.
     pub(crate) fn point(&mut self, exposure: &Exposure) -> bool {
         let Some(now) = exposure.pointed else { return false };
         let has_turned =
@@ -136,12 +136,12 @@ impl CameraState {
         has_turned
     }
 
-    /// How many times its reported covariances count.
+    /// Factor on its reported covariances.
     pub(crate) fn noise_factor(&self) -> f64 {
         self.noise.factor()
     }
 
-    /// How far it is believed.
+    /// How far the camera is believed.
     pub(crate) fn standing(&self) -> CameraStanding {
         if self.is_excluded() {
             CameraStanding::Excluded
@@ -152,17 +152,18 @@ impl CameraState {
         }
     }
 
-    /// Whether it is left out.
+    /// Whether the camera is left out.
     pub(crate) fn is_excluded(&self) -> bool {
         self.standing.is_excluded() || self.punctuality.is_excluded()
     }
 
-    /// Puts into an exposure what is known of the camera, and takes what it shows in. Where too
-    /// little has been seen to tell how many of its bearings are false, there are `clutter_per_sr`.
+    /// Writes into an exposure what is known of its camera, and takes in what it shows. Where too
+    /// little has been seen to tell how many of the camera's bearings are false, `clutter_per_sr`
+    /// is assumed.
     pub(crate) fn tell(&mut self, exposure: &mut Exposure, clutter_per_sr: f64) {
         exposure.uncertainty.pose_scale = self.pose_scale.factor();
         exposure.uncertainty.factor = self.noise.factor();
-        exposure.clutter_per_sr = self.strangers.per_sr(self.known()).unwrap_or(clutter_per_sr);
+        exposure.clutter_per_sr = self.clutter.per_sr(self.known()).unwrap_or(clutter_per_sr);
         let lines = exposure.sightings.iter().map(|sighting| &sighting.line);
         let rooted = self.view.see(exposure.time, lines);
         for (sighting, rooted) in exposure.sightings.iter_mut().zip(rooted) {
@@ -170,7 +171,7 @@ impl CameraState {
         }
     }
 
-    /// How its clock has changed since the tracks were told, by an exposure; `None` if little.
+    /// Change of the clock since the tracks were told, by an exposure; `None` if it is small.
     fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
         let now = ToldClock {
             source: exposure.uncertainty.clock_source,
@@ -179,7 +180,8 @@ impl CameraState {
         };
         let told = *self.told_clock.get_or_insert(now);
         if told.source != now.source {
-            // Tracks hold the error of the clock before, and nothing of this one's.
+            // The tracks are correlated with the error of the clock before, and not with that of
+            // this one.
             self.told_clock = Some(now);
             return Some(ClockChange { ahead: 0.0, ratio: ANOTHER_CLOCK });
         }
@@ -193,19 +195,19 @@ impl CameraState {
         known.then_some(ClockChange { ahead, ratio })
     }
 
-    /// Takes in squared third differences of its bearings of tracks, and how many of an exposure
-    /// are nobody's; a bearing holds a track for `holding_s`.
+    /// Takes in squared third differences of the camera's bearings of tracks, and the number of
+    /// its unassigned bearings in an exposure (clutter). A bearing holds a track for `holding_s`.
     pub(crate) fn learn_noise(
         &mut self,
         time: Timestamp,
-        (third_differences, strangers): (&[f64], usize),
+        (third_differences, unassigned): (&[f64], usize),
         holding_s: f64,
     ) {
         third_differences.iter().for_each(|squared| self.noise.see(*squared));
-        self.strangers.see(time, strangers, holding_s);
+        self.clutter.see(time, unassigned, holding_s);
     }
 
-    /// Takes in whether a frame came in time, one that was refused says nothing else; returns the
+    /// Takes in whether a frame came in time (one that was refused says nothing else); returns the
     /// new standing if that has changed.
     pub(crate) fn note_time(&mut self, time: Timestamp, in_time: bool) -> Option<CameraStanding> {
         let fitting = if in_time { Fitting::Fits } else { Fitting::Refused };
@@ -213,7 +215,7 @@ impl CameraState {
         self.punctuality.review()
     }
 
-    /// It has been moved: what was learnt of it was of how it stood before.
+    /// Forgets what was learnt of how the camera stood before it was moved.
     fn move_on(&mut self) {
         self.pointed = None;
         let known = self.known();
@@ -224,16 +226,16 @@ impl CameraState {
     }
 }
 
-/// What an exposure says of its camera.
+/// Verdict of an exposure on its camera.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Judgement {
     /// The camera's new standing, where it has changed.
     pub(crate) standing: Option<CameraStanding>,
-    /// It passes beside targets: its clock may be wrong.
+    /// The camera's bearings pass beside targets: its clock may be wrong.
     pub(crate) suspects_clock: bool,
 }
 
-/// All that is known of the cameras, by name.
+/// Everything that is known of the cameras, by name.
 #[derive(Clone, Debug)]
 pub(crate) struct Cameras {
     by_name: BTreeMap<CameraName, CameraState>,
@@ -243,13 +245,13 @@ pub(crate) struct Cameras {
 }
 
 impl Cameras {
-    /// None is known yet. What stays in one place for `rooted_s` is rooted.
+    /// No camera is known yet. What stays in one place for `rooted_s` is rooted.
     pub(crate) fn new(rooted_s: f64) -> Self {
         Self { by_name: BTreeMap::new(), rooted_s, watch: Watch::default() }
     }
 
-    /// Makes a camera known, or how it will stand from a capture time on. The first calibration
-    /// holds for all that was captured before it, too.
+    /// Adds a camera, or a calibration of it that holds from a capture time on. The first
+    /// calibration also holds for everything that was captured before it.
     pub(crate) fn calibrate(
         &mut self,
         name: CameraName,
@@ -292,12 +294,12 @@ impl Cameras {
         self.by_name.iter()
     }
 
-    /// How many there are.
+    /// Number of cameras.
     pub(crate) fn len(&self) -> usize {
         self.by_name.len()
     }
 
-    /// Goes on to a time; returns the cameras that stand elsewhere from now on. What was learnt of
+    /// Moves on to a time; returns the cameras that stand elsewhere from now on. What was learnt of
     /// how they stood is forgotten.
     pub(crate) fn advance(&mut self, time: Timestamp) -> Vec<CameraName> {
         let mut moved = Vec::new();
@@ -311,8 +313,8 @@ impl Cameras {
         moved
     }
 
-    /// How the clock of an exposure's camera has changed since the tracks were told; `None` if
-    /// little.
+    /// Change of the clock of an exposure's camera since the tracks were told; `None` if it is
+    /// small.
     pub(crate) fn clock_change(&mut self, exposure: &Exposure) -> Option<ClockChange> {
         let change = self.by_name.get_mut(&exposure.camera)?.clock_change(exposure)?;
         self.watch.forget_clock(&exposure.camera);
@@ -331,7 +333,8 @@ impl Cameras {
         };
         camera.standing.learn(time, &fittings.of_three);
         camera.misfits.learn(time, &fittings.of_two);
-        // Beside the targets that two others see: they accuse nobody, but its clock may be wrong.
+        // By targets that only two others see nobody is accused, but the camera's clock may be
+        // wrong.
         let misfits = camera.misfits.review() == Some(CameraStanding::Excluded);
         let lapsed = camera.standing.lapse(time).then_some(CameraStanding::Good);
         let standing = camera.standing.review().or(lapsed);
@@ -343,12 +346,12 @@ impl Cameras {
         Judgement { standing, suspects_clock: misfits || excluded }
     }
 
-    /// Forgets what the cameras reported beside the targets: it was of another time.
-    pub(crate) fn forget_strangers(&mut self) {
-        self.by_name.values_mut().for_each(|camera| camera.strangers = Strangers::default());
+    /// Forgets the cameras' clutter rates: they are of another time.
+    pub(crate) fn forget_clutter(&mut self) {
+        self.by_name.values_mut().for_each(|camera| camera.clutter = ClutterRate::default());
     }
 
-    /// Forgets when they have seen what.
+    /// Forgets what the cameras have seen stand in their views, and since when.
     pub(crate) fn look_anew(&mut self) {
         self.by_name.values_mut().for_each(|camera| camera.view = camera.view.anew());
     }

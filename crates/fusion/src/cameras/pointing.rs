@@ -6,15 +6,15 @@ use crossfix_message::Pointing;
 use super::KnownCamera;
 use crate::uncertainty::LastingNoise;
 
-/// What a mount says of where it points stays as wrong as it is until it turns, s: longer than it
-/// looks in one direction. With a tenth of it a camera that stares at a target for a minute would be
-/// taken to have told its direction many times over.
+/// How long the error of the angles that a mount reports lasts while the mount does not turn, s:
+/// longer than it looks in one direction. With a tenth of it a camera that stares at a target for a
+/// minute would count as having measured its direction many times over.
 const DWELL_S: f64 = 100.0;
-/// A mount that says it points so many deviations from where it pointed before has turned.
+/// A mount has turned if it reports a direction this many deviations from the one before.
 const TURNED_SDS: f64 = 4.0;
-/// Angles that differ by less than this are one, rad: what is left of a number on its way.
+/// Angles that differ by less than this are the same, rad: what is left of a number on its way.
 const SAME_RAD: f64 = 1e-9;
-/// A mount that knows where it points no better than this says nothing, rad.
+/// A mount whose angles have at least this standard deviation says nothing, rad.
 const WORST_SD_RAD: f64 = 1.0;
 
 /// Where a camera on a mount pointed in an exposure.
@@ -23,12 +23,12 @@ pub(crate) struct Pointed {
     angles: ScanAngles,
     /// Standard deviation of the direction along the axis that is known worse, rad.
     sd_rad: f64,
-    /// Whether it stood still.
+    /// Whether the mount stood still.
     pub(crate) is_settled: bool,
 }
 
 impl Pointed {
-    /// As a frame says it; `None` if that is impossible.
+    /// Reads the pointing of a frame; `None` if it is impossible.
     pub(crate) fn read(message: &Pointing) -> Option<Self> {
         let angles = message.angles()?;
         let sd_rad = (message.azimuth_sd * angles.elevation.cos()).max(message.elevation_sd);
@@ -37,7 +37,7 @@ impl Pointed {
         both.then_some(Self { angles, sd_rad, is_settled: message.settled })
     }
 
-    /// Whether it has turned since it pointed there.
+    /// Whether the mount has turned since it pointed as `before`.
     pub(crate) fn has_turned_from(&self, before: &Self) -> bool {
         let by = (self.angles.azimuth - before.angles.azimuth)
             .hypot(self.angles.elevation - before.angles.elevation);
@@ -46,7 +46,7 @@ impl Pointed {
 }
 
 impl KnownCamera {
-    /// The camera as it points; as it is, if nothing turns it.
+    /// The camera turned to where its mount points; unchanged if no mount turns it.
     pub(crate) fn pointed(&self, pointed: &Pointed) -> Self {
         let Some(mount) = &self.mount else { return self.clone() };
         Self {
@@ -58,8 +58,8 @@ impl KnownCamera {
     }
 }
 
-/// What lasts of a camera's noise, with what its mount's angles are off by: the larger of the two
-/// says for how long.
+/// Lasting noise of a camera's bearings together with the error of its mount's angles: the larger
+/// of the two determines how long it lasts.
 fn with_pointing(lasting: LastingNoise, pointed: &Pointed) -> LastingNoise {
     let time_s = if pointed.sd_rad > lasting.sd_rad { DWELL_S } else { lasting.time_s };
     LastingNoise { sd_rad: lasting.sd_rad.hypot(pointed.sd_rad), time_s }

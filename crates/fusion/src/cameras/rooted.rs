@@ -1,34 +1,34 @@
-//! What stands in a camera's view for good: trees, horizons, lights, cloud edges. Detectors report
-//! them again and again in the same place, and the lines of two cameras to two of them cross as a
-//! target's do.
+//! What stands in a camera's view for good (is rooted): trees, horizons, lights, cloud edges.
+//! Detectors report such objects again and again in the same place, and the lines of two cameras to
+//! two of them cross as a target's do.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::Timestamp;
 use nalgebra::{Unit, Vector3};
 
-/// How far something rooted sways about its middle, rad: a tree of 2 m in the wind at 150 m.
+/// How far a rooted object sways about its middle, rad: a tree of 2 m in the wind at 150 m.
 const REACH_RAD: f64 = 0.015;
-/// The middle follows what it sways about with a time constant of so many times that after which
-/// something is rooted: a few periods of a tree.
+/// Time constant with which the middle follows the swaying object, in units of the time after which
+/// an object is rooted: a few periods of a tree.
 const MIDDLE: f64 = 2.0;
-/// Something rooted is reported in at least this share of the exposures.
+/// Least share of the exposures in which a rooted object is reported.
 const LEAST_SHARE: f64 = 0.3;
-/// What has not been reported for so many times that time is forgotten.
+/// A place that has not been reported for this many times that time is forgotten.
 const FORGOTTEN: f64 = 7.0;
-/// What has been reported in a smaller share of the exposures since is clutter and not remembered:
-/// of clutter there is no end. With half of it twice as many places are searched for each bearing;
-/// ten times as much would forget what is seldom detected.
+/// A place reported in a smaller share of the exposures since its first report is clutter and not
+/// remembered: of clutter there is no end. With half of it twice as many places are searched for
+/// each bearing; ten times as much would forget what is seldom detected.
 const CLUTTER_SHARE: f64 = 0.03;
-/// What is reported within this share of that time of a camera's first exposure may have been there
-/// before.
+/// An object first reported within this share of that time after a camera's first exposure may have
+/// been there before.
 const BEGINNING: f64 = 0.2;
-/// Places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
+/// Most places that are remembered of a camera, the latest ones: clutter cannot fill the memory.
 const MAX_PLACES: usize = 1_000;
 
 /// Whether a bearing is of something that stands in its camera's view for good.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Rooted {
-    /// It was there when the camera began to look, not long ago.
+    /// It was there when the camera began to look, which is not long ago.
     #[default]
     Unknown,
     /// It has come or moved.
@@ -40,20 +40,20 @@ pub(crate) enum Rooted {
 #[derive(Clone, Copy, Debug)]
 struct Place {
     middle: Unit<Vector3<f64>>,
-    /// Where its middle was at [`Self::first`].
+    /// Where the middle was at [`Self::first`].
     start: Unit<Vector3<f64>>,
     first: Timestamp,
     last: Timestamp,
     reports: f64,
-    /// [`View::exposures`] before the first.
+    /// [`View::exposures`] before its first report.
     before: f64,
 }
 
 /// The places in a camera's view from which it has reported something lately.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
-    /// What has stayed within reach of one direction for this long is rooted, s: a target that
-    /// flies leaves it sooner, and one that hovers has been seen to come.
+    /// An object that has stayed within reach of one direction for this long is rooted, s: a target
+    /// that flies leaves it sooner, and one that hovers has been seen to come.
     rooted_s: f64,
     places: Vec<Place>,
     began: Option<Timestamp>,
@@ -61,17 +61,17 @@ pub(crate) struct View {
 }
 
 impl View {
-    /// Of a camera that has not looked yet.
+    /// The view of a camera that has not looked yet.
     pub(crate) fn new(rooted_s: f64) -> Self {
         Self { rooted_s, places: Vec::new(), began: None, exposures: 0.0 }
     }
 
-    /// Of a camera that begins to look once more.
+    /// The view of a camera that begins to look again.
     pub(super) fn anew(&self) -> Self {
         Self::new(self.rooted_s)
     }
 
-    /// Takes an exposure's lines in; says of each whether it is rooted.
+    /// Takes in the lines of an exposure; returns for each whether it is of something rooted.
     pub(crate) fn see<'a>(
         &mut self,
         time: Timestamp,
@@ -123,7 +123,8 @@ impl View {
         place.middle = Unit::new_normalize(place.middle.into_inner() + moved);
         place.last = place.last.max(time);
         place.reports += 1.0;
-        // What sways comes back; a middle that goes on is of something that flies slowly.
+        // A swaying object comes back; a middle that moves on is that of something that flies
+        // slowly.
         if (place.middle.into_inner() - place.start.into_inner()).norm() > REACH_RAD {
             (place.start, place.first) = (place.middle, time);
             return Rooted::No;

@@ -1,24 +1,24 @@
 //! How far each camera can be believed.
 //!
-//! How large a camera's errors are is found from all lines together ([`super::pose_scale`]), and
-//! such a camera counts less; here is what that cannot find: a camera whose lines miss the targets
-//! by so much that no track takes them, and one whose frames come at impossible times. A target
-//! that a camera does not report accuses nobody: something may stand in between. Only a line beside
-//! a target that three other cameras see does.
+//! The size of a camera's errors is estimated from all lines together ([`super::pose_scale`]), and
+//! a camera with large ones counts less. This file finds what that estimate cannot: a camera whose
+//! lines miss the targets by so much that no track takes them, and one whose frames come at
+//! impossible times. That a camera does not report a target is no evidence against it: something
+//! may stand in between. Only a line beside a target that three other cameras see is.
 
 use crossfix_message::Timestamp;
 
-/// What is remembered of a camera, s: long enough for a bird beside a target to pass, short enough
-/// for a camera that has been put right to come back.
+/// Memory of the evidence on a camera, s: long enough for a bird beside a target to pass, short
+/// enough for a camera that has been put right to come back.
 const MEMORY_S: f64 = 5.0;
-/// Evidence that a verdict needs, s.
+/// Least evidence for a verdict, s.
 const LEAST_EVIDENCE_S: f64 = 3.0;
-/// A camera that misses the targets, or whose frames are refused, in this share of the time is left
-/// out.
+/// A camera is left out when it misses the targets, or its frames are refused, in more than this
+/// share of the time.
 const EXCLUSION: f64 = 0.7;
-/// It comes back when it does so in less than this.
+/// It comes back when that share falls below this.
 const RETURN: f64 = 0.3;
-/// Frames further apart than this count no longer than it, s.
+/// Longest time that the step from one frame to the next counts, s.
 const LONGEST_STEP_S: f64 = 1.0;
 
 /// How far a camera is believed.
@@ -36,9 +36,9 @@ pub enum CameraStanding {
 /// How a camera's exposure fits the targets that three other cameras see.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Fitting {
-    /// It has a bearing of such a target.
+    /// The exposure has a bearing of such a target.
     Fits,
-    /// It has one beside it, and none of it.
+    /// It has a bearing beside the target, and none of it.
     Beside,
     /// Its frame was refused for its time.
     Refused,
@@ -54,7 +54,7 @@ pub(crate) struct Fittings {
 }
 
 impl Fittings {
-    /// Notes how a target that so many other cameras see is fitted; `None` says nothing.
+    /// Notes how the exposure fits a target that `others` other cameras see; `None` says nothing.
     pub(crate) fn add(&mut self, others: usize, fitting: Option<Fitting>) {
         if others >= 2 {
             self.of_two.extend(fitting);
@@ -65,12 +65,12 @@ impl Fittings {
     }
 }
 
-/// What a verdict on a camera is made of.
+/// Evidence for a verdict on a camera.
 #[derive(Clone, Copy, Debug)]
 struct Evidence {
-    /// Share of the time in which it has been wrong.
+    /// Share of the time in which the camera has been wrong.
     wrong: f64,
-    /// How long it has been compared, s.
+    /// How long the camera has been compared, s.
     compared_s: f64,
     last: Timestamp,
     excluded: bool,
@@ -82,14 +82,14 @@ impl Evidence {
     }
 }
 
-/// The standing of a camera, by one kind of evidence; none as long as there was nothing to compare
-/// it with.
+/// Standing of a camera by one kind of evidence; `None` as long as there was nothing to compare it
+/// with.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Standing(Option<Evidence>);
 
 impl Standing {
-    /// Takes in how an exposure fits, by its camera's own clock. All targets of one exposure are
-    /// one piece of evidence: they share its pose and time.
+    /// Takes in how an exposure fits, at a time by its camera's own clock. All targets of one
+    /// exposure are one piece of evidence: they share its pose and time.
     pub(super) fn learn(&mut self, time: Timestamp, fittings: &[Fitting]) {
         if fittings.is_empty() {
             return;
@@ -100,20 +100,22 @@ impl Standing {
         evidence.compared_s = (evidence.compared_s + step_s).min(MEMORY_S);
         let wrong = fittings.iter().filter(|fitting| **fitting != Fitting::Fits).count();
         let share = wrong as f64 / fittings.len() as f64;
+        // Running mean over the time compared, of at most MEMORY_S.
         evidence.wrong +=
             (share - evidence.wrong) * (step_s / evidence.compared_s.max(step_s)).min(1.0);
     }
 
-    /// Another camera has been left out: what was held against this one was found beside what that
-    /// one said.
+    /// Voids the evidence against this camera, as another one has been left out: this one was
+    /// compared with what that one said.
     pub(super) fn acquit(&mut self) {
         if let Some(evidence) = self.0.as_mut().filter(|evidence| !evidence.excluded) {
             (evidence.wrong, evidence.compared_s) = (0.0, 0.0);
         }
     }
 
-    /// An exposure at a time says nothing for or against the camera. Where that goes on for long,
-    /// as there is no target left to compare it with, a verdict lapses: returns whether one has.
+    /// Handles an exposure that says nothing for or against the camera. Where that goes on for
+    /// long, as there is no target left to compare it with, an exclusion lapses: returns whether it
+    /// has.
     pub(super) fn lapse(&mut self, time: Timestamp) -> bool {
         let is_old = |evidence: &&mut Evidence| time.seconds_since(evidence.last).abs() > MEMORY_S;
         let lapsed = self.0.as_mut().filter(|evidence| evidence.excluded).filter(is_old);

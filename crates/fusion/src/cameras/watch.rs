@@ -1,9 +1,10 @@
-//! Which camera has been moved since it was calibrated, by where the others see the targets.
+//! Detects a camera that has been moved since it was calibrated, by where the others see the
+//! targets.
 //!
-//! What each camera's pose and clock are off by is estimated from how the sight lines of one target
-//! miss each other, all cameras' errors at once and each as small as its calibration says. A camera
-//! that somebody has turned is one whose error is far larger than that: with a prior as wide as a
-//! knock for it alone, the lines become so many times more likely. The errors themselves correct
+//! The errors of all cameras' poses and clocks are estimated at once from how the sight lines of
+//! one target miss each other, each with a prior as narrow as its calibration says. The error of a
+//! camera that somebody has turned is far larger than that: with a prior as wide as a knock for
+//! this camera alone, the lines become many times more likely. The estimated errors correct
 //! nothing; a new calibration does.
 
 use std::collections::BTreeMap;
@@ -13,57 +14,58 @@ use nalgebra::{DMatrix, DVector, Matrix2, Matrix3, Matrix6, SMatrix, SVector, Ve
 
 use super::{Cameras, Sample};
 
-/// A camera was moved so many seconds of targets ago, or more, each as likely: a large turn shows in
-/// the shorter time, and of the longer one most would be from before it; a small one, or that of a
-/// camera whose bearings are noisy, takes the longer to be sure.
+/// Time constants of the memories, s in which targets are seen: a camera was moved that long ago,
+/// or longer, each as likely. A large turn shows in the shorter time, while most of the longer one
+/// would be from before it; a small turn, or that of a camera whose bearings are noisy, takes the
+/// longer time to be sure.
 const MEMORIES_S: [f64; 2] = [20.0, 100.0];
-/// A target is not seen for longer than this between two draws that follow one another, s: what a
-/// pause lasts is not time in which anything is told.
+/// Longest time that counts between two successive draws, s: in a pause without a target nothing is
+/// learnt.
 const LONGEST_DRAW_S: f64 = 1.0;
-/// A camera that is moved turns by as much as one of these an axis, rad, each as likely: a mast that
-/// settles, a gust, a hand, a fall. With the largest alone a turn of two milliradians would be less
-/// likely by a hundred times.
+/// Standard deviations of the turn of a camera that is moved, rad per axis, each as likely: a mast
+/// that settles, a gust, a hand, a fall. With the largest alone a turn of two milliradians would be
+/// less likely by a hundred times.
 const KNOCKS_RAD: [f64; 4] = [1e-3, 3e-3, 1e-2, 3e-2];
-/// No pose holds better than this: 0.1 mrad is what a mast does in the sun, ...
+/// Least deviation of a pose's rotation, rad: 0.1 mrad is what a mast does in the sun.
 const LEAST_TURN_RAD: f64 = 1e-4;
-/// ... and so many metres. Where an exact pose is declared, nothing else would be left for what a
-/// lens leaves over.
+/// Least deviation of its position, m. Where an exact pose is declared, nothing else would allow
+/// for the errors that a lens leaves.
 const LEAST_SHIFT_M: f64 = 2e-3;
-/// Lines that miss each other by far more than anything explains are of two targets: they count as
-/// Student's t of so many degrees of freedom makes them.
+/// Degrees of freedom of Student's t: lines that miss each other by far more than anything explains
+/// are of two targets, and have the weight that this distribution gives them.
 const FREEDOM: f64 = 4.0;
-/// A camera is said to have been moved if the lines are so many times (logarithm) more likely by it:
-/// a thousand times, as one of a site's is moved about once in so many minutes, a day. Of those that
-/// stand as they say none came to more than 320 times, on real flights; with half of it (30 times)
-/// three in a hundred of these would be accused.
+/// A camera is said to have been moved if the lines are this many times (logarithm) more likely by
+/// it: a thousand times, as one of a site's is moved about once in so many minutes, a day. Of
+/// cameras that stand as they say none came to more than 320 times, on real flights; with half of
+/// it (30 times) three in a hundred of these would be accused.
 const SURE: f64 = 6.9;
-/// Another camera may have been moved in its place unless it is so many times (logarithm) less
-/// likely: one in a hundred.
+/// Another camera may have been moved in its place unless that is less likely by more than this
+/// (logarithm): one in a hundred.
 const DISTINCT: f64 = 4.6;
 
-/// Information of errors that are in their own deviations: next to none.
+/// Information on errors, in units of their own deviations, that is next to none.
 const UNSEEN: f64 = 1e-9;
-/// Fewer cameras do not check one another: an error in the plane of two sight lines shows in neither.
+/// Fewer cameras do not check one another: an error in the plane of two sight lines shows in
+/// neither.
 const LEAST_TOGETHER: usize = 3;
 
-/// Errors of a camera: rotation and place, and its clock, each in its own deviations.
+/// Number of errors of a camera: rotation, place and clock, each in units of its own deviation.
 const ERRORS: usize = 7;
-/// The clock's among them.
+/// Index of the clock's error among them.
 const CLOCK: usize = 6;
 
-/// What the lines say of a camera's having been moved.
+/// What the lines say about whether a camera has been moved.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseFinding {
-    /// For how long it has been watched beside two others, of the last minutes, s.
+    /// How long the camera has been watched beside two others, of the last minutes, s.
     pub watched_s: f64,
     /// By how much it would have been turned, about the world's axes, rad.
     pub turn: Vector3<f64>,
     /// Standard deviation of that along the axis that is known worst, rad.
     pub turn_sd: f64,
-    /// Logarithm of how many times more likely the lines are by its having been moved than by
-    /// nothing's having.
+    /// Log-likelihood ratio of the lines: that the camera has been moved, against that none has.
     pub log_odds: f64,
-    /// Whether it has been moved for sure: it, or one of those that are as likely.
+    /// Whether it has been moved for sure: this camera, or one of those that are as likely.
     pub is_moved: bool,
     /// The other cameras that may have been moved in its place, if it has.
     pub or_else: Vec<CameraName>,
@@ -76,7 +78,7 @@ impl PoseFinding {
     }
 }
 
-/// What all cameras' lines say of their errors.
+/// What the lines say about the errors of all cameras.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Watch {
     cameras: Vec<Watched>,
@@ -84,30 +86,31 @@ pub(super) struct Watch {
     drawn: Option<Timestamp>,
 }
 
-/// What the lines of late have said.
+/// What the lines have said lately about all cameras' errors.
 #[derive(Clone, Debug, Default)]
 struct Memory {
-    /// Fisher information of the errors of all, each in its own deviations, ...
+    /// Fisher information on the errors, each in units of its own deviation.
     information: DMatrix<f64>,
-    /// ... and its product with their estimate.
+    /// Product of the information with the estimate of the errors.
     pull: DVector<f64>,
 }
 
 impl Memory {
-    /// Knows of so many errors.
+    /// Enlarges to this many errors.
     fn widen(&mut self, errors: usize) {
         self.information.resize_mut(errors, errors, 0.0);
         self.pull.resize_vertically_mut(errors, 0.0);
     }
 
-    /// Forgets so many errors, from one on: they are others from now on. What was said of all else
-    /// counts for as much as it says where these may have been anything (the Schur complement).
+    /// Forgets `count` errors from `first` on, which are other errors from now on. The information
+    /// on all others becomes what it is if these may have been anything (the Schur complement).
     fn forget(&mut self, first: usize, count: usize) {
         let own = self.information.view((first, first), (count, count)).into_owned();
         let own_pull = self.pull.rows(first, count).into_owned();
         let mut ties = self.information.columns(first, count).into_owned();
-        // Not all of them need have been seen at all.
+        // Some of them may not have been seen at all.
         let least = DMatrix::identity(count, count) * UNSEEN;
+        // I <- I - T I_ff^-1 T', and the same for the pull.
         if let Some(factor) = (own + least).cholesky() {
             self.information -= &ties * factor.solve(&ties.transpose());
             self.pull -= &ties * factor.solve(&own_pull);
@@ -121,7 +124,7 @@ impl Memory {
         self.pull.rows_mut(first, count).fill(0.0);
     }
 
-    /// Knows of a camera's errors, from this on, no more.
+    /// Removes a camera, whose errors begin at `first`.
     fn remove(&mut self, first: usize) {
         self.forget(first, ERRORS);
         let information = std::mem::take(&mut self.information);
@@ -129,7 +132,8 @@ impl Memory {
         self.pull = std::mem::take(&mut self.pull).remove_rows(first, ERRORS);
     }
 
-    /// Mean and covariance of the errors if no camera has been moved.
+    /// Mean and covariance of the errors if no camera has been moved: their prior has unit
+    /// variance.
     fn estimate(&self) -> Option<(DVector<f64>, DMatrix<f64>)> {
         let size = self.pull.len();
         let factor = (&self.information + DMatrix::identity(size, size)).cholesky()?;
@@ -140,11 +144,11 @@ impl Memory {
 #[derive(Clone, Debug)]
 struct Watched {
     name: CameraName,
-    /// The pose's covariance by its calibration, and its root.
+    /// Covariance of the pose by its calibration, and a root of it.
     covariance: Matrix6<f64>,
     root: Matrix6<f64>,
     watched_s: f64,
-    /// When it was last seen beside others.
+    /// When the camera was last seen beside others.
     drawn: Option<Timestamp>,
 }
 
@@ -159,14 +163,14 @@ impl Watched {
         Self { name, covariance, root, watched_s: 0.0, drawn: None }
     }
 
-    /// Notes that it has been seen beside others.
+    /// Notes that the camera has been seen beside others.
     fn draw(&mut self, now: Timestamp) {
         let last = self.drawn.replace(now);
         self.watched_s +=
             last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
     }
 
-    /// A line's change with the errors.
+    /// Derivative of a line by the errors.
     fn by_errors(&self, sample: &Sample) -> SMatrix<f64, 2, ERRORS> {
         let mut by = SMatrix::<f64, 2, ERRORS>::zeros();
         by.fixed_columns_mut::<6>(0).copy_from(&(sample.by_pose * self.root));
@@ -174,18 +178,19 @@ impl Watched {
         by
     }
 
-    /// The inverse covariance of its errors if it has been knocked so hard, rad.
+    /// Inverse covariance of its errors if it has been knocked by `knock_rad`, rad.
     fn knocked(&self, knock_rad: f64) -> Option<SMatrix<f64, ERRORS, ERRORS>> {
         let mut wide = self.covariance;
         (0..3).for_each(|axis| wide[(axis, axis)] += knock_rad.powi(2));
         let mut inverse = SMatrix::<f64, ERRORS, ERRORS>::identity();
+        // In units of the declared deviations: L' C^-1 L.
         let own = self.root.transpose() * wide.cholesky()?.inverse() * self.root;
         inverse.fixed_view_mut::<6, 6>(0, 0).copy_from(&own);
         Some(inverse)
     }
 
-    /// What the lines say of it, by all errors' means and covariances if nothing has been moved; its
-    /// own are from `first` on.
+    /// What the lines say of it, from the means and covariances of all errors if nothing has been
+    /// moved; its own errors begin at `first`.
     fn found(
         &self,
         estimates: &[(DVector<f64>, DMatrix<f64>)],
@@ -200,12 +205,13 @@ impl Watched {
             }
         }
         let likeliest = each.iter().max_by(|a, b| a.log_odds.total_cmp(&b.log_odds))?;
+        // Mean of the likelihood ratios over all knocks and memories: each is as likely.
         let odds = each.iter().map(|one| (one.log_odds - likeliest.log_odds).exp()).sum::<f64>();
         let log_odds = likeliest.log_odds + (odds / each.len() as f64).ln();
         Some(PoseFinding { log_odds, ..likeliest.clone() })
     }
 
-    /// What the lines of a time say, if it has been knocked so hard, rad.
+    /// What the lines of one memory say, if the camera has been knocked by `knock_rad`, rad.
     fn found_knocked(
         &self,
         knock_rad: f64,
@@ -214,12 +220,15 @@ impl Watched {
     ) -> Option<PoseFinding> {
         let prior = self.knocked(knock_rad)?;
         let known = covariance.cholesky()?.inverse();
-        // The posterior with the wide prior in the place of the narrow one.
+        // The posterior with the wide prior in place of the narrow one, which has unit variance.
         let wide = (known - SMatrix::identity() + prior).cholesky()?;
         let moved = wide.solve(&(known * mean));
         let log_determinant = |factor: &SMatrix<f64, ERRORS, ERRORS>| {
             2.0 * factor.diagonal().iter().map(|root| root.ln()).sum::<f64>()
         };
+        // 2 ln odds = ln|P| - ln|C| - ln|A| + h' (x_wide - x), with the wide prior's precision P,
+        // the narrow posterior's covariance C, the wide posterior's precision A, and the lines'
+        // pull h on the errors.
         let log_odds = (log_determinant(&prior.cholesky()?.l())
             - log_determinant(&covariance.cholesky()?.l())
             - log_determinant(&wide.l())
@@ -250,12 +259,12 @@ impl Watch {
         self.cameras.len() - 1
     }
 
-    /// Where a camera is among those watched.
+    /// Index of a camera among those watched.
     fn known(&self, name: &CameraName) -> Option<usize> {
         self.cameras.iter().position(|camera| camera.name == *name)
     }
 
-    /// A camera stands elsewhere, or is known otherwise: what was seen was of how it stood.
+    /// Forgets a camera that stands elsewhere, or is known otherwise: what was seen is of before.
     pub(super) fn forget(&mut self, name: &CameraName) {
         if let Some(place) = self.known(name) {
             self.cameras.remove(place);
@@ -263,8 +272,8 @@ impl Watch {
         }
     }
 
-    /// A camera's clock is known otherwise than it was, so that what it is off by is another error,
-    /// too: the same one on both sides would turn the camera.
+    /// Forgets the error of a clock that is known otherwise than it was: it is another error from
+    /// now on. Taken for the same one before and after, it would turn the camera.
     pub(super) fn forget_clock(&mut self, name: &CameraName) {
         if let Some(place) = self.known(name) {
             let clock = ERRORS * place + CLOCK;
@@ -272,7 +281,7 @@ impl Watch {
         }
     }
 
-    /// Forgets by as much as the time since the last draw asks for.
+    /// Discounts the memories by the time since the last draw.
     fn age(&mut self, now: Timestamp) {
         let last = self.drawn.replace(now);
         let since = last.map_or(0.0, |last| now.seconds_since(last).clamp(0.0, LONGEST_DRAW_S));
@@ -286,14 +295,15 @@ impl Watch {
         self.cameras.iter_mut().for_each(|camera| camera.watched_s *= kept);
     }
 
-    /// Takes in what cameras have seen of one target; `places` are theirs among those watched.
+    /// Takes in what cameras have seen of one target; `places` are their indices among those
+    /// watched.
     fn learn(&mut self, samples: &[Sample], places: &[usize], now: Timestamp) -> Option<()> {
         let by_errors: Vec<_> = samples
             .iter()
             .zip(places)
             .map(|(sample, place)| self.cameras[*place].by_errors(sample))
             .collect();
-        // Lines by noise alone, and by noise and the errors that poses may have.
+        // Weights by noise alone, and by noise and the errors that poses may have.
         let weights = samples.iter().map(|sample| sample.slow_noise.try_inverse());
         let weights: Vec<_> = weights.collect::<Option<_>>()?;
         let loose = samples
@@ -302,9 +312,12 @@ impl Watch {
             .map(|(sample, by)| (sample.slow_noise + by * by.transpose()).try_inverse());
         let loose: Vec<_> = loose.collect::<Option<_>>()?;
         let squares = Meeting::of(samples, &loose)?.squares;
+        // Student's t: weight (nu + n) / (nu + max(q, n)), with n = 2 m - 3 degrees of freedom.
         let count = 2.0 * samples.len() as f64 - 3.0;
         let weight = (FREEDOM + count) / (FREEDOM + squares.max(count));
         let meeting = Meeting::of(samples, &weights)?;
+        // With the target's place x eliminated (covariance S): pull_i = B_i' W_i (z_i - A_i x) and
+        // I_ij = [i = j] B_i' W_i B_i - B_i' W_i A_i S A_j' W_j B_j.
         for (i, one) in places.iter().enumerate() {
             let own = by_errors[i].transpose() * weights[i];
             let away = samples[i].offset - samples[i].by_position * meeting.place;
@@ -355,17 +368,17 @@ impl Watch {
     }
 }
 
-/// Where sight lines of one target meet.
+/// Where the sight lines of one target meet.
 struct Meeting {
     place: Vector3<f64>,
     /// Covariance of the place.
     spread: Matrix3<f64>,
-    /// Sum of the squares of what the lines miss it by.
+    /// Sum of the squared residuals of the lines.
     squares: f64,
 }
 
 impl Meeting {
-    /// By the inverse covariance of each line.
+    /// Weighted least squares, with the inverse covariance of each line.
     fn of(samples: &[Sample], weights: &[Matrix2<f64>]) -> Option<Self> {
         let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
         for (sample, weight) in samples.iter().zip(weights) {
@@ -410,7 +423,7 @@ mod tests {
 
     use super::*;
 
-    /// What two cameras see of targets in several places, where one of them is turned.
+    /// What two cameras see of a target at a place, where the first one is turned.
     fn samples(turn: Vector3<f64>, place: Point3<f64>) -> Vec<Sample> {
         let sample = |name: &str, origin: Point3<f64>, turn: Vector3<f64>| {
             let model = BearingModel::new(origin, place).unwrap();
@@ -431,7 +444,8 @@ mod tests {
         ]
     }
 
-    /// A minute of a target that moves so far, m, seen by two cameras of which one is turned, rad.
+    /// A minute of a target that moves by `moves_m`, m, seen by two cameras of which one is turned,
+    /// rad.
     fn watched(turn: Vector3<f64>, moves_m: f64) -> Watch {
         let declared = Matrix6::from_diagonal_element(9e-8);
         let mut watch = Watch::default();
@@ -457,7 +471,7 @@ mod tests {
             assert_eq!(own.or_else.len(), 1, "{found:?}");
             assert_ne!(own.or_else[0], *name);
         }
-        // One is calibrated anew: nothing is left of what was seen of it.
+        // One is calibrated again: nothing is left of what was seen of it.
         let name: CameraName = "a".parse().unwrap();
         watch.forget(&name);
         let found = watch.findings();

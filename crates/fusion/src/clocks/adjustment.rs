@@ -1,32 +1,33 @@
-//! The adjustment of a window: the target's way, the clocks and the poses that fit its bearings
-//! best together.
+//! Adjustment of a window: fits the target's trajectory, the clocks and the poses to its bearings
+//! together.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 use super::curve::{Basis, Curve};
 use super::window::Sight;
 
-/// Squared distances (two degrees of freedom) beyond which a bearing pulls no harder: in the
-/// beginning, when all may be far off, ...
+/// Squared Mahalanobis distance (two degrees of freedom) beyond which a bearing pulls no harder, in
+/// the first descent, when all may be far off.
 const HUBER: f64 = 9.0;
-/// ... and in the end, beyond which it is somebody else's and does not pull at all (1 in 50 000).
-const STRANGER: f64 = 22.0;
-/// The median of a squared distance.
+/// Squared distance beyond which a bearing does not pull at all, in the later descents: it is a
+/// stranger, of another object (1 in 50 000 of the target's own lies beyond).
+const OUTLIER: f64 = 22.0;
+/// Median of a squared distance of two degrees of freedom.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
-/// A camera's covariances count no more often than this.
+/// Largest factor on a camera's covariances.
 const MAX_SCALE: f64 = 1e4;
-/// Rounds of one descent; most take three to six.
+/// Most iterations of one descent; most descents take three to six.
 const MAX_ROUNDS: usize = 25;
-/// Damping of a round against the diagonal: first, and when a descent is given up.
+/// Levenberg-Marquardt damping relative to the diagonal: at first, and when a descent is given up.
 const FIRST_DAMPING: f64 = 1e-4;
 const MAX_DAMPING: f64 = 1e4;
-/// A descent has settled when a round gains less than this of the squared distances.
+/// A descent has settled when an iteration lowers the sum of squared distances by less than this.
 const SETTLED: f64 = 1e-3;
 /// Densities of the jerk that are tried, m^2/s^5, as powers of ten: from a straight line to the
 /// turns of a racing drone.
 const DENSITIES: std::ops::RangeInclusive<i32> = -5..=4;
 
-/// What pulls how hard.
+/// Robust loss: how hard a bearing pulls.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Loss {
     Huber,
@@ -34,57 +35,57 @@ enum Loss {
 }
 
 impl Loss {
-    /// What a squared distance costs, and the weight of the bearing.
+    /// Cost of a squared distance, and the weight of its bearing.
     fn of(self, squared: f64) -> (f64, f64) {
         match self {
             Self::Huber if squared > HUBER => {
                 (2.0 * (HUBER * squared).sqrt() - HUBER, (HUBER / squared).sqrt())
             }
-            Self::Trimmed if squared > STRANGER => (STRANGER, 0.0),
+            Self::Trimmed if squared > OUTLIER => (OUTLIER, 0.0),
             _ => (squared, 1.0),
         }
     }
 }
 
-/// Where what is unknown of a camera is among the components of the prior.
+/// Indices of a camera's unknowns among the components of the prior.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Unknowns {
-    /// Its clock's offset, with the drift the next; `None` for the reference.
+    /// Index of its clock's offset, with the drift the next; `None` for the reference.
     pub(super) clock: Option<usize>,
-    /// What its pose is off by: three of rotation, three of position; `None` where it is exact.
+    /// Index of its pose error: three of rotation, three of position; `None` where it is exact.
     pub(super) pose: Option<usize>,
 }
 
-/// The cameras' clocks and poses as they are known before.
+/// Prior of the cameras' clocks and poses.
 #[derive(Clone, Debug)]
 pub(super) struct Prior {
     pub(super) mean: DVector<f64>,
     pub(super) precision: DMatrix<f64>,
-    /// The time their offsets are of, s after the window's beginning.
+    /// Time at which the prior's offsets hold, s after the window's beginning.
     pub(super) epoch_s: f64,
     pub(super) cameras: Vec<Unknowns>,
 }
 
-/// A target's way, and clocks and poses of the cameras.
+/// State that is fitted: coefficients of the target's trajectory, clocks and poses of the cameras.
 #[derive(Clone, Debug)]
 struct State {
     coefficients: DVector<f64>,
     cameras: DVector<f64>,
 }
 
-/// A bearing's target at a state, as if the pose were right: where it lies, and by what vector each
-/// component of the cameras moves it.
+/// A bearing's target at a state, as a camera with the stated pose would see it: its place, and the
+/// shift of that place by each component of the cameras' errors.
 #[derive(Clone, Debug)]
 struct Target {
     basis: Basis,
     place: Vector3<f64>,
     shifts: [(usize, Vector3<f64>); 8],
-    /// How many of them there are.
+    /// How many of `shifts` are set.
     count: usize,
 }
 
-/// Minus twice the logarithm of the posterior density at a state, but for a constant, with half its
-/// gradient and half its second derivative (Gauss-Newton's).
+/// Minus twice the log posterior density at a state, up to a constant, with half its gradient and
+/// half its second derivative (Gauss-Newton's).
 #[derive(Clone, Debug)]
 struct Quadratic {
     cost: f64,
@@ -92,29 +93,29 @@ struct Quadratic {
     information: DMatrix<f64>,
 }
 
-/// What an adjustment has found.
+/// Result of an adjustment.
 #[derive(Clone, Debug)]
 pub(super) struct Adjusted {
     pub(super) cameras: DVector<f64>,
     pub(super) covariance: DMatrix<f64>,
-    /// How often each camera's reported covariances count: 1 where it is honest.
+    /// Factor on each camera's reported covariances: 1 where these agree with its residuals.
     pub(super) scales: Vec<f64>,
     /// Share of each camera's bearings that do not fit.
-    pub(super) strangers: Vec<f64>,
-    /// Squared distance of clocks and poses from what was known of them before.
+    pub(super) outlier_shares: Vec<f64>,
+    /// Squared Mahalanobis distance of clocks and poses from their prior.
     pub(super) pulled: f64,
-    /// Twice the logarithm of the probability of these bearings by what was known before, but for
-    /// what is the same for any knowledge.
+    /// Twice the log evidence of these bearings under the prior, up to what is the same for any
+    /// prior.
     pub(super) evidence: f64,
 }
 
-/// One window's bearings, with what is known beforehand.
+/// One window's bearings, with the prior of its cameras.
 #[derive(Clone, Debug)]
 pub(super) struct Adjustment<'a> {
     sights: &'a [Sight],
     curve: Curve,
     prior: &'a Prior,
-    /// Each camera's covariances count this many times.
+    /// Factor on each camera's covariances.
     scales: Vec<f64>,
 }
 
@@ -123,7 +124,7 @@ impl<'a> Adjustment<'a> {
         Self { sights, curve, prior, scales: vec![1.0; prior.cameras.len()] }
     }
 
-    /// Fits way, clocks and poses. `None` if the numbers fail.
+    /// Fits trajectory, clocks and poses. `None` if the numbers fail.
     pub(super) fn solve(mut self, density: i32) -> Option<Adjusted> {
         let (state, _) = self.descend(self.begin()?, density, Loss::Huber)?;
         self.rescale(&state, Loss::Huber);
@@ -131,28 +132,28 @@ impl<'a> Adjustment<'a> {
         if self.rescale(&state, Loss::Trimmed) {
             (state, density, evidence) = self.best_density(state, density)?;
         }
-        let strangers =
-            self.squares(&state).iter().map(|squares| share_of_strangers(squares)).collect();
+        let outlier_shares =
+            self.squares(&state).iter().map(|squares| outlier_share(squares)).collect();
         let (covariance, pulled) = self.posterior(&state, density)?;
         Some(Adjusted {
             cameras: state.cameras,
             covariance,
             scales: self.scales,
-            strangers,
+            outlier_shares,
             pulled,
             evidence,
         })
     }
 
-    /// Sets how often each camera's covariances count, by its residuals: after the first descent,
-    /// when not all may fit, by their median; in the end by the mean of what fits. Says whether
-    /// that has changed much.
+    /// Sets each camera's covariance factor from its residuals: after the first descent, when not
+    /// all may fit, from their median; in the end from the mean of those that fit. Returns whether
+    /// a factor has changed much.
     fn rescale(&mut self, state: &State, loss: Loss) -> bool {
         let squares = self.squares(state);
         let mut changed = false;
         for (scale, mut squares) in self.scales.iter_mut().zip(squares) {
             if loss == Loss::Trimmed {
-                squares.retain(|squared| *squared <= STRANGER);
+                squares.retain(|squared| *squared <= OUTLIER);
             }
             squares.sort_unstable_by(f64::total_cmp);
             let count = squares.len() as f64;
@@ -161,7 +162,8 @@ impl<'a> Adjustment<'a> {
                 (Loss::Huber, Some(median)) => median / MEDIAN,
                 (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
-            // Up to three standard errors of an honest camera's are chance.
+            // Up to three standard errors above 1 are chance for a camera whose covariances are
+            // right: there the factor stays 1.
             let found = typical * *scale;
             let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
             changed |= (next / *scale - 1.0).abs() > 0.1;
@@ -170,7 +172,7 @@ impl<'a> Adjustment<'a> {
         changed
     }
 
-    /// The squared distances of each camera's bearings.
+    /// Squared Mahalanobis distances of each camera's bearings.
     fn squares(&self, state: &State) -> Vec<Vec<f64>> {
         let mut squares = vec![Vec::new(); self.scales.len()];
         for sight in self.sights {
@@ -180,14 +182,15 @@ impl<'a> Adjustment<'a> {
         squares
     }
 
-    /// Clocks and poses as known before, and a way through the places that the track had.
+    /// Start of the descent: clocks and poses of the prior, a trajectory through the track's
+    /// places.
     fn begin(&self) -> Option<State> {
         let cameras = self.prior.mean.clone();
         let places = self.sights.iter().map(|sight| (self.time(sight, &cameras).0, sight.place));
         Some(State { coefficients: self.curve.fit(places, 1.0)?, cameras })
     }
 
-    /// When a bearing was taken by the reference's clock, s, and how long after the epoch.
+    /// Time of a bearing by the reference's clock, s, and its time after the prior's epoch, s.
     fn time(&self, sight: &Sight, cameras: &DVector<f64>) -> (f64, f64) {
         let since = sight.time_s - self.prior.epoch_s;
         let clock = self.prior.cameras[sight.camera].clock;
@@ -195,9 +198,9 @@ impl<'a> Adjustment<'a> {
         (sight.time_s - offset, since)
     }
 
-    /// The target of a bearing. A clock ahead by o shows it where it was o ago: its offset moves
-    /// the place by minus the velocity, its drift by that times the time since the epoch. A camera
-    /// turned by d and moved by c sees it at p + d x (p - origin) + c.
+    /// The target of a bearing. A clock that is ahead by o shows the target where it was o ago: the
+    /// offset moves the place by minus the velocity, the drift by that times the time since the
+    /// epoch. A camera turned by d and moved by c sees the target at p + d x (p - origin) + c.
     fn target(&self, sight: &Sight, state: &State) -> Target {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);
@@ -227,7 +230,8 @@ impl<'a> Adjustment<'a> {
         Target { basis, place, shifts, count }
     }
 
-    /// The density of jerk of the greatest evidence, with the state that belongs to it.
+    /// Climbs to the jerk density of the greatest evidence; returns its state, density and
+    /// evidence.
     fn best_density(&self, state: State, first: i32) -> Option<(State, i32, f64)> {
         let (state, evidence) = self.with_evidence(state, first)?;
         let mut best = (state, first, evidence);
@@ -251,10 +255,11 @@ impl<'a> Adjustment<'a> {
         Some(best)
     }
 
-    /// Descends, and twice the logarithm of the evidence (Laplace's), but for a constant.
+    /// Descends; returns the state and twice the log evidence (Laplace's), up to a constant.
     fn with_evidence(&self, state: State, density: i32) -> Option<(State, f64)> {
         let (state, Quadratic { cost, information, .. }) =
             self.descend(state, density, Loss::Trimmed)?;
+        // ln det A = 2 sum ln L_ii for A = L L'.
         let factor = information.cholesky()?;
         let log_determinant = 2.0 * factor.l_dirty().diagonal().map(f64::ln).sum();
         let before = self.prior.precision.clone().cholesky()?;
@@ -262,15 +267,18 @@ impl<'a> Adjustment<'a> {
         let scales =
             self.sights.iter().map(|sight| 2.0 * self.scales[sight.camera].ln()).sum::<f64>();
         let width = self.curve.log_width(jerk(density));
+        // 2 ln Z = ln det(prior precision) - cost - ln det A - widths of curve prior and bearing
+        // noise.
         let evidence = log_before - cost - log_determinant - width - scales;
         evidence.is_finite().then_some((state, evidence))
     }
 
-    /// Levenberg and Marquardt's descent to the most likely state.
+    /// Levenberg-Marquardt descent to the most likely state.
     fn descend(&self, mut state: State, density: i32, loss: Loss) -> Option<(State, Quadratic)> {
         let mut here = self.quadratic(&state, density, loss);
         let mut damping = FIRST_DAMPING;
         for _ in 0..MAX_ROUNDS {
+            // (A + lambda diag A) step = gradient.
             let mut damped = here.information.clone();
             for i in 0..damped.nrows() {
                 damped[(i, i)] *= 1.0 + damping;
@@ -288,6 +296,7 @@ impl<'a> Adjustment<'a> {
                     }
                 }
                 _ if damping > MAX_DAMPING => break,
+                // The step is no better, but hardly worse: this is the minimum.
                 (Some(_), Some(there)) if there.cost - here.cost < SETTLED => break,
                 _ => damping *= 10.0,
             }
@@ -321,12 +330,14 @@ impl<'a> Adjustment<'a> {
         quadratic
     }
 
-    /// What is known beforehand.
+    /// The prior's part of the cost: of the trajectory, and of clocks and poses.
     fn prior_quadratic(&self, state: &State, density: i32) -> Quadratic {
         let (points, cameras) = (state.coefficients.len(), state.cameras.len());
         let mut information = DMatrix::zeros(points + cameras, points + cameras);
         self.curve.add_prior(&mut information, jerk(density));
         information.view_mut((points, points), (cameras, cameras)).copy_from(&self.prior.precision);
+        // Distance d from the prior's mean, which is 0 for the trajectory: cost d' A d, half
+        // gradient A d.
         let mut away = DVector::zeros(points + cameras);
         away.rows_mut(0, points).copy_from(&state.coefficients);
         away.rows_mut(points, cameras).copy_from(&(&state.cameras - &self.prior.mean));
@@ -334,10 +345,11 @@ impl<'a> Adjustment<'a> {
         Quadratic { cost: away.dot(&gradient), gradient, information }
     }
 
-    /// Covariance of clocks and poses, and their squared distance from what was known before.
+    /// Posterior covariance of clocks and poses, and their squared distance from the prior.
     fn posterior(&self, state: &State, density: i32) -> Option<(DMatrix<f64>, f64)> {
         let (points, cameras) = (state.coefficients.len(), state.cameras.len());
         let information = self.quadratic(state, density, Loss::Trimmed).information;
+        // The cameras' columns of A^-1: their covariance, with the trajectory marginalised.
         let mut unit = DMatrix::zeros(points + cameras, cameras);
         unit.view_mut((points, 0), (cameras, cameras)).fill_with_identity();
         let covariance = information.cholesky()?.solve(&unit).rows(points, cameras).into_owned();
@@ -348,8 +360,8 @@ impl<'a> Adjustment<'a> {
     }
 }
 
-fn share_of_strangers(squares: &[f64]) -> f64 {
-    squares.iter().filter(|squared| **squared > STRANGER).count() as f64
+fn outlier_share(squares: &[f64]) -> f64 {
+    squares.iter().filter(|squared| **squared > OUTLIER).count() as f64
         / squares.len().max(1) as f64
 }
 
@@ -358,12 +370,12 @@ fn jerk(power: i32) -> f64 {
     10.0_f64.powi(power)
 }
 
-/// A bearing against a place of the target.
+/// The residual of a bearing, with the target at a given place.
 #[derive(Clone, Copy, Debug)]
 struct Seen {
-    /// Squared distance of the residual by its covariance.
+    /// Squared Mahalanobis distance of the residual.
     squared: f64,
-    /// What the residual pulls the place by, and what it tells of the place.
+    /// With H as the derivative of the residual z by the place: H' R^-1 z, and H' R^-1 H.
     pull: Vector3<f64>,
     information: Matrix3<f64>,
 }
@@ -375,7 +387,7 @@ impl Seen {
         let away = target - sight.line.origin.coords;
         let range = away.norm();
         let direction = away / range;
-        // The direction's derivative by the target's place: B' (I - u u') / r.
+        // H, the derivative of the direction by the target's place: B' (I - u u') / r.
         let across: Matrix2x3<f64> = sight.line.basis.transpose()
             * (Matrix3::identity() - direction * direction.transpose())
             / range;
@@ -388,7 +400,7 @@ impl Seen {
 }
 
 impl Quadratic {
-    /// Adds a bearing; the cameras' components come after so many of the way's.
+    /// Adds a bearing; the cameras' components come after the `points` ones of the trajectory.
     fn add(&mut self, target: &Target, points: usize, seen: &Seen, weight: f64) {
         let (pull, information) = (seen.pull * weight, seen.information * weight);
         let shifts = &target.shifts[..target.count];
@@ -410,7 +422,7 @@ impl Quadratic {
                 below += tied.transpose();
             }
         }
-        // A camera's errors move the place as it sees it by `shift` each.
+        // Each error of the camera moves the place by its `shift`: the cameras' columns of J.
         for (one, shift) in shifts {
             self.gradient[points + one] += shift.dot(&pull);
             let told = information * shift;

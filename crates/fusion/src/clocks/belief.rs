@@ -1,5 +1,5 @@
-//! What is believed of the clocks, offset and drift of each against one of them, the reference;
-//! and, as a camera that is turned sees a moving target early or late, of the cameras' poses.
+//! Belief about the clocks: offset and drift of each relative to one of them, the reference; and
+//! about the cameras' poses, as a camera that is turned sees a moving target early or late.
 
 use std::collections::BTreeMap;
 
@@ -12,56 +12,55 @@ use super::common_time::{ClockReading, Common, common_time};
 /// Random walk of an offset (s^2/s) and of a drift (1/s): an ordinary quartz.
 const OFFSET_WALK: f64 = 1e-12;
 const DRIFT_WALK: f64 = 1e-16;
-/// No two clocks are the same to better than this, s and s/s: their covariance stays regular.
+/// No two clocks agree to better than this, s and s/s: it keeps their covariance regular.
 const OFFSET_FLOOR_S: f64 = 1e-6;
 const DRIFT_FLOOR: f64 = 1e-9;
-/// Nor any pose, rad and m.
+/// The same floor for a pose, rad and m.
 const POSE_FLOOR: f64 = 1e-6;
-/// Offsets beyond this are no offsets any more, s.
+/// Offsets are clamped to this, s: beyond it they are no offsets any more.
 const MAX_OFFSET_S: f64 = 2.0;
 
-/// A camera's pose that is uncertain: the place of its error in the state, and its covariance as it
-/// was reported.
+/// An uncertain camera pose: index of its error in the state, and its covariance as reported.
 #[derive(Clone, Copy, Debug)]
 struct UnsurePose {
     place: usize,
     reported: Matrix6<f64>,
 }
 
-/// A camera's clock: where its offset stands, and what was reported of it.
+/// A camera's clock: index of its offset in the state, and what was reported of it.
 #[derive(Clone, Copy, Debug)]
 struct Clock {
-    /// The place of its offset against the reference; its drift is the next. The reference, the
-    /// first camera heard, has no place.
+    /// Index of its offset from the reference; its drift is the next. `None` for the reference
+    /// itself, the first camera heard.
     place: Option<usize>,
     /// Its camera's pose, where that is uncertain.
     pose: Option<UnsurePose>,
-    /// Variance of its offset against true time before anything is seen, s^2; 0 where the camera is
-    /// taken at its word.
+    /// Variance of its offset from true time before any bearing, s^2; 0 where the camera is taken
+    /// at its word.
     prior: f64,
-    /// The same of its drift.
+    /// The same for its drift, (s/s)^2.
     drift_prior: f64,
-    /// What its offset wanders by beside, s^2/s.
+    /// Random walk of its offset beside [`OFFSET_WALK`], s^2/s.
     walk: f64,
 }
 
-/// Offsets and drifts of all clocks against the first, and what the poses are off by (world's axes:
-/// rotation, rad, then position, m), as one normal distribution, as of an epoch.
+/// Offsets and drifts of all clocks relative to the first, and the pose errors (world axes:
+/// rotation, rad, then position, m), as one normal distribution at an epoch.
 ///
-/// What all clocks have in common is left out: no bearing tells it, and a linearised estimate would
-/// yet learn something of it that is not true. It follows from the reported deviations alone.
+/// The error that all clocks have in common is left out: no bearing observes it, and a linearised
+/// estimate would still learn something of it that is not true. It follows from the reported
+/// deviations alone.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Belief {
     cameras: BTreeMap<CameraName, Clock>,
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     epoch: Option<Timestamp>,
-    /// By how much the common time of all clocks, offset and drift, is not what the clocks'
-    /// reported deviations make of them now: it does not step when a clock becomes worse known than
-    /// it was.
+    /// Offset and drift of the clocks' common time from what their reported deviations make of it
+    /// now: with it the common time does not step when a clock becomes less certain than it was.
     site: [f64; 2],
-    /// What all clocks say together: made anew whenever one of them is known otherwise, and not as
-    /// time goes on, which steps nobody's time.
+    /// The clocks' common time: recomputed whenever the belief about one of them changes, and not
+    /// as time goes on, so that nobody's time steps.
     common: Common,
 }
 
@@ -70,8 +69,8 @@ impl Belief {
         self.cameras.contains_key(camera)
     }
 
-    /// Makes a camera known: standard deviations of its clock's offset (s) and drift (s/s), what the
-    /// offset wanders by beside that (s^2/s), and the covariance of its pose.
+    /// Adds a camera: standard deviations of its clock's offset (s) and drift (s/s), random walk of
+    /// the offset beside that (s^2/s), and covariance of its pose.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
@@ -86,7 +85,7 @@ impl Belief {
         if let (Some(reference), Some(place)) = (reference, place) {
             let own = [prior + OFFSET_FLOOR_S.powi(2), drift_prior + DRIFT_FLOOR.powi(2)];
             for (i, common) in [reference.prior, reference.drift_prior].into_iter().enumerate() {
-                // The reference's own error is in every offset against it.
+                // The reference's own error is part of every offset from it.
                 for &other in &others {
                     self.covariance[(place + i, other + i)] = common;
                     self.covariance[(other + i, place + i)] = common;
@@ -99,8 +98,8 @@ impl Belief {
         self.calibrate(camera, pose);
     }
 
-    /// A camera has another pose, of this covariance: what was learnt of the one before is
-    /// forgotten.
+    /// Gives a camera another pose, of this covariance, and forgets what was learnt of the one
+    /// before.
     pub(super) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
         let Some(before) = self.cameras.get(camera).map(|known| known.pose) else {
             return;
@@ -119,7 +118,7 @@ impl Belief {
         }
     }
 
-    /// Makes room for so many components; returns the first.
+    /// Enlarges the state by `by` components; returns the index of the first.
     fn grow(&mut self, by: usize) -> usize {
         let before = self.mean.len();
         self.mean.resize_vertically_mut(before + by, 0.0);
@@ -127,7 +126,7 @@ impl Belief {
         before
     }
 
-    /// The places of all offsets.
+    /// State indices of all offsets.
     fn clock_places(&self) -> impl Iterator<Item = usize> + '_ {
         self.cameras.values().filter_map(|clock| clock.place)
     }
@@ -136,12 +135,12 @@ impl Belief {
         self.cameras.values().find(|clock| clock.place.is_none()).copied()
     }
 
-    /// The place of a clock's offset in the state; its drift is the next. `None` for the reference.
+    /// State index of a clock's offset; its drift is the next. `None` for the reference.
     pub(super) fn place(&self, camera: &CameraName) -> Option<usize> {
         self.cameras.get(camera)?.place
     }
 
-    /// The place of a camera's pose in the state, of six components; `None` where it is exact.
+    /// State index of a camera's pose, of six components; `None` where the pose is exact.
     pub(super) fn pose(&self, camera: &CameraName) -> Option<usize> {
         Some(self.cameras.get(camera)?.pose?.place)
     }
@@ -151,22 +150,22 @@ impl Belief {
         Some(self.cameras.get(camera)?.prior.sqrt())
     }
 
-    /// Whether anything was left open by what a camera has reported of its clock.
+    /// Whether a camera's report leaves its clock uncertain.
     pub(super) fn is_uncertain(&self, camera: &CameraName) -> bool {
         self.reported_sd(camera).is_some_and(|sd| sd > 0.0)
     }
 
-    /// The time that the state is of.
+    /// The time at which the state holds.
     pub(super) fn epoch(&self) -> Option<Timestamp> {
         self.epoch
     }
 
-    /// All clocks have stepped by so much, s: none against another.
+    /// Handles a step of all clocks by `step_s`, s: the offsets between them stay.
     pub(super) fn step_time(&mut self, step_s: f64) {
         self.epoch = self.epoch.map(|epoch| epoch.plus_seconds(step_s));
     }
 
-    /// Moves on to a time; never back.
+    /// Predicts the state to a time; never back.
     pub(super) fn advance(&mut self, time: Timestamp) {
         let dt = self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch));
         if self.epoch.is_some() && dt <= 0.0 {
@@ -174,8 +173,8 @@ impl Belief {
         }
         self.epoch = Some(time);
         self.site[0] += self.site[1] * dt;
-        // Each offset grows by its drift: of mean and covariance only the rows and columns of
-        // offsets change.
+        // P <- F P F' + Q, where each offset grows by dt times its drift: of mean and covariance
+        // only the rows and columns of offsets change.
         let clocks: Vec<usize> = self.clock_places().collect();
         for &k in &clocks {
             self.mean[k] += dt * self.mean[k + 1];
@@ -191,7 +190,7 @@ impl Belief {
         self.wander(dt, &clocks);
     }
 
-    /// Lets the clocks wander that do: the reference against all others.
+    /// Adds the clocks' own random walks; that of the reference moves it relative to all others.
     fn wander(&mut self, dt: f64, places: &[usize]) {
         for clock in self.cameras.values_mut() {
             let walked = clock.walk * dt;
@@ -217,7 +216,7 @@ impl Belief {
         )
     }
 
-    /// Replaces what is believed of some components; what hangs together with them moves along.
+    /// Replaces the belief about some components; those correlated with them move along.
     pub(super) fn learn(
         &mut self,
         components: &[usize],
@@ -231,7 +230,9 @@ impl Belief {
         let n = self.mean.len();
         let ties =
             DMatrix::from_fn(n, components.len(), |i, k| self.covariance[(i, components[k])]);
+        // Regression on the replaced components c: G = P[:, c] P[c, c]^-1.
         let gain = factor.solve(&ties.transpose()).transpose();
+        // m <- m + G (m_c,new - m_c) and P <- P + G (P_cc,new - P_cc) G'.
         let next_mean = &self.mean + &gain * (mean - before_mean);
         let next = &self.covariance + &gain * (covariance - before) * gain.transpose();
         let possible = (0..n).all(|i| next[(i, i)] >= 0.0);
@@ -242,8 +243,8 @@ impl Belief {
         }
     }
 
-    /// A camera says that its clock is worse than it was: standard deviations of offset (s) and
-    /// drift (s/s). What is believed of it stands, and may be that much off.
+    /// Handles a report that a clock is worse than it was: standard deviations of offset (s) and
+    /// drift (s/s). The mean stays, and may be off by that much.
     pub(super) fn reopen(&mut self, camera: &CameraName, deviations: [f64; 2]) {
         let stood = self.forget(camera, deviations);
         let place = self.cameras.get(camera).and_then(|clock| clock.place);
@@ -253,16 +254,19 @@ impl Belief {
         self.settle();
     }
 
-    /// A camera goes by another clock, of these standard deviations of offset (s) and drift (s/s).
+    /// Handles a camera's change to another clock, of these standard deviations of offset (s) and
+    /// drift (s/s).
     pub(super) fn replace(&mut self, camera: &CameraName, deviations: [f64; 2]) {
         let is_reference = self.cameras.get(camera).is_some_and(|clock| clock.place.is_none());
         let stood = self.reference_offset_and_drift();
         if is_reference {
-            // The others were known against the clock before.
+            // The others were known relative to the clock before.
             self.doubt(camera);
         }
         self.forget(camera, deviations);
         if is_reference {
+            // The new reference starts at true time; the offset of the old one from true time goes
+            // into the offsets of all others.
             let now = self.reference_offset_and_drift();
             let others: Vec<usize> = self.clock_places().collect();
             for i in 0..2 {
@@ -273,13 +277,15 @@ impl Belief {
         self.settle();
     }
 
-    /// Gives a clock other deviations and forgets all that was learnt of it; returns what was believed.
+    /// Gives a clock other deviations and forgets all that was learnt of it; returns the offset and
+    /// drift believed before (`None` for the reference).
     fn forget(&mut self, camera: &CameraName, [offset_sd, drift_sd]: [f64; 2]) -> Option<[f64; 2]> {
         let site = self.reference_offset_and_drift();
         let clock = self.cameras.get_mut(camera)?;
         (clock.prior, clock.drift_prior) = (offset_sd.powi(2), drift_sd.powi(2));
         let place = clock.place;
         self.settle();
+        // The new deviations change the clocks' shares: keep the common time where it was.
         for (i, stepped) in self.reference_offset_and_drift().into_iter().enumerate() {
             self.site[i] += site[i] - stepped;
         }
@@ -288,14 +294,15 @@ impl Belief {
         stood
     }
 
-    /// Forgets all that was learnt of a clock: nothing more is known of it than what was reported.
+    /// Forgets all that was learnt of a clock: only its reported deviations remain.
     pub(super) fn doubt(&mut self, camera: &CameraName) {
         let (Some(clock), Some(reference)) = (self.cameras.get(camera).copied(), self.reference())
         else {
             return;
         };
         let Some(place) = clock.place else {
-            // Another reference: all the others are as far from it as it may be from true time.
+            // The reference: all other offsets are relative to it, so they share its deviation from
+            // true time.
             let others: Vec<usize> = self.clock_places().collect();
             for (i, variance) in [clock.prior, clock.drift_prior].into_iter().enumerate() {
                 for (&k, &l) in others.iter().flat_map(|k| others.iter().map(move |l| (k, l))) {
@@ -304,7 +311,8 @@ impl Belief {
             }
             return;
         };
-        // Against true time it is as reported; against the reference, as that is against true time.
+        // Relative to true time the clock is as reported; relative to the reference, which may be
+        // off from true time as well, it has both variances.
         let common = self.reference_offset_and_drift();
         let variances = [
             clock.prior + reference.prior + OFFSET_FLOOR_S.powi(2),
@@ -332,7 +340,7 @@ impl Belief {
         *self = anew;
     }
 
-    /// Finds out how much each clock says of true time, by where they stand now.
+    /// Recomputes each clock's share in the common time, from the offsets now.
     fn settle(&mut self) {
         let clocks = self.cameras.values();
         let stands = |clock: &Clock| ClockReading {
@@ -342,12 +350,13 @@ impl Belief {
         self.common = common_time(&clocks.map(stands).collect::<Vec<_>>());
     }
 
-    /// The clocks, and how much each says of true time.
+    /// The clocks, each with its share in the common time.
     fn shares(&self) -> impl Iterator<Item = (&Clock, f64)> {
         self.cameras.values().zip(self.common.shares.iter().copied())
     }
 
-    /// A clock's components in the state, with the offset as of `ahead` seconds after the epoch.
+    /// A clock's offset (component 0) or drift (1) relative to the reference, the offset `ahead`
+    /// seconds after the epoch.
     fn relative(&self, clock: &Clock, component: usize, ahead: f64) -> f64 {
         clock.place.map_or(0.0, |place| match component {
             0 => self.mean[place] + ahead * self.mean[place + 1],
@@ -359,13 +368,15 @@ impl Belief {
         self.epoch.map_or(0.0, |epoch| time.seconds_since(epoch))
     }
 
-    /// A clock's component (0 offset, 1 drift) against what all clocks say together, with its
-    /// variance and the variance of that common time.
+    /// A clock's offset (component 0) or drift (1) relative to the common time of all clocks, with
+    /// its variance and the variance of that common time.
     fn absolute(&self, clock: &Clock, component: usize, ahead: f64) -> (f64, f64, f64) {
         let common = match component {
             0 => self.common.variance,
             _ => self.shares().map(|(clock, share)| share.powi(2) * clock.drift_prior).sum(),
         };
+        // Row vector h of x_clock - sum_k share_k x_k over the state, where the offset `ahead`
+        // seconds later is offset + ahead * drift.
         let mut row: BTreeMap<usize, f64> = BTreeMap::new();
         let mut put = |clock: &Clock, weight: f64| {
             if let Some(place) = clock.place.filter(|_| weight != 0.0) {
@@ -379,6 +390,7 @@ impl Belief {
         self.shares().for_each(|(other, share)| put(other, -share));
         let site = if component == 0 { self.site[0] + self.site[1] * ahead } else { self.site[1] };
         let mean = row.iter().map(|(&i, weight)| weight * self.mean[i]).sum::<f64>() + site;
+        // Variance: h P h'.
         let along = |(&i, a): (&usize, &f64)| -> f64 {
             a * row.iter().map(|(&k, b)| b * self.covariance[(i, k)]).sum::<f64>()
         };
@@ -386,7 +398,7 @@ impl Belief {
         (mean, variance.max(0.0), common)
     }
 
-    /// The estimate of a camera's clock as of a time.
+    /// The estimate of a camera's clock at a time.
     pub(super) fn estimate(&self, camera: &CameraName, time: Timestamp) -> Option<ClockEstimate> {
         let clock = self.cameras.get(camera)?;
         let ahead = self.ahead(time);
@@ -394,7 +406,7 @@ impl Belief {
         let (drift, own_drift, common_drift) = self.absolute(clock, 1, ahead);
         Some(ClockEstimate {
             offset_s: offset.clamp(-MAX_OFFSET_S, MAX_OFFSET_S),
-            // No clock is worse known than what was reported of it, as far as that is believed.
+            // No clock is worse known than its report says, as far as the report is believed.
             sd_s: (own + common)
                 .min(ClockReading { offset, variance: clock.prior }.believed(offset))
                 .sqrt(),
@@ -405,7 +417,7 @@ impl Belief {
     }
 
     /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
-    /// behind its reported one.
+    /// before its reported one.
     pub(super) fn largest_offset(&self, time: Timestamp) -> f64 {
         let ahead = self.ahead(time);
         let offset = |clock: &Clock| self.relative(clock, 0, ahead);
@@ -418,7 +430,7 @@ impl Belief {
             .min(MAX_OFFSET_S)
     }
 
-    /// Offset and drift of the reference against true time as of the epoch.
+    /// Offset and drift of the reference from true time at the epoch.
     fn reference_offset_and_drift(&self) -> [f64; 2] {
         std::array::from_fn(|i| {
             let common = self.shares().map(|(clock, share)| share * self.relative(clock, i, 0.0));
@@ -435,8 +447,8 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// Three clocks of 0.1 s, of which the second and the third are learnt against the first, the
-    /// reference.
+    /// Three clocks of 0.1 s deviation, of which the second and the third are learnt relative to
+    /// the first, the reference.
     fn learnt(poses: [Option<Matrix6<f64>>; 3]) -> (Belief, Vec<usize>) {
         let mut belief = Belief::default();
         for (camera, pose) in ["a", "b", "c"].into_iter().zip(poses) {
@@ -457,8 +469,8 @@ mod tests {
         belief.estimate(&name(camera), Timestamp::EPOCH).unwrap()
     }
 
-    /// The common offset that is likeliest where each clock is off from it by its deviation, or one
-    /// in a hundred by a second: where the likelihood's slope is 0.
+    /// The likeliest common offset where each clock is off from it by its deviation or, one clock
+    /// in a hundred, by a second: where the likelihood's slope is 0.
     fn most_likely(offsets: &[f64], sd: f64) -> f64 {
         let slope = |common: f64| -> f64 {
             let of_clock = |offset: &f64| {
@@ -484,7 +496,8 @@ mod tests {
         let (belief, _) = learnt([None; 3]);
         for (camera, offset) in [("a", -0.01), ("b", 0.05), ("c", -0.04)] {
             let estimate = of(&belief, camera);
-            // A hundredth that it is a liar's takes a microsecond off the mean.
+            // The chance of one in a hundred that a clock is a liar takes a microsecond off the
+            // mean.
             let offset = offset + 0.01 - most_likely(&[0.0, 0.06, -0.03], 0.1);
             assert!((estimate.offset_s - offset).abs() < 1e-9, "{estimate:?}");
             assert!((estimate.sd_s - 0.1 / 3.0_f64.sqrt()).abs() < 1e-4, "{estimate:?}");
@@ -533,7 +546,7 @@ mod tests {
             belief.reopen(&name(reopened), [0.5, 3e-5]);
             for (camera, before) in ["a", "b", "c"].into_iter().zip(before) {
                 let after = of(&belief, camera);
-                // Nobody's time steps, and only this clock's is unsure.
+                // No clock's estimate steps, and only the reopened clock becomes uncertain.
                 assert!(
                     (after.offset_s - before.offset_s).abs() < 1e-9,
                     "{camera}: {after:?} {before:?}"

@@ -1,25 +1,25 @@
-//! What all clocks of a site say together, of which some are worse than is said of them.
+//! Common time of a site's clocks, some of which are worse than reported.
 //!
-//! Each clock is as good as its deviation says, or one of a few that are off by a second. What is
-//! common to all then has a likelihood of several maxima, each with clocks that are believed and
-//! others that are not. They are found by expectation and maximisation from every clock on, and
-//! count by how likely they are: where two clocks contradict each other either may be right, and
+//! Each clock is as good as its deviation says, or one of a few (liars) that are off by a second.
+//! The likelihood of the common offset then has several maxima, each of which believes some clocks
+//! and not the others. They are found by expectation maximisation started at every clock, and are
+//! weighted by how likely they are: where two clocks contradict each other either may be right, and
 //! the variance is as large as they are apart.
 
 use std::f64::consts::PI;
 
-/// The share of clocks that are not as good as is said of them: a source of time lost, a latency
-/// unknown. It hardly matters: with half of it one of three counts until it is off by 5.6 of its
+/// Share of clocks that are not as good as reported: a source of time lost, a latency unknown. It
+/// hardly matters: with half of it one clock of three counts until it is off by 5.6 of its
 /// deviations, and not by 5.5.
 const LIARS: f64 = 0.01;
-/// How far off those are, s. With half of it the same.
+/// Standard deviation of their offsets, s. With half of it the same.
 const LIARS_SD_S: f64 = 1.0;
-/// Steps to a maximum: they settle in three or four.
+/// Iterations towards a maximum: they settle in three or four.
 const STEPS: usize = 10;
-/// Maxima closer to each other than this many standard deviations are one.
+/// Maxima closer to each other than this many standard deviations count as one.
 const APART: f64 = 0.5;
 
-/// Where a clock stands against any one of them, s, and the variance reported of it, s^2.
+/// A clock's offset from an arbitrary one of the clocks, s, and its reported variance, s^2.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ClockReading {
     pub(super) offset: f64,
@@ -31,37 +31,40 @@ impl ClockReading {
         LIARS_SD_S.powi(2).max(self.variance)
     }
 
-    /// Logarithm of the density of its being off by so much from what all say.
+    /// Log density of the clock's being off by `off` from the common time, s: two normals mixed.
     fn log_likelihood(self, off: f64) -> f64 {
         let normal =
             |variance: f64| (-off.powi(2) / variance / 2.0).exp() / (2.0 * PI * variance).sqrt();
         ((1.0 - LIARS) * normal(self.variance) + LIARS * normal(self.liars_variance())).ln()
     }
 
-    /// The variance that is believed of it where it is off by so much from what all say, s^2.
+    /// Variance that is believed of the clock where it is off by `off` from the common time, s^2.
     pub(super) fn believed(self, off: f64) -> f64 {
         if self.variance <= 0.0 {
             return 0.0;
         }
         let liars = self.liars_variance();
+        // Posterior odds of a liar, L / (1 - L) N(off; V) / N(off; R), of liar's and reported
+        // variance.
         let odds = LIARS / (1.0 - LIARS) * (self.variance / liars).sqrt();
         let honest =
             (1.0 + odds * (off.powi(2) * (1.0 / self.variance - 1.0 / liars) / 2.0).exp()).recip();
+        // The reciprocal of the expected precision.
         (honest / self.variance + (1.0 - honest) / liars).recip()
     }
 }
 
-/// What all clocks say together.
+/// The common time of all clocks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Common {
-    /// How much each counts.
+    /// Each clock's share in it.
     pub(super) shares: Vec<f64>,
     /// Variance of the common offset, s^2.
     pub(super) variance: f64,
 }
 
-/// A maximum of the likelihood: the common offset, its variance, the clocks' shares in it, and how
-/// likely it is.
+/// A maximum of the likelihood: the common offset, its variance, the clocks' shares in it, and its
+/// log-likelihood.
 struct Maximum {
     offset: f64,
     variance: f64,
@@ -69,7 +72,8 @@ struct Maximum {
     log_likelihood: f64,
 }
 
-/// How much each clock says of true time. Clocks that are right by definition say all.
+/// Common time of the clocks, with each one's share. Clocks that are right by definition have all
+/// of it.
 pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
     let right = clocks.iter().filter(|clock| clock.variance <= 0.0).count();
     if right > 0 {
@@ -77,7 +81,7 @@ pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
             |clock: &ClockReading| if clock.variance <= 0.0 { 1.0 / right as f64 } else { 0.0 };
         return Common { shares: clocks.iter().map(share).collect(), variance: 0.0 };
     }
-    // By where they stand and not by the cameras' names: rounding decides nothing.
+    // Ordered by offset and not by the cameras' names: rounding decides nothing.
     let mut order: Vec<usize> = (0..clocks.len()).collect();
     order.sort_by(|&i, &k| clocks[i].offset.total_cmp(&clocks[k].offset));
     let mut maxima: Vec<Maximum> = Vec::new();
@@ -93,11 +97,12 @@ pub(super) fn common_time(clocks: &[ClockReading]) -> Common {
     mixed(clocks.len(), &maxima)
 }
 
-/// The maximum above a common offset.
+/// Climbs from a common offset to the maximum above it.
 fn climb(clocks: &[ClockReading], order: &[usize], start: f64) -> Maximum {
     let mut offset = start;
     let (mut shares, mut variance) = (Vec::new(), 0.0);
     for _ in 0..STEPS {
+        // E step: the precision believed of each clock. M step: the mean weighted by it.
         shares = clocks.iter().map(|clock| clock.believed(clock.offset - offset).recip()).collect();
         variance = order.iter().map(|&i| shares[i]).sum::<f64>().recip();
         shares.iter_mut().for_each(|share| *share *= variance);
@@ -108,8 +113,9 @@ fn climb(clocks: &[ClockReading], order: &[usize], start: f64) -> Maximum {
     Maximum { offset, variance, shares, log_likelihood }
 }
 
-/// Mean and variance over all maxima, each with the volume under it.
+/// Mean and variance over all maxima, each weighted by the volume under it.
 fn mixed(clocks: usize, maxima: &[Maximum]) -> Common {
+    // Logarithm of the volume under a normal peak, up to a constant: ln L + ln sigma.
     let volume = |maximum: &Maximum| maximum.log_likelihood + maximum.variance.ln() / 2.0;
     let largest = maxima.iter().map(volume).fold(f64::NEG_INFINITY, f64::max);
     let weights: Vec<f64> =
@@ -120,6 +126,7 @@ fn mixed(clocks: usize, maxima: &[Maximum]) -> Common {
     let mut shares = vec![0.0; clocks];
     let mut variance = 0.0;
     for (maximum, weight) in weighed() {
+        // Variance of a mixture: within each maximum, plus between them.
         variance += (maximum.variance + (maximum.offset - mean).powi(2)) * weight;
         shares.iter_mut().zip(&maximum.shares).for_each(|(sum, share)| *sum += share * weight);
     }
@@ -134,7 +141,7 @@ mod tests {
 
     use super::*;
 
-    /// What clocks of so many deviations say together that stand so, and its standard deviation, s.
+    /// Common offset of clocks of these offsets and deviations, and its standard deviation, s.
     fn common(clocks: &[(f64, f64)]) -> (f64, f64) {
         let clocks: Vec<ClockReading> = clocks
             .iter()
@@ -171,8 +178,8 @@ mod tests {
                 scaled += (offset / sd).powi(2) / 2000.0;
             }
             assert!(squares < 1.2 * best, "{sds:?}: {} {}", squares.sqrt(), best.sqrt());
-            // The standard error of a mean square of 2000 draws is 0.03; that any may be a liar
-            // makes them less sure.
+            // The standard error of a mean square of 2000 draws is 0.03; that any clock may be a
+            // liar makes the common time less sure.
             assert!((0.7..1.1).contains(&scaled), "{sds:?}: {scaled}");
         }
     }
@@ -182,8 +189,8 @@ mod tests {
         for off in [0.02, 0.05, 1.0, -30.0] {
             let (offset, sd) = common(&[(off, 2e-3), (0.0, 2e-3), (0.3e-3, 2e-3)]);
             assert!((offset - 0.15e-3).abs() < 0.1e-3, "{off}: {offset}");
-            // One in a hundred thousand that the other two are wrong, and alike, is a millisecond
-            // or two of it.
+            // The chance of one in a hundred thousand that the other two are wrong, and alike,
+            // contributes a millisecond or two.
             assert!((1.4e-3..5e-3).contains(&sd), "{off}: {sd}");
         }
     }

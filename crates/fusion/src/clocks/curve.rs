@@ -1,30 +1,31 @@
-//! A target's way through a window of time, as a cubic spline.
+//! A target's trajectory over a window of time, as a cubic spline.
 
 use nalgebra::{DMatrix, DVector, Vector3};
 
 /// Length of a piece, s: a weave of 1 rad/s and 10 m is followed to 2 mm, its beginning and its end
 /// (steps of the acceleration) to a few centimetres.
 const PIECE_S: f64 = 0.5;
-/// Differences of the coefficients that a piece's third derivative is made of.
+/// Finite differences of neighbouring coefficients; a piece's third derivative is made of the
+/// third.
 const THIRD: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
 const SECOND: [f64; 3] = [1.0, -2.0, 1.0];
 const FIRST: [f64; 2] = [-1.0, 1.0];
-/// Nothing accelerates or flies beyond this, m/s^2 and m/s: it holds what no bearing tells.
+/// Nothing accelerates or flies beyond this, m/s^2 and m/s: it constrains what no bearing
+/// determines.
 const VAGUE_ACCELERATION: f64 = 50.0;
 const VAGUE_SPEED: f64 = 300.0;
-/// Variance of a coefficient round where it begins, m^2: it holds what nothing else does.
+/// Standard deviation of a coefficient about the origin, m: it constrains what nothing else does.
 const VAGUE_PLACE_SD_M: f64 = 1e4;
 
-/// A uniform cubic B-spline over an interval of time, and beyond it along its last pieces. Its
-/// coefficients are points in space, one after the other in a vector.
+/// A uniform cubic B-spline over an interval of time, continued beyond it by its first and last
+/// pieces. Its coefficients are points in space, one after the other in a vector.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Curve {
     start_s: f64,
     pieces: usize,
 }
 
-/// How much each of four coefficients counts for the place (1) and for the velocity (1/s) at a
-/// time.
+/// Weights of four successive coefficients in the place (1) and in the velocity (1/s) at a time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Basis {
     /// The first of the four coefficients.
@@ -39,7 +40,7 @@ impl Curve {
         Self { start_s, pieces: ((end_s - start_s) / PIECE_S).ceil().max(1.0) as usize }
     }
 
-    /// How many points its coefficients are.
+    /// Number of its coefficients, each a point.
     pub(super) fn points(&self) -> usize {
         self.pieces + 3
     }
@@ -48,6 +49,8 @@ impl Curve {
         let along = (time_s - self.start_s) / PIECE_S;
         let first = (along.max(0.0) as usize).min(self.pieces - 1);
         let u = along - first as f64;
+        // Within the piece u goes from 0 to 1, and v = 1 - u; the velocity weights are the
+        // derivatives.
         let (v, u2) = (1.0 - u, u * u);
         let u3 = u2 * u;
         let place =
@@ -57,11 +60,12 @@ impl Curve {
         Basis { first, place, velocity }
     }
 
-    /// Adds to a matrix of information what is known of the coefficients beforehand: a white jerk
-    /// of this power spectral density (m^2/s^5), and that nothing flies beyond all bounds.
+    /// Adds the prior of the coefficients to an information matrix: a white jerk of this power
+    /// spectral density (m^2/s^5), and that nothing flies beyond all bounds.
     pub(super) fn add_prior(&self, information: &mut DMatrix<f64>, jerk_density: f64) {
         // The third difference of the coefficients is the jerk times the cube of a piece's length,
-        // and white jerk of density q has the variance q / length over a piece.
+        // and white jerk of density q has the variance q / length over a piece: together q
+        // length^5.
         let share = (self.points() as f64).recip();
         add_differences(
             information,
@@ -69,6 +73,7 @@ impl Curve {
             &THIRD,
             (jerk_density * PIECE_S.powi(5)).recip(),
         );
+        // The vague bounds count once for the whole curve: each difference has its share.
         let bend = share / (VAGUE_ACCELERATION * PIECE_S * PIECE_S).powi(2);
         add_differences(information, self.points(), &SECOND, bend);
         add_differences(
@@ -79,13 +84,13 @@ impl Curve {
         );
     }
 
-    /// How the information of a jerk's density enters the evidence: minus twice the logarithm of
-    /// the prior's density, but for what is the same for all.
+    /// The jerk density's part of the evidence: minus twice the log density of the prior, up to
+    /// what is the same for all.
     pub(super) fn log_width(&self, jerk_density: f64) -> f64 {
         3.0 * (self.points() - THIRD.len() + 1) as f64 * jerk_density.ln()
     }
 
-    /// The coefficients that pass nearest to places at times, all with this standard deviation, m.
+    /// Least-squares coefficients for places at times, all with this standard deviation, m.
     pub(super) fn fit(
         &self,
         places: impl Iterator<Item = (f64, Vector3<f64>)>,
@@ -115,7 +120,7 @@ impl Curve {
     }
 }
 
-/// Adds the information that these differences of neighbouring coefficients are zero.
+/// Adds the information `weight` that these differences of neighbouring coefficients are zero.
 fn add_differences(information: &mut DMatrix<f64>, points: usize, difference: &[f64], weight: f64) {
     for start in 0..(points + 1).saturating_sub(difference.len()) {
         for (i, a) in difference.iter().enumerate() {

@@ -1,11 +1,11 @@
-//! The cameras' clocks, from the tracks themselves: a moving target seen by several cameras lies
-//! off their sight lines by its velocity times their clocks' offsets.
+//! Estimates the cameras' clocks from the tracks: where several cameras see a moving target, it
+//! lies off each sight line by its velocity times the offset of that camera's clock.
 //!
-//! The bearings of a few tracks are gathered for some seconds ([`window`]) by the cameras' own
-//! clocks, and the target's way ([`curve`]) and all clocks are fitted to them at once
-//! ([`adjustment`]); what that tells of the clocks goes into what is believed of them ([`belief`]).
-//! A recursive filter was here before: an offset of 200 ms times a velocity not yet known is no
-//! linear matter, and of straight passes of 30 m/s it was sure of a wrong answer in three of eight.
+//! The bearings of a few tracks are gathered for some seconds ([`window`]), stamped by the cameras'
+//! own clocks. The target's trajectory ([`curve`]) and all clocks are fitted to them at once
+//! ([`adjustment`]), and the result updates the belief about the clocks ([`belief`]). A recursive
+//! filter was used here before: an offset of 200 ms times a velocity not yet known is no linear
+//! problem, and in straight passes at 30 m/s it was sure of a wrong answer in three of eight.
 
 mod adjustment;
 mod belief;
@@ -29,52 +29,52 @@ use crate::track::{Track, TrackId};
 use crate::tracker::Tracker;
 use crate::uncertainty::CameraUncertainty;
 
-/// Targets looked at at a time.
+/// Number of targets whose bearings are gathered at the same time.
 const MAX_WINDOWS: usize = 3;
-/// A target slower than this says next to nothing of clocks, m/s.
+/// Least speed of such a target, m/s: a slower one says next to nothing about clocks.
 const LEAST_SPEED: f64 = 2.0;
-/// How long the bearings of a target are gathered before what they say is kept, s.
+/// How long the bearings of a target are gathered before the result is kept, s.
 const WINDOW_S: f64 = 8.0;
-/// As long as a clock is worse known than this, s, ...
+/// A clock counts as well known when its relative deviation is below this, s.
 const SURE_S: f64 = 0.002;
-/// ... what has been gathered so far is looked at so often, s; ...
+/// How often the open windows are evaluated while a clock is worse known than [`SURE_S`], s.
 const LOOK_EVERY_S: f64 = 1.0;
-/// ... and so often where all are known, for one may jump.
+/// How often they are evaluated when all clocks are well known, s: one may jump.
 const CHECK_EVERY_S: f64 = 4.0;
-/// Time between two windows that are adjusted, s: many exposures may come at once.
+/// Least time between two adjustments, s: many exposures may come at once.
 const PAUSE_S: f64 = 0.02;
-/// A clock is worse than it was when its camera reports it this many times worse.
+/// A clock counts as worse than before when its camera reports a deviation this many times larger.
 const WORSE: f64 = 3.0;
-/// So many windows one after the other that fit only if all that was learnt was wrong say that it
-/// was.
+/// After this many windows in a row that fit only if everything learnt was wrong, it is taken to
+/// have been wrong.
 const MAX_REFUSED: u32 = 2;
 
-/// What is known of a camera's clock.
+/// Estimate of a camera's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClockEstimate {
-    /// How far the clock is ahead, s: taken off its capture times.
+    /// How far the clock is ahead, s: subtracted from its capture times.
     pub offset_s: f64,
-    /// Standard deviation of the offset against true time, s. What all clocks may have in common
-    /// nobody can see: it stays as large as the clocks' reported deviations leave it.
+    /// Standard deviation of the offset from true time, s. An error that all clocks have in common
+    /// cannot be observed: it stays as large as the clocks' reported deviations leave it.
     pub sd_s: f64,
-    /// Standard deviation of the offset against what all clocks of the site say together, s.
+    /// Standard deviation of the offset from the common time of all the site's clocks, s.
     pub relative_sd_s: f64,
-    /// How fast the clock gains, s/s.
+    /// Drift: how fast the clock gains, s/s.
     pub drift: f64,
     /// Standard deviation of the drift, s/s.
     pub drift_sd: f64,
 }
 
-/// What is said of a clock beside what is learnt of it.
+/// What a camera reports of its clock, and whether that clock is suspected of a jump.
 #[derive(Clone, Copy, Debug)]
 struct Reported {
-    /// The standard deviation that its camera reports, which the belief begins with, s.
+    /// Standard deviation that the camera reports, s: the belief starts from it.
     sd_s: f64,
-    /// What sets it, as its camera says.
+    /// Time source of the clock, as the camera reports it.
     source: ClockSource,
-    /// It may have jumped, ...
+    /// Whether the clock may have jumped.
     suspected: bool,
-    /// ... but the open windows tell of it.
+    /// Whether the open windows determine the clock all the same, so that it need not be widened.
     cleared: bool,
 }
 
@@ -84,42 +84,42 @@ impl Reported {
     }
 }
 
-/// A look at the open windows, one window an exposure: an adjustment takes milliseconds.
+/// One pass over the open windows, one window per exposure: an adjustment takes milliseconds.
 #[derive(Clone, Debug, Default)]
 struct Round {
-    /// The window that is next.
+    /// Index of the next window.
     next: usize,
-    /// What is believed with those before it.
+    /// The belief updated by the windows before it.
     belief: Option<Belief>,
-    /// Cameras of which they tell.
+    /// Cameras whose clocks these windows determine.
     cleared: BTreeSet<CameraName>,
 }
 
-/// A clock that wanders as far as the least deviation in this time is none to be taken at its word,
-/// s: as long as a window of the estimate.
+/// Time over which a clock's random walk is counted, s: a clock that wanders by the least deviation
+/// within it is not taken at its word. As long as a window of the estimate.
 const WALK_S: f64 = 8.0;
 
 /// Estimates the clocks of all cameras.
 #[derive(Clone, Debug)]
 pub(crate) struct ClockEstimator {
     config: Clocks,
-    /// What closed windows have told.
+    /// The belief from closed windows.
     belief: Belief,
-    /// The same with what the open windows tell so far.
+    /// The same, updated by what the open windows say so far.
     provisional: Option<Belief>,
     windows: Vec<Window>,
-    /// How badly the worst clock was known when the last window was closed, s.
+    /// Largest relative deviation of a clock when the last window was closed, s.
     worst_sd_s: f64,
-    /// What is said of each clock.
+    /// What each camera reports of its clock.
     reported: BTreeMap<CameraName, Reported>,
     now: Timestamp,
     next_look: Timestamp,
     /// When the next window may be adjusted.
     next_adjustment: Timestamp,
-    /// The look under way.
+    /// The pass over the open windows that is under way.
     round: Option<Round>,
     needed: bool,
-    /// Windows one after the other that fitted nothing that was learnt before.
+    /// Windows in a row that contradicted everything learnt before.
     refused: u32,
 }
 
@@ -146,9 +146,10 @@ impl ClockEstimator {
         self.needed
     }
 
-    /// Makes a camera's clock and pose known by the deviations it reports. Of later reports only
-    /// one counts that makes the clock much worse than it was, as its source of time is lost, and one
-    /// that is of another clock: that of a network camera which has said only now what its own shows.
+    /// Makes a camera's clock and pose known, with the deviations it reports. Of later reports only
+    /// two kinds count: one that makes the clock much worse than it was, as when its time source is
+    /// lost, and one of another clock, as from a network camera that says only now what its own
+    /// clock shows.
     pub(crate) fn see(&mut self, camera: &CameraName, reported: &CameraUncertainty) {
         let reported_sd_s = reported.time_sd_s;
         if !self.config.estimate {
@@ -182,9 +183,9 @@ impl ClockEstimator {
         }
     }
 
-    /// The standard deviation of an exposure's time against the other cameras', s, by what is known
-    /// of its clock and by what its camera says of it: a clock that is not estimated is as good as
-    /// it says.
+    /// Standard deviation of an exposure's time relative to the other cameras', s, from the
+    /// estimate of its clock and from its camera's report: a clock that is not estimated is as good
+    /// as reported.
     pub(crate) fn time_sd_s(
         &self,
         camera: &CameraName,
@@ -198,12 +199,12 @@ impl ClockEstimator {
         }
     }
 
-    /// Whether a clock is not estimated, for its camera says that it is good.
+    /// Whether a clock is not estimated because its camera reports that it is good.
     fn is_at_its_word(&self, camera: &CameraName) -> bool {
         !self.belief.is_uncertain(camera) && !self.config.trusted.contains(camera)
     }
 
-    /// A camera has been calibrated anew: its bearings so far say nothing of the pose that follows.
+    /// Takes in a camera's new calibration: its bearings so far say nothing of the new pose.
     pub(crate) fn calibrate(&mut self, camera: &CameraName, pose: Option<Matrix6<f64>>) {
         if self.belief.knows(camera) {
             self.belief.calibrate(camera, pose);
@@ -212,7 +213,7 @@ impl ClockEstimator {
         }
     }
 
-    /// What the open windows have told so far was of other cameras, or of cameras as they were.
+    /// Discards the result of the open windows so far: a camera is new, or no longer as it was.
     fn forget_provisional(&mut self) {
         self.provisional = None;
         self.round = None;
@@ -240,8 +241,8 @@ impl ClockEstimator {
         self.newest().largest_offset(self.now)
     }
 
-    /// Moves on to a time: closes a window that is full or whose target too few cameras see, or
-    /// looks at one that is open, now and then. One window at a time, for an exposure waits for it.
+    /// Moves on to a time: closes a window that is full or whose track two cameras no longer see,
+    /// or now and then evaluates an open one. One window at a time, as an exposure waits for it.
     pub(crate) fn advance(&mut self, time: Timestamp, tracker: &Tracker) {
         self.now = self.now.max(time);
         if self.now < self.next_adjustment {
@@ -268,8 +269,8 @@ impl ClockEstimator {
         }
     }
 
-    /// All clocks have stepped by so much, s: what was learnt stays, what was being looked at is of
-    /// another time.
+    /// Handles a step of all clocks by `step_s`, s: what was learnt stays, the open windows belong
+    /// to another time.
     pub(crate) fn step_time(&mut self, step_s: f64) {
         self.belief.step_time(step_s);
         (self.provisional, self.round) = (None, None);
@@ -279,8 +280,9 @@ impl ClockEstimator {
         }
     }
 
-    /// Takes a bearing of a track in, by the time that the camera gave it.
+    /// Takes in a bearing of a track, stamped by the camera's own clock.
     pub(crate) fn update(&mut self, track: &Track, exposure: &Exposure, line: &SightLine) {
+        // Undo the correction: windows use the camera's own time.
         let time = exposure.time.plus_seconds(exposure.correction_s);
         let camera = &exposure.camera;
         let index = self.windows.iter().position(|window| window.track == track.id).or_else(|| {
@@ -297,13 +299,14 @@ impl ClockEstimator {
         let is_new = !self.windows[index].cameras.contains(camera);
         let role = if is_new && self.is_wanted(camera, index) { Role::Wanted } else { Role::Link };
         let window = &mut self.windows[index];
+        // The part of the noise that lasts counts as white noise that averages out as slowly.
         let lasting = exposure.uncertainty.lasting.as_white(window.since_last(camera, time));
         let covariance = line.covariance + Matrix2::identity() * lasting;
         let line = SightLine { covariance, ..*line };
         window.add(camera, role, time, line, track.position_at(exposure.time).coords);
     }
 
-    /// The worst standard deviation of a clock among all cameras, s.
+    /// Largest relative deviation of any camera's clock, s.
     fn worst_sd(&self) -> f64 {
         let sd = |camera| {
             self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s)
@@ -311,8 +314,8 @@ impl ClockEstimator {
         self.reported.keys().map(sd).fold(0.0, f64::max)
     }
 
-    /// Whether a window is for a camera's clock, which is among the worst known and no other
-    /// window's.
+    /// Whether a window should learn a camera's clock: it is among the worst known, and the camera
+    /// is in no other window.
     fn is_wanted(&self, camera: &CameraName, index: usize) -> bool {
         let others = || self.windows.iter().enumerate().filter(|(other, _)| *other != index);
         let sd = self.belief.estimate(camera, self.now).map_or(0.0, |clock| clock.relative_sd_s);
@@ -320,15 +323,15 @@ impl ClockEstimator {
         is_bad && !others().any(|(_, window)| window.cameras.contains(camera))
     }
 
-    /// A camera's bearings do not fit the others': its clock may have jumped. It counts as badly
-    /// known as it was in the beginning, until a window tells.
+    /// Marks a clock that may have jumped, as its camera's bearings do not fit the others'. It
+    /// counts as badly known as it was at the start, until a window determines it.
     pub(crate) fn suspect(&mut self, camera: &CameraName) {
         if self.belief.is_uncertain(camera) {
             if let Some(reported) = self.reported.get_mut(camera) {
                 (reported.suspected, reported.cleared) = (true, false);
             }
             self.next_look = self.next_look.min(self.now.plus_seconds(LOOK_EVERY_S));
-            // Up to now its bearings may be by the clock as it was.
+            // Earlier bearings may have been stamped before the jump.
             self.windows
                 .iter_mut()
                 .for_each(|window| *window = window.without_early(f64::INFINITY, camera));
@@ -336,7 +339,7 @@ impl ClockEstimator {
         }
     }
 
-    /// Keeps what a window has told.
+    /// Keeps the result of a closed window.
     fn close(&mut self, window: &Window) {
         match window_update(&self.belief, window) {
             WindowUpdate::Accepted(belief) => {
@@ -363,7 +366,7 @@ impl ClockEstimator {
         self.reported.get(camera).is_some_and(|reported| reported.suspected)
     }
 
-    /// Whether the clock of a camera that sees one of the targets is not well known.
+    /// Whether the clock of a camera that sees one of the windows' targets is not well known.
     fn is_unsure(&self) -> bool {
         self.windows
             .iter()
@@ -376,7 +379,7 @@ impl ClockEstimator {
         self.is_suspected(camera) || clock.is_some_and(|clock| clock.relative_sd_s > SURE_S)
     }
 
-    /// Looks at what the next open window tells so far; after the last it counts.
+    /// Evaluates the next open window; after the last one the provisional belief takes effect.
     fn look(&mut self, mut round: Round) {
         if let Some(window) = self.windows.get(round.next) {
             if let WindowUpdate::Accepted(next) =
@@ -435,7 +438,7 @@ mod tests {
             clock_source,
             ..CameraUncertainty::of_time(sd_s)
         };
-        // The camera that is heard first is the one that the others are held against.
+        // The camera that is heard first is the reference of the others' offsets.
         for late_is_first in [false, true] {
             let mut clocks = ClockEstimator::new(Clocks::default());
             let mut first =
@@ -447,14 +450,14 @@ mod tests {
             let of = |clocks: &ClockEstimator, camera| clocks.estimate(camera).unwrap();
             let sd_s = of(&clocks, &late).sd_s;
             assert!((sd_s - 0.1).abs() < 0.01, "{sd_s}");
-            // Its own clock is good, and its offset is not that of the arrivals.
+            // The camera's own clock is good, and its offset is not that of the arrival times.
             clocks.see(&late, &by(ClockSource::Camera, 0.02));
             for (camera, sd_s) in [(&late, 0.02), (&other, 0.01)] {
                 let estimate = of(&clocks, camera);
                 assert!(estimate.offset_s.abs() < 1e-9, "{camera}: {estimate:?}");
                 assert!(estimate.sd_s < 1.1 * sd_s, "{camera}: {estimate:?}");
             }
-            // What the two are apart is no better known than the new one is.
+            // The offset between the two clocks is no better known than the new clock is.
             let apart_s = of(&clocks, &late).relative_sd_s.hypot(of(&clocks, &other).relative_sd_s);
             assert!(apart_s > 0.01, "{apart_s}");
             clocks.see(&late, &by(ClockSource::Arrival, 0.1));

@@ -1,4 +1,4 @@
-//! The bearings of one track over a few seconds, by the cameras' own clocks.
+//! Bearings of one track over a few seconds, stamped by the cameras' own clocks.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -6,19 +6,19 @@ use nalgebra::Vector3;
 
 use crate::track::TrackId;
 
-/// A window holds no more bearings than this: when it is full, every other one of each camera is
-/// let go, and from then on as many are not taken.
+/// Most bearings of a window: when it is full, every other one of each camera is dropped, and from
+/// then on as many of the new ones are not taken.
 const MAX_SIGHTS: usize = 1500;
-/// A window is of so many cameras: eight unknowns each, in time that is bounded. The others have
-/// their turn with another window.
+/// Most cameras of a window: eight unknowns each, in time that is bounded. The others have their
+/// turn with another window.
 const MAX_CAMERAS: usize = 8;
-/// So many of them may be links in the beginning, ...
+/// Most links ([`Role::Link`]) among them in the first [`ADMISSION_S`].
 const MAX_LINKS: usize = 4;
-/// ... until all that are wanted and see the target have been heard, s.
+/// After this all wanted cameras that see the target have been heard, s.
 const ADMISSION_S: f64 = 0.5;
-/// A camera says nothing of its clock that can be checked with fewer bearings than this.
+/// Least bearings of a camera: with fewer, what it says of its clock cannot be checked.
 const LEAST_SIGHTS: usize = 5;
-/// Bearings this far from the window's beginning are not of it, s.
+/// Bearings farther than this from the window's beginning do not belong to it, s.
 const MAX_SPAN_S: f64 = 30.0;
 
 /// A bearing of a target.
@@ -26,20 +26,20 @@ const MAX_SPAN_S: f64 = 30.0;
 pub(super) struct Sight {
     /// When it was taken by the camera's own clock, s after the window's beginning.
     pub(super) time_s: f64,
-    /// Which camera of the window took it.
+    /// Index of its camera in the window.
     pub(super) camera: usize,
-    /// With the covariance that was reported.
+    /// With the covariance that was reported, and the noise that lasts counted in as white.
     pub(super) line: SightLine,
-    /// Where the track had the target then.
+    /// Where the track had the target at that time.
     pub(super) place: Vector3<f64>,
 }
 
-/// What a camera is to a window.
+/// Role of a camera in a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Role {
     /// Its clock is to be learnt.
     Wanted,
-    /// Its clock is known or another window's: against it the others are learnt.
+    /// Its clock is known, or another window's task: the others are learnt relative to it.
     Link,
 }
 
@@ -50,11 +50,11 @@ pub(super) struct Window {
     pub(super) start: Timestamp,
     pub(super) cameras: Vec<CameraName>,
     pub(super) sights: Vec<Sight>,
-    /// One in so many bearings of each camera is taken.
+    /// One in this many bearings of each camera is taken.
     thinned: usize,
-    /// How many of its cameras are links.
+    /// Number of its cameras that are links.
     links: usize,
-    /// Bearings of each camera that were offered.
+    /// Number of bearings that each camera has offered.
     offered: Vec<usize>,
 }
 
@@ -71,7 +71,7 @@ impl Window {
         }
     }
 
-    /// Takes in a bearing of a camera by its own clock, with where the track has the target.
+    /// Takes in a bearing, stamped by the camera's own clock, with where the track has the target.
     pub(super) fn add(
         &mut self,
         camera: &CameraName,
@@ -106,14 +106,14 @@ impl Window {
         }
     }
 
-    /// How long after the camera's last bearing in the window a time is, s.
+    /// Time since the camera's last bearing in the window, s; infinite if there is none.
     pub(super) fn since_last(&self, camera: &CameraName, time: Timestamp) -> f64 {
         let index = self.cameras.iter().position(|known| known == camera);
         let last = self.sights.iter().rev().find(|sight| Some(sight.camera) == index);
         last.map_or(f64::INFINITY, |last| time.seconds_since(self.start) - last.time_s)
     }
 
-    /// Lets every other bearing of each camera go.
+    /// Drops every other bearing of each camera.
     fn thin(&mut self) {
         self.thinned *= 2;
         let mut seen = vec![0_usize; self.cameras.len()];
@@ -131,18 +131,18 @@ impl Window {
         })
     }
 
-    /// Which cameras have given enough bearings for what they say to be checked.
+    /// Indices of the cameras that have given enough bearings to be checked.
     fn checked_indices(&self) -> Vec<usize> {
         let count = |index: usize| self.sights.iter().filter(|sight| sight.camera == index).count();
         (0..self.cameras.len()).filter(|index| count(*index) >= LEAST_SIGHTS).collect()
     }
 
-    /// Cameras that have given enough bearings for what they say to be checked.
+    /// Cameras that have given enough bearings to be checked.
     pub(super) fn checked_cameras(&self) -> Vec<CameraName> {
         self.checked_indices().into_iter().map(|index| self.cameras[index].clone()).collect()
     }
 
-    /// The window without the bearings that a camera took before a time, s.
+    /// The window without a camera's bearings before a time, s.
     pub(super) fn without_early(&self, time_s: f64, camera: &CameraName) -> Self {
         let mut later = self.clone();
         let index = self.cameras.iter().position(|known| known == camera);
@@ -150,7 +150,7 @@ impl Window {
         later
     }
 
-    /// The window without the cameras that have given it too few bearings.
+    /// The window without the cameras that have given too few bearings to be checked.
     pub(super) fn checked(&self) -> Self {
         let kept = self.checked_indices();
         let moved = |sight: &Sight| {

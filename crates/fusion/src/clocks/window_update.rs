@@ -1,4 +1,5 @@
-//! What a window teaches of the clocks: how believable that is, and whether a clock has jumped.
+//! Update of the belief about the clocks by a window: how credible it is, and whether a clock has
+//! jumped.
 
 use crossfix_message::CameraName;
 use nalgebra::DMatrix;
@@ -8,53 +9,51 @@ use super::belief::Belief;
 use super::curve::Curve;
 use super::window::Window;
 
-/// Bearings of less than this say nothing that can be checked, s.
+/// Least span of a window, s: bearings of less say nothing that can be checked.
 const LEAST_WINDOW_S: f64 = 1.0;
-/// Residuals larger than this (squared, over what was reported) are not the noise's but a
-/// mistake's.
+/// Residuals larger than this (squared, over what was reported) are due to a mistake, not to noise.
 const MAX_SCALE: f64 = 16.0;
-/// When more than this share of a camera's bearings do not fit, the camera does not.
-const MAX_STRANGERS: f64 = 0.3;
-/// Residuals larger than this, or clocks farther than this from what was believed of them (both
-/// squared, over what was expected), may be those of a clock that has jumped.
+/// A camera of which more than this share of bearings are outliers, of other objects, does not fit itself.
+const MAX_OUTLIERS: f64 = 0.3;
+/// Residuals larger than this, or clocks farther than this from their prior (both squared, over
+/// what was expected), may be due to a clock that has jumped.
 const SUSPICIOUS_SCALE: f64 = 1.5;
 const SUSPICIOUS_PULL: f64 = 6.0;
-/// How much likelier (twice the logarithm) a jump must make a window: clocks jump once a day.
+/// By how much (twice the logarithm) a jump must make a window likelier: clocks jump once a day.
 const JUMP: f64 = 18.0;
 /// Cameras that are tried for a jump, the least fitting first.
 const MAX_SUSPECTS: usize = 4;
-/// A part of a camera's bearings that fits so much better (squared) than all of them is after a
-/// jump.
+/// Bearings of a camera that fit better than all of its bearings by this factor (squared) are taken
+/// after a jump.
 const BETTER: f64 = 1.5;
-/// A curve reaches beyond its bearings as far as the clocks may move, and no farther than this, s.
+/// Longest margin of a curve beyond its bearings, s: the margin is as far as the clocks may move.
 const MAX_MARGIN_S: f64 = 1.0;
-/// No window is longer than this, s: the number of a curve's pieces is bounded.
+/// Longest window, s: it bounds the number of a curve's pieces.
 const LONGEST_S: f64 = 12.0;
-/// Density of jerk that is tried first, m^2/s^5, as a power of ten.
+/// Jerk density that is tried first, m^2/s^5, as a power of ten.
 const FIRST_DENSITY: i32 = 0;
 
-/// Evidence (twice the logarithm) as good as equal.
+/// Difference of evidence (twice the logarithm) that is as good as none.
 const EVEN: f64 = 1.0;
 
-/// What a window says to a belief.
+/// Result of a window.
 pub(super) enum WindowUpdate {
-    /// What is believed with it.
+    /// The belief with the window taken in.
     Accepted(Box<Belief>),
-    /// It is too short, sees no clock that could be learnt, or is no target's.
+    /// The window is too short, sees no clock that could be learnt, or is not of one target.
     Uninformative,
-    /// It fits only if all that was learnt before is forgotten: this is what it says then.
+    /// The window fits only if all that was learnt before is forgotten: the belief it gives then.
     Contradicts(Box<Belief>),
 }
 
-/// A belief before a window, and the part of the state that the window tells of.
+/// Test of a window for jumps: the belief before it, and the state components that it observes.
 struct JumpTest<'a> {
     belief: Belief,
     components: Vec<usize>,
     window: &'a Window,
 }
 
-/// A belief after a window. If the window does not fit it well, the clock of a camera may have
-/// jumped.
+/// The belief after a window. If the window does not fit it well, a camera's clock may have jumped.
 pub(super) fn window_update(belief: &Belief, window: &Window) -> WindowUpdate {
     let window = window.checked();
     let Some((_, last)) = window.span().filter(|(first, last)| last - first >= LEAST_WINDOW_S)
@@ -78,6 +77,7 @@ impl JumpTest<'_> {
         if let Some(adjusted) = fitting.filter(|adjusted| !is_suspicious(adjusted)) {
             return WindowUpdate::Accepted(Box::new(self.learnt(self.belief.clone(), adjusted)));
         }
+        // Try a jump within the window first, then for each suspect a jump before it, at a price.
         let suspects = self.suspects(plain.as_ref());
         if let Some(belief) =
             suspects.first().and_then(|camera| self.jumped_within(camera, plain.as_ref()))
@@ -100,6 +100,7 @@ impl JumpTest<'_> {
         if let Some((adjusted, belief)) = best {
             return WindowUpdate::Accepted(Box::new(self.learnt(belief, &adjusted)));
         }
+        // Nothing fits: try without anything learnt before.
         self.belief.reset_all();
         self.components = components(&self.belief, self.window);
         let anew = adjust(&self.belief, self.window, &self.components).filter(fits);
@@ -113,8 +114,9 @@ impl JumpTest<'_> {
         belief
     }
 
-    /// What is believed if a camera's clock has jumped in the first half of the window: its
-    /// bearings of the second half fit much better than all, and not by the clock as it was.
+    /// The belief if a camera's clock has jumped in the first half of the window: its bearings of
+    /// the second half then fit much better than all of them, and the clock as it was explains them
+    /// no better.
     fn jumped_within(&self, camera: &CameraName, plain: Option<&Adjusted>) -> Option<Belief> {
         let index = self.window.cameras.iter().position(|known| known == camera)?;
         let strange = |adjusted: &Adjusted| adjusted.scales[index];
@@ -128,7 +130,8 @@ impl JumpTest<'_> {
         let after = adjust(&doubting, &later, &self.components).filter(fits)?;
         let much_better = plain.is_none_or(|plain| strange(&after) * BETTER < strange(plain));
         let before = adjust(&self.belief, &later, &self.components).filter(fits);
-        // Where nothing was known yet of the clock, nothing speaks for it as it was.
+        // Where nothing was known of the clock yet, the evidences are even: nothing favours the old
+        // clock.
         let jumped = before.is_none_or(|before| after.evidence + EVEN > before.evidence);
         (much_better && jumped).then(|| self.learnt(doubting, &after))
     }
@@ -137,7 +140,7 @@ impl JumpTest<'_> {
     fn suspects(&self, adjusted: Option<&Adjusted>) -> Vec<&CameraName> {
         let strange = |index: usize| {
             adjusted.map_or(0.0, |adjusted| {
-                adjusted.scales[index] + MAX_SCALE * adjusted.strangers[index]
+                adjusted.scales[index] + MAX_SCALE * adjusted.outlier_shares[index]
             })
         };
         let cameras = self.window.cameras.iter().enumerate();
@@ -150,7 +153,7 @@ impl JumpTest<'_> {
     }
 }
 
-/// The components of the state that are a window's cameras': of each its clock's, then its pose's.
+/// State components of a window's cameras: for each those of its clock, then those of its pose.
 fn components(belief: &Belief, window: &Window) -> Vec<usize> {
     let of_camera = |camera: &CameraName| {
         let clock = belief.place(camera).map(|place| place..place + 2);
@@ -162,7 +165,7 @@ fn components(belief: &Belief, window: &Window) -> Vec<usize> {
 
 fn fits(adjusted: &Adjusted) -> bool {
     adjusted.scales.iter().all(|scale| *scale < MAX_SCALE)
-        && adjusted.strangers.iter().all(|share| *share < MAX_STRANGERS)
+        && adjusted.outlier_shares.iter().all(|share| *share < MAX_OUTLIERS)
 }
 
 fn is_suspicious(adjusted: &Adjusted) -> bool {
@@ -170,7 +173,7 @@ fn is_suspicious(adjusted: &Adjusted) -> bool {
         || adjusted.pulled > SUSPICIOUS_PULL * adjusted.cameras.len() as f64
 }
 
-/// Fits a window with what is believed of clocks and poses.
+/// Fits a window with the belief as the prior of clocks and poses.
 fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adjusted> {
     let (mean, covariance) = belief.marginal(components);
     let mut next = 0;
@@ -185,6 +188,7 @@ fn adjust(belief: &Belief, window: &Window, components: &[usize]) -> Option<Adju
     };
     let cameras: Vec<Unknowns> = window.cameras.iter().map(unknowns).collect();
     let sd = |place: usize| covariance[(place, place)].max(0.0).sqrt();
+    // The curve covers the bearings' times with every clock off by two deviations.
     let widest = cameras.iter().filter_map(|unknowns| unknowns.clock).map(sd).fold(0.0, f64::max);
     let margin = (2.0 * widest).min(MAX_MARGIN_S);
     let offset = |unknowns: &Unknowns| unknowns.clock.map_or(0.0, |place| mean[place]);

@@ -5,13 +5,14 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// Exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default lateness,
-/// three of 30 Hz 5400 within the longest.
+/// Most exposures that wait in one queue: 64 cameras of 60 Hz send 1920 within the default
+/// lateness, three of 30 Hz 5400 within the longest.
 const MOST_EXPOSURES: usize = 6_000;
-/// Sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in all.
+/// Most sightings of all exposures that wait in one queue. There are two queues, so about 30 MB in
+/// all.
 const MOST_SIGHTINGS: usize = 100_000;
 
-/// By what exposures are put into order: two of a camera may be corrected to the same time, and the
+/// Key by which exposures are ordered: two of a camera may be corrected to the same time, and the
 /// reported times tell them apart.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Place {
@@ -21,7 +22,7 @@ struct Place {
 }
 
 /// Exposures that wait until nothing can come before them, in the order of their times, each with a
-/// note; never more than may.
+/// note; their number is bounded.
 ///
 /// ```text
 ///                        out, in order
@@ -34,9 +35,9 @@ struct Place {
 ///  refused
 /// ```
 ///
-/// The fusion has two: by the times that the cameras report ([`super::EventBuffer`] says what can
-/// still come), and by those times less what the clocks are found to be ahead (until no clock can
-/// be so far ahead).
+/// The fusion has two: one by the times that the cameras report ([`super::EventBuffer`] says what
+/// can still come), and one by those times less the estimated offsets of the clocks (until no clock
+/// can be so far ahead).
 #[derive(Debug)]
 pub(crate) struct ReorderQueue<Note> {
     waiting: BTreeMap<Place, (Exposure, Note)>,
@@ -67,7 +68,7 @@ impl<Note> ReorderQueue<Note> {
     }
 
     /// The first exposure, if it is no later than the time before which nothing can come any more,
-    /// or if more wait than may.
+    /// or if more wait than is allowed.
     pub(crate) fn pop_settled(&mut self, settled: Option<Timestamp>) -> Option<(Exposure, Note)> {
         let (first, _) = self.waiting.first_key_value()?;
         let is_crowded = self.waiting.len() > MOST_EXPOSURES || self.sightings > MOST_SIGHTINGS;
@@ -81,7 +82,7 @@ impl<Note> ReorderQueue<Note> {
         Some((exposure, note))
     }
 
-    /// How many exposures wait, and sightings.
+    /// Number of exposures that wait, and of their sightings.
     #[cfg(test)]
     pub(super) fn load(&self) -> (usize, usize) {
         (self.waiting.len(), self.sightings)

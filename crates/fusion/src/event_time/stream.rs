@@ -2,44 +2,45 @@ use crossfix_message::Timestamp;
 
 use super::PATIENCES;
 
-/// For so many times the lateness a camera is waited for as one whose frames overtake each other.
+/// A camera whose frames overtake each other is waited for as such for this many times the
+/// lateness.
 const DISORDER_LASTS: f64 = 20.0;
 
-/// So many frames of a camera one after the other far behind its newest say that its clock was
-/// ahead, even where they come too late.
+/// After this many frames in a row far behind its newest, a camera's clock is taken to have been
+/// ahead, even where these frames come too late.
 const MOST_FAR_BEHIND: u32 = 3;
 
-/// What a camera says of a time so far back, s, it has not held back: its clock has gone back. With
-/// half of it a host that stood still for half a minute and says the newest first is taken for a
-/// clock that went back; with twice as much, cameras that outlive others whose clocks were ahead are
-/// followed after a minute.
+/// What a camera says of a time further back than this, s, it has not held back: its clock has gone
+/// back. With half of it a host that stood still for half a minute and says the newest first is
+/// taken for a clock that went back; with twice as much, cameras that outlive others whose clocks
+/// were ahead are followed only after a minute.
 const LONGEST_BACKLOG_S: f64 = 30.0;
 
-/// How one camera's frames come.
+/// Timing of one camera's frames.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stream {
     pub(super) newest: Timestamp,
     /// The newest time that agreed with another camera's.
     pub(super) trusted: Timestamp,
-    /// From the last but one to the newest, s, as far as that is no jump.
+    /// From the last time but one to the newest, s, at most [`PATIENCES`] times the lateness.
     pub(super) step_s: f64,
-    /// How far it has gone on, by its own clock and without jumps, s.
+    /// How far the camera has gone on, by its own clock and without jumps, s.
     pub(super) gone_s: f64,
-    /// How far time had gone on when it was heard last, s.
+    /// How far time had gone on when the camera was heard last, s.
     pub(super) heard_s: f64,
-    /// How far time had gone on when it fell behind by more than anybody waits, s; `None` while it
-    /// keeps up.
+    /// How far time had gone on when the camera fell behind by more than anybody waits, s; `None`
+    /// while it keeps up.
     pub(super) behind_since_s: Option<f64>,
-    /// How far it has gone on since it fell behind what the others say the time is, s: what it may
-    /// have held back.
+    /// How far the camera has gone on since it fell behind the common time of the others, s: what
+    /// it may have held back.
     pub(super) made_up_s: f64,
-    /// Its clock has gone back, by more than it can have held back, and it has not reached since
-    /// what the others say the time is.
+    /// Whether its clock has gone back by more than the camera can have held back, and has not
+    /// reached the common time of the others since.
     pub(super) went_back: bool,
-    /// Frames far behind the newest, one after the other.
+    /// Number of frames in a row far behind the newest.
     far_behind: u32,
-    /// How far behind the newest others came, at most, s, and the newest when one did last; from a
-    /// frame on that came too late for it.
+    /// How far behind the newest other frames came, at most, s, and the newest time when one last
+    /// did; from the first frame on that came too late for it.
     disorder: Option<(f64, Timestamp)>,
 }
 
@@ -59,7 +60,7 @@ impl Stream {
         }
     }
 
-    /// Takes note of a frame that came `late_s` too late.
+    /// Notes the time of a frame; `late_s` is by how much the frame came too late, if it did.
     pub(super) fn hear(&mut self, time: Timestamp, late_s: Option<f64>, lateness_s: f64) {
         let behind_s = self.newest.seconds_since(time);
         let known_s = self.disorder_s(lateness_s);
@@ -82,15 +83,16 @@ impl Stream {
         }
     }
 
-    /// Takes note of whether it keeps up with what the others say the time is, `step_s` further on than
-    /// before; returns how much of that is progress.
+    /// Notes whether the camera keeps up with the common time of the others, after going on by
+    /// `step_s`; returns how much of that is progress.
     pub(super) fn progress(&mut self, keeps_up: bool, step_s: f64) -> f64 {
         if keeps_up {
             (self.made_up_s, self.went_back) = (0.0, false);
             return step_s;
         }
         self.made_up_s += step_s;
-        // Nobody holds back so much: it is behind for good, and may be the one that is right.
+        // Nobody holds back so much: the camera is behind for good, and may be the one that is
+        // right.
         let is_slow = self.went_back || self.made_up_s > LONGEST_BACKLOG_S;
         if is_slow { step_s } else { 0.0 }
     }

@@ -82,7 +82,8 @@ fn what_comes_at_the_time_of_the_last_is_taken_and_what_comes_twice_is_told_from
     assert!(matches!(buffer.insert(exposure("b", 1.0)), Err(RejectionReason::Late { .. })));
 }
 
-/// Frames of `b`, and of `a` in pairs whose second comes first; returns how many are refused.
+/// Takes in frames of `b`, and of `a` in pairs whose second comes first; returns how many are
+/// refused.
 fn swapped(buffer: &mut EventBuffer, tenths: std::ops::Range<u32>) -> usize {
     let mut refused = 0;
     for k in tenths {
@@ -99,7 +100,7 @@ fn swapped(buffer: &mut EventBuffer, tenths: std::ops::Range<u32>) -> usize {
 fn a_camera_whose_frames_overtake_each_other_is_waited_for_from_then_on() {
     let mut buffer = EventBuffer::new(EventTime::default());
     assert_eq!(swapped(&mut buffer, 0..100), 1);
-    // For a while nobody relies on its order, then everybody does again.
+    // For a while nobody relies on the order of `a`, then everybody does again.
     let mut waits = Vec::new();
     for k in 100..400 {
         let t = 0.1 * f64::from(k);
@@ -129,7 +130,7 @@ fn a_clock_that_was_ahead_is_waited_for_when_it_is_right_again() {
             }
             drain(&mut buffer);
         }
-        // When it was ahead nobody waited for it: the others were worked on up to 2.0 s.
+        // When `c` was ahead nobody waited for it: the others were worked on up to 2.0 s.
         assert_eq!(errors, refused);
     }
 }
@@ -169,7 +170,7 @@ fn a_camera_that_should_be_heard_is_waited_for_in_the_beginning_and_not_for_ever
 #[test]
 fn one_camera_from_the_future_is_refused_and_drags_nobody() {
     let mut buffer = EventBuffer::new(EventTime::default());
-    // It comes first, when there is nothing to compare it with.
+    // The liar comes first, when there is nothing to compare it with.
     buffer.insert(exposure("liar", 1e6)).unwrap();
     for i in 0..10 {
         buffer.insert(exposure("a", f64::from(i))).unwrap();
@@ -194,7 +195,8 @@ fn after_a_common_pause_two_cameras_bring_the_time_back() {
     assert!(drain(&mut buffer).contains(&60.01));
 }
 
-/// Ten frames a second of `cameras`, as `change` makes them (`None`: none); how many are refused.
+/// Takes in ten frames a second of `cameras`, as `change` makes them (`None`: none); returns how
+/// many are refused.
 fn run(
     buffer: &mut EventBuffer,
     cameras: usize,
@@ -306,8 +308,8 @@ fn what_a_network_held_back_is_late_and_not_a_clock_that_was_ahead() {
     assert_eq!(buffer.take_restart(), None);
 }
 
-/// Three cameras at 30 Hz until a time; the third is silent from 10 to 20 s and says it all then,
-/// maybe the newest first. What is done with each frame, by its camera.
+/// Three cameras at 30 Hz until `until_s`; the third is silent from 10 to 20 s and says it all
+/// then, maybe the newest first. Returns what is done with each frame, by its camera.
 fn backlog(
     buffer: &mut EventBuffer,
     until_s: f64,
@@ -341,7 +343,7 @@ fn what_a_camera_says_all_at_once_of_ten_seconds_moves_nobody() {
         let heard = backlog(&mut buffer, 30.0, newest_first);
         let refused = |of: &str| heard.iter().filter(|(c, how)| *c == of && how.is_err()).count();
         assert_eq!((refused("a"), refused("b")), (0, 0));
-        // Of the third at most what lies before the lateness, and nothing later.
+        // Of the third at most the frames before the lateness are refused, and none later.
         assert!(refused("c") as f64 <= 30.0 * 10.0, "{}", refused("c"));
         assert!(heard.iter().rev().take(800).all(|(_, how)| how.is_ok()));
     }
@@ -362,7 +364,7 @@ fn a_camera_whose_clock_is_a_second_behind_holds_nobody_up_for_long() {
     }
     let waited = |range: std::ops::Range<usize>| waits[range].iter().filter(|wait| **wait).count();
     assert_eq!(waited(10..300), 0);
-    // Two seconds at its first jump, and none after that; nor when it is right again.
+    // Waited for two seconds at its first jump, and not after that; nor when it is right again.
     assert!(waited(300..600) <= 75, "{}", waited(300..600));
     assert_eq!((waited(400..600), waited(610..900)), (0, 0));
 }

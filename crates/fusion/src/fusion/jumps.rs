@@ -1,4 +1,4 @@
-//! What becomes of all that is known where the site's time jumps.
+//! Jumps of the site's time, and what becomes of the state then.
 
 use crossfix_message::{BearingFrame, Timestamp};
 
@@ -10,11 +10,12 @@ use crate::initiation::Initiator;
 use crate::site_time::{Apart, moved};
 use crate::unmet::Unmet;
 
-/// All clocks have stepped forward, and the cameras have not stood still, where that is so much
-/// likelier by the targets' bearings (logarithm): a host that sleeps is the commoner.
+/// All clocks are taken to have stepped forward, rather than the cameras to have stood still, if
+/// the targets' bearings make that likelier by this log-likelihood ratio: a host that slept is the
+/// commoner cause.
 const STEP_MARGIN: f64 = 8.0;
-/// A longer step forward is not told from a host that slept, s: where a target is after that nobody
-/// knows.
+/// A longer step forward cannot be told from a host that slept, s: after that nobody knows where a
+/// target is.
 const LONGEST_FORWARD_S: f64 = 2.0;
 
 impl Fusion {
@@ -28,8 +29,8 @@ impl Fusion {
         }
     }
 
-    /// Takes the order of time up anew from a time long passed: what was made of a time that never
-    /// was is forgotten.
+    /// Starts the order of time again at a time long passed: whatever came of times that never were
+    /// is dropped.
     pub(super) fn restart(&mut self, time: Timestamp, outputs: &mut Vec<Output>) {
         self.counters.count("event_time_restarts");
         while let Some((exposure, ())) = self.corrected.pop() {
@@ -38,14 +39,15 @@ impl Fusion {
         }
         self.smooth_all(outputs);
         let changes = self.tracker.restart(time);
-        self.cameras.forget_strangers();
+        self.cameras.forget_clutter();
         self.emit_events(changes, time, outputs);
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);
         self.clocks = ClockEstimator::new(self.config.clocks.clone());
     }
 
-    /// Takes frames in that have waited until it was clear whether all clocks have stepped, s.
+    /// Handles frames that have waited until it was clear whether all clocks have stepped, by
+    /// `step_s` seconds.
     pub(super) fn take_after(
         &mut self,
         frames: &[BearingFrame],
@@ -58,8 +60,8 @@ impl Fusion {
         frames.iter().for_each(|frame| self.take(frame, outputs));
     }
 
-    /// Takes frames in that have waited until it was clear that some clocks have stepped for
-    /// themselves: by how much exactly, tracks have to show.
+    /// Handles frames that have waited until it was clear that some clocks have stepped by
+    /// themselves: by how much exactly, the tracks have to show.
     pub(super) fn take_apart(
         &mut self,
         frames: &[BearingFrame],
@@ -76,10 +78,10 @@ impl Fusion {
         frames.iter().for_each(|frame| self.take(frame, outputs));
     }
 
-    /// Whether all clocks have stepped by so much, s. Time that has gone back has. Where it has
-    /// gone forward all cameras may have stood still, as those of a host that slept; they have not,
-    /// if their bearings show the targets where they would be without it, and not where they would
-    /// be with it.
+    /// Whether all clocks have stepped by `step_s` seconds. A step back is always one. At a step
+    /// forward all cameras may instead have stood still, like those of a host that slept; they have
+    /// not if the bearings fit the tracks at the times without the step, and not at the times with
+    /// it.
     fn has_stepped(&self, frames: &[BearingFrame], step_s: f64) -> bool {
         let fit = |ahead_s: f64| -> f64 {
             let of_frame = |frame: &BearingFrame| {
@@ -100,7 +102,7 @@ impl Fusion {
         step_s < 0.0 || (step_s < LONGEST_FORWARD_S && fit(step_s) > fit(0.0) + STEP_MARGIN)
     }
 
-    /// All clocks have stepped at once: the tracks go on by the new time.
+    /// Applies a step of all clocks: the tracks continue on the new time.
     fn step_time(&mut self, step_s: f64, outputs: &mut Vec<Output>) {
         self.counters.count("site_time_steps");
         self.finish(outputs);
@@ -108,7 +110,7 @@ impl Fusion {
         self.buffer.begin_anew();
         self.tracker.step_time(step_s);
         self.clocks.step_time(step_s);
-        self.cameras.forget_strangers();
+        self.cameras.forget_clutter();
         self.cameras.look_anew();
         self.initiator = Initiator::new(&self.config);
         self.unmet = Unmet::new(&self.config.initiation);

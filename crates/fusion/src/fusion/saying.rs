@@ -1,5 +1,5 @@
-//! What the fusion says: what happened to tracks, where they are, where they were, and what cameras
-//! should look for.
+//! Output of the fusion: events of tracks, their states, their smoothed states, and cues for
+//! cameras.
 
 use crossfix_message::{CameraName, Payload, Timestamp, TrackFrame};
 
@@ -12,7 +12,7 @@ use crate::track::{TrackId, TrackStatus};
 use crate::tracker::TrackChange;
 
 impl Fusion {
-    /// Tells what has happened.
+    /// Outputs the events of tracks.
     pub(super) fn emit_events(
         &mut self,
         changes: Vec<TrackChange>,
@@ -31,7 +31,7 @@ impl Fusion {
         }
     }
 
-    /// Tells what has happened, and where all tracks are now.
+    /// Outputs the events of tracks, and the states of the tracks that are due.
     pub(super) fn emit_tracks(
         &mut self,
         exposure: &Exposure,
@@ -67,7 +67,7 @@ impl Fusion {
         }
     }
 
-    /// Tells the cameras that look where they are told what they should look for.
+    /// Sends each camera that takes cues its next cues.
     pub(super) fn cue(&mut self, now: Timestamp, outputs: &mut Vec<Output>) {
         let Self { cameras, tracker, initiator, cueing, clocks, config, site_time, .. } = self;
         let due: Vec<(&CameraName, &KnownCamera)> = cameras
@@ -92,8 +92,8 @@ impl Fusion {
         }
     }
 
-    /// Keeps where tracks are now for what later bearings tell of it, and says what these have told
-    /// of what was kept before.
+    /// Stores the tracks' present states for smoothing, and outputs the smoothed states that are
+    /// due.
     fn smooth(&mut self, now: Timestamp, due: &[TrackId], outputs: &mut Vec<Output>) {
         let Self { smoothing, tracker, .. } = self;
         tracker.remember(due, now);
@@ -103,7 +103,7 @@ impl Fusion {
         outputs.extend(smoothing.due(now, tracker).into_iter().map(Output::Smoothed));
     }
 
-    /// Says what is known of all that was kept: no later bearings tell of it.
+    /// Outputs all waiting frames as smoothed so far: no later bearings will tell of them.
     pub(super) fn smooth_all(&mut self, outputs: &mut Vec<Output>) {
         outputs.extend(self.smoothing.all(&mut self.tracker).into_iter().map(Output::Smoothed));
     }

@@ -1,4 +1,4 @@
-//! Track frames that wait for what later bearings tell of them.
+//! Track frames that wait for smoothing by later bearings.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,7 @@ use crate::messages;
 use crate::track::{Track, TrackId};
 use crate::tracker::Tracker;
 
-/// Track frames that wait, in the order of their times.
+/// The waiting track frames, in the order of their times.
 #[derive(Debug)]
 pub(super) struct Smoothing {
     lag_s: f64,
@@ -24,19 +24,19 @@ impl Smoothing {
         self.lag_s > 0.0
     }
 
-    /// Lets a frame wait.
+    /// Adds a frame.
     pub(super) fn wait(&mut self, frame: TrackFrame) {
         self.waiting.push_back(frame);
     }
 
-    /// Takes what is known by now of where a track was into the frames that wait: it ends.
+    /// Writes the smoothed states of a track that ends into the waiting frames.
     pub(super) fn settle(&mut self, track: &Track) {
         self.waiting
             .iter_mut()
             .for_each(|frame| fill(frame, |id| Some(track).filter(|t| t.id == id)));
     }
 
-    /// The frames that have waited long enough at a time.
+    /// Removes the frames that have waited long enough, and returns them with the smoothed states.
     pub(super) fn due(&mut self, now: Timestamp, tracker: &mut Tracker) -> Vec<TrackFrame> {
         let is_due = |frame: &TrackFrame| {
             now.seconds_since(Timestamp::from_nanos(frame.time_ns)) >= self.lag_s
@@ -45,7 +45,7 @@ impl Smoothing {
         self.release(count, tracker)
     }
 
-    /// All frames that wait.
+    /// Removes all waiting frames, and returns them with the smoothed states.
     pub(super) fn all(&mut self, tracker: &mut Tracker) -> Vec<TrackFrame> {
         self.release(self.waiting.len(), tracker)
     }
@@ -62,7 +62,7 @@ impl Smoothing {
     }
 }
 
-/// Puts what is kept of tracks into a frame.
+/// Writes the stored states of tracks into a frame.
 fn fill<'a>(frame: &mut TrackFrame, track: impl Fn(TrackId) -> Option<&'a Track>) {
     let time = Timestamp::from_nanos(frame.time_ns);
     for told in &mut frame.tracks {

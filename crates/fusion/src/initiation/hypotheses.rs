@@ -1,4 +1,5 @@
-//! Targets to be, followed in every way that the bearings allow until one way is by far the best.
+//! Multi-hypothesis initiation: possible targets are followed in every way that the bearings allow,
+//! until one explanation of the bearings is by far the best.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -19,64 +20,68 @@ use crate::uncertainty::CameraUncertainty;
 use crate::visibility::log_missed;
 use crate::{Exposure, FusionConfig, Tracking};
 
-/// Bearings of one exposure that continue one hypothesis, the best first.
+/// Most bearings of one exposure with which one hypothesis is continued, the best first.
 const MAX_BRANCHES: usize = 3;
-/// Ways to go on that are kept of one beginning.
+/// Most hypotheses kept of one tree.
 const MAX_FAMILY: usize = 100;
-/// Hypotheses that are kept of those with the same lines in the newest period.
+/// Most hypotheses kept of those with the same lines in the newest period.
 const MAX_ALIKE: usize = 20;
-/// A way this much less likely than its tree's best (log-likelihood) is given up.
+/// A hypothesis less likely than its tree's best by this log-likelihood is given up.
 const FAMILY_MARGIN: f64 = 15.0;
-/// A hypothesis less likely than this is clutter.
+/// A hypothesis with a smaller log-likelihood ratio than this is clutter.
 const LEAST_SCORE: f64 = -12.0;
-/// While another reading of the same bearings is within this of the best (a chance of 1 in 3000),
-/// nothing is confirmed.
+/// While another explanation of the same bearings is within this log-likelihood of the best (a
+/// chance of 1 in 3000), nothing is confirmed.
 const RIVAL_MARGIN: f64 = 8.0;
-/// Most hypotheses at a time: the best ones, so that clutter cannot fill the memory.
+/// Most hypotheses at a time, the best ones: memory is bounded however much clutter there is.
 const MAX_HYPOTHESES: usize = 6_000;
 
-/// One reading of the bearings: these are one target's.
+/// One hypothesis: that these bearings are one target's.
 #[derive(Clone, Debug)]
 struct Hypothesis {
-    /// What began alike belongs to one tree.
+    /// The number of its tree: all hypotheses that grew from the same seed.
     tree: u64,
-    /// Apart, as hypotheses are sorted often.
+    /// Boxed, as hypotheses are sorted often.
     track: Box<Track>,
-    /// Its lines of the last periods with the number of the period, in order of time.
+    /// Its lines of the last periods, each with the number of its period, in order of time.
     lines: Vec<(u64, LineId)>,
-    /// Periods that gave it a line.
+    /// Number of periods that gave it a line.
     periods: usize,
     born: Timestamp,
-    /// Whether its lines are rather of several targets that one camera each sees.
+    /// The test against its lines being of several targets, one per camera.
     one_target: OneTargetTest,
 }
 
 /// Multi-scan initiation: hypotheses branch with every bearing in their gate and compete by
-/// log-likelihood ratio; the best set without common bearings is what there is.
+/// log-likelihood ratio; the best set of hypotheses without common bearings is taken to be what is
+/// there.
 #[derive(Debug)]
 pub(super) struct Hypotheses {
     finder: SeedFinder,
     tracking: Tracking,
     gate: Gate,
+    /// Number of periods for which a hypothesis keeps its lines.
     span: u64,
+    /// Number of periods that must have given it a line before it is confirmed.
     needed: usize,
     /// How long two cameras alone must agree, s.
     pair_s: f64,
     max_range_m: f64,
-    /// How fast targets are, m/s, standard deviation per axis.
+    /// Speed of targets, m/s, standard deviation per axis.
     speed: f64,
     shared_lines: usize,
     hypotheses: Vec<Hypothesis>,
-    /// Lines that a track has used which cannot hold its place alone.
+    /// Lines that have been used by a track which only one camera supports.
     claims: BTreeMap<LineId, TrackId>,
+    /// Numbers of periods and of trees so far.
     period: u64,
     trees: u64,
-    /// When each camera was exposed last.
+    /// Time of each camera's last exposure.
     exposed: BTreeMap<CameraName, Timestamp>,
 }
 
 impl Hypothesis {
-    /// The cameras that have lately given it a line.
+    /// The cameras that have given it a line in the last periods.
     fn cameras(&self) -> BTreeSet<&CameraName> {
         self.lines.iter().map(|(_, (camera, ..))| camera).collect()
     }
@@ -95,7 +100,7 @@ struct Context<'a> {
     lines: &'a [NamedLine],
     uncertainty: CameraUncertainty,
     detection: f64,
-    /// Since the camera's exposure before.
+    /// Time since the camera's exposure before, s.
     interval_s: f64,
 }
 
@@ -119,14 +124,15 @@ impl Hypotheses {
         }
     }
 
-    /// Notes which lines of an exposure (by index) a track has used already.
+    /// Notes which lines of an exposure (by index) a track that only one camera supports has used.
     pub(super) fn claim(&mut self, exposure: &Exposure, claims: &[(usize, TrackId)]) {
         for &(index, track) in claims {
             self.claims.insert((exposure.camera.clone(), exposure.sequence, index), track);
         }
     }
 
-    /// Takes one period in (exposures in order of time) and returns the tracks that are sure now.
+    /// Handles one period (exposures in order of time) and returns the tracks that are confirmed by
+    /// it.
     pub(super) fn advance(
         &mut self,
         exposures: &[&Exposure],
@@ -147,7 +153,8 @@ impl Hypotheses {
                 hypothesis.periods += 1;
             }
         }
-        // What one camera alone sees may be anywhere: it begins anew when another sees it too.
+        // What one camera alone sees may be anywhere: it must start again when another camera sees
+        // it too.
         self.hypotheses.retain(|h| {
             h.cameras().len() >= 2 && h.one_target.log_ratio().is_none_or(|r| r > LEAST_SCORE)
         });
@@ -159,7 +166,7 @@ impl Hypotheses {
         now.map_or_else(Vec::new, |now| self.confirm(now, pairs, motion))
     }
 
-    /// Lets every hypothesis go on with each bearing in its gate, and without any.
+    /// Continues every hypothesis with each bearing in its gate, and without any.
     fn extend(&mut self, exposure: &Exposure, known: &KnownCamera, motion: &Motion) {
         let lines: Vec<NamedLine> = lines_of(exposure).collect();
         let uncertainty = CameraUncertainty { clock_is_noise: true, ..exposure.uncertainty };
@@ -176,8 +183,8 @@ impl Hypotheses {
         self.prune_families();
     }
 
-    /// Lets one hypothesis go on with each bearing in its gate that is likely enough beside the
-    /// likeliest way, and without any if that is.
+    /// Continues one hypothesis with each bearing in its gate that is likely enough compared with
+    /// the likeliest continuation, and without any if that is.
     fn extend_one(
         &self,
         mut hypothesis: Hypothesis,
@@ -194,7 +201,7 @@ impl Hypotheses {
             motion,
         );
         let visible = hypothesis.track.visible_to(&exposure.camera, exposure.time, motion);
-        // Where the camera does not look, a line that is left out costs nothing.
+        // If the target is outside the camera's view, a hypothesis without a line costs nothing.
         let miss = if expected { log_missed(visible, detection) } else { 0.0 };
         let ratio = |(i, (_, line)): (usize, &NamedLine)| {
             let fit = prediction.as_ref()?.fit(&line.line, self.gate)?;
@@ -237,7 +244,7 @@ impl Hypotheses {
         next.push(hypothesis);
     }
 
-    /// Keeps the best few of each tree.
+    /// Keeps the best hypotheses of each tree.
     fn prune_families(&mut self) {
         self.sort();
         let mut trees: BTreeMap<u64, (f64, usize)> = BTreeMap::new();
@@ -257,7 +264,7 @@ impl Hypotheses {
         });
     }
 
-    /// Begins a hypothesis with every seed.
+    /// Starts a hypothesis from every seed.
     fn begin(&mut self, seeds: Vec<Seed>, exposures: &[&Exposure], motion: &Motion) {
         let uncertainty: BTreeMap<&CameraName, CameraUncertainty> = exposures
             .iter()
@@ -274,7 +281,8 @@ impl Hypotheses {
             };
             self.trees += 1;
             let (state, velocity) = (seed.solution.state, VelocityKnowledge::Solved);
-            // Eigenvalues cost more than all the rest: they are for those that are confirmed.
+            // Eigenvalues cost more than all the rest: they are computed only for those that are
+            // confirmed.
             let observability = Observability::unexamined(6);
             let fix = Fix { time, state, velocity, solver: Solver::Map, observability };
             let named = seed
@@ -313,7 +321,7 @@ impl Hypotheses {
         }
     }
 
-    /// Of hypotheses that have the same lines in this period the best few go on.
+    /// Keeps the best hypotheses of those that have the same lines in this period.
     fn prune(&mut self) {
         self.sort();
         let mut seen: BTreeMap<Vec<LineId>, usize> = BTreeMap::new();
@@ -329,11 +337,12 @@ impl Hypotheses {
         self.hypotheses.truncate(MAX_HYPOTHESES);
     }
 
-    /// The best hypotheses without common lines that are likely enough and have no rival. One
-    /// target must be likelier than that each camera sees another by the number of pairs of lines
-    /// of which it may be so by chance.
+    /// Confirms hypotheses: those of the best set without common lines that are likely enough and
+    /// have no rival. The log-likelihood ratio of one target against a target per camera must reach
+    /// `pairs`, the logarithm of the number of pairs of lines that may look like one target by
+    /// chance.
     fn confirm(&mut self, now: Timestamp, pairs: f64, motion: &Motion) -> Vec<Start> {
-        // The best come first, and the others are never chosen.
+        // Sorted by score: the rest have scores of 0 and less, which are never chosen.
         let likely = self.hypotheses.iter().take_while(|h| h.track.score > 0.0);
         let scored = likely.map(|h| (h.track.score, h.lines.as_slice()));
         let selection = Selection::new(scored, self.shared_lines);
@@ -341,7 +350,8 @@ impl Hypotheses {
             .chosen()
             .filter(|&i| {
                 let hypothesis = &self.hypotheses[i];
-                // Lines of two targets that two cameras see one each may cross for a while.
+                // Lines of two targets, each seen by another one of two cameras, may cross for a
+                // while.
                 let pair_holds = hypothesis.track.updated.seconds_since(hypothesis.born)
                     >= self.pair_s
                     && hypothesis.track.is_placed();
@@ -384,8 +394,8 @@ impl Hypotheses {
     }
 }
 
-/// How many pairs there are of what two cameras see and is not rooted, where they see most; the
-/// logarithm.
+/// Logarithm of the number of pairs of lines of the two cameras that see most; fixed objects in the
+/// view are not counted.
 fn logarithm_of_pairs(exposures: &[&Exposure]) -> f64 {
     let mut lines: BTreeMap<&CameraName, usize> = BTreeMap::new();
     for exposure in exposures {

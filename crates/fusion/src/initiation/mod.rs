@@ -1,7 +1,7 @@
-//! New tracks from the bearings that no track claims: they are gathered into
-//! observation periods ([`Periods`]), and what of several periods belongs
-//! together is found either by following hypotheses ([`Hypotheses`]) or, as in
-//! Klochko 2020, by solving each period for fixes and grouping these ([`Grouped`]).
+//! Initiation: new tracks from the bearings that no track claims. They are gathered into
+//! observation periods ([`Periods`]), and what belongs together over several periods is
+//! found either by following hypotheses ([`Hypotheses`]) or, as in Klochko 2020, by
+//! solving each period for fixes and grouping these ([`Grouped`]).
 
 mod handover;
 mod hypotheses;
@@ -33,19 +33,19 @@ use handover::Handover;
 use hypotheses::Hypotheses;
 use period::Periods;
 
-/// Lines of one exposure that the initiation looks at: time is bounded, whatever a camera reports.
+/// Most lines of one exposure that the initiation uses: time is bounded, whatever a camera reports.
 const MAX_LINES: usize = 500;
 
 /// A sight line with its name.
 pub(crate) type NamedLine = (LineId, TimedLine);
 
-/// A track that begins.
+/// A new track.
 #[derive(Clone, Debug)]
 pub(crate) struct Start {
     pub(crate) track: Track,
-    /// How many cameras have lately seen it.
+    /// Number of cameras that have lately seen it.
     pub(crate) cameras: usize,
-    /// The tracks whose bearings it has used, where these could not hold their place alone.
+    /// The tracks, supported by one camera only, whose bearings it has used.
     pub(crate) claimed_by: BTreeSet<TrackId>,
 }
 
@@ -79,12 +79,13 @@ impl Initiator {
         }
     }
 
-    /// Forgets what a camera that has been moved has followed alone.
+    /// Forgets what a camera has followed alone: it has been moved.
     pub(crate) fn forget(&mut self, camera: &CameraName) {
         self.handover.forget_camera(camera);
     }
 
-    /// What one camera alone sees for sure, that no track is of, as far as it is known now.
+    /// The confirmed targets that one camera alone sees and no track covers, with their
+    /// predictions.
     pub(crate) fn known(&self, now: Timestamp) -> Vec<Known> {
         match self.method {
             Method::Hypotheses(_) => self.handover.known(now),
@@ -92,8 +93,8 @@ impl Initiator {
         }
     }
 
-    /// Takes in a whole exposure, with which of its lines (by index) tracks have used, and returns
-    /// the tracks that begin with it of targets that cameras see one after another.
+    /// Handles a whole exposure, given which of its lines (by index) tracks have used, and returns
+    /// the new tracks of targets that cameras see one after another.
     pub(crate) fn hand_over(
         &mut self,
         exposure: &Exposure,
@@ -107,8 +108,8 @@ impl Initiator {
         }
     }
 
-    /// Takes in what an exposure has left over, with what of it (by index) a track has used that
-    /// cannot hold its place alone, and returns the tracks that begin with it.
+    /// Adds an exposure's free bearings and returns the tracks that begin with them. `claims` are
+    /// those (by index) that a track has used which only one camera supports.
     pub(crate) fn add(
         &mut self,
         exposure: Exposure,
@@ -131,7 +132,7 @@ impl Initiator {
     }
 }
 
-/// An exposure's sight lines with their names.
+/// An exposure's sight lines with their names, without the pose's uncertainty.
 pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     exposure.sightings.iter().take(MAX_LINES).enumerate().map(|(index, Sighting { line, .. })| {
         let id = (exposure.camera.clone(), exposure.sequence, index);
@@ -140,8 +141,8 @@ pub(crate) fn lines_of(exposure: &Exposure) -> impl Iterator<Item = NamedLine> +
     })
 }
 
-/// The same with what is uncertain of the camera's pose: where one bearing of each camera must
-/// meet, that is noise like any other.
+/// The same with the uncertainty of the camera's pose added to their noise: where single bearings
+/// of several cameras must meet, the pose's error acts like any other noise.
 pub(crate) fn lines_with_pose(exposure: &Exposure) -> impl Iterator<Item = NamedLine> + '_ {
     let pose = exposure.uncertainty.pose;
     let origin_sd_m = pose.map_or(0.0, |pose| {

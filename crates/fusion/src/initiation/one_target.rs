@@ -1,4 +1,5 @@
-//! Whether lines of several cameras are one target's, or each camera sees another.
+//! Test whether lines of several cameras belong to one target, or each camera sees a target of its
+//! own.
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -8,31 +9,33 @@ use crate::prediction::BearingPrediction;
 use crate::spatial::TYPICAL_SPEED;
 use crate::visibility::independent_share;
 
-/// Logarithm of the probability that a camera is blind for a target that it should see.
+/// Logarithm of the probability that a camera never detects a target that it should see: the most
+/// that its misses count.
 const LOG_NEVER_DETECTED: f64 = -4.6;
-/// A camera whose clock shifts its bearings by so many times their own variance agrees with
-/// nothing.
+/// If the clock's uncertainty shifts a camera's bearings by a variance of more than this many times
+/// their own, the test says nothing.
 const INCONCLUSIVE: f64 = 10.0;
 
-/// How much likelier it is that lines are one target's than that every camera sees a target of its
-/// own, which no other camera sees.
+/// Log-likelihood ratio of all lines being one target's against every camera seeing a target of its
+/// own that no other camera sees.
 ///
-/// Against clutter any line that goes on smoothly is a target's. But where there are many targets
-/// that one camera each sees, their lines cross, and only how well these agree with one place and
-/// velocity tells: one target has six numbers, two lines have four each.
+/// Against clutter, any line that continues smoothly is a target's. But if there are many targets
+/// that one camera each sees, their lines cross, and only how well the lines agree with one
+/// position and velocity decides: one target has six numbers, two independent lines have four each.
 #[derive(Clone, Debug)]
 pub(super) struct OneTargetTest {
+    /// Each camera's lines, followed as if that camera alone saw the target.
     sights: Vec<(CameraName, Sight)>,
-    /// Cameras that should see the target and never have, with the logarithm of that probability.
+    /// Cameras that should see the target and never have, with the log-likelihood of their misses.
     silent: Vec<(CameraName, f64)>,
     log_ratio: f64,
-    /// Whether clocks are so uncertain that it says nothing.
+    /// Whether clocks are so uncertain that the test says nothing.
     inconclusive: bool,
 }
 
 impl OneTargetTest {
-    /// Of the lines of a beginning, with its log-likelihood ratio; the target may be as fast as
-    /// `speed` (m/s, standard deviation) at a place.
+    /// The test for the lines of a seed, with its log-likelihood ratio; at `place` the target may
+    /// have a speed of `speed` (m/s, standard deviation).
     pub(super) fn begin<'a>(
         lines: impl Iterator<Item = (&'a CameraName, &'a SightLine, Timestamp)>,
         (place, speed): (nalgebra::Point3<f64>, f64),
@@ -50,7 +53,7 @@ impl OneTargetTest {
         }
     }
 
-    /// Of what one camera has followed so far.
+    /// The test for what one camera alone has followed so far.
     pub(super) fn of_one(camera: &CameraName, sight: Sight) -> Self {
         Self {
             sights: vec![(camera.clone(), sight)],
@@ -60,7 +63,8 @@ impl OneTargetTest {
         }
     }
 
-    /// Learns what a camera shifts its first line by, of which the target's place has been made.
+    /// Estimates a camera's shift from the first line, one of those that the target's position was
+    /// made from.
     pub(super) fn begin_shift(
         &mut self,
         camera: &CameraName,
@@ -72,13 +76,13 @@ impl OneTargetTest {
         }
     }
 
-    /// Whether a camera has given it a line.
+    /// Whether a line of this camera has been used.
     pub(super) fn knows(&self, camera: &CameraName) -> bool {
         self.sights.iter().any(|(name, _)| name == camera)
     }
 
-    /// A camera's first line, with its log-likelihood ratio; the target may move across it at
-    /// `rate_sd` (rad/s).
+    /// Adds a camera's first line, with its log-likelihood ratio; the target may move across it at
+    /// `rate_sd` (rad/s, standard deviation).
     pub(super) fn see_first(
         &mut self,
         camera: &CameraName,
@@ -90,8 +94,8 @@ impl OneTargetTest {
         self.sights.push((camera.clone(), Sight::first(line, time, rate_sd)));
     }
 
-    /// A line that goes on with the target as predicted. `first_ratio` is its log-likelihood ratio
-    /// where it is its camera's first.
+    /// Adds a line that continues the target as predicted. `first_ratio` is its log-likelihood
+    /// ratio, which is used if it is its camera's first.
     pub(super) fn see(
         &mut self,
         camera: &CameraName,
@@ -106,13 +110,14 @@ impl OneTargetTest {
         };
         sight.predict(time, density / range.powi(2));
         self.log_ratio += sight.log_ratio(line, prediction).unwrap_or(0.0);
-        // What an unsure clock shifts a bearing by is not known before the velocity is.
+        // The shift by an uncertain clock is not known before the velocity is: use a typical speed.
         let clock = (speed * TYPICAL_SPEED * time_sd_s / range).powi(2);
         self.inconclusive |= clock > INCONCLUSIVE * line.covariance.trace() / 2.0;
         sight.update(line);
     }
 
-    /// A camera that should have seen the target has not, `interval_s` after its exposure before.
+    /// Notes that a camera that should have seen the target has not, `interval_s` seconds after its
+    /// exposure before.
     pub(super) fn miss(&mut self, camera: &CameraName, log_miss: f64, interval_s: f64) {
         if self.sights.iter().any(|(name, _)| name == camera) {
             return;
@@ -124,7 +129,7 @@ impl OneTargetTest {
         }
     }
 
-    /// The log-likelihood ratio; `None` if clocks are too uncertain for it.
+    /// The log-likelihood ratio; `None` if the clocks are too uncertain for it.
     pub(super) fn log_ratio(&self) -> Option<f64> {
         if self.inconclusive {
             return None;

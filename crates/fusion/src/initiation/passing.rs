@@ -3,7 +3,7 @@ use crossfix_geometry::passing_ranges;
 use crate::Initiation;
 use crate::spatial::{TYPICAL_SPEED, TimedLine};
 
-/// Lines pass each other within this many standard deviations of noise and motion.
+/// Lines of one target pass each other within this many standard deviations of noise and motion.
 const SIGMAS: f64 = 3.0;
 
 /// How two lines pass each other.
@@ -11,20 +11,20 @@ const SIGMAS: f64 = 3.0;
 pub(crate) enum Passing {
     /// They come near each other behind a camera, or too far away.
     Nowhere,
-    /// Farther apart than one moving target's may.
+    /// Farther apart than the lines of one moving target may be.
     Apart {
         /// The smallest distance, m.
         by_m: f64,
     },
-    /// As closely as one moving target's may.
+    /// As closely as the lines of one moving target may.
     Close,
 }
 
-/// What says how two lines pass each other.
+/// Parameters of the comparison.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Passings {
     max_range_m: f64,
-    /// How fast targets are, m/s, standard deviation per axis.
+    /// Speed of targets, m/s, standard deviation per axis.
     speed: f64,
 }
 
@@ -33,7 +33,7 @@ impl Passings {
         Self { max_range_m: config.max_range_m, speed: config.velocity_prior_sd_mps }
     }
 
-    /// How two lines pass each other.
+    /// How two lines pass each other: compared with what one moving target allows.
     pub(crate) fn of(&self, first: &TimedLine, second: &TimedLine) -> Passing {
         let (u, v) = (&first.line.direction, &second.line.direction);
         let base = second.line.origin - first.line.origin;
@@ -42,9 +42,10 @@ impl Passings {
         if !(in_range(r1) && in_range(r2)) {
             return Passing::Nowhere;
         }
+        // Distance between the points at which the lines pass nearest to each other.
         let by_m = (u.into_inner() * r1 - v.into_inner() * r2 - base).norm();
-        // What may be between lines of one target: noise at their ranges, poses, and its own motion
-        // between the two instants.
+        // Allowed distance between lines of one target: noise at their ranges, position errors of
+        // the cameras, and the target's motion between the two times.
         let noise = first.line.standard_deviation() * r1 + second.line.standard_deviation() * r2;
         let poses = first.origin_sd_m + second.origin_sd_m;
         let unsure = TYPICAL_SPEED * (first.time_sd_s + second.time_sd_s);

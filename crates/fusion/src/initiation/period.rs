@@ -4,16 +4,16 @@ use crossfix_message::{CameraName, Timestamp};
 
 use crate::Exposure;
 
-/// A camera whose newest exposure is older than so many frame intervals (of most cameras) is
-/// silent.
+/// A camera counts as silent if its newest exposure is older than this many frame intervals (the
+/// median over the cameras).
 const SILENT_INTERVALS: f64 = 5.0;
-/// A period is closed where the exposures lie within this factor of as close as they ever do.
+/// A period is closed when the exposures lie within this factor of the smallest spread seen lately.
 const SPREAD_FACTOR: f64 = 1.2;
 
-/// How fast a camera's usual frame interval follows its last one.
+/// Weight of the last frame interval in the running mean of a camera's frame interval.
 const INTERVAL_RATE: f64 = 0.2;
 
-/// A camera that is heard.
+/// A camera that sends exposures at present.
 #[derive(Clone, Copy, Debug)]
 struct Heard {
     time: Timestamp,
@@ -22,15 +22,17 @@ struct Heard {
 }
 
 /// Gathers exposures into observation periods: one exposure of each camera that is heard, closed
-/// where these lie closest together, which for cameras that scan in turn is at the end of a scan.
+/// when these lie closest together in time; for cameras that scan in turn that is at the end of a
+/// scan.
 #[derive(Debug)]
 pub(crate) struct Periods {
     shortest_s: f64,
     cameras: usize,
-    /// The newest exposure of each camera that no period has used.
+    /// The newest exposure of each camera that has not been part of a period.
     unused: BTreeMap<CameraName, Exposure>,
     heard: BTreeMap<CameraName, Heard>,
-    /// How far apart the cameras' newest exposures lay, s, at each of the last exposures.
+    /// Time between the oldest and the newest of the cameras' newest exposures, s, at each of the
+    /// last exposures.
     spreads: VecDeque<f64>,
     closed: Option<Timestamp>,
     /// Whether a camera has been heard twice: by then the others have been heard once.
@@ -38,7 +40,7 @@ pub(crate) struct Periods {
 }
 
 impl Periods {
-    /// Periods of at least `shortest_s` seconds and this many cameras.
+    /// Periods of at least `shortest_s` seconds and at least this many cameras.
     pub(crate) fn new(shortest_s: f64, cameras: usize) -> Self {
         Self {
             shortest_s,
@@ -51,7 +53,7 @@ impl Periods {
         }
     }
 
-    /// Takes an exposure in, and returns the period if it ends with it; `known` is the number of
+    /// Adds an exposure, and returns the period if it ends with this one; `known` is the number of
     /// cameras that may be heard.
     pub(crate) fn add(
         &mut self,
@@ -68,7 +70,7 @@ impl Periods {
         }
         self.repeated |= previous;
         if self.heard.len() != before {
-            // Other cameras lie otherwise.
+            // With other cameras the spread is another one.
             self.spreads.clear();
         }
         let spread_of =
@@ -94,13 +96,13 @@ impl Periods {
         Some(std::mem::take(&mut self.unused))
     }
 
-    /// Notes an exposure; tells whether the camera has been heard before.
+    /// Notes an exposure; returns whether the camera has been heard before.
     fn hear(&mut self, camera: &CameraName, now: Timestamp) -> bool {
         let Some(heard) = self.heard.get_mut(camera) else {
             self.heard.insert(camera.clone(), Heard { time: now, interval_s: None });
             return false;
         };
-        // A corrected clock may go back.
+        // Times corrected for the clock's offset may go back.
         let last_s = now.seconds_since(heard.time).max(0.0);
         let usual_s = heard.interval_s.unwrap_or(last_s);
         heard.interval_s = Some(usual_s + INTERVAL_RATE * (last_s - usual_s));
@@ -108,7 +110,7 @@ impl Periods {
         true
     }
 
-    /// The median of the cameras' usual intervals, s: one camera with odd times changes little.
+    /// The median of the cameras' frame intervals, s: one camera with odd times changes little.
     fn usual_interval_s(&self) -> Option<f64> {
         let mut intervals: Vec<f64> =
             self.heard.values().filter_map(|heard| heard.interval_s).collect();

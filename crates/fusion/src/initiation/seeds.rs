@@ -1,4 +1,4 @@
-//! Sets of lines of one period, one a camera, that may be one target's.
+//! Seeds: sets of lines of one period, one per camera, that may be one target's.
 
 use std::collections::BTreeSet;
 use std::f64::consts::PI;
@@ -14,31 +14,31 @@ use crate::prediction::BearingPrediction;
 use crate::spatial::{LineId, MapSolution, TYPICAL_SPEED, TimedLine, chi_square, map};
 use crate::{Exposure, FusionConfig, Initiation};
 
-/// Lines of one camera that are tried beside a pair, the best first.
+/// Most lines of one camera that are tried as an addition to a pair, the best first.
 const MAX_BRANCHES: usize = 5;
-/// Lines that as many cameras as this agree on need not be tried in other sets.
+/// Lines that are part of a set of at least this many cameras need not be tried in other sets.
 const SETTLED_CAMERAS: usize = 4;
-/// Most sets kept of one period, the most likely ones: clutter cannot fill the memory.
+/// Most seeds kept of one period, the likeliest ones: memory is bounded however much clutter there
+/// is.
 const MAX_SEEDS: usize = 2_000;
-/// Quantiles are kept for sets of up to so many cameras; larger ones pass.
+/// The set gates are computed for sets of fewer cameras than this; larger sets pass.
 const MAX_CAMERAS: usize = 64;
-/// Most pairs of lines that pass each other closely and are looked at in one period: time is
-/// bounded.
+/// Most pairs of closely passing lines that are extended in one period: time is bounded.
 const MAX_CLOSE_PAIRS: usize = 20_000;
-/// No more pairs are looked at where so many sets have been found: of bearings that are alike every
-/// combination is as good as any other.
+/// Once more seeds than this have been found, no more pairs are tried: if many bearings are alike,
+/// every combination of them is as good as any other.
 const MAX_FOUND: usize = 20_000;
-/// Most pairs of lines tried of two cameras: time is bounded, whatever a camera reports.
+/// Most pairs of lines tried for two cameras: time is bounded, whatever a camera reports.
 const MAX_PAIRS: usize = 250_000;
 
-/// A set of lines that may be one target's.
+/// A set of lines that may be one target's, with its solution.
 #[derive(Clone, Debug)]
 pub(crate) struct Seed {
-    /// One a camera, in order of time.
+    /// One line per camera, in order of time.
     pub(crate) lines: Vec<NamedLine>,
     /// Position and velocity at the newest line's time.
     pub(crate) solution: MapSolution,
-    /// Log-likelihood ratio of being a new target's against being clutter.
+    /// Log-likelihood ratio of a new target against clutter.
     pub(crate) score: f64,
 }
 
@@ -48,20 +48,20 @@ impl Seed {
     }
 }
 
-/// What finds seeds.
+/// The search for seeds.
 #[derive(Clone, Debug)]
 pub(crate) struct SeedFinder {
     initiation: Initiation,
     passings: Passings,
     detection_probability: f64,
     line_gate: Gate,
-    /// The largest sum of squares of n true lines, by n, with the gate's probability.
+    /// Largest chi-square of n true lines at the gate's probability, indexed by n.
     set_gates: Vec<f64>,
     least_cameras: usize,
     least_score: f64,
 }
 
-/// A pair of lines that pass each other closely, as they are extended.
+/// The lines of a period, from which sets are grown.
 struct Growing<'a> {
     exposures: &'a [&'a Exposure],
     cameras: &'a Cameras,
@@ -69,11 +69,13 @@ struct Growing<'a> {
 }
 
 impl SeedFinder {
-    /// Of sets of so many cameras at least that are so likely at least (log-likelihood ratio).
+    /// A search for sets of at least `least_cameras` cameras with a log-likelihood ratio above
+    /// `least_score`.
     pub(crate) fn new(config: &FusionConfig, least_cameras: usize, least_score: f64) -> Self {
         let initiation = config.initiation.clone();
         let line_gate = Gate::with_probability(initiation.spatial_gate_probability);
-        // n lines have 2 n - 3 degrees of freedom, as the velocity has a prior.
+        // 2 n coordinates and three terms of the velocity's prior, less six unknowns: 2 n - 3
+        // degrees of freedom.
         let set_gates = (0..MAX_CAMERAS)
             .map(|n: usize| {
                 chi_square(initiation.spatial_gate_probability, (2 * n).saturating_sub(3).max(1))
@@ -90,7 +92,7 @@ impl SeedFinder {
         }
     }
 
-    /// Every set of lines of one period that may be one target's, the most likely first.
+    /// All seeds of one period, the likeliest first.
     pub(crate) fn find(&self, exposures: &[&Exposure], cameras: &Cameras) -> Vec<Seed> {
         let lines: Vec<Vec<NamedLine>> =
             exposures.iter().map(|e| lines_with_pose(e).collect()).collect();
@@ -134,9 +136,10 @@ impl SeedFinder {
         self.best(seeds)
     }
 
-    /// The most likely, each set once.
+    /// The likeliest seeds, each set once.
     fn best(&self, seeds: Vec<Seed>) -> Vec<Seed> {
-        // Where cameras report the same bearings many times, many are alike: names are made once.
+        // If cameras report the same bearings many times, many seeds are alike: the names are made
+        // once.
         let names: Vec<Vec<LineId>> = seeds.iter().map(ids).collect();
         let mut order: Vec<usize> = (0..seeds.len()).collect();
         order.sort_by(|&a, &b| {
@@ -144,8 +147,8 @@ impl SeedFinder {
         });
         let mut seen = BTreeSet::new();
         order.retain(|&i| seen.insert(&names[i]));
-        // Where three cameras agree on both lines of a pair, with others or with each other, the
-        // pair can wait for the next period: there are many more of these than targets.
+        // A pair whose two lines are both part of sets of three cameras, the same set or different
+        // ones, can wait for the next period: there are many more such pairs than targets.
         let agreed: BTreeSet<&LineId> =
             order.iter().map(|&i| &names[i]).filter(|names| names.len() > 2).flatten().collect();
         order.retain(|&i| names[i].len() > 2 || !names[i].iter().all(|id| agreed.contains(id)));
@@ -154,8 +157,8 @@ impl SeedFinder {
         order.into_iter().filter_map(|i| seeds[i].take()).collect()
     }
 
-    /// Pairs of cameras, those whose optical axes cross most nearly at a right angle first
-    /// (Klochko 2020, eq. 12).
+    /// Pairs of cameras within reach of each other that have lines, those whose optical axes cross
+    /// most nearly at a right angle first (Klochko 2020, eq. 12).
     fn pairs_of_cameras(&self, growing: &Growing<'_>) -> Vec<(usize, usize)> {
         let camera = |i: usize| Some(&growing.cameras.known(&growing.exposures[i].camera)?.camera);
         let mut pairs = Vec::new();
@@ -179,7 +182,7 @@ impl SeedFinder {
         pairs.into_iter().map(|(_, pair)| pair).collect()
     }
 
-    /// The sets that two lines begin, with the places (camera, line) of their lines.
+    /// The seeds that grow from two lines, with the places (camera, line) of their lines.
     fn sets_of(
         &self,
         growing: &Growing<'_>,
@@ -208,7 +211,7 @@ impl SeedFinder {
                         next.push((longer, solution));
                     }
                 }
-                // While nothing is sure, the camera may also have missed the target.
+                // Until the sets have branched, the camera may also have missed the target.
                 if !branched || near.is_empty() || next.is_empty() {
                     next.push((places, solution));
                 }
@@ -230,7 +233,8 @@ impl SeedFinder {
         map(lines, newest, self.initiation.velocity_prior_sd_mps)
     }
 
-    /// Whether a solution of n lines is as good as a true one's is with the gate's probability.
+    /// Whether the chi-square of a solution of n lines passes the gate: true sets do with the
+    /// gate's probability.
     fn agrees(&self, solution: &MapSolution, lines: usize) -> bool {
         let gate = self.set_gates.get(lines).copied().unwrap_or(f64::INFINITY);
         solution.chi_square <= gate
@@ -252,10 +256,11 @@ impl SeedFinder {
             return Vec::new();
         };
         let state = solution.state.predicted(first.time.seconds_since(reference), 0.0);
-        // Another target's place: most cameras of a wide site do not look there.
+        // Most cameras of a wide site do not look at this position.
         if !known.expects(state.position(), self.initiation.max_range_m) {
             return Vec::new();
         }
+        // Displacement (m, standard deviation) by an uncertain time and an uncertain origin.
         let moved = self.initiation.velocity_prior_sd_mps * TYPICAL_SPEED * first.time_sd_s;
         let moved = moved.hypot(first.origin_sd_m);
         let Some(prediction) = BearingPrediction::of_state(&state, first.line.origin, moved) else {
@@ -270,7 +275,7 @@ impl SeedFinder {
         near.into_iter().map(|(_, l)| l).collect()
     }
 
-    /// The seed of a set, if it is possible at all.
+    /// The seed of a set, if it is consistent and likely enough.
     fn seed(
         &self,
         growing: &Growing<'_>,
@@ -304,11 +309,12 @@ impl SeedFinder {
         (score > self.least_score).then_some(Seed { lines, solution, score })
     }
 
-    /// Logarithm of the density of the lines as a new target's: the density of new targets times
-    /// the integral over all positions and velocities.
+    /// Logarithm of the probability density of the lines if they are a new target's: the density of
+    /// new targets times the integral over all positions and velocities.
     fn log_evidence(&self, lines: &[NamedLine], solution: &MapSolution) -> Option<f64> {
-        // Laplace's approximation: the integral of exp(-chi^2 / 2) over six unknowns is the value at
-        // its best times (2 pi)^3 |P|^1/2; half of the powers of 2 pi are the prior's.
+        // Laplace's approximation: the integral of exp(-chi^2 / 2) over six unknowns is its maximum
+        // times (2 pi)^3 |P|^(1/2). The velocity's prior divides by (2 pi)^(3/2) sd^3, which leaves
+        // (2 pi)^(3/2) |P|^(1/2) / sd^3.
         let factor = solution.state.covariance.cholesky()?;
         let log_root: f64 = factor.l().diagonal().map(f64::ln).sum();
         let velocity = 3.0 * self.initiation.velocity_prior_sd_mps.ln();
@@ -317,6 +323,7 @@ impl SeedFinder {
                 - velocity
                 - solution.chi_square / 2.0;
         let (position, speed) = (solution.state.position(), self.initiation.velocity_prior_sd_mps);
+        // Each line: detected, with the normal density's factor 1 / (2 pi |R|^(1/2)).
         for (_, timed) in lines {
             let noise = timed.noise_at((position - timed.line.origin).norm(), speed);
             let density = (2.0 * PI).ln() + noise.determinant().ln() / 2.0;
@@ -326,8 +333,9 @@ impl SeedFinder {
     }
 }
 
-/// Whether lines are of things that stand in their cameras' views for good. Of a camera that has
-/// only begun to look nobody can say: then three must agree.
+/// Whether a set consists of lines to objects fixed in their cameras' views. As long as this is
+/// unknown of a line (its camera has only begun to look), two cameras are not enough and three must
+/// agree.
 fn is_rooted(growing: &Growing<'_>, places: &[(usize, usize)]) -> bool {
     let rooted = || places.iter().map(|&(k, l)| growing.exposures[k].sightings[l].rooted);
     rooted().all(|rooted| rooted == Rooted::Yes)

@@ -1,26 +1,26 @@
-//! Which leaves go together, where a leaf is one way in which some bearings may be one target's:
-//! the set of greatest total score without common lines.
+//! Selection of compatible leaves: the set of greatest total score without common lines. A leaf is
+//! one way in which some bearings may be one target's.
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::spatial::LineId;
 
-/// Comparisons of leaves in one period, about a tenth of a second's worth; half of them are kept
-/// for the question how sure each choice is.
+/// Most comparisons of leaves in one period, about a tenth of a second's worth; half of them are
+/// reserved for [`Selection::loss_without`], the question how sure each choice is.
 const MAX_COMPARISONS: usize = 20_000_000;
-/// Passes of the local search; each makes the total greater, and few are ever needed.
+/// Most passes of the local search; each increases the total, and few are ever needed.
 const MAX_PASSES: usize = 20;
 
-/// Bearings that may be one target's, and what that is worth.
+/// Bearings that may be one target's, and their score.
 #[derive(Clone, Debug)]
 struct Leaf {
     score: f64,
-    /// Numbers of its lines, ascending.
+    /// The numbers of its lines, ascending.
     lines: Vec<usize>,
 }
 
-/// All leaves with what they have in common.
+/// All leaves, which lines they share, and the choice.
 #[derive(Clone, Debug)]
 pub(super) struct Selection {
     leaves: Vec<Leaf>,
@@ -28,17 +28,19 @@ pub(super) struct Selection {
     users: Vec<Vec<usize>>,
     shared_lines: usize,
     chosen: BTreeSet<usize>,
-    /// Comparisons that may still be made: time is bounded where everything clashes with
+    /// Comparisons that may still be made: time is bounded even if everything clashes with
     /// everything.
     budget: Cell<usize>,
 }
 
 impl Selection {
-    /// The best set found of leaves, given as scores with lines; `shared_lines` is how many lines
-    /// two chosen ones may have in common. Leaves of score 0 and less are never chosen.
+    /// The best set found among leaves, given as scores with lines; `shared_lines` is how many
+    /// lines two chosen leaves may have in common. Leaves with a score of 0 or less are never
+    /// chosen.
     ///
-    /// Choosing the best first lets a leaf of several targets' bearings shut them all out. So
-    /// the choice is improved by exchange: one goes out if those that it kept out are worth more.
+    /// Choosing greedily by score lets a leaf that mixes several targets' bearings shut out all of
+    /// their own leaves. So the choice is improved by exchange: a leaf is taken out if those that
+    /// it kept out are worth more.
     pub(super) fn new<'a>(
         scored: impl Iterator<Item = (f64, &'a [(u64, LineId)])>,
         shared_lines: usize,
@@ -77,19 +79,19 @@ impl Selection {
         self.chosen.iter().copied()
     }
 
-    /// What the total would lose if a chosen leaf were wrong, and every other of its lines that
-    /// `alike` holds for with it.
+    /// How much the total score falls if a chosen leaf is wrong, together with all other leaves of
+    /// its lines for which `alike` holds. 0 if the budget of comparisons is used up.
     pub(super) fn loss_without(&self, chosen: usize, alike: impl Fn(usize) -> bool) -> f64 {
         let others: Vec<usize> = self.neighbours(chosen).filter(|&i| !alike(i)).collect();
         let mut without = self.chosen.clone();
         without.remove(&chosen);
         let gained: f64 =
             self.additions(&without, &others).iter().map(|&i| self.leaves[i].score).sum();
-        // Where there was no time to look for others, nothing is sure.
+        // If there was no time to look for alternatives, nothing is sure.
         if self.budget.get() == 0 { 0.0 } else { self.leaves[chosen].score - gained }
     }
 
-    /// Leaves that have a line in common with one.
+    /// The leaves that share a line with this one.
     fn neighbours(&self, of: usize) -> impl Iterator<Item = usize> {
         let lines = &self.leaves[of].lines;
         let all: BTreeSet<usize> =
@@ -114,7 +116,8 @@ impl Selection {
         near.filter(|i| choice.contains(i)).all(|&i| i != leaf && !self.clash(leaf, i))
     }
 
-    /// Those of some leaves that fit beside a choice and each other, the best first.
+    /// Greedy choice: those of `among` that are compatible with a choice and with each other, the
+    /// best first.
     fn additions(&self, choice: &BTreeSet<usize>, among: &[usize]) -> Vec<usize> {
         let mut by_score: Vec<usize> = among.to_vec();
         by_score.sort_by(|&a, &b| {
@@ -136,8 +139,8 @@ impl Selection {
         self.chosen.extend(added);
     }
 
-    /// Puts one out for those that it kept out, or one in for those that it keeps out, while the
-    /// total grows.
+    /// Local search: takes one leaf out for those that it kept out, or one in for those that it
+    /// clashes with, as long as the total grows.
     fn exchange(&mut self) {
         for _ in 0..MAX_PASSES {
             let mut better = false;
@@ -197,7 +200,8 @@ mod tests {
     fn two_targets_beat_the_better_ghost_of_both() {
         let selection = select(&[(12.0, &[0, 1, 4]), (10.0, &[0, 2]), (9.0, &[1, 3])], 0);
         assert_eq!(selection.chosen().collect::<Vec<_>>(), [1, 2]);
-        // Without the first target the ghost is as good as what is left of both.
+        // The ghost clashes with the second target's leaf too, so nothing makes up for the first
+        // one.
         assert!((selection.loss_without(1, |_| false) - 10.0).abs() < 1e-9);
     }
 

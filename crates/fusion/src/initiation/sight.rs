@@ -1,4 +1,4 @@
-//! What one camera alone sees of a target: a direction that turns.
+//! A target as one camera alone sees it: a direction that turns.
 
 use std::f64::consts::PI;
 
@@ -9,14 +9,15 @@ use nalgebra::{Matrix2, Unit, Vector3};
 
 use crate::prediction::{BearingPrediction, Beginning, GivenShift, log_density};
 
-/// What it counts that noise is as reported, in coordinates of bearings (two each).
+/// Weight of the prior that the noise is as reported, as a number of coordinates (two per bearing).
 const PRIOR_COORDINATES: f64 = 10.0;
 
-/// A line as one camera alone goes on with it: a direction that turns evenly.
+/// Filter for the direction in which one camera alone follows a target: a constant turning rate
+/// driven by white acceleration.
 #[derive(Clone, Debug)]
 pub(super) struct Sight {
     pub(super) direction: Unit<Vector3<f64>>,
-    /// How fast the direction turns, rad/s.
+    /// Turning rate of the direction, rad/s.
     pub(super) rate: Vector3<f64>,
     /// Variances of the direction (rad^2) and its rate (rad^2/s^2) along each tangent, and their
     /// covariance.
@@ -24,18 +25,18 @@ pub(super) struct Sight {
     pub(super) rate_variance: f64,
     pub(super) tie: f64,
     pub(super) time: Timestamp,
-    /// What the pose shifts all bearings of the camera by, as far as is known (rad, world), and its
-    /// covariance along the tangents once the first prediction has told it.
+    /// Estimate of the shift that the pose gives to all bearings of the camera (rad, world), and
+    /// its covariance along the tangents, once the first prediction has given it.
     shift: Vector3<f64>,
     shift_covariance: Option<Matrix2<f64>>,
-    /// Squared innovations by what the reported noise lets expect, and how many coordinates these
-    /// are.
+    /// Sum of the squared innovations in units of the variance expected with the reported noise,
+    /// and the number of coordinates in it.
     squares: f64,
     coordinates: f64,
 }
 
 impl Sight {
-    /// A first line, of a target that may move across it at `rate_sd` (rad/s).
+    /// The filter after a first line, of a target that may move across it at `rate_sd` (rad/s).
     pub(super) fn first(line: &SightLine, time: Timestamp, rate_sd: f64) -> Self {
         Self {
             direction: line.direction,
@@ -51,14 +52,17 @@ impl Sight {
         }
     }
 
-    /// Learns the camera's shift from the first line, of which the target's place has been made:
-    /// what is left of the line is shift and noise, in the proportion of their covariances.
+    /// Estimates the camera's shift from the first line, one of those that the target's position
+    /// was made from: the line's residual is divided between shift and noise in proportion to their
+    /// covariances.
     pub(super) fn begin_shift(
         &mut self,
         line: &SightLine,
         prediction: &BearingPrediction,
     ) -> Option<()> {
         let Beginning { left, shift, noise, placed } = prediction.beginning(line)?;
+        // K = V (V + R)^-1, with V the covariance of the shift; the residual itself has the
+        // covariance V + R - H P H', as the target was fitted to the line.
         let total = shift + noise;
         let gain = shift * total.try_inverse()?;
         self.shift = prediction.basis() * (gain * left);
@@ -66,12 +70,13 @@ impl Sight {
         Some(())
     }
 
-    /// Where the line is expected at a time; `density` is that of the white acceleration that
-    /// drives it, rad^2/s^3.
+    /// Predicts to a time; `density` is that of the white acceleration that drives the direction,
+    /// rad^2/s^3.
     pub(super) fn predict(&mut self, time: Timestamp, density: f64) {
         let dt = time.seconds_since(self.time);
         self.direction = Unit::new_normalize(self.direction.into_inner() + self.rate * dt);
-        // A clock's correction may take it back in time: that makes it no surer.
+        // A clock's correction may lead back in time: this must not make the direction surer.
+        // Process noise: q [t^3/3, t^2/2; t^2/2, t].
         let noise = density * dt.abs();
         self.variance += dt * (2.0 * self.tie + dt * self.rate_variance) + noise * dt * dt / 3.0;
         self.tie += dt * self.rate_variance + noise * dt / 2.0;
@@ -79,9 +84,9 @@ impl Sight {
         self.time = time;
     }
 
-    /// How much likelier (logarithm) a line is where the target of all cameras is predicted than
-    /// where this camera alone expects it; learns the camera's shift, which is the same in all its
-    /// lines.
+    /// Log-likelihood ratio of a line: the prediction of the target that all cameras see, against
+    /// the prediction of this camera alone. Also updates the camera's shift, which is the same in
+    /// all its lines.
     pub(super) fn log_ratio(
         &mut self,
         line: &SightLine,
@@ -93,21 +98,22 @@ impl Sight {
         let seen = to_tangents * line.direction.into_inner();
         let alone = seen - to_tangents * self.direction.into_inner();
         let alone = log_density(&(own + Matrix2::identity() * self.variance), alone)?;
-        // z = E' d - L s with the camera's shift s ~ N(shift, known): S = spread + L known L'.
+        // With all cameras: z = E' d - L s, where s is the camera's shift, of which this filter
+        // knows N(shift, known): S = spread + L known L'.
         let GivenShift { shift, left, spread } = prediction.given_shift(line, self.factor());
         let known = self.shift_covariance.unwrap_or(shift);
         let spread = spread + left * known * left.transpose();
         let off = seen - left * (to_tangents * self.shift);
         let together = log_density(&spread, off)?;
-        // And the shift is learnt as in any Kalman filter: K = known L' S^-1.
+        // The shift's Kalman update: K = known L' S^-1.
         let gain = known * left.transpose() * spread.try_inverse()?;
         self.shift += prediction.basis() * (gain * off);
         self.shift_covariance = Some(known - gain * left * known);
         Some(together - alone)
     }
 
-    /// Logarithm of the density of a line, 1/sr, whose reported covariance counts `factor` times;
-    /// `None` if it lies outside the gate.
+    /// Logarithm of the probability density of a line, 1/sr, whose reported covariance counts at
+    /// least `factor` times; `None` if it lies outside the gate.
     pub(super) fn density(&self, line: &SightLine, factor: f64, gate: Gate) -> Option<f64> {
         let variance = self.variance + line.covariance.trace() / 2.0 * factor.max(self.factor());
         let squared =
@@ -115,12 +121,14 @@ impl Sight {
         gate.holds(squared).then(|| -squared / 2.0 - (2.0 * PI * variance).ln())
     }
 
+    /// Updates the filter with a line.
     pub(super) fn update(&mut self, line: &SightLine) {
         let reported = line.covariance.trace() / 2.0;
         let off = line.direction.into_inner() - self.direction.into_inner();
         self.squares += off.norm_squared() / (self.variance + reported);
         self.coordinates += 2.0;
-        // The two states of a constant rate, direction and rate, updated by the direction alone.
+        // Kalman update of the two states direction and rate by the direction alone, with the gains
+        // P_dd / S and P_dr / S.
         let spread = self.variance + reported * self.factor();
         let (gain, rate_gain) = (self.variance / spread, self.tie / spread);
         self.direction = Unit::new_normalize(self.direction.into_inner() + off * gain);
@@ -130,8 +138,8 @@ impl Sight {
         self.variance -= gain * self.variance;
     }
 
-    /// How many times the lines' reported covariances count, as far as these have shown: where
-    /// noise is larger than it says, every small difference would pass for evidence.
+    /// Factor on the lines' reported covariances, at least 1, estimated from the innovations: if
+    /// the noise is larger than reported, every small difference would otherwise pass for evidence.
     fn factor(&self) -> f64 {
         (self.squares / self.coordinates).max(1.0)
     }

@@ -1,4 +1,4 @@
-//! What is known of a track of a neighbour, and of one here.
+//! What is known of a neighbour's track, and of one here.
 
 use std::collections::VecDeque;
 
@@ -8,21 +8,22 @@ use nalgebra::{Matrix6, Vector6};
 
 use super::Number;
 
-/// Who knows a target's place so many times better says it. Below 1.5 two centres that see it alike
-/// would take turns.
+/// A centre whose standard deviation of a target's place is this many times smaller says the
+/// target. Below 1.5 two centres that see it alike would take turns.
 const MUCH_BETTER: f64 = 2.0;
 
-/// So far back states are kept, s: two centres may be as far apart in the time of the data. With half of
-/// it those that wait for a slow camera do not know their neighbours' targets.
+/// How far back states are kept, s: two centres may be as far apart in the time of the data. With
+/// half of it those that wait for a slow camera do not know their neighbours' targets.
 const KEPT_S: f64 = 2.0;
-/// They are kept this often, s: between two of them a target's manoeuvre is no matter.
+/// Interval of the states that are kept, s: a target's manoeuvre between two of them does not
+/// matter.
 pub(super) const KEPT_EVERY_S: f64 = 0.2;
 
-/// Where a track was of late.
+/// Where a track was lately.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Past {
     newest: Option<(Timestamp, KinematicState)>,
-    /// Some of what was the newest, the oldest first.
+    /// Some of the states that were the newest before, the oldest first.
     kept: VecDeque<(Timestamp, KinematicState)>,
 }
 
@@ -40,8 +41,8 @@ impl Past {
         }
     }
 
-    /// Where it was at a time, from the last state before it; what of its acceleration nobody knows has
-    /// that density, m^2/s^3. `None` of a track without a past.
+    /// Where the track was at a time, predicted from the last state before it with an unknown
+    /// acceleration of this density, m^2/s^3. `None` for a track without a past.
     pub(super) fn at(&self, time: Timestamp, density: f64) -> Option<KinematicState> {
         let newest = self.newest.iter().filter(|(at, _)| *at <= time);
         let before = newest.chain(self.kept.iter().rev().filter(|(at, _)| *at <= time)).next();
@@ -50,11 +51,11 @@ impl Past {
     }
 }
 
-/// A track as a neighbour said it last.
+/// A track as a neighbour last said it.
 #[derive(Clone, Debug)]
 pub(super) struct Theirs {
     pub(super) time: Timestamp,
-    /// What time it was here.
+    /// The time here when it was heard.
     pub(super) heard: Option<Timestamp>,
     pub(super) past: Past,
     pub(super) grip: Grip,
@@ -64,16 +65,16 @@ pub(super) struct Theirs {
 /// A track of the fusion here.
 #[derive(Clone, Debug)]
 pub(super) struct Ours {
-    /// Under which it is said, and when that one began.
+    /// The number under which it is said, and when the track of that number began.
     pub(super) number: Number,
     pub(super) born: Timestamp,
-    /// What it was before it took another's.
+    /// Its number and its beginning before it took another's.
     pub(super) first: (Number, Timestamp),
     pub(super) voice: Voice,
     pub(super) past: Past,
     pub(super) compared: Option<Timestamp>,
     pub(super) ended: Option<Timestamp>,
-    /// What has happened to it and is said when it is said itself.
+    /// What has happened to it and is to be said when the track itself is said.
     pub(super) untold: Vec<TrackEvent>,
 }
 
@@ -103,15 +104,15 @@ impl Ours {
 /// Whether a track is said here.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Voice {
-    /// Not yet under this number.
+    /// Not yet, under this number.
     Unsaid,
-    /// Since a time.
+    /// It is, since this time.
     Speaking(Timestamp),
-    /// A neighbour says it.
+    /// It is not: a neighbour says it.
     Silent,
 }
 
-/// How well a target is held.
+/// How well a centre knows where a target is.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Grip {
     /// 0: its place is known; 1: a direction; 2: it is not seen; 3: it is hardly there.
@@ -136,7 +137,7 @@ impl Grip {
     }
 }
 
-/// The state of a track of the wire; `None` where it is none.
+/// The state of a track from the wire; `None` if it is not valid.
 pub(super) fn state_of(track: &Track) -> Option<KinematicState> {
     let (position, velocity) = (track.position.as_ref()?, track.velocity.as_ref()?);
     let covariance: &[f64; 36] = track.covariance.as_slice().try_into().ok()?;

@@ -7,36 +7,37 @@ use crossfix_message::Timestamp;
 
 use super::{Number, Own};
 
-/// Two tracks are held against each other for so long before anything follows, s. Half of it and two
-/// targets that cross are taken for one; with twice as much a fast one has left where both see it.
+/// How long two tracks are compared before anything follows, s. With half of it two targets that
+/// cross are taken for one; with twice as much a fast one has left where both centres see it.
 const LONG_ENOUGH_S: f64 = 1.0;
-/// Places that are farther apart, as a squared Mahalanobis distance of three degrees of freedom, are
-/// hardly of one target: of one they are once in a thousand times. A mean over a second is no better
-/// than one of them, as what both tracks are off by lasts.
+/// Squared Mahalanobis distance (three degrees of freedom) beyond which two places are hardly of
+/// one target: of one they are once in a thousand times. A mean over a second is no better than one
+/// of them, as the errors of both tracks last.
 const UNLIKE: f64 = 16.3;
-/// Who has been taken for one is two beyond this: seven standard deviations. With half of it poses that
-/// disagree by more than they say take a target to and fro.
+/// Squared distance beyond which two tracks that have been taken for one target are two: seven
+/// standard deviations. With half of it poses that disagree by more than they say take a target to
+/// and fro.
 const PARTED: f64 = 3.0 * UNLIKE;
 /// A squared distance counts no more than this, so that one bad update is outweighed in a second.
 const MOST: f64 = 3.0 * PARTED;
-/// Targets are taken to be this thick, 1/m^3: one in a cube of 100 m. Ten times as thick asks for half
-/// the error before two tracks are one.
+/// Assumed density of targets, 1/m^3: one in a cube of 100 m. With ten times as much the error has
+/// to be half as large before two tracks are one.
 const DENSITY: f64 = 1e-6;
-/// That two tracks are one target must be so many times likelier than each other reading.
+/// That two tracks are one target must be this many times likelier than each other reading.
 const CLEARLY: f64 = 100.0;
 
 /// A track of a neighbour: which neighbour, and under which number it says it.
 pub(super) type Said = (usize, Number);
 
-/// How well the places of two tracks have agreed of late, as means over about [`LONG_ENOUGH_S`].
+/// How well the places of two tracks have agreed lately, as means over about [`LONG_ENOUGH_S`].
 #[derive(Clone, Copy, Debug)]
 struct Likeness {
     since: Timestamp,
     seen: Timestamp,
     /// Squared Mahalanobis distance.
     distance: f64,
-    /// That, and the logarithm of the determinant of what both may be off by: -2 times the
-    /// logarithm of the likelihood of one target, less a constant. A track that may be anywhere
+    /// The distance plus the log determinant of the covariance of both errors together: -2 times
+    /// the logarithm of the likelihood of one target, less a constant. A track that may be anywhere
     /// explains nothing.
     cost: f64,
 }
@@ -52,6 +53,7 @@ impl Likeness {
 
     /// Whether one target is clearly likelier than two that are there by chance.
     fn is_likely(&self) -> bool {
+        // exp(-cost / 2) / (2 pi)^(3/2) must exceed CLEARLY times the density of targets.
         let by_chance = CLEARLY * DENSITY * (2.0 * std::f64::consts::PI).powf(1.5);
         self.distance < UNLIKE && self.cost < -2.0 * by_chance.ln()
     }
@@ -62,8 +64,8 @@ impl Likeness {
 pub(super) struct Likenesses(BTreeMap<(Own, Said), Likeness>);
 
 impl Likenesses {
-    /// Holds two states of one time against each other; `is_one` of tracks that are said under one
-    /// number, whose pair is kept whatever comes out.
+    /// Compares two states of one time; `is_one` is for tracks that are said under one number,
+    /// whose pair is kept whatever comes out.
     pub(super) fn see(
         &mut self,
         pair: (Own, Said),
@@ -79,6 +81,7 @@ impl Likenesses {
             return;
         }
         let Some(factor) = spread.cholesky() else { return };
+        // -2 ln N(d; 0, S) = d' S^-1 d + ln det S, less a constant.
         let distance = apart.dot(&factor.solve(&apart)).min(MOST);
         let cost = distance + 2.0 * factor.l().diagonal().map(f64::ln).sum();
         let new = Likeness { since: now, seen: now, distance, cost };
@@ -100,8 +103,8 @@ impl Likenesses {
         self.0.range(all).map(|((_, said), likeness)| (*said, likeness))
     }
 
-    /// The neighbours' tracks that are of the same target as one here, beyond doubt: one of a neighbour at
-    /// most, as each has one track of a target.
+    /// The neighbours' tracks that are beyond doubt of the same target as one here: at most one per
+    /// neighbour, as each has one track of a target.
     pub(super) fn same_as(&self, own: Own, now: Timestamp) -> impl Iterator<Item = Said> + '_ {
         let is_sure = move |(said, likeness): &(Said, &Likeness)| {
             let is_rival = |other: &Likeness| {
@@ -123,7 +126,7 @@ impl Likenesses {
         self.of_own(own).any(|(_, likeness)| likeness.is_of_late(now) && likeness.is_likely())
     }
 
-    /// Whether two tracks that are said under one number are where one target may be.
+    /// Whether two tracks that are said under one number are near enough to be of one target.
     pub(super) fn may_be_one(&self, own: Own, said: Said) -> bool {
         self.0.get(&(own, said)).is_some_and(|likeness| likeness.distance < PARTED)
     }
@@ -134,7 +137,7 @@ impl Likenesses {
         likeness.is_some_and(|likeness| likeness.has_lasted() && likeness.distance > PARTED)
     }
 
-    /// Forgets pairs of which one has not been seen of late.
+    /// Forgets pairs of which one track has not been seen lately.
     pub(super) fn forget(&mut self, now: Timestamp) {
         self.0.retain(|_, likeness| likeness.is_of_late(now));
     }

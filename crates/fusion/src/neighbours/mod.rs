@@ -1,18 +1,18 @@
-//! A site that is too large for one fusion centre has several, each of an area. Cameras that see into
-//! two areas are heard by both, so a target that flies from the one into the other has for a while a
-//! track in each. What is here makes it one target for everybody else: both tracks have the number
-//! of the elder, and one of the two centres says it.
+//! A site that is too large for one fusion centre has several, each for an area. Cameras that see
+//! into two areas are heard by both centres, so a target that flies from one area into the other
+//! has for a while a track in each. This module makes them one target for everybody else: both
+//! tracks have the number of the elder, and one of the two centres says (publishes) it.
 //!
 //! - *Whether two tracks are one target* is a test of hypotheses ([`likeness`]): for a second their
 //!   places are where one target's would be, clearly likelier than by chance, and no other track of
 //!   either centre explains that as well.
-//! - *Which number* is a comparison of what both centres have said, so that both come to the same end:
-//!   that of the track that began earlier. The younger one takes it. Where they part again, who took
-//!   a number gives it back.
+//! - *Which number* is a comparison of what both centres have said, so that both come to the same
+//!   result: the number of the track that began earlier. The younger track takes it. Where the two
+//!   part again, the track that took a number gives it back.
 //! - *Which centre says it* is the one that knows where the target is; where both do, the one that
 //!   has said it so far ([`Voice`]).
 //!
-//! Each centre's time is its own: how long ago something was said counts by who said it.
+//! Each centre has its own time: how long ago something was said counts by the time of its centre.
 //!
 //! There is no border on a map, no message but the tracks themselves, and nobody who decides: a
 //! centre that falls silent leaves its targets to those beside it.
@@ -32,29 +32,29 @@ use crate::{FusionConfig, Output};
 use known::{Grip, KEPT_EVERY_S, Ours, Theirs, Voice, event, state_of};
 use likeness::{Likenesses, Said};
 
-/// A track of which nothing has been heard for so long is not said any more, s: each is said at least
-/// every half second. With half of it a message that is lost ends it; with twice as much a target
-/// whose centre has died is gone for twice as long.
+/// A track of which nothing has been heard for this long is no longer said, s: each is said at
+/// least every half second. With half of it a message that is lost ends the track; with twice as
+/// much a target whose centre has died is gone for twice as long.
 const HEARD_FOR_S: f64 = 1.0;
 /// Tracks are compared this often, s: they move little between, and each costs a pass over all.
 const COMPARED_EVERY_S: f64 = 0.1;
-/// So long a new track that may be a neighbour's is not said, s: twice what it takes to find out. Its
-/// place is said all the while, by the neighbour.
+/// How long a new track that may be a neighbour's is not said, s: twice what it takes to find out.
+/// Its place is said all the while, by the neighbour.
 const HELD_BACK_S: f64 = 2.0;
-/// Tracks of neighbours that are kept in mind.
+/// Most tracks of neighbours that are kept in mind.
 const MOST_TRACKS: usize = 10_000;
 
-/// Which of a site's fusion centres one is.
+/// Place of one fusion centre among those of its site.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Share {
-    /// Its place among them by name, from 0: it numbers its tracks by every `of`-th number.
+    /// Its index among them by name, from 0: it numbers its tracks by every `of`-th number.
     pub index: usize,
     /// How many there are.
     pub of: usize,
 }
 
 impl Share {
-    /// The number of this one's so-many-th track, from 1; `own` is one of the same run.
+    /// The number of this centre's `count`-th track, from 1; `own` is a number of the same run.
     fn number(self, own: Own, count: u64) -> Number {
         Number(renumbered(own.0, (count - 1) * self.of as u64 + self.index as u64 + 1))
     }
@@ -68,7 +68,8 @@ struct Own(u64);
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Number(u64);
 
-/// The fusion centres of the areas beside one, as it hears them, and what it says itself for that.
+/// The neighbouring fusion centres as one centre hears them, and what it says itself because of
+/// that.
 ///
 /// ```
 /// use crossfix_fusion::{FusionConfig, Neighbours, Output, Share};
@@ -88,11 +89,11 @@ struct Number(u64);
 #[derive(Clone, Debug)]
 pub struct Neighbours {
     share: Share,
-    /// What of a target's acceleration nobody knows, m^2/s^3: between the times of two states.
+    /// Density of a target's unknown acceleration between the times of two states, m^2/s^3.
     density: f64,
     /// How long after a track's end something may still be said of it, s.
     smoothing_s: f64,
-    /// What time it is in the data here; `None` before there are any.
+    /// The time of the data here; `None` before there are any.
     now: Option<Timestamp>,
     /// The newest time that each neighbour has said.
     newest: BTreeMap<usize, Timestamp>,
@@ -104,7 +105,7 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// Of a fusion centre that has some share in its site's targets.
+    /// For a fusion centre that has this share in its site's targets.
     pub fn new(share: Share, config: &FusionConfig) -> Self {
         let densities = config.tracking.models.iter().map(|model| model.acceleration_density);
         Self {
@@ -121,7 +122,7 @@ impl Neighbours {
         }
     }
 
-    /// Takes in what the neighbour at a place among all centres says of its tracks.
+    /// Takes in what a neighbour, by its index among all centres, says of its tracks.
     pub fn hear(&mut self, index: usize, frame: &TrackFrame) {
         let (time, heard) = (Timestamp::from_nanos(frame.time_ns), self.now);
         self.newest.insert(index, time);
@@ -137,7 +138,7 @@ impl Neighbours {
             };
             if self.theirs.len() < MOST_TRACKS || self.theirs.contains_key(&said) {
                 let grip = Grip::of(track, &state);
-                // Who does not say when it began has not said it before.
+                // A neighbour that does not say when a track began has not said it before.
                 let began = (track.born_ns != 0).then(|| Timestamp::from_nanos(track.born_ns));
                 let born = began.unwrap_or(time);
                 let known = self.theirs.remove(&said).map(|known| known.past);
@@ -148,8 +149,8 @@ impl Neighbours {
         }
     }
 
-    /// Whether a neighbour says a track now: by its own time it has done so of late, and by the time
-    /// here it has not fallen silent.
+    /// Whether a neighbour says a track now: by the neighbour's own time it has done so lately, and
+    /// by the time here it has not fallen silent.
     fn is_said(&self, (index, _): Said, theirs: &Theirs) -> bool {
         let newest = self.newest.get(&index).copied().unwrap_or(theirs.time);
         let silent_s = match (self.now, theirs.heard) {
@@ -159,7 +160,7 @@ impl Neighbours {
         newest.seconds_since(theirs.time) < HEARD_FOR_S && (0.0..HEARD_FOR_S).contains(&silent_s)
     }
 
-    /// What the fusion here says, as it is said beside its neighbours.
+    /// Turns what the fusion here says into what is said beside its neighbours.
     pub fn pass(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         let mut said = Vec::with_capacity(outputs.len());
         for output in outputs {
@@ -177,7 +178,7 @@ impl Neighbours {
     fn pass_tracks(&mut self, mut frame: TrackFrame, said: &mut Vec<Output>) {
         let now = Timestamp::from_nanos(frame.time_ns);
         if self.now.is_none() {
-            // What was said before there was a time here was said now.
+            // What was heard before there was a time here counts as heard now.
             self.theirs.values_mut().for_each(|theirs| theirs.heard = Some(now));
         }
         self.now = Some(now);
@@ -219,7 +220,7 @@ impl Neighbours {
         }
     }
 
-    /// A track of the fusion here; one of which it speaks for the first time gets a number.
+    /// A track of the fusion here; one that is spoken of for the first time gets a number.
     fn ours(&mut self, own: Own, now: Timestamp) -> &mut Ours {
         let Self { share, numbered, .. } = self;
         self.ours.entry(own).or_insert_with(|| {
@@ -228,7 +229,7 @@ impl Neighbours {
         })
     }
 
-    /// Holds a track against those of the neighbours, if it is time to.
+    /// Compares a track with those of the neighbours if it is time to; returns whether it has.
     fn compare(&mut self, track: &Track, now: Timestamp) -> bool {
         let own = Own(track.id);
         let ours = self.ours(own, now);
@@ -244,9 +245,10 @@ impl Neighbours {
             if !self.is_said(*said, theirs) {
                 continue;
             }
-            // At the earlier of both times where these are apart: there neither is predicted far.
+            // Where the two times are apart, at the earlier one: there neither state is predicted
+            // far.
             let is_behind = since(theirs.time) > KEPT_EVERY_S;
-            // And once: what was compared there already tells nothing new.
+            // And only once: what was compared there already tells nothing new.
             if is_behind && theirs.heard < before {
                 continue;
             }
@@ -269,8 +271,8 @@ impl Neighbours {
         self.newest.keys().filter_map(of_neighbour)
     }
 
-    /// Takes the number of the eldest track of the same target, or gives back one that is another's
-    /// after all. The number of before, if a reader knows it.
+    /// Takes the number of the eldest track of the same target, or gives back a number that is
+    /// another target's after all. Returns the number before, if a reader knows it.
     fn settle_number(&mut self, own: Own, now: Timestamp) -> Option<Number> {
         let ours = self.ours.get(&own)?;
         let has_parted = |(said, _): (Said, &Theirs)| self.likenesses.have_parted(own, said);
@@ -300,7 +302,7 @@ impl Neighbours {
         (was_said && elder.1 != before).then_some(before)
     }
 
-    /// Decides who says a track.
+    /// Decides which centre says a track.
     fn settle_voice(&mut self, track: &Track, now: Timestamp) {
         // Whoever has said it so far says its end.
         if track.state() != TrackState::Lost
@@ -314,7 +316,7 @@ impl Neighbours {
     fn voice_of(&self, track: &Track, now: Timestamp) -> Option<Voice> {
         let own = Own(track.id);
         let ours = self.ours.get(&own)?;
-        // Somebody who says the number of something else says nothing of this.
+        // A neighbour that says this number of something elsewhere says nothing of this track.
         let of_number = self.of_number(ours.number);
         let mut theirs =
             of_number.filter(|(said, _)| self.likenesses.may_be_one(own, *said)).peekable();
@@ -328,8 +330,8 @@ impl Neighbours {
         let grip = Grip::of(track, &state_of(track)?);
         let is_outdone = theirs.any(|((index, _), theirs)| match ours.voice {
             Voice::Speaking(since) => {
-                // What was said before this one began is what it began for. Where both began at once,
-                // one goes on.
+                // What the neighbour said before this centre began is why this one began. Where
+                // both began at once, one goes on.
                 let is_new = theirs.heard.is_some_and(|heard| heard > since);
                 let yields = index < self.share.index && !grip.is_better_than(&theirs.grip);
                 is_new && (theirs.grip.is_better_than(&grip) || yields)
@@ -343,7 +345,7 @@ impl Neighbours {
         })
     }
 
-    /// Whether a track that has not been said waits: it may be a neighbour's, or is not seen.
+    /// Whether a track that has not been said has to wait: it may be a neighbour's, or is not seen.
     fn is_held_back(&self, own: Own, track: &Track, now: Timestamp) -> bool {
         let is_new = self
             .ours
@@ -364,7 +366,7 @@ impl Neighbours {
         (!frame.tracks.is_empty()).then_some(Output::Smoothed(frame))
     }
 
-    /// What happens to a track is said by who says the track.
+    /// What happens to a track is said by the centre that says the track.
     fn pass_event(&mut self, event: TrackEvent) -> Option<Output> {
         let (own, now) = (Own(event.track_id), Timestamp::from_nanos(event.time_ns));
         let kind = event.kind();
@@ -388,7 +390,7 @@ impl Neighbours {
         }
         let other = (event.other_id != 0).then(|| self.ours(Own(event.other_id), now));
         let other_id = other.map_or(0, |other| {
-            // Who knows this one is to find the other.
+            // A reader who knows this track has to find the other.
             if other.voice == Voice::Unsaid {
                 other.voice = Voice::Speaking(now);
             }

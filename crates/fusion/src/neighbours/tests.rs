@@ -31,7 +31,7 @@ fn centres() -> [Neighbours; 2] {
     [0, 1].map(|index| Neighbours::new(Share { index, of: 2 }, &FusionConfig::default()))
 }
 
-/// Lets both centres say their tracks at a time, and hear each other; what each has said.
+/// Lets both centres say their tracks at a time, and hear each other; returns what each has said.
 fn exchange(
     [west, east]: &mut [Neighbours; 2],
     seconds: f64,
@@ -53,7 +53,8 @@ fn exchange(
 
 use TrackState::{Coasting, Confirmed, Lost, OneCamera};
 
-/// What people would see at each tenth of a second: the numbers that are said, of both centres.
+/// The numbers that both centres say at one time, as people would see them at each tenth of a
+/// second.
 fn numbers(said: &[Vec<Track>; 2]) -> Vec<u64> {
     let mut numbers: Vec<u64> = said.iter().flatten().map(|track| track.id).collect();
     numbers.sort_unstable();
@@ -215,8 +216,8 @@ fn what_a_neighbour_says_goes_over_the_wire_and_may_be_anything() {
     assert!(matches!(&seen[..], [Output::Tracks(frame)] if frame.tracks[0].id == 1));
 }
 
-/// Any number of centres, each of which hears all others, as they say their tracks at a time. What
-/// each has said.
+/// Lets any number of centres, each of which hears all others, say their tracks at a time; returns
+/// what each has said.
 fn exchange_all(
     centres: &mut [Neighbours],
     seconds: f64,
@@ -318,7 +319,7 @@ fn centres_whose_times_are_apart_know_their_targets_all_the_same() {
                 }
             }
         }
-        // That of the one that has seen it since an earlier time.
+        // The number of the centre that has seen it since an earlier time.
         assert_eq!(heard, if behind_s > 0.0 { [2] } else { [1] }, "{behind_s}");
     }
 }
@@ -332,7 +333,7 @@ fn who_says_anothers_number_elsewhere_silences_nobody() {
         let outputs = west.pass(vec![Output::Tracks(frame(seconds, own))]);
         let is_said = matches!(&outputs[..], [Output::Tracks(frame)] if frame.tracks[0].id == 2);
         assert!(is_said, "at {seconds} s: {outputs:?}");
-        // By somebody whose list of areas is another, 500 m away.
+        // Said by somebody whose list of areas is another, 500 m away.
         west.hear(0, &frame(seconds, vec![said(2, f64::from(step), 500.0, 0.1, Confirmed)]));
     }
 }
@@ -346,7 +347,7 @@ fn time_that_goes_back_leaves_nothing_behind() {
             let tracks = vec![said(round as u64 + 1, f64::from(step), 0.0, 1.0, Confirmed)];
             west.pass(vec![Output::Tracks(frame(seconds, tracks))]);
         }
-        // As where event time is taken up anew: an event, and no frame.
+        // As where event time starts again: an event, and no frame.
         let lost = event(TrackEventKind::Lost, west.now.unwrap(), [round as u64 + 1, 0]);
         assert_eq!(west.pass(vec![Output::Event(lost)]).len(), 1, "it is said");
     }

@@ -1,13 +1,14 @@
-//! How accurate ranges are, from the angles between the lines alone (Klochko 2020, the section on
+//! Accuracy of ranges, from the angles between the lines alone (Klochko 2020, the section on
 //! accuracy).
 
 use nalgebra::{Matrix2, Matrix3};
 
 /// Covariance of the ranges of [`super::pair`], m^2 (Klochko 2020, eq. 12).
 ///
-/// `angle` is the one between the lines, rad; `equation_sd` the standard deviation of each
-/// coordinate of the vector `e_2` of equation 4, m, the coordinates uncorrelated. It is least at a
-/// right angle, where the range is as good as the equation. `None` for parallel lines.
+/// `angle` is the angle between the lines, rad; `equation_sd` the standard deviation of each
+/// coordinate of the vector `e_2` of equation 4, m, the coordinates being uncorrelated. The
+/// covariance is least at a right angle, where the range is as good as the equation. `None` for
+/// parallel lines.
 pub fn pair_range_covariance(angle: f64, equation_sd: f64) -> Option<Matrix2<f64>> {
     let (sin, cos) = angle.sin_cos();
     let sine_square = sin * sin;
@@ -21,11 +22,11 @@ pub fn pair_range_covariance(angle: f64, equation_sd: f64) -> Option<Matrix2<f64
 /// `alpha` is the angle between the first line and the second, `beta` that between the first and
 /// the third, rad; `equation_sd` as in [`pair_range_covariance`].
 ///
-/// The formula takes all six coordinates of `e_2` and `e_3` for uncorrelated. Both hold the error
-/// of the first receiver's `r_1 a_1`, so that with equal, isotropic errors of the three points
-/// their coordinates correlate by a half, and the formula is optimistic (erratum): three
-/// perpendicular lines give `r_1` a standard deviation 1.22 times as large. `None` if all lines are
-/// parallel.
+/// The formula takes all six coordinates of `e_2` and `e_3` to be uncorrelated. Both contain the
+/// error of the first receiver's `r_1 a_1`, so that with equal, isotropic errors of the three
+/// points their coordinates have a correlation of one half, and the formula is optimistic
+/// (erratum): for three perpendicular lines the true standard deviation of `r_1` is 1.22 times as
+/// large. `None` if all lines are parallel.
 pub fn triple_range_covariance(alpha: f64, beta: f64, equation_sd: f64) -> Option<Matrix3<f64>> {
     let ((sin_a, cos_a), (sin_b, cos_b)) = (alpha.sin_cos(), beta.sin_cos());
     let (square_a, square_b) = (sin_a * sin_a, sin_b * sin_b);
@@ -73,7 +74,8 @@ mod tests {
         [50f64.to_radians(), 75f64.to_radians()]
     }
 
-    /// Covariance of least squares solutions of a system whose right-hand side has given noise.
+    /// Covariance of the least squares solutions of a system with this noise on its right-hand
+    /// side.
     fn covariance<const E: usize, const U: usize>(
         a: &SMatrix<f64, E, U>,
         mut noise: impl FnMut() -> SVector<f64, E>,
@@ -101,7 +103,7 @@ mod tests {
         matrix
     }
 
-    /// Every element, relative to the diagonal.
+    /// Compares every element, relative to the diagonal.
     fn assert_near<const N: usize>(found: &SMatrix<f64, N, N>, formula: &SMatrix<f64, N, N>) {
         for i in 0..N {
             for j in 0..N {
@@ -131,8 +133,9 @@ mod tests {
         assert_near(&found, &triple_range_covariance(angles()[0], angles()[1], SD).unwrap());
     }
 
-    /// `e_k` is the error of the first receiver's point less that of receiver k's: SD of a
-    /// coordinate of a point, and so of `e_k` times root 2.
+    /// Covariance of the ranges where `e_k` is the error of the first receiver's point less that of
+    /// receiver k's. A coordinate of a point has the deviation SD / root 2, and so one of `e_k` has
+    /// SD.
     fn of_shared_errors(a: [Vector3<f64>; 3]) -> Matrix3<f64> {
         let mut normal = normals();
         covariance(&system_of_three(a), || {

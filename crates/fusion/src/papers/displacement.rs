@@ -2,8 +2,8 @@ use nalgebra::Vector3;
 
 /// How a target moves between the instants of two lines (Klochko 2020, eq. 5).
 ///
-/// The scales say what is known beforehand, as standard deviations per axis: the rank is decided
-/// against them, and where the data cannot carry an unknown the answer stays near zero of it.
+/// The scales are prior standard deviations per axis: the rank is decided against them, and an
+/// unknown that the data do not determine stays near zero.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Displacement {
     /// `dM = V dt`: three unknowns.
@@ -31,7 +31,7 @@ impl Displacement {
         }
     }
 
-    /// How many unknowns it has.
+    /// Number of its unknowns.
     pub(crate) fn unknowns(self) -> usize {
         match self {
             Self::Velocity { .. } => 3,
@@ -40,7 +40,7 @@ impl Displacement {
     }
 }
 
-/// `dM` of a motion found (Klochko 2020, eq. 5), m.
+/// `dM` of a motion that has been found (Klochko 2020, eq. 5), m.
 pub(crate) fn displacement(
     velocity: Vector3<f64>,
     acceleration: Option<Vector3<f64>>,

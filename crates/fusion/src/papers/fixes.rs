@@ -1,4 +1,4 @@
-//! The fixes of one period: what the papers' spatial processing answers.
+//! Fixes of one period by the papers' spatial processing.
 
 use crossfix_message::{Solver, Timestamp};
 
@@ -9,10 +9,10 @@ use crate::initiation::{NamedLine, SeedFinder, lines_of};
 use crate::spatial::{Fix, MapSolution, TimedLine, VelocityKnowledge, map};
 use crate::{Exposure, FusionConfig, Initiation, SpatialSolver};
 
-/// A target is not faster than this many standard deviations of the velocity prior.
+/// Largest speed of a target, in standard deviations of the velocity prior.
 pub(super) const SPEED_SIGMAS: f64 = 4.0;
 
-/// Bearings of each camera that are tried in every combination of three: time is bounded.
+/// Most bearings of each camera that are tried in every combination of three: time is bounded.
 const MAX_IN_TRIPLES: usize = 40;
 /// Most fixes of one period, the first ones: memory is bounded.
 const MAX_FIXES: usize = 2_000;
@@ -115,7 +115,7 @@ impl FixFinder {
         self.range_fix(lines, &solution, Solver::Stacked)
     }
 
-    /// The fix of a solution for ranges and velocity, if it is possible.
+    /// The fix of a solution for ranges and velocity; `None` if a range or the speed is impossible.
     fn range_fix(
         &self,
         lines: Vec<NamedLine>,

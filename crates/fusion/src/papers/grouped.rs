@@ -58,7 +58,7 @@ impl Grouped {
     }
 }
 
-/// A tentative track from a group of fixes: from the first fix, with the lines of the later ones.
+/// A tentative track: started from a group's first fix, updated with the lines of the later ones.
 fn start(group: &Group, motion: &Motion) -> Option<Track> {
     let (fix, later) = starting_point(group)?;
     let vague = Fix { state: vague_velocity(fix), ..fix.clone() };
@@ -89,7 +89,8 @@ fn starting_point(group: &Group) -> Option<(&Fix, Vec<&NamedLine>)> {
     Some((&first.fix, lines))
 }
 
-/// The covariance of a fix without a velocity says so: the prior is replaced by a vague one.
+/// The state of a fix; for one without a velocity the velocity prior is replaced by a vague one, so
+/// that the covariance says so.
 fn vague_velocity(fix: &Fix) -> crossfix_filter::KinematicState {
     let mut state = fix.state.clone();
     if fix.velocity == VelocityKnowledge::Unknown {

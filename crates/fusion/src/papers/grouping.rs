@@ -1,14 +1,12 @@
-//! Klochko's temporal processing: fixes of successive periods are grouped by the
-//! residual from the group's extrapolation, with an accumulated indicator, and
-//! the best groups without common sight lines are handed over (Klochko 2020, temporal
-//! processing of both algorithms).
+//! Klochko's temporal processing: fixes of successive periods are grouped by their residual from
+//! the group's extrapolation, with an accumulated indicator, and the best groups without common
+//! sight lines are handed over (Klochko 2020, temporal processing of both algorithms).
 //!
-//! How many targets there are, the paper's `m^` (step 5 of the alternative
-//! algorithm, step 4 of the proposed one), is the number of groups selected by
-//! this rule: of the groups with enough fixes, in the order of their
-//! indicators, each that shares at most `shared_lines` sight lines with all
-//! those selected before it together. With no sharing allowed it cannot exceed
-//! the number of lines of any camera.
+//! The number of targets, the paper's `m^` (step 5 of the alternative algorithm, step 4 of the
+//! proposed one), is the number of groups selected by this rule: of the groups with enough fixes,
+//! in the order of their indicators, each that shares at most `shared_lines` sight lines with all
+//! those selected before it together. With no sharing allowed it cannot exceed the number of lines
+//! of any camera.
 
 use std::collections::BTreeSet;
 
@@ -16,9 +14,10 @@ use nalgebra::{Point3, Vector3};
 
 use crate::spatial::{Fix, LineId, TimedLine, VelocityKnowledge};
 
-/// Groups kept from one period to the next: the best ones, so that clutter cannot fill the memory.
+/// Most groups kept from one period to the next, the best ones: clutter cannot fill the memory.
 const MAX_GROUPS: usize = 5_000;
-/// Fixes of one period that are grouped, the first ones: with [`MAX_GROUPS`] it bounds the time.
+/// Most fixes of one period that are grouped, the first ones: with [`MAX_GROUPS`] it bounds the
+/// time.
 const MAX_FIXES: usize = 500;
 
 /// A fix with the sight lines that it was made of.
@@ -26,11 +25,11 @@ const MAX_FIXES: usize = 500;
 pub struct PeriodFix {
     /// The fix.
     pub fix: Fix,
-    /// Its lines, one a camera.
+    /// Its lines, one per camera.
     pub lines: Vec<(LineId, TimedLine)>,
 }
 
-/// Fixes that may be one target's, one a period at most.
+/// Fixes that may be of one target, at most one per period.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
     /// In order of time.
@@ -40,7 +39,7 @@ pub struct Group {
     first_period: u64,
 }
 
-/// What may continue a group.
+/// Gate for a fix that continues a group.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum TemporalGate {
     /// The papers': a distance in metres, which is also what is summed in the indicator.
@@ -58,15 +57,15 @@ pub enum TemporalGate {
 /// How fixes are grouped.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GroupingRules {
-    /// Periods that a group may span, `N`.
+    /// Most periods that a group may span, `N`.
     pub periods: usize,
-    /// Fixes that make a group good enough.
+    /// Number of fixes from which a group is good enough.
     pub fixes: usize,
-    /// What may continue a group.
+    /// Gate for a fix that continues a group.
     pub gate: TemporalGate,
-    /// The fastest target, m/s: limits the second fix where the first has no velocity.
+    /// Largest speed of a target, m/s: limits the second fix where the first has no velocity.
     pub max_speed: f64,
-    /// How many sight lines a selected group may share with those selected before it: the paper's
+    /// Most sight lines that a selected group may share with those selected before it: the paper's
     /// "small number of crossings", for targets that a camera saw as one.
     pub shared_lines: usize,
 }
@@ -86,9 +85,10 @@ impl Group {
         &self.fixes[self.fixes.len() - 1]
     }
 
-    /// Where the group is at the time of its last fix and how fast: the fix itself where it has a
-    /// velocity (Klochko 2020, proposed algorithm, step 3), or the line through all vectors of the
-    /// group (alternative algorithm, steps 1 and 4). `None` for a single fix without a velocity.
+    /// The group's position at the time of its last fix, and its velocity: those of the fix itself
+    /// where it has a velocity (Klochko 2020, proposed algorithm, step 3), or of the line through
+    /// all vectors of the group (alternative algorithm, steps 1 and 4). `None` for a single fix
+    /// without a velocity.
     fn trajectory(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
         let state = &self.last().fix.state;
         match self.last().fix.velocity {
@@ -97,7 +97,7 @@ impl Group {
         }
     }
 
-    /// Positions over time by least squares, at the time of the last.
+    /// Least-squares line of the positions over time, at the time of the last.
     fn fitted_line(&self) -> Option<(Point3<f64>, Vector3<f64>)> {
         let reference = self.last().fix.time;
         let times: Vec<f64> =
@@ -108,6 +108,7 @@ impl Group {
         let mean = positions().sum::<Vector3<f64>>() / count;
         let spread: f64 = times.iter().map(|t| (t - mean_time).powi(2)).sum();
         (spread > 0.0).then(|| {
+            // v = sum of (t - mean) p / sum of (t - mean)^2.
             let weighted = positions().zip(&times).map(|(position, t)| position * (t - mean_time));
             let velocity = weighted.sum::<Vector3<f64>>() / spread;
             (Point3::from(mean - velocity * mean_time), velocity)
@@ -123,12 +124,13 @@ impl Group {
     }
 }
 
-/// What a group would be, before it is made: where all is alike there are millions.
+/// A group as it would be, before it is made: where all fixes are alike there are millions.
 #[derive(Clone, Copy, Debug)]
 struct Candidate {
     fixes: usize,
     indicator: f64,
-    /// An old group, one with one fix more, or a new one; the group's place, and the fix's.
+    /// Its origin: 0 an old group, 1 an old group with one fix more, 2 a new one; then the index of
+    /// the group, and that of the fix.
     from: (u8, usize, usize),
 }
 
@@ -153,7 +155,7 @@ impl Grouping {
     }
 
     /// Takes in all fixes of one period and returns the groups that are good enough, best first;
-    /// what shares a line with them is forgotten.
+    /// groups that share too many lines with them are forgotten.
     pub fn advance(&mut self, fixes: &[PeriodFix]) -> Vec<Group> {
         self.period += 1;
         let oldest = self.period.saturating_sub(self.rules.periods as u64 - 1);
@@ -164,8 +166,8 @@ impl Grouping {
         self.select()
     }
 
-    /// Every group goes on with each fix that passes the gate, and without any; every fix begins
-    /// one.
+    /// Continues every group with each fix that passes the gate, and without any; every fix begins
+    /// a group.
     fn grow(&mut self, fixes: &[PeriodFix]) {
         let mut candidates = Vec::new();
         for (index, group) in self.groups.iter().enumerate() {
@@ -228,6 +230,8 @@ impl Grouping {
                 (distance <= beta).then_some(distance)
             }
             TemporalGate::Covariance { threshold, density } => {
+                // Squared Mahalanobis distance, by the covariances of the extrapolation and of the
+                // fix.
                 let spread = last.state.predicted(dt, density).position_covariance()
                     + fix.fix.state.position_covariance();
                 let squared = difference.dot(&spread.cholesky()?.solve(&difference));
@@ -236,8 +240,8 @@ impl Grouping {
         }
     }
 
-    /// The groups with the least indicators that share no lines, or few (Klochko 2020, step 5 of
-    /// the alternative algorithm and step 4 of the proposed one).
+    /// Selects the groups of the least indicators that share no lines, or few (Klochko 2020, step 5
+    /// of the alternative algorithm and step 4 of the proposed one).
     fn select(&mut self) -> Vec<Group> {
         let good = self.groups.iter().filter(|group| group.fixes.len() >= self.rules.fixes);
         let mut good: Vec<(BTreeSet<&LineId>, &Group)> =
@@ -251,7 +255,8 @@ impl Grouping {
                 selected.push(group.clone());
             }
         }
-        // What goes on may cross what is taken as seldom as what was selected, and must have more.
+        // A group that goes on may share no more lines with the selected ones than a selected one
+        // may, and must have others.
         self.groups.retain(|group| {
             let shared = group.shares(&taken);
             shared <= self.rules.shared_lines && (shared == 0 || shared < group.lines().len())
@@ -339,8 +344,8 @@ mod tests {
         assert_eq!(grouping.advance(&[fix(3, 30.0, 0, VelocityKnowledge::Solved)]).len(), 1);
     }
 
-    /// Two targets on straight lines whose fixes share `lines` of the first camera and not the
-    /// second.
+    /// Two targets on straight lines whose fixes share the first camera's line, and not the
+    /// second's, in `merged_periods`.
     fn two_that_cross(shared_lines: usize, merged_periods: &[u64]) -> Grouping {
         let rules = GroupingRules {
             periods: 5,
@@ -392,8 +397,8 @@ mod tests {
         };
         let mut grouping = Grouping::new(rules);
         grouping.advance(&[of([0, 0], 0, 0.0), of([1, 1], 0, 50.0), of([0, 1], 0, 99.0)]);
-        // The third comes last, as it wanders by half a metre. It shares a line a period with the
-        // first and one with the second: two with each, four in all.
+        // The third is last in order, as it wanders by half a metre. In each period it shares one
+        // line with the first and one with the second: two with each, four in all.
         grouping.advance(&[of([0, 0], 1, 10.0), of([1, 1], 1, 60.0), of([0, 1], 1, 109.5)]);
         assert_eq!(grouping.target_count(), 2);
     }

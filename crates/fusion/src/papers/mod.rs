@@ -1,8 +1,8 @@
-//! The papers' way of finding targets (Klochko 2020): each period is solved for fixes, and fixes
+//! The papers' method of finding targets (Klochko 2020): each period is solved for fixes, and fixes
 //! that follow from each other are grouped until a group is good enough to be a target.
 //! `initiation.method = "grouping"` chooses it in place of the hypotheses of
 //! [`Fusion`](crate::Fusion); `initiation.solver` chooses the system that a period is solved by.
-//! What is made of a track once it has begun is the same for both.
+//! Once a track has begun, both methods treat it alike.
 //!
 //! | here | unknowns | where it is from |
 //! |---|---|---|

@@ -2,8 +2,8 @@ use nalgebra::{Matrix3x2, Point3, Vector3};
 
 use crate::spatial::TimedLine;
 
-/// About how far away a target is, m: the longer range of the first line and the one that crosses
-/// it at the widest angle, the target taken to stand still; not less than the longest base.
+/// Rough range of a target, m: the longer range of the first line and the one that crosses it at
+/// the widest angle, the target taken to stand still; not less than the longest baseline.
 pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
     let base = others
         .iter()
@@ -17,7 +17,7 @@ pub(super) fn typical_range(first: &TimedLine, others: &[&TimedLine]) -> f64 {
     if range.is_finite() { range.max(base) } else { base }
 }
 
-/// Two ranges and how badly the lines miss each other.
+/// Two ranges, and by how much the lines miss each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PairSolution {
     /// Range from the first camera, m.
@@ -67,6 +67,7 @@ pub fn pair(
     // r1 a1 - r2 a2' + dM - b2 = e2 (Klochko 2020, eq. 4)
     let a = Matrix3x2::from_columns(&[a1, -a2]);
     let b = (second.line.origin - first.line.origin) - displacement;
+    // Least squares: r = (A'A)^-1 A' b.
     let ranges = (a.transpose() * a).try_inverse()? * a.transpose() * b;
     let residual = a * ranges - b;
     Some(PairSolution {

@@ -6,22 +6,22 @@ use super::pair::typical_range;
 use super::{Displacement, RangeSolution, pair};
 use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
-/// The papers' system for n cameras: n ranges and the velocity from n lines, 3(n - 1) equations in
-/// n + 3 unknowns (Klochko 2020: "with n > 3 only the dimensions change"), unweighted.
+/// The papers' system for n cameras, unweighted: n ranges and the velocity from n lines, 3(n - 1)
+/// equations in n + 3 unknowns (Klochko 2020: "with n > 3 only the dimensions change").
 ///
 /// Rank and pseudo-inverse as in [`super::triple`], which is the case n = 3. `None` for fewer than
-/// three lines, if all are of one camera, or if those that the range is refined with are parallel.
+/// three lines, if all are of one camera, or if the two lines that refine the range are parallel.
 pub fn stacked(lines: &[TimedLine], velocity_scale: f64) -> Option<RangeSolution> {
     stacked_with(lines, Displacement::Velocity { velocity_scale })
 }
 
-/// The same with a motion of choice (Klochko 2020, eq. 5): n ranges and three unknowns, or six with
-/// acceleration, from n lines of any instants; a camera may give several.
+/// The same with a motion of choice (Klochko 2020, eq. 5): n ranges and three unknowns of motion,
+/// or six with acceleration, from n lines of any instants; a camera may give several.
 ///
 /// With acceleration there are n + 6 unknowns for 3(n - 1) equations, so that five lines are the
 /// least: five cameras, or four of which one gives a second instant, or three with two each. With
 /// fewer, or with instants that lie too close together for the noise, the rank is not full, and
-/// what cannot be seen is left at zero.
+/// what cannot be observed is left at zero.
 pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSolution> {
     let (first, others) = lines.split_first()?;
     if others.len() < 2 {
@@ -29,6 +29,7 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     }
     let n = lines.len();
     let range = typical_range(first, &others.iter().collect::<Vec<_>>());
+    // Prior scales of the unknowns: the n ranges, then three axes of each term of the motion.
     let scales: Vec<f64> = std::iter::repeat_n(range, n)
         .chain(motion.terms(0.0).into_iter().flat_map(|(scale, _)| [scale; 3]))
         .collect();
@@ -36,6 +37,7 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     let svd = a.thin_svd().ok()?;
     let unknowns = scales.len();
     let values: Vec<f64> = (0..unknowns).map(|i| svd.S()[i]).collect();
+    // Noise of the right-hand side, m: the largest deviation of a line times the range.
     let noise = lines.iter().map(|l| l.line.standard_deviation()).fold(0.0, f64::max) * range;
     let observability = Observability::of_singular_values(&values, noise, |worst| {
         let combination: Vec<f64> = (0..unknowns).map(|row| svd.V()[(row, worst)]).collect();
@@ -45,6 +47,8 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
 
     let largest = values.iter().copied().fold(0.0, f64::max);
     let mut x = vec![0.0; unknowns];
+    // Pseudo-inverse over the determined directions, x = D V S^-1 U' b, where the scales D turn the
+    // scaled unknowns back into ranges and motion.
     for (i, &value) in values.iter().enumerate().filter(|&(_, &v)| determined(v, noise, largest)) {
         let coefficient = (0..a.nrows()).map(|row| svd.U()[(row, i)] * b[row]).sum::<f64>() / value;
         for (column, unknown) in x.iter_mut().enumerate() {
@@ -53,6 +57,7 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     }
     let vector = |column: usize| x.get(column..column + 3).map(Vector3::from_column_slice);
     let (velocity, acceleration) = (vector(n)?, vector(n + 3));
+    // Refined position: the first line and the widest partner, with the displacement removed.
     let partner = widest_partner(first, others)?;
     let dt = partner.time.seconds_since(first.time);
     let refined = pair(first, partner, displacement(velocity, acceleration, dt))?;
@@ -66,8 +71,8 @@ pub fn stacked_with(lines: &[TimedLine], motion: Displacement) -> Option<RangeSo
     })
 }
 
-/// The matrix, its columns scaled, and the right-hand side of `r1 a1 - r_k a_k' + dM_k = b_k`
-/// (Klochko 2020, eqs. 4 and 5); rows of zeros make up for equations that are missing.
+/// The matrix with scaled columns, and the right-hand side, of `r1 a1 - r_k a_k' + dM_k = b_k`
+/// (Klochko 2020, eqs. 4 and 5); rows of zeros stand in for missing equations.
 fn system(
     first: &TimedLine,
     others: &[TimedLine],
@@ -97,8 +102,8 @@ fn system(
     (a, b)
 }
 
-/// The other camera's line most nearly perpendicular to the first: there the pair's range is best
-/// (Klochko 2020, eq. 12).
+/// The line of another camera that is most nearly perpendicular to the first: there the pair's
+/// range is best (Klochko 2020, eq. 12).
 fn widest_partner<'a>(first: &TimedLine, others: &'a [TimedLine]) -> Option<&'a TimedLine> {
     let along = |l: &TimedLine| l.line.direction.dot(&first.line.direction).abs();
     let elsewhere = others.iter().filter(|l| l.line.origin != first.line.origin);
@@ -195,7 +200,7 @@ mod tests {
         assert!(solution.observability.rank < 10);
         assert!(solution.observability.weak_axis.is_some());
         assert!(solution.velocity.norm() < 60.0 && solution.acceleration.unwrap().norm() < 20.0);
-        // The velocity alone they carry.
+        // They do determine the velocity alone.
         assert!(stacked(&lines, 15.0).unwrap().observability.is_full());
     }
 

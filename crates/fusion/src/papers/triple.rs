@@ -5,10 +5,10 @@ use super::{RangeSolution, pair};
 use crate::spatial::{Observability, TimedLine, WeakAxis, determined};
 
 /// The three-receiver algorithm: three ranges and the velocity from three lines of three times
-/// (Klochko 2020, eqs. 10-11), by the pseudo-inverse where the system cannot carry all six.
+/// (Klochko 2020, eqs. 10-11), by the pseudo-inverse where the system does not determine all six.
 ///
-/// The system is regular only if the three times differ and the lines do not lie in a plane (`det
-/// A = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the lines,
+/// The system is regular only if the three times differ and the lines do not lie in a plane (`det A
+/// = -dt2 dt3 (dt3 - dt2) det[a1 a2' a3']`). The rank is decided against the noise of the lines,
 /// their deviation times the range: unknowns are scaled by the range and by `velocity_scale`, and a
 /// singular direction counts if the noise leaves it better known than its scale. `None` if even the
 /// first two lines are parallel.
@@ -19,6 +19,7 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
     let [dt2, dt3] = [second, third].map(|l| l.time.seconds_since(first.time));
 
     let mut a = Matrix6::zeros();
+    // Rows of line k: r1 a1 - r_k a_k' + V dt_k = b_k.
     for (rows, line_column, line, dt) in [(0, 1, a2, dt2), (3, 2, a3, dt3)] {
         a.fixed_view_mut::<3, 1>(rows, 0).copy_from(&a1);
         a.fixed_view_mut::<3, 1>(rows, line_column).copy_from(&-line);
@@ -46,12 +47,14 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
         let combination: Vec<f64> = v_t.row(worst).iter().copied().collect();
         WeakAxis::of_ranges(&combination, &lines.map(|l| l.line.direction))
     });
+    // Of the system as it is, not of the scaled one.
     observability.condition_number = condition_number(&a);
 
     let x = if observability.is_full() {
         a.lu().solve(&b)?
     } else {
         let largest = values.max();
+        // Pseudo-inverse: a singular direction that the noise hides stays at zero.
         let projected = u.transpose() * b;
         let kept = Vector6::from_fn(|i, _| {
             if determined(values[i], noise, largest) { projected[i] / values[i] } else { 0.0 }
@@ -59,6 +62,7 @@ pub fn triple(lines: [&TimedLine; 3], velocity_scale: f64) -> Option<RangeSoluti
         scale * v_t.transpose() * kept
     };
     let velocity = Vector3::new(x[3], x[4], x[5]);
+    // The position is refined by the first pair, with the displacement V dt2 removed.
     let refined = pair(first, second, velocity * dt2)?;
     Some(RangeSolution {
         ranges: vec![x[0], x[1], x[2]],

@@ -3,12 +3,12 @@ use nalgebra::{Matrix2x6, Matrix6, Point3, Vector6};
 
 use super::{Observability, TimedLine};
 
-/// Re-weightings at most: the ranges settle to a part in a million after three.
+/// Most re-weightings: the ranges settle to a part in a million after three.
 const ITERATIONS: usize = 4;
-/// The ranges have settled when the state moves by less than this share of the nearest.
+/// The ranges have settled when the position moves by less than this share of the nearest range.
 const SETTLED: f64 = 1e-5;
 
-/// Position and velocity with the greatest posterior density.
+/// Maximum a posteriori solution for position and velocity.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapSolution {
     /// The state at the reference time, with its posterior covariance.
@@ -16,25 +16,25 @@ pub struct MapSolution {
     /// Sum of squared normalised residuals, the prior's included: chi-square with
     /// `2 n - 3` degrees of freedom for n true lines.
     pub chi_square: f64,
-    /// Fisher information of the lines alone, and the scales that it is held against, m and m/s.
+    /// Fisher information of the lines alone, and the scales that it is compared with, m and m/s.
     information: Matrix6<f64>,
     scales: (f64, f64),
 }
 
 impl MapSolution {
-    /// What the lines alone say, against the prior scales: the farthest line's length and the
-    /// velocity prior. Not computed with the solution, as eigenvalues cost more than that.
+    /// Observability by the lines alone, against the prior scales: the farthest line's length and
+    /// the velocity prior. Not computed with the solution, as eigenvalues cost more than that.
     pub fn observability(&self) -> Observability {
         Observability::of_information(&self.information, self.scales.0, self.scales.1)
     }
 }
 
-/// The weighted solution for any number of lines of any times: position and velocity at
+/// The weighted solution for any number of lines at any times: position and velocity at
 /// `reference`, with a zero-mean prior of `velocity_sd` (m/s per axis) on the velocity.
 ///
-/// Where the papers' system is regular this is its solution, weighted by what each line is worth;
-/// where it is not, the prior stands in for what cannot be seen. `None` for fewer than two lines,
-/// or if they do not meet in front of the cameras.
+/// Where the papers' system is regular this is its solution, with each line weighted by its
+/// information; where it is not, the prior stands in for what cannot be observed. `None` for fewer
+/// than two lines, or if they do not meet in front of the cameras.
 pub fn map(
     lines: &[TimedLine],
     reference: crossfix_message::Timestamp,
@@ -60,10 +60,10 @@ pub fn map(
             let offset = |x: &Vector6<f64>| {
                 Point3::from(x.fixed_rows::<3>(0) + x.fixed_rows::<3>(3) * dt) - line.origin
             };
-            // The first round weighs all lines as if they were of one range.
+            // The first iteration weights all lines as if they had the same range.
             let range = state.as_ref().map_or(1.0, |x| offset(x).dot(&line.direction).max(1e-3));
             nearest = nearest.min(range);
-            // E' (p + v dt - c) / range = 0
+            // With the tangents E, H x = z is linear in the state: E' (p + v dt - c) / range = 0.
             let tangents = line.basis.transpose() / range;
             let mut h = Matrix2x6::zeros();
             h.fixed_view_mut::<2, 3>(0, 0).copy_from(&tangents);
@@ -72,6 +72,7 @@ pub fn map(
                 if state.is_some() { timed.noise_at(range, velocity_sd) } else { line.covariance };
             let weight = noise.try_inverse()?;
             let target = tangents * line.origin.coords;
+            // Normal equations: the sums of H' W H and of H' W z.
             data += h.transpose() * weight * h;
             right += h.transpose() * weight * target;
             if let Some(x) = &state {
@@ -82,10 +83,12 @@ pub fn map(
         if let Some(x) = &state {
             chi_square = squares + (x.transpose() * prior * x).x;
         }
+        // x = (H' W H + P0^-1)^-1 H' W z, where the prior has zero mean.
         let next = (data + prior).cholesky()?.solve(&right);
         let moved = state.map_or(f64::INFINITY, |x| (next - x).fixed_rows::<3>(0).norm());
         state = Some(next);
-        // Squares are of the round before: it may not have been far off.
+        // The squares are of the state before this step: it must hardly have been off when the loop
+        // ends.
         if moved < SETTLED * nearest {
             break;
         }
@@ -96,7 +99,7 @@ pub fn map(
         .map(|l| (l.line.origin.coords - mean.fixed_rows::<3>(0)).norm())
         .fold(0.0, f64::max);
     in_front(lines, reference, &mean).then_some(())?;
-    // A nearly singular system is inverted to something that rounding leaves not quite symmetric.
+    // Rounding leaves the inverse of a nearly singular system not quite symmetric.
     let inverse = (data + prior).cholesky()?.inverse();
     let covariance = (inverse + inverse.transpose()) / 2.0;
     Some(MapSolution {

@@ -31,14 +31,13 @@ pub struct TimedLine {
 }
 
 impl TimedLine {
-    /// A line of which time and origin are known exactly.
+    /// A line whose time and origin are known exactly.
     pub fn exact(line: SightLine, time: Timestamp) -> Self {
         Self { line, time, time_sd_s: 0.0, origin_sd_m: 0.0 }
     }
 
     /// Covariance of the direction to a target at `range` whose velocity has a prior of
-    /// `velocity_sd` (m/s per axis): the line's own, and what the uncertainty of its time and origin
-    /// adds.
+    /// `velocity_sd` (m/s per axis): the line's own, plus what its uncertain time and origin add.
     pub(crate) fn noise_at(&self, range: f64, velocity_sd: f64) -> Matrix2<f64> {
         let variance =
             (velocity_sd * TYPICAL_SPEED * self.time_sd_s).powi(2) + self.origin_sd_m.powi(2);
@@ -46,10 +45,10 @@ impl TimedLine {
     }
 }
 
-/// A sight line's name: camera, sequence number of the frame, place in the frame.
+/// Identity of a sight line: camera, sequence number of the frame, index in the frame.
 pub type LineId = (CameraName, u64, usize);
 
-/// One period's solution: where something was, and how fast.
+/// Solution of one period: where something was, and how fast.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fix {
     /// The state's time: that of the newest line.
@@ -58,7 +57,7 @@ pub struct Fix {
     pub state: KinematicState,
     /// Whether the velocity was solved for, or is only the prior's zero.
     pub velocity: VelocityKnowledge,
-    /// What made it.
+    /// Solver that has found it.
     pub solver: crossfix_message::Solver,
     /// How well the system was conditioned.
     pub observability: Observability,
@@ -73,15 +72,16 @@ pub enum VelocityKnowledge {
     Unknown,
 }
 
-/// How fast most targets are, as a share of the velocity prior, which is wide enough for the
-/// fastest: what an unsure clock moves a line by. With the whole of it the lines of unsure clocks
+/// Speed of most targets as a share of the velocity prior, which is wide enough for the fastest: it
+/// sets how far an uncertain clock moves a line. With the whole prior the lines of uncertain clocks
 /// would meet anywhere.
 pub(crate) const TYPICAL_SPEED: f64 = 0.3;
 
-/// Standard deviation of a velocity prior that says nothing: faster than any UAV, m/s per axis.
+/// Standard deviation of an uninformative velocity prior, m/s per axis: faster than any UAV.
 pub(crate) const VAGUE_VELOCITY_SD: f64 = 100.0;
 
-/// The squared distance that a true value of `dimensions` stays within with probability `p`.
+/// The squared Mahalanobis distance within which a true value of `dimensions` lies with probability
+/// `p`.
 pub(crate) fn chi_square(p: f64, dimensions: usize) -> f64 {
     // A positive number of degrees of freedom is all that the distribution asks for.
     ChiSquared::new(dimensions as f64)
@@ -95,7 +95,7 @@ pub(crate) mod tests_support {
 
     use super::*;
 
-    /// 0.1 m at 150 m.
+    /// Standard deviation of a direction per tangent, rad: 0.1 m at 150 m.
     pub(crate) const SIGMA: f64 = 0.1 / 150.0;
 
     /// Cameras 150 m from the origin whose lines of sight to it are mutually orthogonal.

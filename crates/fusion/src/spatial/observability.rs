@@ -3,17 +3,18 @@ use nalgebra::{Matrix6, Unit, Vector3, Vector6};
 /// How much a system of equations says about its unknowns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observability {
-    /// Unknowns, or combinations of them, that the data determine better than the prior scale.
+    /// Number of unknowns, or combinations of them, that the data determine better than the prior
+    /// scale.
     pub rank: usize,
     /// Number of unknowns.
     pub unknowns: usize,
-    /// Largest singular value of the system by the smallest; infinite if that is 0.
+    /// Largest singular value of the system over the smallest; infinite if that is 0.
     pub condition_number: f64,
-    /// What the data say least about; `None` if they say enough about everything.
+    /// Combination that the data determine least; `None` if they determine everything well enough.
     pub weak_axis: Option<WeakAxis>,
 }
 
-/// What a combination of unknowns is of, for its greater part.
+/// The quantity that makes up the greater part of a combination of unknowns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Quantity {
     /// The position, or a range.
@@ -26,11 +27,11 @@ pub enum Quantity {
 
 /// The worst determined combination of the unknowns of a degenerate system.
 ///
-/// Unknowns are compared in units of what is known of them beforehand: the combination is the
-/// singular vector of the scaled system, and this is the greatest part of it.
+/// Unknowns are compared in units of their prior scales: the combination is the singular vector of
+/// the scaled system, and this is the greatest part of it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WeakAxis {
-    /// What cannot be seen.
+    /// The quantity that cannot be observed.
     pub quantity: Quantity,
     /// Along which line, world frame; its greatest component is positive.
     pub direction: Unit<Vector3<f64>>,
@@ -45,8 +46,8 @@ impl WeakAxis {
         Some(Self { quantity, direction: Unit::new_unchecked(direction.into_inner() * sign) })
     }
 
-    /// Of a combination of ranges and then velocity, acceleration: a range that is not known is a
-    /// place on that range's line that is not known.
+    /// The same for a combination of ranges followed by velocity, then acceleration: a range that
+    /// is not known is a place on that range's line that is not known.
     pub(crate) fn of_ranges(
         combination: &[f64],
         directions: &[Unit<Vector3<f64>>],
@@ -67,28 +68,28 @@ impl WeakAxis {
 }
 
 impl Observability {
-    /// Of a system in which everything can be seen.
+    /// Of a system in which everything can be observed.
     pub fn full(unknowns: usize, condition_number: f64) -> Self {
         Self { rank: unknowns, unknowns, condition_number, weak_axis: None }
     }
 
-    /// Of a system that nobody has looked at yet.
+    /// Of a system that has not been examined yet.
     pub(crate) fn unexamined(unknowns: usize) -> Self {
         Self { rank: 0, unknowns, condition_number: f64::INFINITY, weak_axis: None }
     }
 
-    /// Whether everything asked for can be seen.
+    /// Whether all unknowns can be observed.
     pub fn is_full(&self) -> bool {
         self.rank == self.unknowns
     }
 
-    /// Of the singular values of a system whose unknowns are scaled to 1 and whose right-hand side
-    /// is in metres, against the noise of the right-hand side in metres.
+    /// From the singular values of a system whose unknowns are scaled to 1 and whose right-hand
+    /// side is in metres, compared with the noise of the right-hand side in metres.
     ///
     /// A direction of singular value s is known to `noise / s` of its scale; beyond 1 the prior
     /// scale knows better. A fixed threshold on the condition number does not do: noise makes a
-    /// singular system look regular. `weak_axis` is asked, if the rank is not full, for what the
-    /// singular vector of that place means.
+    /// singular system look regular. If the rank is not full, `weak_axis` is called with the index
+    /// of the least singular value and says what its singular vector means.
     pub(crate) fn of_singular_values(
         values: &[f64],
         noise: f64,
@@ -107,7 +108,7 @@ impl Observability {
         }
     }
 
-    /// Of a position and velocity whose data have given Fisher information, against prior scales.
+    /// From the data's Fisher information on position and velocity, compared with prior scales.
     pub fn of_information(
         information: &Matrix6<f64>,
         position_scale: f64,
@@ -116,6 +117,7 @@ impl Observability {
         let [p, v] = [position_scale, velocity_scale];
         let scale = Matrix6::from_diagonal(&Vector6::new(p, p, p, v, v, v));
         let scaled = scale * information * scale;
+        // The singular values of the scaled and whitened system, whose noise is 1.
         let singular = |eigenvalue: &f64| eigenvalue.max(0.0).sqrt();
         let values: Vec<f64> = scaled.symmetric_eigenvalues().iter().map(singular).collect();
         Self::of_singular_values(&values, 1.0, |_| {
@@ -128,7 +130,7 @@ impl Observability {
     }
 }
 
-/// Whether a direction of a singular value is determined by the data.
+/// Whether the data determine the direction of a singular value.
 pub(crate) fn determined(value: f64, noise: f64, largest: f64) -> bool {
     value > noise.max(largest * 1e-12)
 }

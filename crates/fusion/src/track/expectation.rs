@@ -1,4 +1,4 @@
-//! What a camera should see of a track.
+//! The predicted bearing of a track for one camera.
 
 use crossfix_filter::{Gate, KinematicState};
 use crossfix_geometry::SightLine;
@@ -11,28 +11,29 @@ use crate::prediction::{BearingPrediction, Fit};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 use crate::update::{Measured, Updated, VAGUE_LOG_RANGE_SD, updated};
 
-/// What a camera should see of a track.
+/// The predicted bearing of a track for one camera.
 // Made and used in one exposure: never stored, so the size of the larger variant costs nothing.
 #[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
 pub(crate) enum Expectation {
-    /// The range is known: one direction with its covariance.
+    /// The range is known: one predicted direction with its covariance.
     Near(BearingPrediction),
-    /// It is not: a stripe along another camera's sight line. Each bearing is tried by an update.
+    /// The range is unknown: the prediction is a stripe along another camera's sight line, and each
+    /// bearing is tried by an update.
     Along {
         /// The track's state at the exposure's time.
         state: KinematicState,
-        /// Where the camera stands that follows the target.
+        /// Position of the camera that alone follows the target.
         seen_from: Point3<f64>,
-        /// The camera that looks now, ...
+        /// The uncertainty of the camera that is exposed now, ...
         camera: CameraUncertainty,
-        /// ... and what the track knows of its errors.
+        /// ... and what the track knows of that camera's errors.
         errors: SharedErrors,
     },
 }
 
 impl Expectation {
-    /// How a bearing fits; `None` if it lies outside the gate.
+    /// How well a bearing fits; `None` if it lies outside the gate.
     pub(crate) fn fit(&self, line: &SightLine, gate: Gate) -> Option<Fit> {
         match self {
             Self::Near(prediction) => prediction.fit(line, gate),
@@ -51,7 +52,8 @@ impl Expectation {
 }
 
 impl Track {
-    /// What a camera at `origin` should see at a time.
+    /// The predicted bearing at a time for a camera at `origin`; `None` if the target would be at
+    /// the camera itself.
     pub(crate) fn expectation(
         &self,
         time: Timestamp,

@@ -1,4 +1,4 @@
-//! A bearing against what is expected of it.
+//! The innovation of a bearing: measured less predicted.
 
 use crossfix_filter::KinematicState;
 use crossfix_geometry::{BearingModel, SightLine};
@@ -9,13 +9,13 @@ use super::Track;
 use crate::motion::{Detector, Motion};
 use crate::uncertainty::{CameraUncertainty, SharedErrors};
 
-/// A bearing against what is expected of it.
+/// The innovation of a bearing.
 pub(super) struct Innovation {
     pub(super) offset: Vector2<f64>,
     pub(super) model: BearingModel,
 }
 
-/// A bearing and the state that is expected at its time.
+/// A bearing, and the predicted state at its time.
 struct Against<'a> {
     before: &'a KinematicState,
     line: &'a SightLine,
@@ -29,8 +29,8 @@ impl Against<'_> {
         let Innovation { offset, model } = innovation;
         let by = model.by_position();
         let shifts = self.uncertainty.shifts(model, self.before.velocity());
-        // S = H P H' + H C s' + s C' H' + s W s' + f R: the camera's errors s are in the bearing and,
-        // by the bearings that it has given before (C), in the track.
+        // S = H P H' + H X J' + J X' H' + J W J' + f R: the camera's errors (effect J, covariance
+        // W) are in the bearing and, by the camera's earlier bearings (X), also in the track.
         let cross = by * errors.ties.fixed_rows::<3>(0) * shifts.transpose();
         let spread = by * self.before.position_covariance() * by.transpose()
             + cross
@@ -44,14 +44,14 @@ impl Against<'_> {
 }
 
 impl Track {
-    /// A bearing against what is expected at its time.
+    /// The innovation of a bearing; `None` if it points away from the target.
     pub(super) fn innovation(&self, time: Timestamp, line: &SightLine) -> Option<Innovation> {
         let model = BearingModel::new(line.origin, self.position_at(time))?;
         Some(Innovation { offset: model.offset(line)?, model })
     }
 
-    /// Its squared Mahalanobis distance, where the camera's reported covariances count as often as
-    /// they are found to.
+    /// The innovation's squared Mahalanobis distance; the reported covariance counts by the factor
+    /// that was found for the camera.
     fn nis(
         &self,
         innovation: &Innovation,
@@ -66,8 +66,8 @@ impl Track {
         Some(against.distance(innovation, &errors)?.0)
     }
 
-    /// What is known of a camera's errors where a bearing tells that those that last have been drawn
-    /// anew.
+    /// What is known of a camera's errors if this bearing makes it likelier that the lasting ones
+    /// have been drawn again; `None` if it does not.
     pub(super) fn renewed(
         &self,
         innovation: &Innovation,
@@ -79,6 +79,7 @@ impl Track {
         let (anew, probability) = errors.renewed()?;
         let before = self.imm.predicted(interval, motion.models(self.ranged));
         let against = Against { before: &before, line, uncertainty };
+        // ln of probability times normal density; the constant 2 pi is common to both cases.
         let log_likelihood = |errors: &SharedErrors, probability: f64| {
             let (squared, determinant) = against.distance(innovation, errors)?;
             Some(probability.ln() - (squared + determinant.ln()) / 2.0)
@@ -87,7 +88,7 @@ impl Track {
         (log_likelihood(&anew, probability) > went_on).then_some(anew)
     }
 
-    /// Whether a detector sees in a bearing that the target has begun to manoeuvre.
+    /// Whether the manoeuvre detector fires on a bearing.
     pub(super) fn sees_manoeuvre(
         &mut self,
         innovation: &Innovation,

@@ -1,10 +1,15 @@
-//! What a track's bearings tell of the errors that last.
+//! Estimation of the lasting errors: those that a camera's bearings of one target keep for a while.
 //!
-//! A tracker that sits beside a target's middle does so for a while. The next bearing has all but a
-//! little of that error, so what changes between two bearings of a camera is known far better than
-//! where they point, and with it the velocity. For that the error must be estimated beside position
-//! and velocity. One that is only considered, as those of pose and clock are, stands in each
-//! bearing with all of its variance.
+//! An image tracker that sits beside a target's middle does so for a while. The next bearing then
+//! has nearly the same error, so what changes between two bearings of a camera is known far better
+//! than where they point, and with it the velocity. To use that, the error must be estimated along
+//! with position and velocity. An error that is only considered (Schmidt), as those of pose and
+//! clock are, counts in each bearing with its full variance.
+//!
+//! Notation: e are the learnt (estimated) lasting errors, two per camera; s_k all shared errors of
+//! camera k, each in units of its own standard deviation; W = cov(e).
+//! X_k = cov(state, s_k) and L_k = cov(e, s_k); if camera k is learnt, the last two columns of
+//! L_k are part of W. A bearing has the Jacobians H by the state and J by its camera's errors.
 
 use crossfix_message::{CameraName, Timestamp};
 use nalgebra::{DMatrix, Dyn, Matrix2, Matrix6, OMatrix, U2, U5, U6, Vector2};
@@ -13,18 +18,19 @@ use super::{Ties, Track};
 use crate::uncertainty::{CONSIDERED, LASTING, LastingNoise, SharedCovariance, SharedErrors};
 use crate::update::Told;
 
-/// Of so many cameras a track learns the errors at most, as an update's cost grows with the square
-/// of their number; those of the others are considered. With half as many a site of six cameras errs
-/// by 1 % more in velocity.
+/// Most cameras whose lasting errors a track learns, as an update's cost grows with the square of
+/// their number; the errors of the others are considered. With half as many, the velocities of a
+/// site of six cameras err by 1 % more.
 const MOST_LEARNT: usize = 8;
-/// After so many of the times for which an error lasts, what has been learnt of it is gone (e^-5),
-/// and another camera's may take its place.
+/// After this many decay times of an error nothing is left of what has been learnt of it (e^-5),
+/// and another camera may take its place.
 const FORGOTTEN: f64 = 5.0;
 
-/// Covariance of the learnt errors with those that the bearings of one camera share.
+/// L_k: covariance of the learnt errors with the shared errors of one camera.
 pub(super) type LearntTies = OMatrix<f64, Dyn, U5>;
 
-/// Whose errors a track learns, and what they are thought to be, in their own deviations.
+/// The cameras whose lasting errors a track learns, and the estimates, in units of the errors' own
+/// deviations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Learnt {
     cameras: Vec<CameraName>,
@@ -36,12 +42,12 @@ impl Learnt {
         self.cameras.is_empty()
     }
 
-    /// How many errors they are.
+    /// Number of learnt errors.
     fn count(&self) -> usize {
         2 * self.cameras.len()
     }
 
-    /// Which rows of a covariance are a camera's: this one and the next.
+    /// The first of the two rows that a camera has in the covariances.
     fn row_of(&self, camera: &CameraName) -> Option<usize> {
         self.cameras.iter().position(|name| name == camera).map(|place| 2 * place)
     }
@@ -53,7 +59,7 @@ impl Learnt {
 }
 
 impl Track {
-    /// What is known of the errors that a camera's bearings share, `interval` seconds on.
+    /// What is known of a camera's shared errors, `interval` seconds after the track's last update.
     pub(super) fn errors_of(&self, camera: &CameraName, interval: f64) -> SharedErrors {
         let Some(ties) = self.ties.get(camera) else {
             return SharedErrors::unknown();
@@ -63,6 +69,7 @@ impl Track {
             let kept = ties.kept(interval);
             let known = ties.learnt.fixed_rows::<2>(row);
             let mean = self.learnt.means[row / 2] * kept;
+            // First-order Gauss-Markov: e' = k e + noise, W' = k^2 W + (1 - k^2) I.
             let own = known.fixed_columns::<2>(LASTING) * kept.powi(2)
                 + Matrix2::identity() * (1.0 - kept.powi(2));
             let considered = known.fixed_columns::<CONSIDERED>(0) * kept;
@@ -73,19 +80,19 @@ impl Track {
                 .fixed_view_mut::<CONSIDERED, 2>(0, LASTING)
                 .copy_from(&considered.transpose());
             errors.mean.fixed_rows_mut::<2>(LASTING).copy_from(&mean);
-            // An error that lasts T ends at a rate of 1/T.
+            // An error with decay time T is drawn again at a rate of 1/T: P = 1 - exp(-t / T).
             let silent_s = ties.silent_s(self.updated).unwrap_or(0.0) + interval;
             errors.renewal = Some(1.0 - ties.kept(silent_s));
         }
         errors
     }
 
-    /// The ties of a camera's errors with the learnt ones, where there are none yet.
+    /// Covariance of the learnt errors with those of a camera that has no ties yet: zero.
     pub(super) fn untied(&self) -> LearntTies {
         LearntTies::zeros(self.learnt.count())
     }
 
-    /// Takes all ties, and what is known of the errors that last, `interval` seconds on.
+    /// Predicts all ties and learnt errors over `interval` seconds.
     pub(super) fn pass(&mut self, interval: f64) {
         let kept: Vec<f64> = self
             .learnt
@@ -101,6 +108,8 @@ impl Track {
             if kept.is_empty() {
                 continue;
             }
+            // Each lasting error decays with its own factor k: columns by this camera's, rows by
+            // the row's camera, and (1 - k^2) I of new error in the camera's own block.
             let own_kept = ties.kept(interval);
             let mut lasting = ties.learnt.fixed_columns_mut::<2>(LASTING);
             lasting *= own_kept;
@@ -115,8 +124,8 @@ impl Track {
         }
     }
 
-    /// Makes room for what is to be learnt of a camera's errors, if they last and the track is sure
-    /// to be a target's: while it is weighed against clutter, they are considered.
+    /// Begins to learn a camera's lasting errors, if it has any and the track is confirmed: while
+    /// the track is still weighed against clutter, they are only considered.
     pub(super) fn begin_to_learn(
         &mut self,
         camera: &CameraName,
@@ -133,7 +142,8 @@ impl Track {
         self.learnt.cameras.push(camera.clone());
         self.learnt.means.push(Vector2::zeros());
         let count = self.learnt.count();
-        // While it was considered its errors may have come to go with learnt ones.
+        // While this camera's errors were only considered they may have become correlated with
+        // learnt ones.
         let known =
             self.ties.get(camera).map_or_else(|| LearntTies::zeros(0), |t| t.learnt.clone());
         for (name, ties) in &mut self.ties {
@@ -148,12 +158,13 @@ impl Track {
         }
     }
 
-    /// Whether a camera's errors that last are learnt.
+    /// Whether a camera's lasting errors are learnt.
     pub(super) fn learns(&self, camera: &CameraName) -> bool {
         self.learnt.row_of(camera).is_some()
     }
 
-    /// The covariance of the learnt errors, as each camera's ties hold its columns.
+    /// The covariance of the learnt errors, put together from the columns that each camera's ties
+    /// hold.
     fn learnt_covariance(&self) -> Option<DMatrix<f64>> {
         let count = self.learnt.count();
         let mut own = DMatrix::<f64>::zeros(count, count);
@@ -164,7 +175,8 @@ impl Track {
         Some(own)
     }
 
-    /// The rows of a camera that has been silent for so long that nothing is left to know.
+    /// The first row of a camera that has been silent for so long that nothing is left of what was
+    /// learnt of its errors.
     fn forgotten(&self, now: Timestamp) -> Option<usize> {
         let is_forgotten = |name: &CameraName| {
             self.ties.get(name).is_none_or(|ties| {
@@ -174,6 +186,7 @@ impl Track {
         self.learnt.rows().find(|(_, name)| is_forgotten(name)).map(|(row, _)| row)
     }
 
+    /// Stops learning the errors in these two rows.
     fn forget(&mut self, row: usize) {
         self.learnt.cameras.remove(row / 2);
         self.learnt.means.remove(row / 2);
@@ -183,7 +196,7 @@ impl Track {
         }
     }
 
-    /// Takes a camera's errors that last for drawn anew: nothing is known of them.
+    /// Resets a camera's lasting errors: they have been drawn again, and nothing is known of them.
     pub(super) fn renew(&mut self, camera: &CameraName) {
         self.renew_past(camera);
         let Some(row) = self.learnt.row_of(camera) else { return };
@@ -198,17 +211,18 @@ impl Track {
         }
     }
 
-    /// Takes all errors that last for unknown again.
+    /// Stops learning all lasting errors: nothing is known of them.
     fn forget_all(&mut self) {
         self.learnt = Learnt::default();
         self.ties.values_mut().for_each(|ties| ties.learnt = LearntTies::zeros(0));
     }
 
-    /// Carries the ties to all cameras' errors through a bearing of one of them, and learns of those
-    /// that last.
+    /// Updates the ties to all cameras' errors with a bearing of one camera, and the estimates of
+    /// the lasting errors.
     pub(super) fn learn(&mut self, camera: &CameraName, told: &Told) {
         if self.learnt.is_empty() {
-            // No camera's errors go with another's.
+            // Without learnt errors no camera's errors are correlated with another's:
+            // X <- (I - K H) X, and for the bearing's own camera X <- (I - K H) X - K J.
             for (name, ties) in &mut self.ties {
                 ties.covariance = told.carried * ties.covariance;
                 if name == camera {
@@ -217,6 +231,9 @@ impl Track {
             }
             return;
         }
+        // A = cov(e, bearing). Means: e += A S^-1 z. Covariances: the usual gain A S^-1, less the
+        // spread of S^-1 z over the models where a covariance between estimated quantities is
+        // reduced.
         let across = self.across(camera, told);
         let gain = &across * told.weight;
         let known = &across * (told.weight - told.pull_spread);
@@ -226,6 +243,8 @@ impl Track {
             *mean += across.fixed_rows::<2>(row) * told.pull;
         }
         for ((name, ties), between) in self.ties.iter_mut().zip(&between) {
+            // cov(bearing, s_k) = H X_k + J cov(s, s_k)
+            // X_k <- (I - K H) X_k - K J cov(s, s_k)
             let seen = told.by * ties.covariance + told.shifts * between;
             ties.covariance = told.carried * ties.covariance - told.gained * between;
             match self.learnt.row_of(name) {
@@ -244,7 +263,7 @@ impl Track {
         self.balance();
     }
 
-    /// Makes the covariance of the learnt errors its own transpose again: rounding grows.
+    /// Makes the covariance of the learnt errors symmetric again: rounding errors would grow.
     fn balance(&mut self) {
         let Some(own) = self.learnt_covariance() else { return };
         let own = (&own + own.transpose()) * 0.5;
@@ -256,7 +275,7 @@ impl Track {
         }
     }
 
-    /// Covariance of the learnt errors with a bearing of a camera.
+    /// Covariance A of the learnt errors with a bearing of a camera: A = L J' + X' H'.
     fn across(&self, camera: &CameraName, told: &Told) -> OMatrix<f64, Dyn, U2> {
         let Some(own) = self.ties.get(camera) else {
             return OMatrix::<f64, Dyn, U2>::zeros(self.learnt.count());
@@ -272,7 +291,7 @@ impl Track {
         across
     }
 
-    /// Covariance of the shared errors of one camera with those of another.
+    /// Covariance of the shared errors of two cameras, which may be the same one.
     pub(super) fn between(&self, one: &CameraName, other: &CameraName) -> SharedCovariance {
         if one == other {
             return self.errors_of(one, 0.0).covariance;
@@ -289,9 +308,9 @@ impl Track {
         between
     }
 
-    /// One of a camera's considered errors, or several from `first` on, has been found to have
-    /// `ratio` times its variance, and what it does to the track with it; `scale` is what becomes of
-    /// the ties. Returns what the state's covariance changes by.
+    /// Passes on that `N` considered errors of a camera, from `first` on, have `ratio` times the
+    /// variance that was assumed; `scale` is the factor on their ties. What is correlated with them
+    /// changes accordingly. Returns the change of the state's covariance, (ratio - 1) X X'.
     pub(super) fn rescale<const N: usize>(
         &mut self,
         camera: &CameraName,
@@ -307,6 +326,7 @@ impl Track {
         columns *= scale;
         for (row, name) in self.learnt.rows() {
             if let Some(ties) = self.ties.get_mut(name) {
+                // cov(e) += (q - 1) L L' and cov(state, e) += (q - 1) X L', by columns.
                 let own = learnt.fixed_rows::<2>(row).transpose() * (ratio - 1.0);
                 let mut lasting = ties.learnt.fixed_columns_mut::<2>(LASTING);
                 lasting += &learnt * own;
@@ -318,7 +338,8 @@ impl Track {
         Some(state * state.transpose() * (ratio - 1.0))
     }
 
-    /// A camera's considered error has been found to be `ahead` of its own deviations.
+    /// Passes on that a camera's considered error was found to be `ahead` of its own deviations:
+    /// the estimates move by L times that.
     pub(super) fn shift_learnt(&mut self, camera: &CameraName, error: usize, ahead: f64) {
         let Some(ties) = self.ties.get(camera) else { return };
         for (mean, row) in self.learnt.means.iter_mut().zip((0..).step_by(2)) {
@@ -326,10 +347,11 @@ impl Track {
         }
     }
 
-    /// What the shared errors do to the state: no less can be unknown of it. Where rounding has left
-    /// less than nothing of the learnt ones, they are taken for unknown again.
+    /// The part of the state's covariance that the shared errors cause, which is its lower bound.
+    /// If rounding has made the learnt errors' covariance indefinite, they are reset.
     pub(super) fn shared_part(&mut self) -> Matrix6<f64> {
-        // Summed by size and not by the cameras' names: what is nearly singular magnifies rounding.
+        // Summed by size and not by the cameras' names, so that names decide no rounding: a nearly
+        // singular matrix magnifies it.
         let sum = |mut parts: Vec<Matrix6<f64>>| -> Matrix6<f64> {
             parts.sort_by(|one, other| one.trace().total_cmp(&other.trace()));
             parts.iter().sum()
@@ -351,8 +373,8 @@ impl Track {
         }
     }
 
-    /// What the learnt errors do to the state beside those that are considered; `None` if by their
-    /// numbers there is less than nothing to know of them.
+    /// The part that the learnt errors cause beyond the considered ones; `None` if their covariance
+    /// is not positive definite.
     fn learnt_part(&self) -> Option<Matrix6<f64>> {
         if self.learnt.is_empty() {
             return Some(Matrix6::zeros());
@@ -363,6 +385,9 @@ impl Track {
             let columns = self.ties.get(name)?.covariance.fixed_columns::<2>(LASTING);
             tied.fixed_columns_mut::<2>(row).copy_from(&columns);
         }
+        // With B = cov(e, considered), conditional on the considered errors e has the covariance W
+        // - B B' and X_e - X_s B' with the state. The part is
+        // (X_e - X_s B') (W - B B')^-1 (X_e - X_s B')'.
         for (name, ties) in &self.ties {
             let mut with = ties.learnt.clone();
             if self.learnt.row_of(name).is_some() {

@@ -1,8 +1,8 @@
-//! Where a track was, as the bearings since have told: a smoother of fixed lag.
+//! Fixed-lag smoothing: where a track was, as the later bearings tell.
 //!
-//! A state that has gone out is kept as one more thing that is unknown, tied to where the target is
-//! now and to the cameras' errors. Each bearing then tells of it what it tells of any error that is
-//! learnt, with what poses and clocks may be off by considered as in the track itself.
+//! A published state is kept as one more unknown, correlated with the present state and with the
+//! cameras' errors. Each bearing then updates it as it updates a learnt error ([`super::learnt`]),
+//! with the errors of poses and clocks considered as in the track itself.
 
 use crossfix_filter::KinematicState;
 use crossfix_message::{CameraName, Timestamp};
@@ -13,26 +13,26 @@ use crate::motion::Motion;
 use crate::uncertainty::{LASTING, SharedTies};
 use crate::update::Told;
 
-/// Where it is tells no more than this share of what is unknown of where it was: rounding takes the
-/// rest.
+/// Upper limit of the share of a past state's covariance that the present state explains: rounding
+/// takes the rest.
 const CLOSEST: f64 = 1.0 - 1e-9;
 
-/// Where a track was at a time.
+/// The state of a track at an earlier time, with what later bearings tell of it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Past {
     time: Timestamp,
     state: KinematicState,
-    /// Covariance of where the track is at `carried_to` with where it was.
+    /// Covariance of the track's state at `carried_to` (rows) with this past state (columns).
     with_now: Matrix6<f64>,
     carried_to: Timestamp,
-    /// Whether nothing more is told of it.
+    /// Whether it no longer changes.
     is_settled: bool,
-    /// What ties it to the shared errors of each camera; in the order of their names.
+    /// Covariance of the past state with the shared errors of each camera, ordered by name.
     ties: Vec<(CameraName, SharedTies)>,
 }
 
 impl Past {
-    /// Goes on with the target to a time.
+    /// Carries `with_now` on to a later present time: the position moves with the velocity.
     fn pass(&mut self, to: Timestamp, interval: f64) {
         let velocity = self.with_now.fixed_rows::<3>(3).into_owned();
         let mut position = self.with_now.fixed_rows_mut::<3>(0);
@@ -51,20 +51,25 @@ impl Past {
         &mut self.ties[place].1
     }
 
-    /// Takes in a bearing of a camera; what it tells of each camera's errors is `seen`.
+    /// Updates the past state with a bearing of a camera; `seen` says how the bearing is correlated
+    /// with each camera's errors.
     fn learn(&mut self, camera: &CameraName, told: &Told, seen: &[Seen<'_>]) {
         let own = *self.ties_to(camera);
+        // A = cov(past, bearing) = N' H' + X J', with N = `with_now` and X the ties to the
+        // bearing's camera. Mean += A S^-1 z; covariance -= A (S^-1 - spread over the models) A'.
         let across: Matrix6x2<f64> =
             self.with_now.transpose() * told.by.transpose() + own * told.shifts.transpose();
         let known = across * (told.weight - told.pull_spread);
         let covariance = self.state.covariance - known * across.transpose();
         let covariance = (covariance + covariance.transpose()) / 2.0;
         if covariance.cholesky().is_none() {
-            // The mean over the models has promised too much: nothing more is believed.
+            // The mean over the models has promised more information than there is: the state is
+            // left as it is.
             return self.settle();
         }
         self.state.covariance = covariance;
         self.state.mean += across * told.pull;
+        // N <- (I - K H) N - K J X', and the covariance over the models of state and S^-1 z.
         self.with_now = told.carried * self.with_now - told.gained * own.transpose()
             + told.moved * across.transpose();
         let gain = across * told.weight;
@@ -81,16 +86,17 @@ impl Past {
         }
     }
 
-    /// Makes the tie to where the target is now no closer than two states can be tied, by the inverse
-    /// covariance of that: the models' weights change it otherwise than any bearing does, and what a
-    /// tie that is too close promises is not there.
+    /// Limits the covariance with the present state to what two states can have, given the inverse
+    /// of the present covariance, `now`: the models' weights change that covariance in ways that no
+    /// bearing explains, and a correlation that is too strong promises information that is not
+    /// there.
     fn keep_possible(&mut self, now: &Matrix6<f64>) {
         let explained = self.with_now.transpose() * now * self.with_now;
         if (self.state.covariance * CLOSEST - explained).cholesky().is_some() {
             return;
         }
-        // The largest eigenvalue of L^-1 E L^-T, with L L' the covariance and E what of it the tie
-        // explains.
+        // The largest eigenvalue of L^-1 E L^-T, with L L' the past covariance and E the part of it
+        // that the present state explains, N' P^-1 N.
         let largest = self.state.covariance.cholesky().and_then(|factor| {
             let half = factor.l().solve_lower_triangular(&explained)?;
             let whole = factor.l().solve_lower_triangular(&half.transpose())?;
@@ -102,7 +108,7 @@ impl Past {
         }
     }
 
-    /// Is told nothing more.
+    /// Freezes the state: no later bearing changes it.
     fn settle(&mut self) {
         self.is_settled = true;
         self.with_now = Matrix6::zeros();
@@ -110,16 +116,16 @@ impl Past {
     }
 }
 
-/// How a bearing goes with the shared errors of a camera.
+/// The covariance of a bearing with the shared errors of one camera.
 struct Seen<'a> {
     camera: &'a CameraName,
     by_errors: Matrix2x5<f64>,
-    /// Whether those that last are learnt.
+    /// Whether the camera's lasting errors are learnt.
     is_learnt: bool,
 }
 
 impl Track {
-    /// Keeps where the track is at a time, so that later bearings tell of it.
+    /// Stores the track's state at a time, so that later bearings can smooth it.
     pub(crate) fn remember(&mut self, time: Timestamp, motion: &Motion) {
         let state = self.predicted(time, motion);
         let interval = time.seconds_since(self.updated);
@@ -136,20 +142,20 @@ impl Track {
         });
     }
 
-    /// Where the track was at a time, if that is kept.
+    /// The smoothed state at a time, if it is stored.
     pub(crate) fn remembered(&self, time: Timestamp) -> Option<&KinematicState> {
         self.past.iter().find(|past| past.time == time).map(|past| &past.state)
     }
 
-    /// Keeps nothing of until a time.
+    /// Drops the stored states up to a time.
     pub(crate) fn forget_until(&mut self, time: Timestamp) {
         while self.past.front().is_some_and(|past| past.time <= time) {
             self.past.pop_front();
         }
     }
 
-    /// Takes over what another track of the same target has kept since this one has anything; nothing
-    /// more is told of it.
+    /// Takes over the stored states of another track of the same target that are newer than all of
+    /// this track's own, or all of them if it has none; they no longer change.
     pub(crate) fn inherit(&mut self, old: &mut Self) {
         let last = self.past.back().map(|past| past.time);
         let newer = old.past.drain(..).filter(|past| last.is_none_or(|last| past.time > last));
@@ -159,12 +165,12 @@ impl Track {
         }));
     }
 
-    /// What is kept and may still be told more of.
+    /// The stored states that later bearings still change.
     fn open_past(&mut self) -> impl Iterator<Item = &mut Past> {
         self.past.iter_mut().filter(|past| !past.is_settled)
     }
 
-    /// Takes what is kept on to a time.
+    /// Carries the stored states' correlations to a new present time.
     pub(super) fn pass_past(&mut self, to: Timestamp) {
         for past in self.past.iter_mut().filter(|past| !past.is_settled) {
             let interval = to.seconds_since(past.carried_to);
@@ -177,7 +183,8 @@ impl Track {
         }
     }
 
-    /// Takes a bearing of a camera in for all that is kept; before the ties themselves take it in.
+    /// Updates the stored states with a bearing; called before the track's own ties are updated
+    /// with it.
     pub(super) fn look_back(&mut self, camera: &CameraName, told: &Told) {
         if self.past.is_empty() {
             return;
@@ -203,19 +210,20 @@ impl Track {
         self.past = past;
     }
 
-    /// What is kept is no longer tied to where the target is: it may be anywhere.
+    /// Freezes all stored states: the target may now be anywhere, and later bearings tell nothing
+    /// of them.
     pub(super) fn settle_past(&mut self) {
         self.past.iter_mut().for_each(Past::settle);
     }
 
-    /// A camera's errors that last have been drawn anew.
+    /// Drops the stored states' ties to a camera's lasting errors, which have been drawn again.
     pub(super) fn renew_past(&mut self, camera: &CameraName) {
         for past in self.open_past() {
             past.ties_to(camera).fixed_columns_mut::<2>(LASTING).fill(0.0);
         }
     }
 
-    /// A camera's shared error has been found to be `ahead` of its own deviations, ...
+    /// Passes on that a camera's shared error was found to be `ahead` of its own deviations, ...
     pub(super) fn shift_past(&mut self, camera: &CameraName, error: usize, ahead: f64) {
         for past in self.open_past() {
             let moved: Vector6<f64> = past.ties_to(camera).column(error) * ahead;
@@ -223,8 +231,8 @@ impl Track {
         }
     }
 
-    /// ... and `N` of them, from `first` on, to have `ratio` times their variance, so that the ties
-    /// are `scale` times what they were.
+    /// ... and that `N` of them, from `first` on, have `ratio` times their variance; the ties
+    /// become `scale` times what they were. `with_now` is the present state's tie to these errors.
     pub(super) fn rescale_past<const N: usize>(
         &mut self,
         camera: &CameraName,

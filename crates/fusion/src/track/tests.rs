@@ -10,13 +10,13 @@ use crate::spatial::{VelocityKnowledge, map};
 use crate::uncertainty::LastingNoise;
 use crate::{Manoeuvres, Tracking};
 
-/// Mean NEES after `periods` of the papers' geometry, started from the MAP fix of the first.
+/// Mean NEES after five periods of the papers' geometry, started from the MAP fix of the first one.
 #[test]
 fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
     const RUNS: u32 = 1000;
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
-    // Next to no process noise: the truth flies straight, and the bound knows it.
+    // Almost no process noise: the truth flies straight, as the bound assumes.
     let tracking = Tracking {
         manoeuvres: Manoeuvres::None,
         acceleration_density: 1e-9,
@@ -64,12 +64,12 @@ fn single_bearings_reach_the_batch_bound_with_an_honest_covariance() {
     let nees = nees / f64::from(RUNS);
     assert!((nees - 6.0).abs() < 3.0 * (12.0 / f64::from(RUNS)).sqrt() + 0.1, "{nees}");
     // The reference implementation's figures: the bound from all five periods is 0.093 m at camera
-    // 1's last time; held to the last bearing's time, as here, it is a little wider.
+    // 1's last time; at the last bearing's time, as here, it is a little wider.
     let rmse = (square / f64::from(RUNS)).sqrt();
     assert!((0.088..0.105).contains(&rmse), "{rmse}");
 }
 
-/// What bearings of three cameras, thirty a second each, are off by: for a while by the same.
+/// Lasting errors of the bearings of three cameras, thirty a second each.
 struct LastingErrors {
     noise: LastingNoise,
     errors: [Vector2<f64>; 3],
@@ -105,16 +105,16 @@ impl LastingErrors {
 
 const WHITE_RAD: f64 = 2e-5;
 
-/// A state's error and its square by the covariance.
+/// A state's error, and its NEES.
 fn erring(state: &KinematicState, truth: &Vector6<f64>) -> (Vector6<f64>, f64) {
     let error = state.mean - truth;
     (error, (error.transpose() * state.covariance.try_inverse().unwrap() * error).x)
 }
 
-/// Errors of position and velocity with their squares by the covariance, now and of half a second
-/// before as the bearings since have told, of a target that is driven by white acceleration for six
-/// seconds; a tentative track considers what lasts, a confirmed one learns it. `hand` shifts the
-/// bearings of a camera from a time on, rad.
+/// Errors of position and velocity with their NEES, of the present state and of the smoothed one
+/// half a second before, for a target that is driven by white acceleration for six seconds. A
+/// tentative track considers the lasting errors, a confirmed one learns them. `hand` is a jump of
+/// camera 0's bearings from a time on, rad.
 fn flown(
     status: TrackStatus,
     (hand_from_s, hand): (f64, Vector2<f64>),
@@ -169,7 +169,7 @@ fn flown(
         let bearing = (timed.time, &uncertainty);
         track.measurement_update(&names[camera], &timed.line, bearing, &motion).unwrap();
         if k == 30 {
-            // Until here all errors are considered.
+            // Up to this bearing all errors are considered.
             track.status = status;
         }
         if k == 494 {
@@ -181,8 +181,8 @@ fn flown(
     [erring(track.state(), &truth), erring(track.remembered(then).unwrap(), &truth_then)]
 }
 
-/// An error that lasts is in the next bearing too: where it is learnt, velocities are better known
-/// than where it is only considered, and both are as good as they say.
+/// A lasting error is in the next bearing too: if it is learnt, velocities are better known than if
+/// it is only considered, and the covariances are consistent in both cases.
 #[test]
 fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
     const RUNS: u32 = 300;
@@ -200,14 +200,15 @@ fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
         (nees, squares.map(f64::sqrt))
     };
     let (considered, learnt) = (figures(TrackStatus::Tentative), figures(TrackStatus::Confirmed));
-    // A mean of n squares of six deviates is known to sqrt(12 / n).
+    // The mean of n squared errors in six dimensions (chi-square) has a standard deviation of
+    // sqrt(12 / n).
     let tolerance = 3.0 * (12.0 / f64::from(RUNS)).sqrt();
     for nees in [considered.0, learnt.0].into_iter().flatten() {
         assert!((nees - 6.0).abs() < tolerance, "{considered:?} {learnt:?}");
     }
-    // The Riccati equations of one axis and the two of the cameras that look across it, iterated for
-    // a filter that considers the errors and for one that estimates them, m/s: now, and of half a
-    // second before.
+    // Expected deviations, m/s, now and of half a second before, from the Riccati equations of one
+    // axis and the two cameras that look across it, iterated for a filter that considers the errors
+    // and for one that estimates them.
     for ((_, found), expected) in [(considered, [0.219, 0.129]), (learnt, [0.189, 0.123])] {
         for (found, expected) in found.into_iter().zip(expected) {
             let axis = found / 3.0f64.sqrt();
@@ -217,7 +218,7 @@ fn errors_that_last_are_learnt_and_the_velocity_is_better_known_by_it() {
     }
 }
 
-/// A hand that draws labels, or a tracker that finds its target again, moves on at once.
+/// Whoever draws labels by hand, or a tracker that finds its target again, moves on at once.
 #[test]
 fn an_error_that_is_drawn_anew_is_no_motion() {
     const RUNS: u32 = 100;
@@ -229,7 +230,8 @@ fn an_error_that_is_drawn_anew_is_no_motion() {
         (square / f64::from(RUNS)).sqrt()
     };
     let calm = velocity((f64::INFINITY, Vector2::zeros()));
-    // In the last bearing of a camera, by three deviations: taken for motion, it doubles the error.
+    // A jump by three deviations in the camera's last bearing: taken for motion, it would double
+    // the error.
     let moved = velocity((5.97, Vector2::new(9e-4, 0.0)));
     assert!(moved < 1.3 * calm, "{moved} {calm}");
 }

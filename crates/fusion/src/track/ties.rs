@@ -1,5 +1,9 @@
-//! What ties a track to the errors that all bearings of a camera share, and what its bearings tell
-//! of them.
+//! The cross-covariance ("ties") of a track with the errors that all bearings of a camera share,
+//! and what the track's bearings tell of these errors.
+//!
+//! The shared errors of a camera are two of its pose, one of its clock, and two that last from one
+//! bearing of the target to the next, each in units of its own standard deviation
+//! (`uncertainty.rs`).
 
 use crossfix_geometry::SightLine;
 use crossfix_message::{CameraName, Timestamp};
@@ -13,77 +17,81 @@ use crate::uncertainty::{CameraUncertainty, LASTING, LastingNoise, OF_CLOCK, OF_
 use crate::update::{Told, Updated};
 use crate::visibility::Visibility;
 
-/// Bearings further apart than this share of the time for which one holds a track tell no noise
-/// from jerks.
+/// Longest interval between bearings whose third difference is used, as a share of the holding time
+/// ([`Motion::holding_s`], how long after a bearing its camera still supports the track): over
+/// longer intervals noise cannot be told from jerk.
 const CLOSE_BEARINGS: f64 = 0.1;
-/// A draw of the cameras' errors lasts this long, s: some bearings of each camera, and a sway of a
-/// mast is seen.
+/// A draw (one comparison of the cameras' mean offsets from the target) lasts this long, s: long
+/// enough for some bearings of each camera, short enough to see a mast sway.
 const DRAW_S: f64 = 0.3;
 
-/// A camera's bearing holds a track for so many times what has lain between its last two, so that
-/// it may miss none and come late, ...
+/// A camera supports the track for at least this many times the interval between its last two
+/// bearings: the next one may be late, but none may be missed, ...
 const HOLDING_PERIODS: f64 = 1.5;
-/// ... where these lay no further apart than so many times what a bearing holds a track for.
+/// ... with intervals counted as no longer than this many times the holding time.
 const LONGEST_PERIOD: f64 = 2.0;
 
-/// A camera that sees a target misses it without having lost it for this share of the time for which
-/// one bearing holds a track: 0.3 s by default. In that time a small drone's speed changes by a metre
-/// a second or two, unseen along the sight line of the other camera; with half of it a detector's
-/// misses are taken for that.
+/// A camera that has missed the target for no longer than this share of the holding time has not
+/// lost it: 0.3 s by default. In that time a small drone's speed changes by a metre a second or
+/// two, unseen along the sight line of the other camera; with half of it a detector's ordinary
+/// misses are taken for a loss.
 const MISSED: f64 = 0.2;
 
-/// Something beside a target is steady if it moves by less than this share of how far away it is
-/// from draw to draw, ...
+/// Something beside the target is steady if from draw to draw its offset changes by less than this
+/// share of the offset, ...
 const STEADY: f64 = 0.2;
-/// ... for so many draws, a second and a half. With half of it what flies by in the same direction
-/// is taken for the target.
+/// ... for this many draws in a row, a second and a half. With half of it, what flies past in the
+/// same direction is taken for the target.
 const STEADY_DRAWS: u32 = 5;
-/// So many cameras must have it beside the target: one may be turned, and it is for the others to
-/// accuse it.
+/// At least this many cameras must have it beside the target: a single one may be turned, and it is
+/// for the others to accuse it.
 const LEAST_BESIDE: usize = 2;
 
-/// What ties a track to the shared errors of a camera that has seen it.
+/// The ties of a track to one camera that has seen it, and how that camera sees the target.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Ties {
-    /// Covariance of position and velocity with the errors, each in its own deviations.
+    /// Covariance of position and velocity with the camera's shared errors, each in units of its
+    /// own deviation.
     pub(super) covariance: SharedTies,
-    /// Covariance of what the track learns of errors that last with them.
+    /// Covariance of the lasting errors that the track estimates (rows) with this camera's shared
+    /// errors.
     pub(super) learnt: LearntTies,
-    /// How long those last that pass, s.
+    /// Decay time of the camera's lasting errors, s.
     pub(super) lasting_s: f64,
-    /// Whether the camera can see the target, when it was exposed last.
+    /// Whether the target is visible to the camera, as of its last exposure.
     pub(super) visibility: Visibility,
-    /// When it gave the track its last bearing, ...
+    /// Time of its last bearing of the track, ...
     seen: Option<Timestamp>,
-    /// ... and how long after the one before, s.
+    /// ... and the interval to the one before, s.
     period_s: f64,
     pub(super) last_three: LastThree,
     pub(super) drawn: Option<Drawn>,
-    /// The same of what it has seen beside the target, where it has not seen that.
+    /// The same for what it has seen beside the target, when it has not seen the target itself.
     beside: Option<Drawn>,
-    /// Where that was in the last draw (rad), and for how many draws it has been there.
+    /// The offset of that in the last draw (rad), and for how many draws it has stayed there.
     steady: (Vector2<f64>, u32),
 }
 
-/// What a camera has seen of the target since the last draw: see [`crate::pose_scale`].
+/// A camera's bearings of the target since the last draw, summed: see `cameras/pose_scale.rs`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Drawn {
+    /// Sum of the offsets from the track, rad, and their number.
     offsets: Vector2<f64>,
     count: f64,
     by_position: Matrix2x3<f64>,
-    /// Covariance of each bearing's noise, rad^2.
+    /// Covariance of one bearing's noise, rad^2.
     noise: Matrix2<f64>,
-    /// What lasts of it, and so is no less in the mean.
+    /// The part of the noise that lasts, and so is not averaged away.
     lasting: LastingNoise,
     pose: Matrix2<f64>,
     by_pose: Matrix2x6<f64>,
     clock: Vector2<f64>,
-    /// What the clock may be off by, s.
+    /// Standard deviation of the clock, s.
     time_sd_s: f64,
 }
 
 impl Drawn {
-    /// What is gathered with one bearing more.
+    /// The sums with one bearing more.
     fn with(
         before: Option<Self>,
         (innovation, velocity): (&Innovation, Vector3<f64>),
@@ -105,11 +113,14 @@ impl Drawn {
         }
     }
 
-    /// The mean, of a target whose velocity is known to `speed`, m/s.
+    /// The mean offset as a sample, for a target whose velocity has a standard deviation of
+    /// `speed`, m/s.
     fn sample(self, camera: &CameraName, speed: f64) -> Sample {
         let moved = self.by_position * (speed * DRAW_S / 10.0);
+        // White noise averages out over the bearings; what an unknown velocity does within a draw
+        // does not.
         let white = self.noise / self.count + moved * moved.transpose();
-        // What the clock shifts it by is reckoned with a velocity that is no better known.
+        // The clock's effect is computed with the estimated velocity, and is as uncertain as that.
         let by_speed = self.by_position * (speed * self.time_sd_s);
         let lasting = Matrix2::identity() * self.lasting.as_white(DRAW_S);
         Sample {
@@ -126,8 +137,8 @@ impl Drawn {
 }
 
 impl Ties {
-    /// What the camera has seen beside the target since the last draw, if it has long been in the
-    /// same place.
+    /// What the camera has seen beside the target since the last draw, if that has stayed in the
+    /// same place for at least [`STEADY_DRAWS`] draws.
     fn steady_beside(&mut self) -> Option<Drawn> {
         let beside = self.beside.take().filter(|_| self.drawn.is_none());
         let place = beside.map(|drawn| drawn.offsets / drawn.count);
@@ -153,7 +164,7 @@ impl Ties {
         }
     }
 
-    /// Of a camera that has given the bearing with which the track begins.
+    /// For a camera whose bearing is one of those that the track starts from.
     pub(super) fn begun(time: Timestamp, covariance: SharedTies, lasting: LastingNoise) -> Self {
         let lasting_s = lasting.time_s;
         Self {
@@ -165,32 +176,32 @@ impl Ties {
         }
     }
 
-    /// All clocks have stepped by so much, s.
+    /// Moves all times: all clocks have stepped by `step_s` seconds.
     pub(super) fn step_time(&mut self, step_s: f64) {
         self.visibility.step_time(step_s);
         self.seen = self.seen.map(|seen| seen.plus_seconds(step_s));
         self.last_three = LastThree::default();
     }
 
-    /// For how long the camera has given the track no bearing, s.
+    /// Time since the camera's last bearing of the track, s; `None` if there was none.
     pub(super) fn silent_s(&self, now: Timestamp) -> Option<f64> {
         Some(now.seconds_since(self.seen?))
     }
 
-    /// Takes the velocity for tied to none of the errors.
+    /// Sets the velocity's ties to zero.
     pub(super) fn forget_velocity(&mut self) {
         self.covariance.fixed_rows_mut::<3>(3).fill(0.0);
     }
 
-    /// The camera has given the track a bearing.
+    /// Notes a bearing of the track by the camera.
     pub(super) fn see(&mut self, time: Timestamp) {
         self.period_s = self.seen.map_or(0.0, |seen| time.seconds_since(seen).abs());
         self.seen = Some(time);
     }
 
-    /// Whether the camera has given the track a bearing so lately that it holds it, as one does for
-    /// `holding_s` seconds: a camera that sees the target every two seconds has not lost it after
-    /// one and a half.
+    /// Whether the camera's last bearing of the track is recent enough to support it: within
+    /// `holding_s` seconds, or longer for a slow camera. One that sees the target every two seconds
+    /// has not lost it after one and a half.
     pub(super) fn has_seen_lately(&self, now: Timestamp, holding_s: f64) -> bool {
         let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
         self.seen.is_some_and(|seen| {
@@ -198,16 +209,16 @@ impl Ties {
         })
     }
 
-    /// Whether the camera sees the target now: it has not missed it for longer than a detector may,
-    /// or than its bearings lie apart.
+    /// Whether the camera sees the target now: it has missed it for no longer than a detector's
+    /// ordinary misses last, or than its bearings are apart.
     pub(super) fn sees(&self, now: Timestamp, holding_s: f64) -> bool {
         let period_s = self.period_s.min(LONGEST_PERIOD * holding_s);
         let missed_s = (MISSED * holding_s).max(HOLDING_PERIODS * period_s);
         self.seen.is_some_and(|seen| now.seconds_since(seen) <= missed_s)
     }
 
-    /// The same `interval` seconds on: the position goes on with the velocity, and what lasts is
-    /// partly gone.
+    /// The ties `interval` seconds later: the position moves on with the velocity, and the lasting
+    /// errors have partly decayed.
     pub(super) fn predicted(&self, interval: f64) -> SharedTies {
         let mut covariance = self.covariance;
         let velocity = covariance.fixed_rows::<3>(3).into_owned();
@@ -218,14 +229,14 @@ impl Ties {
         covariance
     }
 
-    /// How much of what lasts is left after an interval, s.
+    /// Share of a lasting error that is left after an interval (s): exp(-t / T).
     pub(super) fn kept(&self, interval: f64) -> f64 {
         (-interval.abs() / self.lasting_s).exp()
     }
 }
 
 impl Track {
-    /// Keeps a bearing for the next draw.
+    /// Adds a bearing of the target to the next draw.
     pub(super) fn gather(
         &mut self,
         camera: &CameraName,
@@ -239,7 +250,8 @@ impl Track {
         }
     }
 
-    /// Keeps a bearing for the next draw that a camera has beside the target, and none of it.
+    /// Adds a bearing that passes beside the target to the next draw, for an exposure that has none
+    /// of the target.
     pub(crate) fn gather_beside(
         &mut self,
         camera: &CameraName,
@@ -255,16 +267,17 @@ impl Track {
         }
     }
 
-    /// What the cameras have seen of the target since the last draw, if it is time for the next.
-    /// Where as many cameras as see it have long had something beside it in the same place, it is
-    /// the target, and the poses are worse than they say.
+    /// The cameras' mean offsets since the last draw, if the next draw is due; empty otherwise. If
+    /// at least as many cameras as see the target have for long had something beside it in the same
+    /// place, that is the target, and their poses are worse than stated: these offsets are then
+    /// included.
     pub(crate) fn draw(&mut self) -> Vec<Sample> {
         if self.updated.seconds_since(self.drawn) < DRAW_S {
             return Vec::new();
         }
         self.drawn = self.updated;
-        // Cameras see it at other times within a draw: a velocity that is not known moves it in
-        // between.
+        // The cameras see the target at different times within a draw: an uncertain velocity moves
+        // it in between.
         let speed = self.state().covariance.diagonal().fixed_rows::<3>(3).sum().max(0.0).sqrt();
         let (mut samples, mut beside) = (Vec::new(), Vec::new());
         for (camera, ties) in &mut self.ties {
@@ -280,19 +293,21 @@ impl Track {
         samples
     }
 
-    /// A camera's pose errors have been found to be larger or smaller (`ratio` of the variances):
-    /// what they have done to the track is as well.
+    /// Passes on that a camera's pose error variances are `ratio` times what was assumed, and with
+    /// them the part of the track's covariance that they cause.
     pub(crate) fn rescale_pose(&mut self, camera: &CameraName, ratio: f64) {
         if let Some(change) = self.rescale::<OF_POSE>(camera, 0, (ratio, ratio.sqrt())) {
             self.imm.add_covariance(&change);
         }
     }
 
-    /// A camera's clock has been found to be `ahead` (in the deviations that it had) of what was
-    /// taken off its times, and its variance to be `ratio` times what it was: the track lies by as
-    /// much beside where it was thought to be. What makes a variance smaller has been learnt of the
-    /// error that the track holds; what makes it larger is an error that has come since, of which
-    /// the track holds nothing.
+    /// Passes on what has been learnt of a camera's clock: it is `ahead` (in its standard
+    /// deviations so far) of what was subtracted from its times, and its variance is `ratio` times
+    /// what it was. The track's mean moves by its tie to the clock times `ahead`.
+    ///
+    /// A smaller variance (`ratio` below 1) comes from knowledge of the very error that the track
+    /// contains, and shrinks the track's covariance. A larger one is a new error, which the track
+    /// does not contain: only the ties shrink.
     pub(crate) fn set_clock(
         &mut self,
         camera: &CameraName,
@@ -305,13 +320,15 @@ impl Track {
         self.imm.shift(&moved);
         self.shift_learnt(camera, OF_CLOCK, ahead);
         self.shift_past(camera, OF_CLOCK, ahead);
+        // X <- sqrt(q) X and P <- P + (q - 1) X X' for q < 1; X <- X / sqrt(q) alone for q > 1.
         let scale = ratio.min(ratio.recip()).sqrt();
         if let Some(change) = self.rescale::<1>(camera, OF_CLOCK, (ratio.min(1.0), scale)) {
             self.imm.add_covariance(&change);
         }
     }
 
-    /// A camera's mount has turned it: what of its errors lasts until then is drawn anew.
+    /// Passes on that a camera's mount has turned it: the errors that last until the next turn are
+    /// now other ones.
     pub(crate) fn turn_camera(&mut self, camera: &CameraName) {
         self.renew(camera);
         let learns = self.learns(camera);
@@ -324,6 +341,8 @@ impl Track {
         }
     }
 
+    /// The squared third difference of the camera's last four bearings from the predicted
+    /// directions, in units of the reported noise; `None` if they are too far apart.
     pub(super) fn third_difference(
         &mut self,
         camera: &CameraName,
@@ -339,8 +358,8 @@ impl Track {
         last_three.see(now, line, motion.holding_s * CLOSE_BEARINGS, expected)
     }
 
-    /// Carries what is known of all cameras' errors through an update, by the mean over the models;
-    /// returns the mean squared distance of the bearing.
+    /// Updates what is known of all cameras' errors after a bearing has updated the models, by the
+    /// mean over the models; returns the bearing's mean squared Mahalanobis distance.
     pub(super) fn carry(
         &mut self,
         (camera, lasting): (&CameraName, LastingNoise),
@@ -364,7 +383,7 @@ impl Track {
         nis
     }
 
-    /// Has ties to a camera's errors from now on.
+    /// Creates the ties to a camera's errors, if there are none.
     pub(super) fn note(&mut self, camera: &CameraName, time: Timestamp) {
         if !self.ties.contains_key(camera) {
             let learnt = self.untied();
@@ -372,12 +391,12 @@ impl Track {
         }
     }
 
-    /// The ties are carried by the mean over the models: where one model alone is surer than they
-    /// allow, it is not believed.
+    /// Widens each model whose covariance is smaller than the ties allow: the ties are updated with
+    /// the mean over the models, and a single model that is surer than that is not believed.
     pub(super) fn keep_ties_possible(&mut self) {
         let shared = self.shared_part();
         if shared.amax() > 0.0 {
-            self.imm.exceed(&shared);
+            self.imm.raise_to(&shared);
         }
     }
 }

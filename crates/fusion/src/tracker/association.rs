@@ -1,4 +1,4 @@
-//! Which bearing of an exposure is which track's.
+//! Association: which bearing of an exposure belongs to which track.
 
 use std::collections::BTreeMap;
 
@@ -13,17 +13,19 @@ use crate::track::{Track, TrackId, TrackStatus};
 use crate::visibility::log_missed;
 use crate::{Exposure, Sighting};
 
-/// A bearing is not compared with tracks beyond this many times the range of the cameras.
+/// A camera's bearings are not compared with tracks farther from it than this many times the
+/// largest range.
 const REACH: f64 = 1.5;
-/// A score beyond this counts no more: a track that has long been good can still be doubted.
+/// Upper limit of a track's score: a track that has long been good can still be doubted.
 const MAX_SCORE: f64 = 40.0;
-/// A camera that is turned by no more than this shows a target beside where the others have it,
-/// rad.
+/// Bearings within this angle of a target's expected direction count as beside it, rad: a camera
+/// that is turned by no more than this shows the target there.
 const BESIDE_RAD: f64 = 0.1;
 
 impl Tracker {
-    /// Which tracks choose first: those that several cameras hold in their place, then those that
-    /// one alone follows, then those that are not sure. A ghost must not take a target's bearings.
+    /// The tracks in the order in which they choose bearings: first those that several cameras
+    /// support, then those that one camera alone follows, then unconfirmed ones. A ghost must not
+    /// take a target's bearings.
     pub(super) fn in_order_of_choice(&self) -> [Vec<TrackId>; 3] {
         let mut order = [const { Vec::new() }; 3];
         for track in self.tracks.values().filter(|track| track.status != TrackStatus::Lost) {
@@ -33,7 +35,8 @@ impl Tracker {
         order
     }
 
-    /// Gives bearings that are still open to some tracks, and judges these by it.
+    /// Assigns bearings that are still free to these tracks, updates the tracks with them, and
+    /// adjusts the tracks' scores.
     pub(super) fn associate(
         &mut self,
         exposure: &Exposure,
@@ -83,16 +86,17 @@ impl Tracker {
             let seen_since = !sure || track.is_seen_since_look_of(&exposure.camera);
             let silent = sure && silent;
             let change = match gain {
-                // What one camera alone follows may be anything along its sight line.
+                // No evidence for the target: what one camera alone follows may be anything along
+                // its sight line.
                 Some(_) if sure && !track.is_held() => 0.0,
                 Some(gain) => gain + missed,
-                // What hides the target from all is no evidence against it: of what nobody sees
-                // time decides.
+                // If whatever hides the target hides it from all cameras, a miss is no evidence
+                // against it; when nobody sees it, time decides.
                 None if sees && !silent && seen_since => missed,
                 None => 0.0,
             };
             track.judge(change, MAX_SCORE);
-            // Outside its field of view a camera has missed nothing.
+            // A camera misses nothing outside its field of view.
             if gain.is_some() || sees {
                 track.look(
                     &exposure.camera,
@@ -108,7 +112,8 @@ impl Tracker {
         }
     }
 
-    /// What the open bearings in the gates of these tracks are worth to them.
+    /// The possible pairs of these tracks and free bearings in their gates, with the gain of each:
+    /// its log-likelihood ratio against clutter, less that of a miss.
     fn candidates(
         &self,
         exposure: &Exposure,
@@ -116,7 +121,8 @@ impl Tracker {
         owners: &[Option<TrackId>],
         ids: &[TrackId],
     ) -> Vec<Candidate> {
-        // What a line must be worth to bring a track back that the camera has lost sight of.
+        // Least log-density of a bearing that is to update a track which this camera has lost sight
+        // of.
         let stranger = exposure.clutter_per_sr.ln() + FOUND_AGAIN_MARGIN;
         let origin = known.camera.pose().position();
         let mut candidates = Vec::new();
@@ -152,7 +158,7 @@ impl Tracker {
     }
 }
 
-/// Keeps the line that passes nearest to a track, of an exposure that has none of it.
+/// Notes the line that passes nearest to a track, for an exposure that has no bearing of it.
 fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
     let expected = track.position_at(exposure.time) - known.camera.pose().position();
     let away = |sighting: &Sighting| sighting.line.direction.angle(&expected);
@@ -166,7 +172,8 @@ fn note_beside(track: &mut Track, exposure: &Exposure, known: &KnownCamera) {
     }
 }
 
-/// How an exposure fits a track that other cameras see; `None` if it says nothing.
+/// How an exposure fits a track that other cameras see; `None` if it has no bearing of the track
+/// and none beside it, and so says nothing.
 pub(super) fn fitting(
     track: &Track,
     exposure: &Exposure,

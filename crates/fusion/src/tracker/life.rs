@@ -1,4 +1,4 @@
-//! How tracks come, are confirmed, and go.
+//! The life cycle of tracks: start, confirmation, coasting, merging, loss.
 
 use crossfix_message::{Timestamp, TrackEventKind, track_id};
 
@@ -8,23 +8,23 @@ use crate::initiation::Start;
 use crate::motion::Motion;
 use crate::track::{Track, TrackId, TrackStatus};
 
-/// The smallest target that is found, px: what lies closer together for every camera is one. With
-/// half of it the two ends of a target make two tracks, with twice as much targets in formation are
-/// one.
+/// Size of the smallest target that is found, px: tracks closer together than this for every camera
+/// are one target. With half of it the two ends of a target make two tracks; with twice as much,
+/// targets in formation become one.
 const SMALLEST_TARGET_PX: f64 = 7.0;
-/// A track whose score falls below this is dropped: a chance of 1 in 100 against clutter.
+/// A track whose score falls below this is ended: odds of 1 in 100 against clutter.
 const DROP_SCORE: f64 = -4.6;
-/// A new track is compared with the older ones this often, s, ...
+/// A new track is compared with the older ones at this interval, s, ...
 const COMPARED_EVERY_S: f64 = 1.0;
-/// ... and so many times: its place is well known by then, and two targets that fly side by side
+/// ... this many times: by then its position is well known, and two targets that fly side by side
 /// have been seen apart.
 const COMPARISONS: u32 = 5;
-/// A track that one camera alone was following is found again within this distance (squared
-/// Mahalanobis, P = 0.999 999).
+/// Gate for finding a track again that one camera alone was following (squared Mahalanobis
+/// distance, P = 0.999 999).
 const FOUND_AGAIN_GATE: f64 = 30.7;
 
 impl Tracker {
-    /// Confirms, coasts and gives up.
+    /// Sets the status of all tracks: confirms, lets coast, and ends.
     pub(super) fn review(&mut self, now: Timestamp) -> Vec<TrackChange> {
         let mut changes = Vec::new();
         for track in self.tracks.values_mut() {
@@ -58,7 +58,8 @@ impl Tracker {
         changes
     }
 
-    /// A coasting track beside a live one was the same target: the live one goes on.
+    /// Merges a coasting track into a live one at the same position: they were the same target, and
+    /// the live one goes on.
     pub(super) fn merge(&mut self, now: Timestamp) -> Vec<TrackChange> {
         let coasting = self.tracks.values().filter(|t| t.status == TrackStatus::Coasting);
         let live: Vec<&Track> =
@@ -83,8 +84,8 @@ impl Tracker {
             .collect()
     }
 
-    /// Compares each track a few times while it is young with those that were there before it: a
-    /// detector that reports the two ends of a target makes two tracks.
+    /// Compares each young track a few times with the older ones: a detector that reports the two
+    /// ends of a target makes two tracks.
     pub(super) fn prove(&mut self, now: Timestamp, cameras: &Cameras) -> Vec<TrackChange> {
         let is_due = |track: &&Track| {
             let next_s = f64::from(track.comparisons + 1) * COMPARED_EVERY_S;
@@ -97,7 +98,7 @@ impl Tracker {
         for id in due {
             let older = self.tracks.range(..id).map(|(_, old)| old);
             let mut older = older.filter(|old| old.status == TrackStatus::Confirmed);
-            // Two targets that cross part again.
+            // They must also be together a moment later: two targets that only cross part again.
             let stays = |old: &Track, new: &Track| {
                 [0.0, COMPARED_EVERY_S]
                     .iter()
@@ -123,11 +124,12 @@ impl Tracker {
         changes
     }
 
-    /// Takes a track over that the initiation has found, and numbers it. Where it has used the
-    /// bearings of a track that one camera alone was following and lies where that may have gone,
-    /// it is the same target found again: it goes on under the old number. Where it lies elsewhere,
-    /// the old one was wrong and is given up; but two cameras are not enough to say so, as their
-    /// lines cross anywhere.
+    /// Takes over a new track from the initiation, and numbers it.
+    ///
+    /// If it has used the bearings of a track that one camera alone was following, and lies where
+    /// that track may have gone, it is the same target found again and goes on under the old
+    /// number. If it lies elsewhere, the old track was wrong and is ended; but two cameras are not
+    /// enough to say so, as their lines cross anywhere.
     pub(crate) fn adopt(&mut self, start: Start, cameras: &Cameras) -> Vec<TrackChange> {
         let Start { mut track, cameras: seen_by, claimed_by } = start;
         let owners = claimed_by.iter().filter_map(|id| self.tracks.get(id));
@@ -177,11 +179,12 @@ impl Tracker {
     }
 }
 
-/// Whether two tracks lie so close together at a time for every camera that sees the new one that
+/// Whether two tracks lie so close together at a time, for every camera that sees the new one, that
 /// they are parts of one target: a detector may report its two ends.
 fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) -> bool {
     let [there, here] = [old.position_at(time), new.position_at(time)];
-    // What was split once is split again, and where a track begins it is less sure where.
+    // A target that was split once will be split again, and a track that is just beginning is less
+    // certain in position: twice the distance is allowed.
     let times = if old.has_ends { 2.0 } else { 1.0 };
     new.residuals.keys().all(|name| {
         cameras.known(name).is_some_and(|known| {
@@ -192,8 +195,8 @@ fn is_one_image(old: &Track, new: &Track, time: Timestamp, cameras: &Cameras) ->
     })
 }
 
-/// Root of the sum of the position's variances, m: not less than the standard deviation along any
-/// axis.
+/// Root of the summed variances of the predicted position, m: at least the standard deviation along
+/// any axis.
 fn position_sd(track: &Track, now: Timestamp, motion: &Motion) -> f64 {
     let state = track.predicted(now, motion);
     state.covariance.diagonal().fixed_rows::<3>(0).sum().sqrt()

@@ -89,7 +89,7 @@ fn areas_that_share_a_camera_are_linked_once_and_others_are_not() {
         let (listen, connect) = network.endpoints(&role).unwrap();
         (listen, connect.iter().map(|e| e[e.len() - 4..].to_owned()).collect::<Vec<_>>())
     };
-    // By name, east comes before middle and west last.
+    // By name, east comes before middle, and west is last.
     assert_eq!(connects("east").1, ["7453", "7454"]);
     assert_eq!(connects("middle").1, ["7452", "7453", "7463"]);
     assert_eq!(connects("west").1, ["7451", "7452", "7462"]);

@@ -1,4 +1,4 @@
-//! Who may say what: one table for all, in the words of Zenoh's access control.
+//! Which component may publish what: one table for all, in the form of Zenoh's access control.
 
 use std::iter::once;
 
@@ -8,20 +8,20 @@ use serde_json::{Value, json};
 use super::{Identity, Security};
 use crate::NetworkConfig;
 
-/// What says something.
+/// Kinds of messages that publish.
 const SAYING: [&str; 3] = ["put", "delete", "liveliness_token"];
-/// What asks for something.
+/// Kinds of messages that subscribe or query.
 const ASKING: [&str; 4] =
     ["declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber"];
-/// What answers a question.
+/// The kind of message that answers a query.
 const ANSWERING: &str = "reply";
 
-/// What the holder of one certificate may do with whoever reads this.
+/// What the holder of one certificate may do in a session with the reader of these rules.
 struct Rights {
     identity: Identity,
-    /// What it may say: key expressions.
+    /// Key expressions that it may publish on.
     says: Vec<String>,
-    /// What it may hear.
+    /// Key expressions that it may receive.
     hears: Vec<String>,
 }
 
@@ -30,7 +30,7 @@ impl Rights {
         let of = |component: &str| format!("crossfix/{site}/{component}/**");
         let everything = || vec![format!("crossfix/{site}/**")];
         let (says, hears) = match &identity {
-            // It begins when those are there who must hear it.
+            // An agent starts once its receivers are alive, so it must hear who is.
             Identity::Camera(camera) => {
                 (vec![of(camera.as_str())], vec![of("fusion"), Key::of_all_cameras(site, "alive")])
             }
@@ -43,7 +43,8 @@ impl Rights {
         Self { identity, says, hears }
     }
 
-    /// A rule of Zenoh's: messages of some kinds on some keys in one direction.
+    /// A Zenoh rule: allows some kinds of messages on some keys in one direction; `None` without
+    /// keys.
     fn rule(&self, what: &str, flow: &str, messages: &[&str], keys: &[String]) -> Option<Value> {
         (!keys.is_empty()).then(|| {
             json!({
@@ -55,7 +56,8 @@ impl Rights {
 
     fn rules(&self, site: &SiteName) -> Vec<Value> {
         let saying: Vec<&str> = SAYING.into_iter().chain(once(ANSWERING)).collect();
-        // Only who is told that somebody listens sends anything; what is listened to is no secret.
+        // A component publishes only once it is told of a subscriber. Who subscribes to what is no
+        // secret, so subscriptions may go out to all.
         let everything = [format!("crossfix/{site}/**")];
         [
             self.rule("says", "ingress", &saying, &self.says),
@@ -69,11 +71,12 @@ impl Rights {
     }
 }
 
-/// Zenoh's access control: what this component takes from each other one, and gives it. The same for
-/// all, as no component is trusted with more by one than by another; what no rule allows is dropped.
+/// Zenoh's access control: what this component accepts from each other component, and sends to it.
+/// The table is the same for all, as no component is trusted with more by one than by another; what
+/// no rule allows is dropped.
 ///
-/// A rule allows what its key expressions include, whole: `crossfix/site/north/**` does not let an
-/// agent subscribe to `crossfix/site/**`.
+/// A key expression is allowed only if a rule's includes all of it: `crossfix/site/north/**` does
+/// not let an agent subscribe to `crossfix/site/**`.
 pub(crate) fn access_control(security: &Security, network: &NetworkConfig) -> Value {
     let site = &network.site;
     let cameras = network.cameras.keys().cloned().map(Identity::Camera);

@@ -1,4 +1,4 @@
-//! What signs the certificates of a site.
+//! The certificate authority of a site, which signs its certificates.
 
 use std::time::Duration;
 
@@ -15,21 +15,22 @@ use x509_parser::parse_x509_certificate;
 
 use super::credentials::common_name;
 
-/// How long the authority itself holds. Whoever has its key can join the site, so it stays where
-/// `enroll` is run; at its end every certificate is issued anew by another.
+/// How long the authority itself is valid. Whoever has its key can join the site, so the key stays
+/// where `enroll` is run; at the authority's end all certificates must be issued again by a new
+/// one.
 const AUTHORITY_HOLDS: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
-/// What precedes the site's name in the authority's own.
+/// Prefix of the site's name in the authority's common name.
 const OF_SITE: &str = "Crossfix site ";
-/// What a host's clock may be behind the issuing one's.
+/// How far a host's clock may be behind that of the issuing host.
 const CLOCKS: Duration = Duration::from_secs(3600);
 
-/// What went wrong with an authority.
+/// What can go wrong with an authority.
 #[derive(Debug, Error)]
 pub enum AuthorityError {
-    /// What it would sign nobody would believe.
+    /// Key and certificate do not match: nobody would believe what the key signs.
     #[error("the authority's key is not that of its certificate: they are of two authorities")]
     OtherKey,
-    /// Something could not be made or read.
+    /// Something could not be created or read.
     #[error("{what}")]
     Certificate {
         /// What was tried.
@@ -57,9 +58,9 @@ pub struct Authority {
 pub struct Issued {
     /// The certificate.
     pub certificate: String,
-    /// Its private key (PKCS #8): whoever has it is taken for the component.
+    /// Its private key (PKCS #8): its holder is taken for the component.
     pub key: String,
-    /// From when on it is no longer believed.
+    /// When it expires.
     pub not_after: OffsetDateTime,
 }
 
@@ -71,7 +72,7 @@ fn is_key_of(pair: &KeyPair, pem: &str) -> bool {
 }
 
 impl Authority {
-    /// A new authority of a site, from a time on.
+    /// Creates an authority of a site, valid from a time on.
     ///
     /// # Errors
     /// [`AuthorityError`] if no key can be made.
@@ -90,10 +91,10 @@ impl Authority {
         Ok(Self { issuer: Issuer::new(params, pair), certificate: pem, key })
     }
 
-    /// The authority of its certificate and key, as PEM.
+    /// The authority with a certificate and a key, both as PEM.
     ///
     /// # Errors
-    /// [`AuthorityError`] if they are none.
+    /// [`AuthorityError`] if they are not a certificate and its key.
     pub fn load(pem: &str, key: &str) -> Result<Self, AuthorityError> {
         let pair =
             KeyPair::from_pem(key).map_err(certificate("the authority's key is no private key"))?;
@@ -105,28 +106,28 @@ impl Authority {
         Ok(Self { issuer, certificate: pem.to_owned(), key: key.to_owned() })
     }
 
-    /// The site that it was made for, if its certificate says.
+    /// The site that it was made for, if its certificate says so.
     pub fn site(&self) -> Option<String> {
         let der = CertificateDer::from_pem_slice(self.certificate.as_bytes()).ok()?;
         let (_, parsed) = parse_x509_certificate(&der).ok()?;
         common_name(&parsed)?.strip_prefix(OF_SITE).map(str::to_owned)
     }
 
-    /// Its certificate, as PEM: goes to every host.
+    /// Its certificate, as PEM; copied to every host.
     pub fn certificate(&self) -> &str {
         &self.certificate
     }
 
-    /// Its private key, as PEM: goes nowhere.
+    /// Its private key, as PEM; must not be copied anywhere.
     pub fn key(&self) -> &str {
         &self.key
     }
 
-    /// Issues a certificate with a new key for a common name, for hosts (names or addresses) on
-    /// which its holder is connected to, for so long from a time on.
+    /// Issues a certificate with a new key for a common name, valid from `now` on for `holds`.
+    /// `hosts` are the names or addresses under which others connect to its holder.
     ///
     /// # Errors
-    /// [`AuthorityError`] if a host is no name or no key can be made.
+    /// [`AuthorityError`] if a host is no valid name or no key can be made.
     pub fn issue(
         &self,
         common_name: &str,

@@ -1,4 +1,4 @@
-//! What a component shows the others, read from its files and held against all that can be wrong with them.
+//! Certificate and key by which a component shows its identity, read from files and checked.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,10 +14,10 @@ use x509_parser::prelude::X509Certificate;
 
 use super::{Identity, Security};
 
-/// Why a component cannot show who it is.
+/// Why a component cannot show its identity.
 #[derive(Debug, Error)]
 pub enum CredentialsError {
-    /// A file that is not there.
+    /// A file is missing.
     #[error("{} is not there: run `crossfix enroll`, and copy what it says to this host", path.display())]
     Missing {
         /// The file.
@@ -32,7 +32,7 @@ pub enum CredentialsError {
         #[source]
         source: io::Error,
     },
-    /// A file that holds something else.
+    /// A file holds something else.
     #[error("{} holds no {what} in PEM", path.display())]
     Form {
         /// The file.
@@ -40,23 +40,23 @@ pub enum CredentialsError {
         /// What should be in it.
         what: &'static str,
     },
-    /// Past its end.
+    /// The certificate has expired.
     #[error("the certificate {} ended {} ago: run `crossfix enroll`", path.display(), days(*ago))]
     Expired {
         /// The file.
         path: PathBuf,
-        /// How long ago.
+        /// How long ago it expired.
         ago: Duration,
     },
-    /// Before its beginning.
+    /// The certificate is not valid yet.
     #[error("the certificate {} begins in {}: is this host's clock right?", path.display(), days(*ahead))]
     NotYet {
         /// The file.
         path: PathBuf,
-        /// How far ahead.
+        /// How long until it is valid.
         ahead: Duration,
     },
-    /// Of somebody else, or revoked: a number behind the name counts the revocations.
+    /// It is another component's, or revoked: a number after the name counts the revocations.
     #[error(
         "the certificate {} is of `{found}`, and the network file believes `{believed}` alone: it was \
          revoked, or is another component's; copy the new one here",
@@ -70,7 +70,7 @@ pub enum CredentialsError {
         /// The one that is believed.
         believed: String,
     },
-    /// By another authority.
+    /// It is signed by another authority.
     #[error(
         "the certificate {} is not by the authority of {}: copy both of one site",
         path.display(), authority.display()
@@ -78,10 +78,10 @@ pub enum CredentialsError {
     Foreign {
         /// The certificate.
         path: PathBuf,
-        /// The authority's.
+        /// The authority's certificate.
         authority: PathBuf,
     },
-    /// Its key is another's.
+    /// The key belongs to another certificate.
     #[error("{} is not the key of {}", key.display(), path.display())]
     Key {
         /// The certificate.
@@ -94,7 +94,7 @@ pub enum CredentialsError {
     },
 }
 
-/// A time as people say it.
+/// A duration in words for people.
 pub(crate) fn days(time: Duration) -> String {
     let (minutes, hours) = (time.as_secs() / 60, time.as_secs() / 3600);
     match hours {
@@ -104,7 +104,7 @@ pub(crate) fn days(time: Duration) -> String {
     }
 }
 
-/// What a component shows the others: a certificate that is believed now, with its key.
+/// A component's certificate, checked, with its key.
 pub struct Credentials {
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
@@ -136,8 +136,8 @@ pub(super) fn common_name(parsed: &X509Certificate<'_>) -> Option<String> {
 }
 
 impl Credentials {
-    /// Reads those of a component and checks that they are believed at a time, as far as can be
-    /// seen without asking anybody.
+    /// Reads a component's credentials and checks that others believe them at a time, as far as
+    /// that can be seen without contacting anybody.
     ///
     /// # Errors
     /// [`CredentialsError`] naming the file and what is wrong with it.
@@ -184,8 +184,8 @@ impl Credentials {
         Ok(credentials)
     }
 
-    /// The client's side of a handshake that shows them; it believes what this site's authority has signed
-    /// and nobody else.
+    /// TLS settings of a client that shows these credentials and believes only what this site's
+    /// authority has signed.
     pub(super) fn client(&self) -> Result<ClientConfig, rustls::Error> {
         let mut roots = RootCertStore::empty();
         roots.add(self.authority.clone())?;
@@ -196,24 +196,24 @@ impl Credentials {
             .with_client_auth_cert(self.chain.clone(), self.key.clone_key())
     }
 
-    /// How long they are believed from a time on, if that is less than a third of what they were
-    /// issued for: time to renew them.
+    /// Time left until they expire, if that is less than a third of their whole validity: time to
+    /// renew them.
     pub fn ending(&self, now: SystemTime) -> Option<Duration> {
         self.validity().ending(now)
     }
 
-    /// From when to when they are believed.
+    /// The period in which they are valid.
     pub fn validity(&self) -> Validity {
         Validity { not_before: self.not_before, not_after: self.not_after }
     }
 
-    /// From when on they are not believed any more.
+    /// When they expire.
     pub fn not_after(&self) -> SystemTime {
         self.not_after
     }
 }
 
-/// From when to when a certificate is believed.
+/// The period in which a certificate is valid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Validity {
     not_before: SystemTime,
@@ -221,7 +221,7 @@ pub struct Validity {
 }
 
 impl Validity {
-    /// How long it holds from a time on, if that is less than a third of the whole.
+    /// Time left until its end, if that is less than a third of the whole period.
     pub fn ending(&self, now: SystemTime) -> Option<Duration> {
         let left = self.not_after.duration_since(now).unwrap_or_default();
         let whole = self.not_after.duration_since(self.not_before).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! One TLS handshake with another component, to say why there is no link: Zenoh only waits.
+//! A TLS handshake with another component, to find out why there is no link: Zenoh only waits.
 
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -13,23 +13,23 @@ use x509_parser::parse_x509_certificate;
 use super::Credentials;
 use super::credentials::common_name;
 
-/// How long the other side may take to answer, and to refuse a certificate after that.
+/// How long the other side may take to answer, and then to refuse a certificate.
 const ANSWER: Duration = Duration::from_secs(2);
 const REFUSAL: Duration = Duration::from_millis(300);
 
 /// Why there is no link.
 #[derive(Debug, Error)]
 pub enum HandshakeError {
-    /// No connection at all.
+    /// No connection.
     #[error("nobody answers")]
     Connect(#[source] io::Error),
-    /// It answers, and not by TLS.
+    /// It answers, but not by TLS.
     #[error("it does not speak TLS: does it run without [security]?")]
     NoTls,
-    /// Its certificate is past its end.
+    /// Its certificate has expired.
     #[error("its certificate has ended: renew it on that host")]
     TheirsExpired,
-    /// Its certificate is by another authority.
+    /// Its certificate is signed by another authority.
     #[error("its certificate is by another authority than this site's")]
     TheirsForeign,
     /// Its certificate is for another host.
@@ -45,8 +45,8 @@ pub enum HandshakeError {
     Other(#[source] io::Error),
 }
 
-/// A connection with whoever listens at `HOST:PORT`, by each of its addresses; nobody waits for it for
-/// longer than two seconds.
+/// A TCP connection with whoever listens at `HOST:PORT`, trying each of its addresses; each step
+/// waits for two seconds at most.
 ///
 /// # Errors
 /// What the system says of the last address.
@@ -65,7 +65,7 @@ pub fn connect(address: &str) -> io::Result<TcpStream> {
     Err(last)
 }
 
-/// What a failed handshake was for.
+/// The cause of a failed handshake.
 fn explain(error: io::Error) -> HandshakeError {
     let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<rustls::Error>());
     match tls {
@@ -98,8 +98,8 @@ fn explain(error: io::Error) -> HandshakeError {
     }
 }
 
-/// Shakes hands with whoever listens at `HOST:PORT`, and returns the common name of the certificate
-/// that it shows.
+/// Does a handshake with whoever listens at `HOST:PORT`, and returns the common name of the
+/// certificate that it shows.
 ///
 /// # Errors
 /// [`HandshakeError`] saying whose certificate is refused, and why.
@@ -118,7 +118,8 @@ pub fn handshake(credentials: &Credentials, address: &str) -> Result<String, Han
         tls.conn.complete_io(&mut tls.sock).map_err(explain)?;
     }
     tls.flush().map_err(explain)?;
-    // The server looks at our certificate after we are done, and says nothing where it is good.
+    // The server checks our certificate after our side is done, and sends nothing if it is good: so
+    // a refusal is waited for.
     tls.sock.set_read_timeout(Some(REFUSAL)).map_err(HandshakeError::Other)?;
     match tls.read(&mut [0]) {
         Err(error) if is_tls(&error) => return Err(explain(error)),

@@ -1,4 +1,4 @@
-//! Which component of a site a certificate is of.
+//! The component of a site that a certificate belongs to.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,8 +7,9 @@ use crossfix_message::{AreaName, CameraName, NameError};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// Which component of a site a certificate is of. Its text is the certificate's common name and the
-/// name of its files: `camera-north`, `fusion` or `fusion-west`, `recorder`, `router`, `viewer`.
+/// The component of a site that a certificate belongs to. Its text is the certificate's common name
+/// and the name of its files: `camera-north`, `fusion` or `fusion-west`, `recorder`, `router`,
+/// `viewer`.
 ///
 /// ```
 /// use crossfix_transport::Identity;
@@ -21,25 +22,25 @@ use thiserror::Error;
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Identity {
-    /// A camera's agent: says what its camera sees, and hears the fusion centre.
+    /// A camera's agent: publishes what its camera sees, and hears the fusion centre.
     Camera(CameraName),
-    /// The fusion centre, an area's or the only one: hears all, says the tracks.
+    /// The fusion centre, an area's or the only one: hears everything, publishes the tracks.
     Fusion(Option<AreaName>),
-    /// The recorder: hears all, says how it does.
+    /// The recorder: hears everything, publishes its health.
     Recorder,
-    /// A Zenoh router: carries everything, and holds the others to what each may say.
+    /// A Zenoh router: carries everything, and enforces what each other component may publish.
     Router,
-    /// Whoever looks on (`view`, `status`, `outlet`): hears all, says nothing.
+    /// An observer (`view`, `status`, `outlet`): hears everything, publishes nothing.
     Viewer,
 }
 
-/// Why a text names no component.
+/// Why a text is not an identity.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum IdentityError {
-    /// None of the components.
+    /// It names none of the components.
     #[error("`{0}` is none of camera-NAME, fusion, fusion-AREA, recorder, router, viewer")]
     Unknown(String),
-    /// An impossible camera, or area.
+    /// It names an impossible camera or area.
     #[error("`{text}` names an impossible component")]
     Name {
         /// The text.
@@ -50,9 +51,9 @@ pub enum IdentityError {
     },
 }
 
-/// What precedes a camera's name, so that a camera may be called `viewer`.
+/// Prefix of a camera's name, so that a camera may be called `viewer`.
 const CAMERA: &str = "camera-";
-/// What precedes an area's.
+/// Prefix of an area's name.
 const CENTRE: &str = "fusion-";
 
 impl fmt::Display for Identity {

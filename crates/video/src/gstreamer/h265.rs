@@ -8,31 +8,31 @@ use gstreamer_app::{AppSink, AppSrc};
 use super::pipeline::{brightness, built, trouble};
 use crate::h264::Picture;
 
-/// Access units in, pictures out. One thread, as each more holds back a picture.
+/// Access units in, pictures out. One thread, as each further thread holds back another picture.
 const DECODER: &str = "appsrc name=units format=time is-live=true \
                        caps=video/x-h265,stream-format=byte-stream,alignment=au ! h265parse ! \
                        avdec_h265 max-threads=1 max-errors=-1";
-/// How long a picture may take to come out before it is one that is held back: several times what 4K
-/// takes.
+/// A picture that has not come out after this time is taken as held back by the decoder: several
+/// times what decoding 4K takes.
 const DECODED_WITHIN: Duration = Duration::from_millis(100);
-/// Units whose pictures may be held back: H.265 allows 16.
+/// Most units whose pictures are waited for: H.265 allows 16 to be held back.
 const MOST_PENDING: usize = 32;
-/// The time by which the decoder knows the first unit: others may be shown before it.
+/// Time that the decoder is given for the first unit: later units may be shown before it.
 const FIRST: ClockTime = ClockTime::from_seconds(3600);
-/// What a unit of the source's time is to the decoder, which only has to see the order.
+/// Nanoseconds that the decoder is given for a tick of the source; it only needs the order.
 const TICK_NS: i64 = 1000;
 
-/// Decodes H.265 to brightness, every picture with its own time: GStreamer carries it through.
+/// Decodes H.265 to brightness; GStreamer carries each picture's time through.
 pub(crate) struct H265Decoder {
     pipeline: Pipeline,
     units: AppSrc,
     pictures: AppSink,
-    /// The time of the first unit.
+    /// The source's time of the first unit, ticks.
     first: Option<i64>,
-    /// The times, in the units of their source, of the units whose pictures have not come out yet, by those
-    /// by which the decoder knows them.
+    /// Times of the units whose pictures have not come out yet: the decoder's time to the source's.
     pending: BTreeMap<ClockTime, i64>,
-    /// Of those, so many are held back until it is sure that none is to be shown before them.
+    /// Number of pending pictures that the decoder holds back until it is sure that none is to be
+    /// shown before them.
     held_back: usize,
 }
 
@@ -45,7 +45,8 @@ impl H265Decoder {
         Ok(Self { pipeline, units, pictures, first: None, pending: BTreeMap::new(), held_back: 0 })
     }
 
-    /// Decodes an access unit in Annex B; returns the pictures that are out, those of earlier units among them.
+    /// Decodes an access unit in Annex B; returns the pictures that have come out, of earlier units
+    /// too.
     pub(crate) fn decode(&mut self, unit: &[u8], shown_at: i64) -> Result<Vec<Picture>, String> {
         let since_first = shown_at.wrapping_sub(*self.first.get_or_insert(shown_at));
         let known = FIRST.nseconds().saturating_add_signed(since_first.saturating_mul(TICK_NS));
@@ -56,7 +57,7 @@ impl H265Decoder {
         }
         self.pending.insert(known, shown_at);
         while self.pending.len() > MOST_PENDING {
-            // A unit without a picture: nothing will come out of it.
+            // Some units have no picture: nothing will come out for the oldest.
             self.pending.pop_first();
         }
         self.units.push_buffer(buffer).map_err(|error| error.to_string())?;
@@ -67,8 +68,8 @@ impl H265Decoder {
         Ok(pictures)
     }
 
-    /// All pictures that are out. Waits for one where more units wait than are held back; what does not
-    /// come then is held back.
+    /// All pictures that have come out. Waits for one if more units are pending than the decoder
+    /// holds back; if none comes in time, all pending ones count as held back.
     fn come_out(&mut self) -> Result<Vec<Picture>, String> {
         let begun = Instant::now();
         let mut pictures = Vec::new();
@@ -96,7 +97,7 @@ impl H265Decoder {
 
 impl Drop for H265Decoder {
     fn drop(&mut self) {
-        // One that does not stop is left: there is nobody to tell.
+        // If it does not stop it is left: there is nobody to report that to.
         let _ = self.pipeline.set_state(State::Null);
     }
 }
@@ -107,7 +108,8 @@ mod tests {
 
     const PICTURES: u64 = 60;
 
-    /// A ball that flies about, with what stands between the pattern and the brightness.
+    /// A flying ball as a running pipeline; `encoded_by` stands between the test pattern and the
+    /// brightness.
     fn ball(encoded_by: &str) -> (Pipeline, AppSink) {
         let description = format!(
             "videotestsrc pattern=ball num-buffers={PICTURES} ! \
@@ -118,7 +120,7 @@ mod tests {
         (pipeline, sink)
     }
 
-    /// The middle of what is bright.
+    /// Centroid of the bright pixels.
     fn middle(width: usize, pixels: &[u8]) -> [f64; 2] {
         let bright = pixels.iter().enumerate().filter(|(_, pixel)| **pixel > 128);
         let places: Vec<[usize; 2]> = bright.map(|(at, _)| [at % width, at / width]).collect();
@@ -127,7 +129,7 @@ mod tests {
         })
     }
 
-    /// H.265 of the ball, in access units with the number of the picture that each is.
+    /// The ball as H.265 access units, each with the number of its picture.
     fn units(encoder: &str) -> Vec<(usize, Vec<u8>)> {
         gstreamer::init().unwrap();
         let description = format!(
@@ -164,13 +166,13 @@ mod tests {
         places
     }
 
-    /// A picture shows the ball where it was at its time.
+    /// Checks that a picture shows the ball where it was at the picture's time.
     fn check(encoder: &str, picture: &Picture, truth: &[[f64; 2]]) {
         assert_eq!((picture.width, picture.height), (322, 242));
         let number = (picture.shown_at / 3000) as usize;
         let place = middle(picture.width, &picture.brightness);
         let off = [0, 1].map(|axis| (place[axis] - truth[number][axis]).abs());
-        // What builds on the spoilt one is spoilt itself.
+        // Pictures that build on the spoilt unit are spoilt themselves.
         let is_whole = !(30..42).contains(&number);
         assert!(!is_whole || off.iter().all(|off| *off < 0.5), "{encoder} {number}: {off:?}");
     }
@@ -180,13 +182,13 @@ mod tests {
         let truth = truth();
         for (encoder, held_back) in [
             ("x265enc tune=zerolatency key-int-max=10", 1),
-            // Pictures that build on later ones.
+            // With B frames: pictures that build on later ones.
             ("x265enc key-int-max=10 option-string=bframes=3", 8),
         ] {
             let mut decoder = H265Decoder::new().unwrap();
             let mut seen = 0;
             for (sent, (number, unit)) in units(encoder).iter().enumerate() {
-                // A unit that is spoilt gives no picture, and none after it another's time.
+                // A spoilt unit gives no picture, and no later picture gets another's time.
                 let unit = if sent == 35 { &unit[..unit.len() / 2] } else { &unit[..] };
                 for picture in decoder.decode(unit, *number as i64 * 3000).unwrap_or_default() {
                     check(encoder, &picture, &truth);

@@ -1,5 +1,5 @@
-//! Whatever GStreamer can show: cameras, codecs and decoders in hardware for which this crate has nothing of
-//! its own. Needs the feature `gstreamer` and the system's libraries.
+//! Anything that GStreamer can show: cameras, codecs and hardware decoders that this crate does not
+//! support itself. Needs the feature `gstreamer` and the system's libraries.
 
 #[cfg(feature = "gstreamer")]
 mod h265;
@@ -14,18 +14,18 @@ pub(crate) use self::h265::H265Decoder;
 use crate::stream_clock::ClockMemory;
 use crate::{FrameSource, Latency, Login, VideoError};
 
-/// A pipeline to watch and how.
+/// A pipeline to watch, and how.
 #[derive(Clone, Debug)]
 pub struct GstreamerOptions {
-    /// Elements with `!` between them, as `gst-launch-1.0` takes them, to the decoded video; it has no sink.
-    /// Frames for which it has a reference time (`rtspsrc add-reference-timestamp-meta=true`) are timed by
-    /// that.
+    /// Elements with `!` between them, as `gst-launch-1.0` takes them, up to the decoded video,
+    /// without a sink. Frames that carry a reference time (`rtspsrc
+    /// add-reference-timestamp-meta=true`) are timed by it.
     pub pipeline: String,
-    /// Who asks: `user-id` and `user-pw` of the element that is named `camera`.
+    /// User and password: set as `user-id` and `user-pw` of the element that is named `camera`.
     pub login: Option<Login>,
-    /// Whether the reference time is believed; else frames are timed by their arrival.
+    /// Whether the reference time is believed; otherwise frames are timed by their arrival.
     pub heeds_reports: bool,
-    /// What it takes from the exposure to the arrival.
+    /// Delay from the exposure to the arrival.
     pub latency: Latency,
 }
 
@@ -37,7 +37,7 @@ pub struct GstreamerCamera {
 }
 
 impl GstreamerCamera {
-    /// A camera that is watched so.
+    /// A camera that is watched with these options.
     pub fn new(options: GstreamerOptions) -> Self {
         Self { options, memory: ClockMemory::default() }
     }
@@ -47,7 +47,7 @@ impl GstreamerCamera {
         self.options.pipeline.clone()
     }
 
-    /// Starts it. `silence` is how long it may show nothing.
+    /// Starts it. `silence` is how long it may show nothing before that is an error.
     ///
     /// # Errors
     /// [`VideoError::Stream`] if there are no such elements, or they do not fit.
@@ -57,7 +57,7 @@ impl GstreamerCamera {
         Ok(Box::new(source))
     }
 
-    /// As with the feature, but that nothing can be opened.
+    /// Without the feature nothing can be opened.
     ///
     /// # Errors
     /// [`VideoError::Stream`], always.

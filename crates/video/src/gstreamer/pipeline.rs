@@ -10,15 +10,16 @@ use super::GstreamerOptions;
 use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
 use crate::{Arrival, Frame, FrameSource, MAX_PIXELS, Pixels, TimedBy, VideoError};
 
-/// Ends every pipeline: brightness alone, as soon as it is there. Whoever watches takes each frame at once, and
-/// what stands in a decoder is limited by what was given to it.
+/// Ends every pipeline: brightness alone, handed over as soon as it is there. The caller takes each
+/// frame at once, and what a decoder holds is limited by what it was given.
 const BRIGHTNESS: &str =
     "videoconvert ! video/x-raw,format=GRAY8 ! appsink name=brightness sync=false";
-/// What a reference time counts from, as GStreamer's streams name it: NTP's beginning, or Unix'.
+/// Origin of a reference time, as GStreamer's streams name it: the start of NTP's count, or of
+/// Unix's.
 const NTP: &str = "timestamp/x-ntp";
 const UNIX: &str = "timestamp/x-unix";
 
-/// Builds what is described, with brightness at its end.
+/// Builds the pipeline that is described, with the brightness sink at its end.
 pub(super) fn built(description: &str) -> Result<(Pipeline, AppSink), String> {
     gstreamer::init().map_err(|error| error.to_string())?;
     let built = gstreamer::parse::launch(&format!("{description} ! {BRIGHTNESS}"));
@@ -28,7 +29,7 @@ pub(super) fn built(description: &str) -> Result<(Pipeline, AppSink), String> {
     sink.map(|sink| (pipeline, sink)).ok_or_else(|| "it has no end".to_owned())
 }
 
-/// The size and the brightness of a sample, without what rows are filled up with.
+/// Columns, rows and brightness of a sample, without the padding of its rows.
 pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), String> {
     let caps = sample.caps().ok_or("a frame has no format")?;
     let info = VideoInfo::from_caps(caps).map_err(|error| error.to_string())?;
@@ -49,7 +50,7 @@ pub(super) fn brightness(sample: &Sample) -> Result<(usize, usize, Vec<u8>), Str
     Ok((width, height, pixels))
 }
 
-/// What went wrong with a pipeline, if something did; what it says else is forgotten.
+/// The first error that a pipeline has reported, if any; messages of other kinds are discarded.
 pub(super) fn trouble(pipeline: &Pipeline) -> Option<String> {
     let message = pipeline.bus()?.pop_filtered(&[gstreamer::MessageType::Error])?;
     match message.view() {
@@ -61,7 +62,7 @@ pub(super) fn trouble(pipeline: &Pipeline) -> Option<String> {
     }
 }
 
-/// When a sample was captured by a clock that the pipeline has followed to its source.
+/// When a sample was captured by its reference time, which the pipeline has from the source.
 fn told(sample: &Sample) -> Option<Timestamp> {
     let meta = sample.buffer()?.meta::<ReferenceTimestampMeta>()?;
     let nanos = meta.timestamp().nseconds();
@@ -136,7 +137,7 @@ impl PipelineSource {
         let arrived_s = self.host.since_s(at);
         let count = sample.buffer().and_then(|buffer| buffer.pts());
         let told = told(sample);
-        // A pipeline's own count follows what the network does, and the reference does not.
+        // The pipeline's own count varies with the network's delays; the reference time does not.
         let stream_s = match (told, count) {
             (Some(told), _) => told.seconds(),
             (None, Some(count)) => count.nseconds() as f64 * 1e-9,
@@ -175,7 +176,7 @@ impl FrameSource for PipelineSource {
 
 impl Drop for PipelineSource {
     fn drop(&mut self) {
-        // A pipeline that does not stop is left: there is nobody to tell.
+        // If it does not stop it is left: there is nobody to report that to.
         let _ = self.pipeline.set_state(State::Null);
     }
 }

@@ -1,24 +1,24 @@
-//! What of an index is read, and the rest left out.
+//! Filters an MP4 index down to the boxes that are read.
 //!
-//! `mp4-atom` reads every box that it knows wherever it meets it, boxes within boxes without an end, and some
-//! of them take memory by what they claim and not by their length. It is given only those that are asked for
-//! here, each where it belongs.
+//! `mp4-atom` reads every box that it knows wherever it meets it, nested without a limit, and
+//! allocates for some of them what they claim and not what their length allows. It is given only
+//! the boxes that are listed here, each where it belongs.
 
 use std::ops::Range;
 
 use self::Holds::{Boxes, Counted, Picture, Values};
 
-/// A kind of box that is read, and what it has within.
+/// A kind of box that is read, and its contents.
 #[derive(Clone, Copy)]
 pub(super) struct Known([u8; 4], Holds);
 
 #[derive(Clone, Copy)]
 enum Holds {
-    /// What is read as it is.
+    /// Values, which are kept as they are.
     Values,
     /// Boxes.
     Boxes(&'static [Known]),
-    /// A version, how many boxes there are, and the boxes.
+    /// A version, the number of boxes, and the boxes.
     Counted(&'static [Known]),
     /// A picture's description, and boxes.
     Picture(&'static [Known]),
@@ -34,7 +34,7 @@ pub(super) const MOOV: &[Known] = &[
 const MDIA: &[Known] =
     &[Known(*b"mdhd", Values), Known(*b"hdlr", Values), Known(*b"minf", Boxes(MINF))];
 
-/// It must say where its data are, though they are always in this file.
+/// Must contain the reference to its data (`dinf`), though the data are always in this file.
 const MINF: &[Known] =
     &[Known(*b"dinf", Boxes(&[Known(*b"dref", Counted(&[]))])), Known(*b"stbl", Boxes(STBL))];
 
@@ -58,10 +58,10 @@ pub(super) const MOOF: &[Known] = &[
     ),
 ];
 
-/// The length of a picture's description, bytes (ISO/IEC 14496-12, 12.1.3).
+/// The length of a picture's description before its boxes, bytes (ISO/IEC 14496-12, 12.1.3).
 const PICTURE_BYTES: usize = 78;
 
-/// A box with what of it is read.
+/// A box with only those parts that are read.
 ///
 /// # Errors
 /// What is wrong with it, in words, if a box within it is cut off.
@@ -72,7 +72,7 @@ pub(super) fn known(whole: &[u8], within: &'static [Known]) -> Result<Vec<u8>, S
     Ok(kept)
 }
 
-/// Appends a box with what of it is read.
+/// Appends a box with only those parts that are read; its size is set to what was kept.
 fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<(), String> {
     const COUNT: Range<usize> = 4..8;
     let begins = kept.len();
@@ -100,13 +100,13 @@ fn append(Known(kind, holds): Known, body: &[u8], kept: &mut Vec<u8>) -> Result<
     Ok(())
 }
 
-/// Appends those of a box's boxes that are read, and says how many.
+/// Appends those inner boxes that are read, and returns their number.
 fn append_within(
     within: &'static [Known],
     mut bytes: &[u8],
     kept: &mut Vec<u8>,
 ) -> Result<u32, String> {
-    /// What is shorter than a box's head is padding.
+    /// Fewer bytes than a box's head are padding.
     const LEAST: usize = 8;
     let mut count = 0;
     while bytes.len() >= LEAST {
@@ -120,7 +120,7 @@ fn append_within(
     Ok(count)
 }
 
-/// The first of some boxes.
+/// The first of several boxes.
 struct First<'a> {
     kind: [u8; 4],
     body: &'a [u8],
@@ -132,7 +132,7 @@ fn first(bytes: &[u8]) -> Result<First<'_>, String> {
     let (head, rest) = bytes.split_first_chunk::<8>().ok_or_else(cut_off)?;
     let [s0, s1, s2, s3, kind @ ..] = *head;
     let (size, head) = match u32::from_be_bytes([s0, s1, s2, s3]) {
-        // To the end.
+        // Size 0: the box reaches to the end.
         0 => (bytes.len(), 8),
         1 => {
             let long = rest.first_chunk::<8>().ok_or_else(cut_off)?;
@@ -168,7 +168,8 @@ mod tests {
             let media = a_box(b"mdia", &[&a_box(b"minf", &[&table])]);
             a_box(b"moov", &[outer, &[&a_box(b"trak", &[&media])]].concat())
         };
-        // A box that belongs elsewhere is not read either, and what is shorter than a box is padding.
+        // A box in the wrong place is not read either, and what is shorter than a box's head is
+        // padding.
         let full = index(&[&groups, &times, &[0; 4]], &[&groups, &header, &times]);
         assert_eq!(known(&full, MOOV).unwrap(), index(&[&times], &[&header]));
     }

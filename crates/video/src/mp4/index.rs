@@ -1,31 +1,31 @@
 //! Where the compressed frames of an MP4 file lie, and when each is shown.
 //!
-//! The boxes are `mp4-atom`'s business. It is given whole boxes out of a buffer, which it cannot
-//! leave, with nothing in them but what is read here, and every loop here goes on to a later byte of
-//! the file or ends: a damaged file costs no more time and memory than its size.
+//! The boxes are parsed by `mp4-atom`. It is given whole boxes in a buffer, so it cannot read
+//! beyond them, with nothing in them but what is read here; every loop here advances in the file or
+//! ends. So a damaged file costs no more time and memory than its size.
 
 use std::io::{Read, Seek, SeekFrom};
 
 use super::boxes::{self, known};
 use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak};
 
-/// The longest index that is read, bytes: a day of 60 frames per second.
+/// The longest index that is read, bytes: that of a day at 60 frames per second.
 const MAX_INDEX_BYTES: u64 = 128 << 20;
-/// The most frames of a file: 19 hours of 60 per second.
+/// Most frames of a file: 19 hours at 60 per second.
 const MAX_SAMPLES: usize = 1 << 22;
-/// A compressed frame larger than this is damage.
+/// A compressed frame longer than this is taken for damage, bytes.
 const MAX_SAMPLE_BYTES: u64 = 64 << 20;
 
 /// One compressed frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Sample {
-    /// Where it begins, bytes from the file's beginning.
+    /// Where it begins, bytes from the start of the file.
     pub(super) offset: u64,
     /// How long it is, bytes.
     pub(super) size: usize,
-    /// Whether it can be decoded without those before it.
+    /// Whether it can be decoded without the frames before it.
     pub(super) is_sync: bool,
-    /// When it is shown, in ticks after the first one is.
+    /// When it is shown, in ticks after the first frame shown.
     pub(super) shown_at: i64,
 }
 
@@ -34,13 +34,13 @@ pub(super) struct Sample {
 pub(super) struct Index {
     /// In the order of decoding.
     pub(super) samples: Vec<Sample>,
-    /// Ticks a second.
+    /// Ticks per second.
     pub(super) timescale: f64,
-    /// The sets of parameters that every picture needs.
+    /// The parameter sets that every picture needs.
     pub(super) parameters: Vec<Vec<u8>>,
-    /// Bytes of the length before each part of a frame.
+    /// Bytes of the length field before each part of a frame.
     pub(super) length_bytes: usize,
-    /// Frames that lie beyond the file's end.
+    /// Number of frames that lie beyond the file's end.
     pub(super) missing: usize,
 }
 
@@ -84,7 +84,7 @@ fn h264(table: &Stbl) -> Result<&Avc1, String> {
 
 type Fragments = Vec<(u64, Moof)>;
 
-/// The index, and the fragments with their places. Boxes after a torn one are not looked for.
+/// The index, and the fragments with their places. Reading stops at a torn box.
 fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), String> {
     let text = |error: std::io::Error| error.to_string();
     let end = file.seek(SeekFrom::End(0)).map_err(text)?;
@@ -114,7 +114,7 @@ fn boxes<R: Read + Seek>(file: &mut R) -> Result<(Option<Moov>, Fragments), Stri
     Ok((moov, moofs))
 }
 
-/// Kind and size of the box at a place; `None` if none lies there whole.
+/// Kind and size of the box at a place; `None` if no whole box lies there.
 fn head<R: Read + Seek>(
     file: &mut R,
     at: u64,

@@ -21,7 +21,7 @@ pub struct Mp4Source {
     decoder: H264Decoder,
     ready: VecDeque<Frame>,
     failed: VecDeque<String>,
-    /// Frames that lie beyond the file's end, as long as that has not been said.
+    /// Frames that lie beyond the file's end; set to 0 once that has been reported.
     missing: usize,
     timescale: f64,
     next: u64,
@@ -80,7 +80,7 @@ impl Mp4Source {
         Ok(unit)
     }
 
-    /// Decodes one more compressed frame; what comes out waits in `ready`.
+    /// Decodes one more compressed frame; the pictures that come out wait in `ready`.
     fn advance(&mut self, sample: &Sample) {
         let unit = match self.access_unit(sample) {
             Ok(unit) => unit,

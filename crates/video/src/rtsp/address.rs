@@ -5,11 +5,11 @@ use url::Url;
 
 use crate::VideoError;
 
-/// Where a network camera's stream is: an RTSP address without who asks for it.
+/// Address of a network camera's stream (RTSP), without user and password.
 #[derive(Clone, PartialEq, Eq)]
 pub struct StreamAddress(Url);
 
-/// Who asks a camera for its stream. The password is shown nowhere.
+/// User and password for a camera. The password is never displayed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Login {
     user: String,
@@ -27,7 +27,7 @@ impl Login {
         &self.user
     }
 
-    /// The password, to be shown to the camera alone.
+    /// The password, to be sent to the camera alone.
     pub fn password(&self) -> &str {
         &self.password
     }
@@ -40,10 +40,10 @@ impl fmt::Debug for Login {
 }
 
 impl StreamAddress {
-    /// Reads `rtsp://HOST[:PORT]/PATH`; a user and a password before the host are taken out of it.
+    /// Reads `rtsp://HOST[:PORT]/PATH`; a user and a password before the host are split off.
     ///
     /// # Errors
-    /// [`VideoError::Address`] if it is none.
+    /// [`VideoError::Address`] if the text is not such an address.
     pub fn parse(text: &str) -> Result<(Self, Option<Login>), VideoError> {
         let wrong = |what: &str| VideoError::Address { what: what.to_owned() };
         let mut url = Url::parse(text).map_err(|error| wrong(&error.to_string()))?;
@@ -57,7 +57,7 @@ impl StreamAddress {
         let login = (!url.username().is_empty()).then(|| {
             Login::new(decoded(url.username()), decoded(url.password().unwrap_or_default()))
         });
-        // Neither fails for an address with a host.
+        // Neither call fails for an address with a host.
         let _ = url.set_username("");
         let _ = url.set_password(None);
         Ok((Self(url), login))
@@ -69,7 +69,7 @@ impl StreamAddress {
 }
 
 impl fmt::Display for StreamAddress {
-    /// Without what follows a `?`, and without a path that holds a password: some makes want it there.
+    /// Leaves out what follows a `?`, and a path that holds a password: some makes want it there.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut url = self.0.clone();
         let path = url.path().to_ascii_lowercase();

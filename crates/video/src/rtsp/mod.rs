@@ -1,4 +1,4 @@
-//! Streams of network cameras.
+//! Streams of network cameras (RTSP).
 
 mod address;
 mod packets;
@@ -28,67 +28,69 @@ use crate::live::SILENCE;
 use crate::stream_clock::{ClockMemory, HostClock, SET_S, StreamClock, unix_time};
 use crate::{Arrival, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
-/// What can be decoded, as sessions' descriptions name it.
+/// Codecs that are decoded, as session descriptions name them.
 const DECODED: &[&str] =
     if cfg!(feature = "gstreamer") { &["h264", "h265", "jpeg"] } else { &["h264", "jpeg"] };
 /// How long a camera may take to answer before it is given up.
 const ANSWER: Duration = Duration::from_secs(5);
-/// How long it may take to take leave of it.
+/// How long closing the session may take.
 const FAREWELL: Duration = Duration::from_millis(200);
-/// A stream that comes slowly may pause for so many of its longest intervals.
+/// A slow stream may pause for this many times its longest recent interval.
 const INTERVALS: u32 = 3;
-/// The intervals of which the longest is taken.
+/// Number of recent intervals of which the longest is taken.
 const REMEMBERED_INTERVALS: usize = 8;
-/// A stream of which nothing could be decoded for so long is opened anew: longer than any camera takes
-/// from one picture that builds on none to the next.
+/// A stream of which nothing could be decoded for this long is reopened: longer than the time
+/// between two key pictures of any camera.
 const UNDECODED: Duration = Duration::from_secs(30);
-/// Units whose pictures may be held back.
+/// Most units whose arrival is kept while the decoder holds their pictures back.
 const MOST_ARRIVALS: usize = 64;
 
-/// How a stream is brought here.
+/// How a stream is transported.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum RtspTransport {
-    /// Within the connection: nothing is lost, what is lost on the way is sent again and comes late.
+    /// Within the RTSP connection: lost packets are sent again, so nothing is missing but some
+    /// comes late.
     #[default]
     Tcp,
-    /// In datagrams: what is lost is lost, with all that builds on it.
+    /// In datagrams: a lost packet is not sent again, and all pictures that need it are lost too.
     Udp,
 }
 
-/// A stream to watch and how.
+/// A stream to watch, and how.
 #[derive(Clone, Debug)]
 pub struct RtspOptions {
-    /// Where it is.
+    /// Address of the stream.
     pub address: StreamAddress,
-    /// Who asks, if the camera wants to know.
+    /// User and password, if the camera requires them.
     pub login: Option<Login>,
-    /// How it comes.
+    /// How the stream is transported.
     pub transport: RtspTransport,
-    /// Whether what the camera says of its clock is believed; else frames are timed by their arrival.
+    /// Whether the camera's clock reports are believed; otherwise frames are timed by their
+    /// arrival.
     pub heeds_reports: bool,
-    /// What it takes from the exposure to the arrival.
+    /// Delay from the exposure to the arrival.
     pub latency: Latency,
 }
 
 impl RtspOptions {
-    /// What is wrong with the stream.
+    /// An error of this stream.
     fn wrong(&self, what: String) -> VideoError {
         VideoError::Stream { url: self.address.to_string(), what }
     }
 }
 
-/// What it takes from the exposure of a frame to its arrival.
+/// Delay from the exposure of a frame to its arrival.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Latency {
     /// The mean, s.
     pub mean_s: f64,
-    /// How well that is known: its standard deviation, s. What cameras say of their clocks is no
-    /// better, as some say when they sent a frame and not when they took it.
+    /// Standard deviation of the latency, s. It is also used where the camera reports its clock, as
+    /// some cameras report when they sent a frame and not when they took it.
     pub sd_s: f64,
 }
 
 impl Default for Latency {
-    /// What cameras of many makes take: 50 to 300 ms.
+    /// Typical of cameras of many makes, which take 50 to 300 ms.
     fn default() -> Self {
         Self { mean_s: 0.1, sd_s: 0.1 }
     }
@@ -102,21 +104,22 @@ pub struct RtspCamera {
 }
 
 impl RtspCamera {
-    /// A camera that is watched so.
+    /// A camera that is watched with these options.
     pub fn new(options: RtspOptions) -> Self {
         Self { options, memory: ClockMemory::default() }
     }
 
-    /// Where it is, without who asks.
+    /// Its address, without user and password.
     pub fn address(&self) -> String {
         self.options.address.to_string()
     }
 
-    /// Asks for its stream. `silence` is how long it may send nothing; a stream whose frames come
+    /// Opens its stream. `silence` is how long it may send nothing; a stream whose frames come
     /// slowly may pause for three of their intervals.
     ///
     /// # Errors
-    /// [`VideoError::Stream`] if nobody answers, it refuses, or it has no video that can be decoded.
+    /// [`VideoError::Stream`] if nobody answers, the camera refuses, or it has no video that can be
+    /// decoded.
     pub fn open(&self, silence: Duration) -> Result<RtspSource, VideoError> {
         RtspSource::open(&self.options, self.memory.clone(), silence)
     }
@@ -125,10 +128,10 @@ impl RtspCamera {
 /// A network camera's stream, H.264 or Motion JPEG, over RTSP, until it ends or falls silent.
 ///
 /// Capture times are by the camera's clock as its sender reports tell it (RFC 3550, 6.4.1), and by
-/// arrival until the first of them comes, which takes some seconds.
+/// arrival until the first report comes, which takes some seconds.
 pub struct RtspSource {
     runtime: Runtime,
-    /// Is there until this is dropped.
+    /// Always there until this is dropped.
     stream: Option<Demuxed>,
     sessions: Arc<SessionGroup>,
     stream_id: usize,
@@ -137,24 +140,24 @@ pub struct RtspSource {
     clock: StreamClock,
     host: HostClock,
     begun: Instant,
-    /// How long it may be silent.
+    /// How long the stream may be silent.
     silence: Duration,
-    /// When the last frame came, ...
+    /// When the last frame arrived, ...
     last: Option<Instant>,
-    /// ... and the last that could be decoded.
+    /// ... and the last one that could be decoded.
     pictured: Instant,
     /// The last intervals between frames.
     intervals: VecDeque<Duration>,
-    /// When the units came whose pictures have not come out yet.
+    /// Arrival of the units whose pictures have not come out yet, by their stream time, ticks.
     arrivals: BTreeMap<i64, Instant>,
-    /// A packet was lost: what comes builds on it until the next picture that builds on none.
+    /// A packet was lost: pictures cannot be decoded until the next key picture.
     torn: bool,
     next: u64,
-    /// Frames that came out together with the one before them.
+    /// Frames that came out together with the frame before them.
     ready: VecDeque<Frame>,
 }
 
-/// A picture's time by the stream's count, size and pixels.
+/// A picture's stream time, ticks, its columns, rows and pixels.
 type Decoded = (i64, usize, usize, Pixels);
 
 enum Codec {
@@ -184,7 +187,7 @@ impl RtspSource {
             })
         });
         if connected.is_err() {
-            // It may have given a place to whoever does not come.
+            // The camera may have reserved a place for this client: the session is closed.
             runtime.block_on(async {
                 let _ = tokio::time::timeout(FAREWELL, sessions.await_teardown()).await;
             });
@@ -212,7 +215,7 @@ impl RtspSource {
         })
     }
 
-    /// How long to wait for what comes next.
+    /// How long the stream may pause before it counts as silent.
     fn patience(&self) -> Duration {
         let slowest = self.intervals.iter().max();
         slowest.map_or(self.silence, |slowest| SILENCE.max(*slowest * INTERVALS))
@@ -231,7 +234,7 @@ impl RtspSource {
     /// The next packet of frames or reports.
     fn receive(&mut self) -> Result<Option<CodecItem>, VideoError> {
         let patience = self.patience();
-        // What the camera says of its clock is no frame.
+        // The wait counts from the last frame: a clock report does not prolong it.
         let silent = self.last.unwrap_or(self.begun).elapsed();
         let left = patience.saturating_sub(silent);
         let Some(stream) = &mut self.stream else {
@@ -252,7 +255,8 @@ impl RtspSource {
         })
     }
 
-    /// Makes ready the frames that a unit of the stream lets out; none if its picture comes out later.
+    /// Decodes a unit and puts the frames that come out into `ready`; none if its picture comes out
+    /// later.
     fn take(&mut self, unit: &VideoFrame) -> Result<(), VideoError> {
         let at = unit.end_ctx().received();
         self.note_arrival(at);
@@ -272,7 +276,7 @@ impl RtspSource {
         Ok(())
     }
 
-    /// A picture as a frame, that came out when a unit had come at a time.
+    /// A frame of a picture that came out after a unit had arrived at `at`.
     fn frame(
         &mut self,
         unit: &VideoFrame,
@@ -294,7 +298,7 @@ impl RtspSource {
         Ok(Frame { index, capture, live, width, height, pixels })
     }
 
-    /// The pictures that a unit lets out.
+    /// The pictures that come out after a unit.
     fn decode(&mut self, unit: &VideoFrame, at: Instant) -> Result<Vec<Decoded>, VideoError> {
         let is_whole = unit.loss() == 0;
         self.torn = !is_whole || self.torn && !unit.is_random_access_point();
@@ -321,7 +325,7 @@ impl RtspSource {
         })
     }
 
-    /// Heeds what the camera says of its clock.
+    /// Takes in the camera's reports of its clock.
     fn heed(&mut self, reports: &ReceivedCompoundPacket) {
         let of_stream = reports.stream_id() == self.stream_id;
         let Some(time) = reports.rtp_timestamp().filter(|_| of_stream) else {
@@ -338,8 +342,8 @@ impl RtspSource {
     }
 }
 
-/// What a camera says is read by libraries that it can make panic (a line without `=` in a session's
-/// description does it): then it is the stream that is wrong.
+/// Runs `read` and turns a panic into a stream error: what a camera sends can make the libraries
+/// that read it panic (a line without `=` in a session's description does).
 fn unharmed<T>(url: &str, read: impl FnOnce() -> Result<T, VideoError>) -> Result<T, VideoError> {
     catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|panic| {
         let said = panic.downcast_ref::<String>().map(String::as_str);
@@ -349,15 +353,15 @@ fn unharmed<T>(url: &str, read: impl FnOnce() -> Result<T, VideoError>) -> Resul
     })
 }
 
-/// What is to be said of an error of the protocol: the details of the connection follow in further
-/// lines.
+/// The part of a protocol error that is worth showing: further lines hold the details of the
+/// connection.
 fn first_line(text: &str) -> String {
     text.lines().next().unwrap_or_default().to_owned()
 }
 
-/// What a refusal means to people.
+/// What a camera's refusal means, in words for people.
 fn refusal(options: &RtspOptions, error: &retina::Error) -> VideoError {
-    // Of an address, what follows a `?` may be a password.
+    // What follows the `?` of an address may be a password, so it is replaced.
     let query = options.address.url().query().map(|query| format!("?{query}"));
     let said = first_line(&error.to_string()).replace(query.as_deref().unwrap_or("\n"), "?...");
     options.wrong(match error.status_code() {
@@ -423,12 +427,12 @@ async fn connect(
 }
 
 impl Drop for RtspSource {
-    /// Tells the camera that nobody watches any more: many have room for a few only.
+    /// Closes the session: many cameras have room for only a few clients.
     fn drop(&mut self) {
         let _guard = self.runtime.enter();
         drop(self.stream.take());
         self.runtime.block_on(async {
-            // A camera that is gone does not answer.
+            // A camera that is gone does not answer, so there is a time limit.
             let _ = tokio::time::timeout(FAREWELL, self.sessions.await_teardown()).await;
         });
     }

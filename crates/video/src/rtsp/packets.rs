@@ -1,20 +1,20 @@
-//! H.264 and clock reports as packets (RFC 3550, RFC 6184), for the server.
+//! H.264 and clock reports as RTP packets (RFC 3550, RFC 6184), for the server.
 
 use crossfix_message::Timestamp;
 
 use crate::annex_b::units;
 use crate::stream_clock::NTP_TO_UNIX_S;
 
-/// The longest payload of a packet, bytes: what an Ethernet frame takes.
+/// The longest payload of a packet, bytes: that of an Ethernet frame.
 const LONGEST_PAYLOAD: usize = 1400;
-/// Type of the payload, as the session's description names it.
+/// RTP payload type, as the session's description names it.
 pub(super) const PAYLOAD_TYPE: u8 = 96;
 /// The clock of video streams, Hz.
 pub(super) const CLOCK_HZ: u32 = 90_000;
-/// Kind of a unit that is a part of one (FU-A).
+/// Unit type of a fragment of a unit (FU-A).
 const FRAGMENT: u8 = 28;
 
-/// Numbers packets of one stream.
+/// Makes numbered packets of one stream.
 #[derive(Debug)]
 pub(super) struct Packetiser {
     source: u32,
@@ -28,7 +28,7 @@ impl Packetiser {
         Self { source, sequence: 0, packets: 0, bytes: 0 }
     }
 
-    /// An access unit as packets within the connection, on channel 0.
+    /// An access unit as packets within the RTSP connection, on channel 0.
     pub(super) fn access_unit(&mut self, stream: &[u8], ticks: u32) -> Vec<u8> {
         let payloads: Vec<Vec<u8>> = units(stream).flat_map(payloads).collect();
         let mut out = Vec::new();
@@ -48,7 +48,8 @@ impl Packetiser {
         out
     }
 
-    /// What the camera's clock shows when the stream's count is at `ticks`, on channel 1.
+    /// A report of what the camera's clock shows when the stream's count is at `ticks`, on channel
+    /// 1.
     pub(super) fn report(&self, told: Timestamp, ticks: u32) -> Vec<u8> {
         let nanos = told.nanos().max(0) as u64;
         let seconds = nanos / 1_000_000_000 + NTP_TO_UNIX_S;
@@ -64,7 +65,7 @@ impl Packetiser {
     }
 }
 
-/// A unit as it is, or in parts.
+/// A unit in one payload, or fragmented if it is too long for one.
 fn payloads(unit: &[u8]) -> Vec<Vec<u8>> {
     let Some((&head, body)) = unit.split_first() else {
         return Vec::new();
@@ -84,7 +85,7 @@ fn payloads(unit: &[u8]) -> Vec<Vec<u8>> {
     chunks.iter().enumerate().map(part).collect()
 }
 
-/// A packet within the connection (RFC 2326, 10.12).
+/// A packet framed for the RTSP connection (RFC 2326, 10.12).
 fn interleaved(channel: u8, packet: &[u8]) -> Vec<u8> {
     let mut framed = vec![b'$', channel];
     framed.extend((packet.len() as u16).to_be_bytes());

@@ -13,23 +13,23 @@ use super::Login;
 use super::packets::{CLOCK_HZ, PAYLOAD_TYPE, Packetiser};
 use crate::annex_b::is_key;
 
-/// Frames that may wait for one who watches; who is farther behind is sent away.
+/// Number of frames that may wait for a watcher; one that is farther behind is disconnected.
 const WAITING: usize = 64;
-/// How long one who watches may take nothing.
+/// How long a watcher may take no data before it is disconnected.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// The longest line and the most lines of a request.
+/// The longest line, bytes, and the most lines of a request.
 const LONGEST_LINE: u64 = 4096;
 const MOST_LINES: usize = 64;
-/// The number of a session. Who watches has a connection of its own, so one will do.
+/// The session's name. Each watcher has a connection of its own, so all can have the same.
 const SESSION: &str = "1";
 
 /// The streams of a server, by path.
 type Streams = Arc<Mutex<BTreeMap<String, Arc<Mutex<Stream>>>>>;
 
-/// Plays streams of H.264 as a network camera does: RTSP, within the connection.
+/// Serves H.264 streams as a network camera does: RTSP, with the packets within the connection.
 ///
-/// For scenes and tests. It knows nothing of the pictures: whoever has the [`Mount`] of a stream sends
-/// them at their time.
+/// For scenes and tests. The server does not make the pictures: the holder of a stream's [`Mount`]
+/// sends each at its time.
 ///
 /// ```
 /// use crossfix_video::RtspServer;
@@ -56,12 +56,12 @@ struct Stream {
     watchers: Vec<Watcher>,
 }
 
-/// One who watches.
+/// A client that watches.
 #[derive(Debug)]
 struct Watcher {
     queue: SyncSender<Vec<u8>>,
     connection: TcpStream,
-    /// Whether it has had a picture that builds on no other.
+    /// Whether it has been sent a key picture, which can be decoded without others.
     sees: bool,
 }
 
@@ -70,7 +70,7 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl RtspServer {
-    /// Listens at an address; who asks has to log in, if a login is given (basic authentication).
+    /// Listens at an address; clients have to log in if a login is given (basic authentication).
     ///
     /// # Errors
     /// What the system says.
@@ -94,7 +94,7 @@ impl RtspServer {
         self.address
     }
 
-    /// A stream at a path.
+    /// Adds a stream at a path.
     pub fn mount(&mut self, path: &str) -> Mount {
         let source = locked(&self.streams).len() as u32 + 1;
         let packetiser = Packetiser::new(source);
@@ -105,13 +105,13 @@ impl RtspServer {
 }
 
 impl Mount {
-    /// Whether anybody watches.
+    /// Whether any client watches.
     pub fn is_watched(&self) -> bool {
         !locked(&self.0).watchers.is_empty()
     }
 
-    /// Sends an access unit (Annex B) to all who watch; `ticks` is its time by the stream's count of
-    /// 90 000 a second.
+    /// Sends an access unit (Annex B) to all who watch; `ticks` is its time by the stream's count
+    /// of 90 000 per second.
     pub fn send(&self, unit: &[u8], ticks: u32) {
         let mut stream = locked(&self.0);
         let packets = stream.packetiser.access_unit(unit, ticks);
@@ -129,14 +129,14 @@ impl Mount {
         stream.watchers.retain_mut(|watcher| !watcher.sees || watcher.send(report.clone()));
     }
 
-    /// Ends all connections to it, as a camera does that starts again.
+    /// Closes all connections to it, as a restarting camera does.
     pub fn hang_up(&self) {
         locked(&self.0).watchers.clear();
     }
 }
 
 impl Watcher {
-    /// Whether it still watches.
+    /// Queues packets; returns whether the client still watches.
     fn send(&self, packets: Vec<u8>) -> bool {
         !matches!(
             self.queue.try_send(packets),
@@ -147,19 +147,19 @@ impl Watcher {
 
 impl Drop for Watcher {
     fn drop(&mut self) {
-        // Gone already, perhaps.
+        // The client may have closed it already.
         let _ = self.connection.shutdown(Shutdown::Both);
     }
 }
 
-/// One who asks.
+/// A connected client.
 struct Caller {
     streams: Streams,
     login: Option<Login>,
     path: Option<String>,
 }
 
-/// What is asked for.
+/// An RTSP request.
 struct Request {
     method: String,
     url: String,
@@ -167,9 +167,9 @@ struct Request {
 }
 
 impl Request {
-    /// The next request; `None` at the end of the connection, or where it is none.
+    /// The next request; `None` at the end of the connection, or if what comes is not a request.
     fn read(reader: &mut BufReader<&TcpStream>) -> Option<Self> {
-        // Who watches may say within the connection how it does.
+        // Clients may send receiver reports within the connection: they are skipped.
         while *reader.fill_buf().ok()?.first()? == b'$' {
             let mut head = [0; 4];
             reader.read_exact(&mut head).ok()?;
@@ -216,7 +216,7 @@ impl Caller {
         }
     }
 
-    /// The stream at a path that begins so.
+    /// The path that a URL names, and its stream.
     fn stream(&self, url: &str) -> Option<(String, Arc<Mutex<Stream>>)> {
         let path = url.split_once("://").map_or(url, |(_, rest)| rest);
         let path = path.split_once('/').map_or("", |(_, path)| path);
@@ -233,7 +233,7 @@ impl Caller {
         })
     }
 
-    /// The answer, and whether the stream begins after it.
+    /// The answer, and whether the stream starts after it.
     fn answer(&mut self, request: &Request) -> (String, bool) {
         let number = request.headers.get("cseq").map_or("0", String::as_str);
         let reply = |status: &str, headers: &[&str], body: &str| {
@@ -287,7 +287,7 @@ impl Caller {
         (answer, false)
     }
 
-    /// Begins to send the stream.
+    /// Starts to send the stream.
     fn play(&self, connection: &TcpStream, queue: &SyncSender<Vec<u8>>) -> Option<()> {
         let (_, stream) = self.stream(&format!("/{}", self.path.as_deref()?))?;
         let connection = connection.try_clone().ok()?;
@@ -297,7 +297,7 @@ impl Caller {
     }
 }
 
-/// A queue that a thread of its own empties into a connection, answers and frames in turn.
+/// A queue that a thread of its own writes to a connection, answers and frames in order.
 fn write_behind(connection: &TcpStream) -> std::io::Result<SyncSender<Vec<u8>>> {
     let (queue, waiting) = sync_channel::<Vec<u8>>(WAITING);
     let mut writer = connection.try_clone()?;
@@ -305,7 +305,7 @@ fn write_behind(connection: &TcpStream) -> std::io::Result<SyncSender<Vec<u8>>> 
     std::thread::spawn(move || {
         for bytes in waiting {
             if writer.write_all(&bytes).is_err() {
-                // Whoever reads from it is to know.
+                // Shutting the connection down ends the thread that reads from it.
                 let _ = writer.shutdown(Shutdown::Both);
                 return;
             }

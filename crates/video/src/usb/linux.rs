@@ -1,4 +1,4 @@
-//! Cameras of this host as Linux shows them: Video4Linux, version 2.
+//! Cameras of this host on Linux: Video4Linux, version 2.
 
 use std::os::fd::AsRawFd;
 use std::path::PathBuf;
@@ -17,17 +17,18 @@ use nix::time::{ClockId, clock_gettime};
 use super::UsbOptions;
 use crate::{Arrival, CaptureTime, Frame, FrameSource, Pixels, TimedBy, VideoError, decode_still};
 
-/// Buffers that the driver fills in turn: with one it could not fill the next while this one is read.
+/// Number of buffers that the driver fills in turn: with one it could not fill the next while this
+/// one is read.
 const BUFFERS: usize = 4;
-/// Formats that are read, those without loss first.
+/// Pixel formats that are read, in order of preference: those without loss first.
 const FORMATS: [FourCc; 3] = [FourCc::Grey, FourCc::Yuyv, FourCc::Mjpeg];
-/// What is asked for where all are to come, Hz: drivers take the next that they have.
+/// Frame rate that is requested to get all frames, Hz: drivers take the nearest that they have.
 const FASTEST_HZ: f64 = 1000.0;
-/// A rate this much below what is asked for is not it: 29.97 is 30.
+/// Least share of the requested rate that counts as that rate: 29.97 is 30.
 const LEAST_RATE: f64 = 0.97;
 
-/// Flags of a buffer (videodev2.h): it is damaged; its time is that of `CLOCK_MONOTONIC`; its time is of the
-/// start of the exposure, and not of the frame's end.
+/// Flags of a buffer (videodev2.h): it is damaged; its time is by `CLOCK_MONOTONIC`; its time is
+/// that of the start of the exposure, and not of the frame's end. The last two are (mask, value).
 const DAMAGED: u32 = 0x40;
 const MONOTONIC: (u32, u32) = (0xe000, 0x2000);
 const START_OF_EXPOSURE: (u32, u32) = (0x7_0000, 0x1_0000);
@@ -43,7 +44,7 @@ pub(super) struct UsbSource {
     interval_s: f64,
     silence: Duration,
     last: Instant,
-    /// The driver's number of the first frame.
+    /// The driver's sequence number of the first frame.
     first: Option<u32>,
 }
 
@@ -53,7 +54,7 @@ impl UsbSource {
             |what: String| VideoError::Stream { url: options.device.display().to_string(), what };
         let device = Device::open(&options.device).map_err(|error| failed(opening(&error)))?;
         let (format, interval_s) = choose(&device, options).map_err(failed)?;
-        // Whoever waits for a frame is to be told that none comes.
+        // A read must not block, so that silence can be reported.
         fcntl(device.as_raw_fd(), FcntlArg::F_SETFL(OFlag::O_NONBLOCK))
             .map_err(|error| failed(error.to_string()))?;
         let stream = device
@@ -91,7 +92,7 @@ impl UsbSource {
         }
     }
 
-    /// What a filled buffer holds.
+    /// The frame in a filled buffer.
     fn take(&mut self, filled: &Filled<'_>) -> Result<Frame, VideoError> {
         self.last = Instant::now();
         let index =
@@ -114,16 +115,18 @@ impl UsbSource {
         })
     }
 
-    /// When a frame was captured, and its time by the driver's count, s.
+    /// When a frame was captured, and the driver's time of it, s.
     fn capture(&self, filled: &Filled<'_>) -> (CaptureTime, f64) {
         let is = |(mask, value): (u32, u32)| filled.flags & mask == value;
         let wall_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
         let now_s = clock_gettime(ClockId::CLOCK_MONOTONIC)
             .map_or(0.0, |now| Duration::from(now).as_secs_f64());
-        // A driver that stamps by no clock that is known has its frames' arrival.
+        // If the driver stamps by an unknown clock, the frame counts as stamped now, on its
+        // arrival.
         let stamped_s = if is(MONOTONIC) { filled.time.as_secs_f64() } else { now_s };
         let usual_s = if is(START_OF_EXPOSURE) { 0.0 } else { self.interval_s / 2.0 };
         let before_s = now_s - stamped_s + self.options.latency_s.unwrap_or(usual_s);
+        // capture time = now - (now - stamp) - latency, with `now` by both clocks
         let time = Timestamp::from_seconds(wall_s).plus_seconds(-before_s);
         (CaptureTime { time, sd_s: self.options.sd_s }, stamped_s)
     }
@@ -151,7 +154,7 @@ impl FrameSource for UsbSource {
     }
 }
 
-/// What the driver says of a buffer, with what it holds.
+/// What the driver says of a buffer, and its contents.
 struct Filled<'a> {
     sequence: u32,
     flags: u32,
@@ -159,7 +162,7 @@ struct Filled<'a> {
     bytes: &'a [u8],
 }
 
-/// What keeps a device from being opened, with what mends it.
+/// Why a device cannot be opened, with a remedy.
 fn opening(error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::NotFound => "there is no such device: is the camera plugged in?".into(),
@@ -172,8 +175,9 @@ fn opening(error: &std::io::Error) -> String {
     }
 }
 
-/// Sets the camera to the size that is asked for, in the first format that has the rate, or in that which
-/// has the most; the format, and the interval between frames, s.
+/// Sets the camera to the requested size, in the first format that has the requested rate. If no
+/// rate is requested, the format with the highest rate is taken. Returns the format and the
+/// interval between frames, s.
 fn choose(device: &Device, options: &UsbOptions) -> Result<(PixFormat, f64), String> {
     let size = match options.size {
         Some(size) => size,
@@ -215,13 +219,13 @@ fn choose(device: &Device, options: &UsbOptions) -> Result<(PixFormat, f64), Str
     set.ok_or_else(|| "it does not keep to a format".to_owned())
 }
 
-/// The size that a camera is set to.
+/// The size that the camera is set to at present.
 fn size_of(device: &Device) -> std::io::Result<[u32; 2]> {
     let format = device.format(BufferType::VideoCapture)?;
     Ok(format.try_ref::<PixFormat>().map_or([0, 0], |now| [now.width(), now.height()]))
 }
 
-/// Devices that capture, in the order of their names, and what they call themselves.
+/// Devices that capture, sorted by path, each with the name that it reports.
 pub(super) fn cameras() -> Vec<(PathBuf, String)> {
     let captures = |path: PathBuf| {
         let capability = Device::open(&path).ok()?.capabilities().ok()?;
@@ -236,7 +240,8 @@ pub(super) fn cameras() -> Vec<(PathBuf, String)> {
     cameras
 }
 
-/// Sets the camera to a format; what it has become, and its interval, s. `None` if it has not got that.
+/// Sets the camera to a format; returns the format that the driver chose, and the interval between
+/// frames, s. `None` if the camera does not have the wanted pixel format.
 fn set(
     device: &Device,
     size: [u32; 2],
@@ -248,7 +253,7 @@ fn set(
         pixels.set_width(size[0]);
         pixels.set_height(size[1]);
         pixels.set_pixel_format(wanted);
-        // Strides and sizes are the driver's to say.
+        // The driver sets strides and sizes.
         pixels.set_bytes_per_line(0);
         pixels.set_size_image(0);
     }
@@ -265,14 +270,14 @@ fn set(
         interval.set_denominator((rate_hz.unwrap_or(FASTEST_HZ) * 1000.0) as u32);
         capture.set_time_per_frame(interval);
     }
-    // Some have one rate, and say so by refusing to be asked.
+    // Some cameras have one rate only, and refuse this call.
     let _ = device.set_param(&mut parameters);
     let parameters = device.param(BufferType::VideoCapture)?;
     let interval_s = parameters.try_ref::<CaptureParm>().map_or(0.0, |capture| {
         let interval = capture.time_per_frame();
         f64::from(interval.numerator()) / f64::from(interval.denominator().max(1))
     });
-    // Of one that does not say the rate is taken to be the usual.
+    // If the camera does not say, the usual 30 Hz are assumed.
     Ok(Some((now, if interval_s > 0.0 { interval_s } else { 1.0 / 30.0 })))
 }
 
@@ -282,7 +287,7 @@ fn pixels(format: &PixFormat, bytes: &[u8]) -> Result<Pixels, String> {
     let stride = format.bytes_per_line() as usize;
     match format.pixel_format() {
         FourCc::Grey => rows(bytes, [width, height], stride, 1).map(Pixels::Gray8),
-        // Brightness is every other byte.
+        // YUYV: every other byte is brightness.
         FourCc::Yuyv => rows(bytes, [width, height], stride, 2).map(Pixels::Gray8),
         _ => match decode_still(bytes)? {
             (columns, lines, pixels) if (columns, lines) == (width, height) => Ok(pixels),
@@ -291,7 +296,7 @@ fn pixels(format: &PixFormat, bytes: &[u8]) -> Result<Pixels, String> {
     }
 }
 
-/// The first byte of each pixel, of rows that are a stride apart.
+/// The first byte of each pixel, from rows that are `stride` bytes apart.
 fn rows(
     bytes: &[u8],
     [width, height]: [usize; 2],
@@ -299,7 +304,7 @@ fn rows(
     pixel: usize,
 ) -> Result<Vec<u8>, String> {
     let stride = stride.max(width * pixel);
-    if bytes.len() < stride * (height - 1) + width * pixel {
+    if height == 0 || bytes.len() < stride * (height - 1) + width * pixel {
         return Err(format!("it holds {} bytes only", bytes.len()));
     }
     let row = |row: usize| bytes[row * stride..][..width * pixel].iter().step_by(pixel).copied();

@@ -1,4 +1,4 @@
-//! A camera on a bus of this host: USB, or a ribbon's.
+//! A camera on a bus of this host: USB, or a ribbon cable.
 
 #[cfg(target_os = "linux")]
 mod linux;
@@ -8,31 +8,31 @@ use std::time::Duration;
 
 use crate::{FrameSource, VideoError};
 
-/// How a camera of this host is watched.
+/// Options for watching a camera of this host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UsbOptions {
-    /// Its device, `/dev/video0`.
+    /// Its device, such as `/dev/video0`.
     pub device: PathBuf,
-    /// Columns and rows; as it is set where it is not said.
+    /// Columns and rows; if `None`, the size that it is set to.
     pub size: Option<[u32; 2]>,
-    /// Frames a second; the most that it has where it is not said.
+    /// Frames per second; if `None`, the most that it has.
     pub rate_hz: Option<f64>,
-    /// From the middle of the exposure to the driver's time, s. Where it is not said, nothing for
-    /// drivers that give the exposure's start, and half of a frame's interval for the others: a
-    /// picture is read out in about an interval.
+    /// Time from the middle of the exposure to the driver's time stamp, s. If `None`: zero for
+    /// drivers that stamp the start of the exposure, and half a frame's interval for the others, as
+    /// a picture takes about an interval to read out.
     pub latency_s: Option<f64>,
     /// Standard deviation of its frames' times, s.
     pub sd_s: f64,
 }
 
-/// A camera of this host that is opened again and again.
+/// A camera of this host that can be opened again and again.
 #[derive(Clone, Debug)]
 pub struct UsbCamera {
     options: UsbOptions,
 }
 
 impl UsbCamera {
-    /// A camera that is watched so.
+    /// A camera that is watched with these options.
     pub fn new(options: UsbOptions) -> Self {
         Self { options }
     }
@@ -42,7 +42,7 @@ impl UsbCamera {
         self.options.device.display().to_string()
     }
 
-    /// Opens it. `silence` is how long it may send nothing.
+    /// Opens it. `silence` is how long it may send nothing before that is an error.
     ///
     /// # Errors
     /// [`VideoError::Stream`] if it is not there, may not be opened, or does not have the size.
@@ -51,7 +51,7 @@ impl UsbCamera {
         Ok(Box::new(linux::UsbSource::open(&self.options, silence)?))
     }
 
-    /// As on Linux, but that nothing can be opened here.
+    /// Without Linux nothing can be opened.
     ///
     /// # Errors
     /// [`VideoError::Stream`], always.
@@ -62,13 +62,13 @@ impl UsbCamera {
     }
 }
 
-/// The cameras of this host: their devices, and what they call themselves.
+/// The cameras of this host: their devices and the names that they report.
 #[cfg(target_os = "linux")]
 pub fn usb_cameras() -> Vec<(PathBuf, String)> {
     linux::cameras()
 }
 
-/// As on Linux, but that none is known here.
+/// Without Linux none is found.
 #[cfg(not(target_os = "linux"))]
 pub fn usb_cameras() -> Vec<(PathBuf, String)> {
     Vec::new()

@@ -45,6 +45,8 @@ pub struct Behaviour {
     pub follows: bool,
     /// Another application has control.
     pub taken: bool,
+    /// Makes another description of what it has, of the right one.
+    pub describes: fn(String) -> String,
 }
 /// What it knows.
 struct State {
@@ -118,7 +120,7 @@ impl State {
 
 impl Fake {
     pub fn start(ip: Ipv4Addr, behaviour: Behaviour) -> Self {
-        let xml = xml();
+        let xml = (behaviour.describes)(xml());
         let hz = behaviour.clock.ticks_hz;
         let url = format!("Local:fake.xml;{XML_AT:X};{:X}", xml.len()).into_bytes();
         let begun = SystemTime::now();

@@ -39,7 +39,7 @@ fn tracks_of_a_fusion_centre_that_is_gone_are_not_drawn_for_ever() {
     assert_eq!(picture.drawn.len(), 1, "it may only be late");
     tell(&mut picture, &north, 104.0, &bearings(14.0));
     assert!(picture.drawn.is_empty() && picture.trails.is_empty());
-    // And where nothing comes at all.
+    // The same where no message comes at all.
     tell(&mut picture, &Channel::Tracks, 105.0, &track(15.0));
     picture.clear_silent(Timestamp::from_seconds(109.0)).unwrap();
     assert!(picture.drawn.is_empty());
@@ -52,7 +52,7 @@ fn neither_a_clock_from_the_future_nor_tracks_made_later_are_ghosts() {
     tell(&mut picture, &Channel::Tracks, 100.0, &track(10.0));
     tell(&mut picture, &north, 100.1, &bearings(1e6));
     assert_eq!(picture.drawn.len(), 1, "a camera's clock is wrong");
-    // Fused long after it was recorded.
+    // Tracks that were fused long after the recording.
     tell(&mut picture, &north, 1.79e9, &bearings(10.1));
     assert_eq!(picture.drawn.len(), 1);
 }
@@ -83,11 +83,11 @@ fn a_camera_on_a_mount_is_drawn_as_its_last_frame_says() {
             ..Default::default()
         };
         tell(&mut picture, &Channel::Bearings(name.clone()), time_s, &frame.encode());
-        // The calibration is told again and again; it does not turn the camera back.
+        // The calibration is repeated; it does not turn the camera back.
         tell(&mut picture, &Channel::Calibration(name.clone()), time_s, &message);
         picture.cameras["north"].camera.pose().rotation() * Vector3::z()
     };
-    // To the left of north is west.
+    // West is to the left of north.
     for (azimuth, time_s) in [(0.0, 2.0), (0.5, 3.0), (-0.5, 4.0)] {
         let axis = look(azimuth, time_s);
         assert!((axis - Vector3::new(-azimuth.sin(), azimuth.cos(), 0.0)).norm() < 1e-9);

@@ -1,84 +1,86 @@
-//! What plots of one image after the other belong to: detection after tracking over a second or
-//! two, so that what is no more than the noise in one image is found in ten.
+//! Candidates: which plots of successive images belong together. This is detection after tracking
+//! over a second or two, so that what does not exceed the noise in one image is found in ten.
 
 use crossfix_filter::{AxisFilter, AxisMeasurement, Gate};
 
 use super::plots::Plot;
 use crate::ImagePoint;
 
-/// Probability that a candidate's plot is in its gate.
+/// Probability that a candidate's plot lies in its gate.
 const IN_GATE: f64 = 0.999;
-/// Probability that what is there makes a plot in an image. With 0.9 what blinks in noise is
-/// dropped, with 0.6 chains of noise live long.
+/// Probability that a target makes a plot in an image. With 0.9 what blinks in noise is dropped,
+/// with 0.6 chains of noise live long.
 const MAKES_PLOT: f64 = 0.8;
-/// Standard deviation of the velocity of what is found, px/s: 400 px/s is not lost by it.
+/// Standard deviation of a target's velocity beforehand, px/s: one of 400 px/s is not lost by it.
 const VELOCITY_SD_PX: f64 = 120.0;
-/// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m in a lens of 1000
-/// px a radian, half over.
+/// Standard deviation of its white acceleration, px/s^2: a turn of 2 g at 100 m, with a lens of
+/// 1000 px per radian, and half as much again.
 const ACCELERATION_SD_PX: f64 = 300.0;
-/// Scales of one thing's plots differ by at most so many times: as its parts and its shadow come
-/// and go, the next scale on either side stands out more. With 5 a bird's plots and its flock's are
-/// one thing's.
+/// Largest ratio between the scales of one thing's plots: as its parts and its shadow come and go,
+/// the next scale on either side stands out more. With 5 the plots of a bird and of its flock count
+/// as one thing's.
 const SCALES: f64 = 2.5;
-/// A plot tells at most so much (logarithm of a likelihood ratio): an empty corner of the map is
-/// not known to be empty.
+/// Most that one plot tells (logarithm of a likelihood ratio): an empty corner of the clutter map
+/// is not known to be empty.
 const MOST_OF_PLOT: f64 = 4.0;
-/// Plots of something that keeps to its place tell at most so much together: what comes and goes in
-/// the same place, as a branch in the wind, makes as many as a target. With half of it false tracks
-/// are 0.4 and 1.5 per minute (thermal, visible) in place of 1.1 and 3.1, but what a shaken camera
-/// sees in noise is found in 76 % of the images in place of 89; with twice as much they are 13 and
-/// 49.
+/// Most that the plots of a candidate that keeps to its place tell together (log likelihood ratio):
+/// what comes and goes in one place, as a branch in the wind, makes as many plots as a target. With
+/// half of it there are 0.4 and 1.5 false tracks per minute (thermal, visible) instead of 1.1 and
+/// 3.1, but what a shaken camera sees in noise is found in 76 % of the images instead of 89; with
+/// twice as much there are 13 and 49.
 const MOST_IN_PLACE: f64 = 8.0;
-/// ... and so much more where noise does not last: then what lasts is less likely to be nothing.
+/// ... and this much more where noise does not last: there, what lasts is less likely to be noise.
 const MOST_IN_NOISE: f64 = 4.0;
-/// So many of its cells further it is in another place, over another part of the scene, ...
+/// This many of its cells further a candidate is in another place, over another part of the scene,
+/// ...
 const PLACE_CELLS: f64 = 6.0;
-/// ... of which so many are counted: what jumps from branch to branch has gone far too.
+/// ... of which at most this many are counted: what jumps from branch to branch has gone far too.
 const MOST_PLACES: f64 = 10.0;
-/// The scene's own changes fall off with size as the exponential of so many of its textures:
-/// compressed video has more large ones than a normal distribution. With twice as much 89.0 % of
-/// the thermal frames have their target in place of 90.6, and false tracks are 0.4 and 1.9 a
-/// minute.
+/// Decay length of the scene's own changes, which fall off exponentially with their size, in units
+/// of the texture: compressed video has more large ones than a normal distribution. With twice as
+/// much 89.0 % of the thermal frames have their target instead of 90.6, and there are 0.4 and 1.9
+/// false tracks per minute.
 const TAIL: f64 = 1.5;
-/// What it takes to stand out for a target, nats. Strengths from one to two hundred, uniform in
-/// their logarithm, give `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without targets.
+/// Constant of the density of a target's strength, nats: strengths from one to two hundred, uniform
+/// in their logarithm, give `ln ln 200` = 1.7; the rest is a margin, chosen on scenes without
+/// targets.
 const STANDING: f64 = 2.5;
-/// What stands out tells at most so much.
+/// Most that the strength tells (log likelihood ratio).
 const MOST_OF_STANDING: f64 = 10.0;
-/// Variance of the noise that a mean over many images keeps, spreads^2: plots are those of the
-/// noise that stand out.
+/// Least variance of the noise in a mean over many images, spreads^2: plots are the part of the
+/// noise that stands out.
 const LEAST_NOISE: f64 = 0.5;
-/// A candidate with less than this is dropped, ...
+/// A candidate whose log likelihood ratio by motion is less than this is dropped, ...
 const LEAST_LOG_RATIO: f64 = -2.0;
-/// ... and one without a plot for so long, s.
+/// ... and so is one without a plot for this long, s.
 const UNSEEN_S: f64 = 0.4;
-/// Most candidates, those with the greatest log ratios: two images' plots.
+/// Most candidates, those with the greatest log likelihood ratios: as many as two images' plots.
 const MOST: usize = 400;
-/// Side of a cell of the map of clutter, px.
+/// Side of a cell of the clutter map, px.
 const MAP_CELL_PX: f64 = 32.0;
-/// Over how long the clutter is a mean, s: with 1 a target's own first plots make it improbable,
-/// with 10 the leaves of a gust are targets.
+/// Averaging time of the clutter, s: with 1 a target's own first plots make it improbable, with 10
+/// the leaves of a gust are taken for targets.
 const CLUTTER_S: f64 = 3.0;
-/// Least clutter of a cell of the map, plots an image: one in ten thousand. With less, whatever
+/// Least clutter of a cell of the map, plots per image: one in ten thousand. With less, whatever
 /// comes into an empty sky is found with its second plot.
 const LEAST_CLUTTER: f64 = 1e-4;
 
-/// Something that may be a target.
+/// A track of plots that may be a target.
 ///
-/// Its places are in the scene: what a place is in the first image.
+/// Its places are in the scene: as in the first image, whatever the camera has turned since.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     axes: [AxisFilter; 2],
     /// The latest plot.
     pub(super) plot: Plot,
-    /// Log-likelihood ratio of where its plots were against chance.
+    /// Log-likelihood ratio of the places of its plots, a target's against chance.
     motion_log_ratio: f64,
-    /// Mean of the plots' excess, in spreads.
+    /// Mean excess of its plots, in spreads.
     mean_excess: f64,
     pub(super) plots: u32,
     unseen_s: f64,
     first: [f64; 2],
-    /// How far it has been from its first place, px.
+    /// Largest distance that it has been from its first place, px.
     pub(super) gone_px: f64,
 }
 
@@ -100,25 +102,29 @@ impl Candidate {
         }
     }
 
-    /// How many parts of the scene it has been over.
+    /// Number of parts of the scene that it has been over.
     fn parts(&self) -> f64 {
         1.0 + (self.gone_px / (PLACE_CELLS * self.plot.cell)).min(MOST_PLACES)
     }
 
     /// Log-likelihood ratio of a target against what the scene and the noise make.
     ///
-    /// The scene's texture is another in every part of it; noise is another in every image, as far
-    /// as it does not last.
+    /// The scene's texture is independent in each of its parts; the noise is independent in each
+    /// image, as far as it does not last.
     pub(super) fn log_ratio(&self) -> f64 {
         let persistence = f64::from(self.plot.persistence);
+        // n images of noise with persistence p are worth n (1 - p) / (1 + p) independent ones.
         let looks = f64::from(self.plots) * (1.0 - persistence) / (1.0 + persistence);
         let noise = (1.0 / looks.max(1.0)).max(LEAST_NOISE);
         let texture = f64::from(self.plot.texture).powi(2) / self.parts();
         let standing = (self.mean_excess / (texture + noise).sqrt()).max(TAIL);
+        // Strength s: a density uniform in ln s against the exponential tail of the scene's
+        // changes.
         self.motion_log_ratio + (standing / TAIL - standing.ln() - STANDING).min(MOST_OF_STANDING)
     }
 
-    /// Squared Mahalanobis distance of a plot's place, and the determinant of its covariance.
+    /// Squared Mahalanobis distance of a plot's place, and the determinant of the innovation's
+    /// covariance.
     fn distance(&self, plot: &Plot, place: [f64; 2]) -> (f64, f64) {
         let variance = plot.variance();
         let axes = self.axes.iter().zip(place);
@@ -136,7 +142,7 @@ impl Candidate {
         self.plot.is_brighter == plot.is_brighter && scales <= SCALES
     }
 
-    /// Takes a plot in; `chance` is the density of plots of nothing, 1/px^2.
+    /// Updates with a plot; `chance` is the density of clutter, 1/px^2.
     fn take(
         &mut self,
         plot: Plot,
@@ -149,7 +155,7 @@ impl Candidate {
         }
         let off = [0, 1].map(|i| self.axes[i].position() - self.first[i]);
         self.gone_px = self.gone_px.max(off[0].hypot(off[1]));
-        // ln N(off; 0, S) of the place against the density of plots of nothing there.
+        // ln (P_D N(innovation; 0, S) / clutter), with P_D the probability of a plot.
         let there = -0.5 * distance - (std::f64::consts::TAU * determinant.sqrt()).ln();
         let told = (MAKES_PLOT.ln() + there - chance.ln()).min(MOST_OF_PLOT);
         self.motion_log_ratio = (self.motion_log_ratio + told).min(
@@ -163,14 +169,14 @@ impl Candidate {
     }
 }
 
-/// How many plots of nothing there are, by place.
+/// Map of clutter: plots that no candidate explains.
 #[derive(Debug, Default)]
 struct Clutter {
     columns: usize,
-    /// Plots an image, in each cell of the map.
+    /// Mean number of such plots per image, in each cell of the map.
     means: Vec<f64>,
     counts: Vec<f64>,
-    /// Plots a minute that no candidate explains.
+    /// Rate of such plots, 1/min.
     a_minute: f64,
 }
 
@@ -180,7 +186,7 @@ impl Clutter {
         (x.min(self.columns - 1) + y * self.columns).min(self.means.len() - 1)
     }
 
-    /// Plots of nothing at a place, 1/px^2.
+    /// Density of clutter at a place, 1/px^2.
     fn density(&self, place: ImagePoint) -> f64 {
         self.means[self.cell(place)] / (MAP_CELL_PX * MAP_CELL_PX)
     }
@@ -189,7 +195,7 @@ impl Clutter {
         let [columns, rows] =
             [width, height].map(|side| (side as f64 / MAP_CELL_PX).ceil() as usize);
         if (self.columns, self.means.len()) != (columns, columns * rows) {
-            // As long as nothing is known, one plot in an image.
+            // As long as nothing is known, one plot per image over the whole map.
             let mean = 1.0 / (columns * rows) as f64;
             *self = Self {
                 columns,
@@ -212,7 +218,7 @@ impl Clutter {
     }
 }
 
-/// All that may be targets.
+/// All candidates, and the clutter.
 #[derive(Debug, Default)]
 pub(super) struct Candidates {
     /// The most likely first.
@@ -221,13 +227,14 @@ pub(super) struct Candidates {
 }
 
 impl Candidates {
-    /// Plots a minute that no candidate explained: so often chance may begin a candidate.
+    /// Rate of plots that no candidate explained, 1/min: so often chance may begin a candidate.
     pub(super) fn chances_a_minute(&self) -> f64 {
         self.clutter.a_minute
     }
 
-    /// Takes the plots of the next image. `turned` is by how much the scene has moved since the
-    /// first image, px.
+    /// Associates the plots of the next image: each candidate takes the nearest free plot in its
+    /// gate, and the plots that are left begin candidates and count as clutter. `turned` is by how
+    /// much the scene has moved since the first image, px.
     pub(super) fn step(
         &mut self,
         plots: &[Plot],
@@ -278,7 +285,7 @@ impl Candidates {
         self.list.truncate(MOST);
     }
 
-    /// Takes out what passes.
+    /// Removes the candidates that pass, and returns them.
     pub(super) fn take_if(&mut self, passes: impl Fn(&Candidate) -> bool) -> Vec<Candidate> {
         self.list.extract_if(.., |candidate| passes(candidate)).collect()
     }

@@ -31,8 +31,8 @@ pub(super) struct Lines {
     means: Vec<f32>,
 }
 
-/// By how much each cell, smoothed by a quarter, a half and a quarter of its neighbours, is
-/// brighter than the square about it; beyond the border the border goes on.
+/// Fills `to` with how much brighter each cell, smoothed by a quarter, a half and a quarter of its
+/// neighbours, is than the square about it; beyond the border the border cells are repeated.
 pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
     let (width, height) = (from.width(), from.height());
     to.reshape(width, height);
@@ -43,7 +43,7 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
         line.clear();
         line.resize(width, 0.0);
     }
-    // The square's means by running sums: down the columns here, along the rows in `means_along`.
+    // The square's means, by running sums: down the columns here, along the rows in `means_along`.
     for y in -reach..=reach {
         sums.iter_mut().zip(row(y)).for_each(|(sum, sample)| *sum += sample);
     }
@@ -59,7 +59,8 @@ pub(super) fn stand_out(from: &Plane, to: &mut Plane, lines: &mut Lines) {
             {
                 *out = 0.25 * near[0] + 0.5 * near[1] + 0.25 * near[2] - mean;
             }
-            // At the ends the border goes on: its weight is added to the border's own.
+            // At the ends the border is repeated: the missing neighbour's weight is added to the
+            // border's own.
             let last = width - 1;
             out[0] = 0.75 * smoothed[0] + 0.25 * smoothed[1.min(last)] - means[0];
             out[last] =
@@ -89,7 +90,7 @@ fn means_along(sums: &[f32], means: &mut [f32]) {
     }
 }
 
-/// The plane sampled at each cell plus `by`, less than a cell on either axis.
+/// The plane sampled at each cell plus `by`, which is less than a cell on either axis.
 pub(super) fn resample(from: &Plane, by: [f32; 2], to: &mut Plane) {
     let (width, height) = (from.width(), from.height());
     to.reshape(width, height);
@@ -110,7 +111,7 @@ pub(super) fn resample(from: &Plane, by: [f32; 2], to: &mut Plane) {
     });
 }
 
-/// The plane moved by whole cells; beyond the border the border goes on.
+/// The plane moved by whole cells; beyond the border the border cells are repeated.
 pub(super) fn moved(from: &Plane, [right, down]: [isize; 2], to: &mut Plane) {
     let (width, height) = (from.width() as isize, from.height() as isize);
     to.reshape(from.width(), from.height());
@@ -122,7 +123,8 @@ pub(super) fn moved(from: &Plane, [right, down]: [isize; 2], to: &mut Plane) {
     }
 }
 
-/// The value at a place between the cells; beyond the border the border goes on.
+/// The value at a place between the cells, linearly interpolated; beyond the border the border
+/// cells are repeated.
 pub(super) fn between(plane: &Plane, [x, y]: [f64; 2]) -> f32 {
     let (left, top) = (x.floor(), y.floor());
     let [right, down] = [x - left, y - top].map(|rest| rest as f32);

@@ -1,5 +1,5 @@
 //! One scale of the image: by how much each cell stands out of its surroundings, how that has been
-//! over the last seconds, and how unlike that it is now.
+//! over the last seconds, and how much it has changed now.
 
 use crossfix_correlation::Plane;
 use pulp::Arch;
@@ -7,55 +7,56 @@ use pulp::Arch;
 use super::filter::{Lines, SURROUNDINGS, between, moved, resample, stand_out};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Of a squared change beyond this many variances only so much is learnt, of mean and variance:
-/// what comes by is no noise of the place. With half of it flickering leaves are learnt in twice
-/// the time, without it the first target makes its path blind, and its place before it was found
-/// something that has come.
+/// A squared change counts in the learnt mean and variance for at most this many variances: what
+/// passes by is no noise of the place. With half of it flickering leaves take twice as long to be
+/// learnt; without it the first target makes its path blind, and the place where it was before it
+/// was found looks like something that has come.
 const OUTLYING: f32 = 16.0;
 /// Least standard deviation of a cell's change, levels: video codecs change whole blocks by a
 /// level, and with half of it each such step is two standard deviations.
 const LEAST_SPREAD: f32 = 0.5;
-/// By how much a contrast is taken to vary from place to place when light changes, a share of it.
-/// With half of it a cloud's shadow changes sharp edges by three standard deviations.
+/// Standard deviation by which contrasts vary from place to place when the light changes, as a
+/// share of the contrast. With half of it a cloud's shadow changes sharp edges by three standard
+/// deviations.
 const CONTRAST_SPREAD: f32 = 0.03;
-/// Bounds of the sway, px: no scene is stiller than the first, and beyond the second it is not sway
+/// Bounds of the sway, px: no scene is stiller than the first, and more than the second is no sway
 /// but another scene.
 const SWAY_PX: [f32; 2] = [0.05, 1.0];
-/// Share of what has texture that changes at most, if it is the scene of the background that is
-/// seen: targets cover less, and another scene has hardly a cell in common.
+/// Largest share of the textured cells that may have changed while the background's scene is in
+/// view: targets cover less, and another scene has hardly a cell in common.
 const MOST_CHANGED: f32 = 0.3;
-/// The sway is told by the cells that a sway by so much changes by more than noise, px; with half
-/// of it fewer scenes tell theirs, with twice as much noise does.
+/// The sway is told by the cells that a sway of this size, px, changes by more than noise; with
+/// half of it fewer scenes have enough of them, with twice as much noise is taken for sway.
 const PROBE_PX: f32 = 0.25;
-/// What the sway is taken for before there is an image to tell, px.
+/// Sway that is assumed before any image tells it, px.
 const FIRST_SWAY_PX: f32 = 0.5;
-/// Time constant with which a scene that has swayed is believed to be still again, s: a gust's or a
-/// step's. With half of it the second swing of a mast is taken for something that moves.
+/// Time constant with which a scene that has swayed is believed to be still again, s: that of a
+/// gust or a step. With half of it the second swing of a mast is taken for something that moves.
 const STILL_AGAIN_S: f64 = 0.3;
-/// Images over which the changes' persistence is a mean: a key frame of a codec, one in 12 to 30,
-/// must not count for all.
+/// Averaging length of the persistence of changes, images: a codec's key frame, one in 12 to 30,
+/// must not outweigh the others.
 const PERSISTENCE_IMAGES: f32 = 10.0;
 /// Least change of a plot, standard deviations. With 4 slow targets in still video are found half a
-/// second later; with 3 plots of noise are so many that more is asked of each candidate, and faint
-/// ones are found later too.
+/// second later; with 3 there are so many plots of noise that more is asked of each candidate, and
+/// faint targets are found later too.
 pub(super) const LEAST_CHANGE: f32 = 3.5;
-/// Noise that lasts is not less by being looked at again: what stands out must do so against its
-/// variance over many images, `(1 + p) / (1 - p)` times that of one, but no more than so many
-/// times. That is a persistence p of 0.7; compressed video has 0.9 and would ask for 19, and lose
-/// birds and far drones.
+/// Noise that lasts is not averaged out by looking again: what stands out is compared with the
+/// noise's variance over many images, `(1 + p) / (1 - p)` times that of one image for a persistence
+/// p, but at most this many times. That is a p of 0.7; compressed video has 0.9, which would ask
+/// for 19 and lose birds and far drones.
 const MOST_LASTING: f32 = 6.0;
-/// Cells that tell a spread, a contrast or a persistence to two per cent, ...
+/// Number of cells that tell a spread, a contrast or a persistence to two per cent, ...
 const SAMPLES: usize = 4096;
-/// ... and the fewest that tell a contrast, or, of twice as many, a sway: fewer may be those of a
-/// target.
+/// ... and the fewest that tell a contrast, or, sampled twice as densely, a sway: fewer may be
+/// those of a target.
 const LEAST_SAMPLES: usize = 100;
 const LEAST_TEXTURED: usize = 40;
-/// The contrast is told by cells that stand out by so many spreads, and never by more than this
-/// range: beyond it is another scene, or none.
+/// The contrast is told by cells that stand out by this many spreads, and is limited to this range:
+/// beyond it is another scene, or none.
 const CONTRAST_TOLD_BY: f32 = 4.0;
 const CONTRASTS: [f32; 2] = [0.5, 2.0];
 
-/// Where and when an image was taken, for the background.
+/// Time and camera direction of an image, for the background.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment {
     /// By how much the scene has moved since the first image, px: what is at (x, y) was at (x, y)
@@ -63,12 +64,12 @@ pub(super) struct Moment {
     pub(super) turned: [f64; 2],
     /// Time since the image before, s.
     pub(super) interval: f64,
-    /// Share of this image in the background.
+    /// Weight of this image in the background.
     pub(super) share: f32,
     pub(super) is_first: bool,
 }
 
-/// Cells from the first to before the second, in columns and in rows.
+/// A range of cells: from the first to before the second, in columns and in rows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Cells {
     pub(super) columns: [usize; 2],
@@ -76,7 +77,8 @@ pub(super) struct Cells {
 }
 
 impl Cells {
-    /// Whether they are in a cell's surroundings, or hold it: what covers them may stand out there.
+    /// Whether a cell is in the range or has part of it in its surroundings: what covers the range
+    /// may stand out there.
     fn are_near(&self, [x, y]: [usize; 2]) -> bool {
         let is_near = |at: usize, [from, to]: [usize; 2]| {
             at + SURROUNDINGS >= from && at < to.saturating_add(SURROUNDINGS)
@@ -87,8 +89,8 @@ impl Cells {
 
 /// One scale.
 ///
-/// The background's cells stay with the scene: when the camera turns they move over the image, by
-/// whole cells, and the image is sampled between its own.
+/// The background's cells are fixed to the scene: when the camera turns they move over the image by
+/// whole cells, and for the rest the image is sampled between its own cells.
 #[derive(Debug)]
 pub(super) struct Level {
     /// Side of a cell, px.
@@ -99,24 +101,24 @@ pub(super) struct Level {
     lines: Lines,
     /// By how much the background's cells stand out in this image, levels.
     pub(super) now: Plane,
-    /// Mean and variance of that over the last seconds.
+    /// Mean and variance of `now` over the last seconds.
     mean: Plane,
     variance: Plane,
-    /// Change of this image against the mean, standard deviations; 0 where something known is.
+    /// Change of this image from the mean, standard deviations; 0 where a known target is.
     pub(super) change: Plane,
-    /// By how many cells the background has moved against the image: whole ones, and the rest.
+    /// Shift of the background against the image, cells: the whole ones, and the rest.
     whole: [isize; 2],
     rest: [f32; 2],
-    /// How much stronger the background's contrast is in this image than in the mean.
+    /// Contrast of the background in this image, as a multiple of that in the mean.
     contrast: f32,
     /// Standard deviation of this image's changes where nothing comes, levels.
     pub(super) spread: f32,
-    /// Mean square by which the scene sways, cells^2.
+    /// Mean square of the scene's sway, cells^2.
     sway: f32,
-    /// Correlation of an image's changes with the next one's, 0 to 1: that of a sensor's noise is
-    /// 0, and of compressed video's 0.9.
+    /// Correlation of an image's changes with the next one's, 0 to 1: 0 for a sensor's noise, 0.9
+    /// for compressed video.
     pub(super) persistence: f32,
-    /// Whether too many of the cells have changed for the scene to be that of the background.
+    /// Whether so many cells have changed that the scene cannot be that of the background.
     is_lost: bool,
     /// This image's changes and the last one's at some cells.
     samples: [Vec<f32>; 2],
@@ -151,12 +153,12 @@ impl Level {
         self.cell
     }
 
-    /// How far what has texture sways, px (root of the mean square).
+    /// Sway of what has texture, px (root mean square).
     pub(super) fn sway_px(&self) -> f64 {
         f64::from(self.sway.sqrt()) * self.cell as f64
     }
 
-    /// Whether what is seen is no longer the scene of the background.
+    /// Whether the scene in view is no longer that of the background.
     pub(super) fn has_lost_scene(&self) -> bool {
         self.sway_px() >= 0.99 * f64::from(SWAY_PX[1]) || self.is_lost
     }
@@ -167,7 +169,8 @@ impl Level {
         [0, 1].map(|i| (cell[i] - f64::from(self.rest[i]) + 0.5) * side - 0.5)
     }
 
-    /// A place of the image in the background's cells: whole numbers are their middles.
+    /// Converts a place of the image to the background's cells, whose middles are the whole
+    /// numbers.
     pub(super) fn cell_of(&self, place: [f64; 2]) -> [f64; 2] {
         [0, 1].map(|i| (place[i] + 0.5) / self.cell as f64 - 0.5 + f64::from(self.rest[i]))
     }
@@ -177,21 +180,21 @@ impl Level {
         self.contrast * between(&self.mean, self.cell_of(place))
     }
 
-    /// What share of what stands out at a cell is new: 1 if the background has nothing there, 0 if
+    /// Share of what stands out at a cell that is new: 1 if the background has nothing there, 0 if
     /// it has the same.
     pub(super) fn new_share(&self, [x, y]: [usize; 2]) -> f32 {
         let now = self.now.row(y)[x];
         if now == 0.0 { 0.0 } else { 1.0 - self.contrast * self.mean.row(y)[x] / now }
     }
 
-    /// The least by which something stands out that is not noise, in spreads.
+    /// Least strength of something that is not noise, in spreads.
     pub(super) fn least_strength(&self) -> f32 {
         let lasting = (1.0 + self.persistence) / (1.0 - self.persistence).max(1e-3);
         LEAST_CHANGE * lasting.min(MOST_LASTING).sqrt()
     }
 
     /// How much the scene about a cell stands out by itself, in spreads: the median over the ring
-    /// from the end of the cell's surroundings to twice that.
+    /// from the edge of the cell's surroundings to twice that.
     pub(super) fn texture_about(&mut self, [x, y]: [usize; 2]) -> f32 {
         let reach = 2 * SURROUNDINGS as isize + 1;
         self.scratch.clear();
@@ -206,7 +209,8 @@ impl Level {
         OF_MEDIAN * median(&mut self.scratch) / self.spread
     }
 
-    /// Takes in the image whose means are in `reduced`, and learns it, but for what `known` covers.
+    /// Takes in the image whose means are in `reduced`, and learns it, except where `known` covers
+    /// it.
     pub(super) fn see(&mut self, moment: Moment, known: &[Cells]) {
         stand_out(&self.reduced, &mut self.stands_out, &mut self.lines);
         self.turn(moment);
@@ -242,10 +246,11 @@ impl Level {
         self.whole = whole;
     }
 
-    /// Takes this image's changes, and what they tell of the light, the noise and the sway.
+    /// Estimates the light, the noise and the sway from this image's changes.
     fn compare(&mut self, interval: f64, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         let step = (width * height / SAMPLES) | 1;
+        // Contrast c: the median of now / mean over the cells that stand out.
         let cells = || self.mean.samples().iter().zip(self.now.samples()).step_by(step);
         self.scratch.clear();
         self.scratch.extend(
@@ -256,10 +261,12 @@ impl Level {
         let told = self.scratch.len() >= LEAST_SAMPLES;
         self.contrast =
             if told { median(&mut self.scratch).clamp(CONTRASTS[0], CONTRASTS[1]) } else { 1.0 };
+        // Spread: standard deviation of now - c mean, by the median of its absolute values.
         self.scratch.clear();
         self.scratch.extend(cells().map(|(mean, now)| (now - self.contrast * mean).abs()));
         self.spread = (OF_MEDIAN * median(&mut self.scratch)).max(LEAST_SPREAD);
 
+        // Sway: solve change^2 = sway slope^2 + usual variance, over the textured cells together.
         let (mut slopes, mut changes, mut told_by, mut changed) = (0.0_f32, 0.0_f32, 0, 0);
         let [least, most] = SWAY_PX.map(|px| (px / self.cell as f32).powi(2));
         let probe = (PROBE_PX / self.cell as f32).powi(2);
@@ -285,13 +292,13 @@ impl Level {
         self.is_lost = is_told && changed as f32 > MOST_CHANGED * told_by as f32;
         if is_told {
             let told = (changes / slopes).clamp(least, most);
-            // A camera that is shaken shakes at once; a still one is believed later.
+            // A camera that is shaken is believed at once, one that is still only later.
             let share = 1.0 - (-interval / STILL_AGAIN_S).exp() as f32;
             self.sway = told.max(self.sway + share * (told - self.sway));
         }
     }
 
-    /// Makes the changes ones in standard deviations, and learns the background.
+    /// Converts the changes to standard deviations, and learns the background.
     fn learn(&mut self, share: f32, known: &[Cells]) {
         let (width, height) = (self.now.width(), self.now.height());
         self.change.reshape(width, height);
@@ -319,7 +326,7 @@ impl Level {
         }
     }
 
-    /// How much of the changes lasts from image to image.
+    /// Updates the persistence: how much of the changes lasts from image to image.
     fn remember_changes(&mut self) {
         let changes = self.change.samples();
         let step = (changes.len() / SAMPLES) | 1;
@@ -330,6 +337,7 @@ impl Level {
             changes.iter().step_by(step).map(|change| change.clamp(-LEAST_CHANGE, LEAST_CHANGE)),
         );
         if before.len() == now.len() {
+            // Correlation of the two images' changes: 2 sum(a b) / (sum(a^2) + sum(b^2)).
             let product: f32 =
                 now.iter().zip(before.iter()).map(|(now, before)| now * before).sum();
             let squares: f32 = now.iter().chain(before.iter()).map(|change| change * change).sum();
@@ -339,13 +347,13 @@ impl Level {
     }
 }
 
-/// Square of the slope, levels a cell, from what is left and right and what is above and below.
+/// Squared slope, (levels per cell)^2, by central differences between the neighbours.
 #[inline(always)]
 fn slope_squared([left, right]: [f32; 2], [above, below]: [f32; 2]) -> f32 {
     0.25 * ((right - left) * (right - left) + (below - above) * (below - above))
 }
 
-/// How one image changes the background's cells.
+/// One image's update of the background's cells.
 #[derive(Clone, Copy, Debug)]
 struct CellUpdate {
     share: f32,
@@ -365,7 +373,8 @@ struct Row<'a> {
 }
 
 impl CellUpdate {
-    /// Variances by which a row changes where the scene sways and the light varies.
+    /// Variance of each cell's change in a row, from the scene's sway and the light: `sway slope^2
+    /// + (CONTRAST_SPREAD mean)^2`.
     fn textures(self, above: &[f32], here: &[f32], below: &[f32], to: &mut Vec<f32>) {
         let Self { sway, .. } = self;
         to.clear();
@@ -386,6 +395,8 @@ impl CellUpdate {
             for (((mean, variance), change), (now, texture)) in
                 learnt.zip(row.now.iter().zip(row.textures))
             {
+                // The change in standard deviations; mean and variance learn from it with a limit
+                // on outliers.
                 let off = now - contrast * *mean;
                 let usual = variance.max(noise);
                 *change = off / (usual + texture).sqrt();
@@ -397,7 +408,7 @@ impl CellUpdate {
     }
 }
 
-/// The parts of a row that no known thing covers.
+/// The parts of a row that no known target covers.
 fn free_of(known: &[Cells], row: usize, width: usize) -> Vec<[usize; 2]> {
     let in_row = known.iter().filter(|cells| (cells.rows[0]..cells.rows[1]).contains(&row));
     let mut covered: Vec<[usize; 2]> = in_row.map(|cells| cells.columns).collect();
@@ -430,7 +441,7 @@ mod tests {
         assert_eq!(free_of(&known, 10, 20), [[0, 20]]);
     }
 
-    /// Sky above waves, seen by a camera that has turned by so many pixels.
+    /// Sky above waves, seen by a camera that has turned by `turned` pixels and is shaken.
     fn see_waves(level: &mut Level, turned: [f64; 2], is_first: bool, shaken: f64) {
         let side = level.cell() as f64;
         level.reduced = Plane::from_fn(80, 60, |x, y| {

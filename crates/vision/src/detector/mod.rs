@@ -1,12 +1,13 @@
-//! Finds what comes into the image, or moves in it, by itself (Lytvynets 2020, chapter 2).
+//! Detector: finds by itself what comes into the image, or moves in it (Lytvynets 2020, chapter 2).
 //!
-//! The image goes down a pyramid. On each scale ([`level`]) every cell is compared with what it has
-//! been over the last seconds: background, noise, sway of the scene, light. What stands out and did
-//! not before makes plots ([`plots`]); plots of one image after the other make candidates
-//! ([`candidates`]), of which those are found that chance, the noise and the scene's own texture
-//! explain less well than a target, by as much as one false find in so long asks for. What has been
-//! found is followed by its image from then on; here it is covered, so that it hides nothing and
-//! teaches nothing, and watched: where the background has the same, it was the scene.
+//! The image goes down a pyramid of scales. On each scale ([`level`]) every cell is compared with
+//! what it has been over the last seconds: background, noise, sway of the scene, light. Cells that
+//! stand out and did not before make plots ([`plots`]); plots of successive images make candidates
+//! ([`candidates`]). A candidate is found if a target explains its plots better than chance, the
+//! noise and the scene's own texture do, by the odds that the configured rate of false finds asks
+//! for. What has been found is followed by its image from then on; in the detector it is covered,
+//! so that it hides nothing and is not learnt as background, and watched: where the background
+//! shows the same, it was the scene.
 //!
 //! What comments say of other values of a constant is reasoned, unless they give figures: those
 //! were measured on real clips of a fixed camera, thermal and visible, as boxes within 10 px and
@@ -29,49 +30,52 @@ use plots::Plot;
 
 /// Sides of the cells of the scales, px: what is found is two or three cells large, 4 to 48 px.
 const CELLS: [usize; 4] = [2, 4, 8, 16];
-/// Fewest cells a side of a scale: its surroundings, and as much again.
+/// Fewest cells per side of a scale: a cell's surroundings, and as much again.
 const LEAST_CELLS: usize = 18;
 /// How long the background is learnt before anything is found, s, and in how many images at least.
 const WARM_UP_S: f64 = 0.25;
 const WARM_UP_IMAGES: u32 = 4;
-/// Fewest plots of what is found: two are a line, however far apart.
+/// Fewest plots of a candidate that is found: two always lie on a line, however far apart.
 const LEAST_PLOTS: u32 = 3;
-/// What is found has moved by more than so many times the scene's sway: a swing of twice its root
-/// mean square is common, ...
+/// A candidate that is found has moved by more than this many times the scene's sway: a swing of
+/// twice its root mean square is common, ...
 const SWAYS: f64 = 3.0;
-/// ... and twice the error of a plot's place, a cell over its strength. With half of the first
-/// hovering drones are found sooner (91.5 % of the thermal frames in place of 90.6) and no more
-/// false ones, but a mast swings as far.
+/// ... and this many times the error of a plot's place, which is a cell over the plot's strength.
+/// With half of the first hovering drones are found sooner (91.5 % of the thermal frames instead of
+/// 90.6) and no more false ones, but a mast swings as far.
 const PLACE_ERRORS: f64 = 2.0;
-/// Nats asked for above the odds of chance, as images of a minute are not as many as they seem:
-/// noise, clouds and leaves of one image are those of the next. With 2 it is 2.3 and 3.8 false
-/// tracks per minute (thermal, visible) in place of 1.1 and 3.1.
+/// Margin that is asked above the odds of chance, nats: the images of a minute are not as many
+/// chances as they seem, as noise, clouds and leaves of one image are those of the next. With 2
+/// there are 2.3 and 3.8 false tracks per minute (thermal, visible) instead of 1.1 and 3.1.
 const NOT_INDEPENDENT: f64 = 4.0;
-/// Fewest chances a minute that are reckoned with: before there has been a minute, nobody knows.
+/// Least rate of chances that is reckoned with, 1/min: within the first minute nobody knows the
+/// rate.
 const LEAST_CHANCES: f64 = 600.0;
-/// A known thing is covered with this much about it: a share of its sides, and px. With half of it
-/// rotors and shadows beyond the box are found as others.
+/// Margin of a known target that is covered with it: a share of its sides, and px. With half of it
+/// rotors and shadows beyond the box are found as other targets.
 const COVER: [f64; 2] = [0.25, 2.0];
 /// Sides of a target in cells of the scale at which it stands out most.
 const TARGET_CELLS: f64 = 2.5;
-/// Half side of the part of the image in which it is told how a target stands out, cells.
+/// Half side of the part of the image from which it is computed how much a target stands out,
+/// cells.
 const PART_CELLS: usize = filter::SURROUNDINGS + 2;
-/// A watched thing is new in an image if the background lacks at least this share of what stands
-/// out (with half of it clouds and changing light make the scene new, with twice as much a target
-/// in front of its like is the scene), ...
+/// A watched target is new in an image if the background lacks at least this share of what stands
+/// out there (with half of it clouds and changing light make the scene new, with twice as much a
+/// target in front of its like is taken for the scene), ...
 const NEW: f32 = 0.35;
-/// ... and if that is at least this share of the least strength of a plot.
+/// ... and if it stands out by at least this share of the least strength of a plot.
 const STANDS_OUT: f32 = 0.7;
-/// Below this share of the latest images, a mean over so long, s, it is the scene, and given up.
+/// Share of the latest images in which it must be new, and the averaging time of that share, s:
+/// with a smaller share it is the scene, and given up.
 const LEAST_NEW: f64 = 0.3;
 const NEW_S: f64 = 0.5;
 
-/// Something that is followed already.
+/// A target that is followed already.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Known {
     pub(crate) id: ImageTrackId,
     pub(crate) place: PixelBox,
-    /// Whether the background of its place is that of before it came.
+    /// Whether the background at its place is known from before it came.
     pub(crate) is_watched: bool,
 }
 
@@ -79,28 +83,28 @@ pub(crate) struct Known {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Found {
     pub(crate) place: PixelBox,
-    /// How far it went before it was found, px.
+    /// How far it had gone when it was found, px.
     pub(crate) gone_px: f64,
 }
 
-/// What an image has told.
+/// What an image has told the detector.
 #[derive(Debug, Default)]
 pub(crate) struct Findings {
     pub(crate) found: Vec<Found>,
-    /// Known things that are the scene itself.
+    /// Known targets that have turned out to be the scene itself.
     pub(crate) scene: Vec<ImageTrackId>,
 }
 
-/// A known thing that may turn out to be the scene.
+/// A known target that may turn out to be the scene.
 #[derive(Clone, Copy, Debug)]
 struct Watch {
     id: ImageTrackId,
-    /// The scale of its size.
+    /// Index of the scale that fits its size.
     level: usize,
     place: [f64; 2],
     /// By how much it stands out in this image, levels.
     stands_out: f32,
-    /// Share of the latest images in which it was new.
+    /// Running share of the images in which it was new.
     share_new: f64,
 }
 
@@ -164,7 +168,7 @@ impl Detector {
         Findings { found, scene }
     }
 
-    /// Begins again: the camera looks elsewhere.
+    /// Forgets the background and all candidates: the camera looks elsewhere.
     fn forget(&mut self) {
         for level in &mut self.levels {
             *level = Level::new(level.cell());
@@ -174,7 +178,7 @@ impl Detector {
         self.watches.clear();
     }
 
-    /// Notes by how much what is watched stands out, before it is covered.
+    /// Notes by how much each watched target stands out, before it is covered.
     fn watch(&mut self, known: &[Known]) {
         self.watches
             .retain(|watch| known.iter().any(|known| known.id == watch.id && known.is_watched));
@@ -203,9 +207,9 @@ impl Detector {
         }
     }
 
-    /// Takes the image into the background of every scale, but for what is known.
+    /// Takes the image into the background of every scale, except where known targets are.
     fn learn(&mut self, interval: f64, turned: [f64; 2], known: &[Known]) {
-        // A young background is the mean of what there was; an old one forgets.
+        // A young background is the plain mean of its images; an old one forgets exponentially.
         let young = 1.0 / (f64::from(self.images) + 1.0);
         let share = young.max(1.0 - (-interval / self.config.background_s).exp()) as f32;
         let moment = Moment { turned, interval, share, is_first: self.images == 0 };
@@ -225,7 +229,7 @@ impl Detector {
         self.images = self.images.saturating_add(1);
     }
 
-    /// Which of the watched are the scene.
+    /// Which of the watched targets are the scene.
     fn judge(&mut self, interval: f64) -> Vec<ImageTrackId> {
         let share = 1.0 - (-interval / NEW_S).exp();
         for watch in &mut self.watches {
@@ -253,6 +257,7 @@ impl Detector {
         self.plots.retain(|plot| !known.iter().any(|known| touches(&known.place, plot)));
         self.candidates.step(&self.plots, turned, interval, self.sides);
         let chances = self.candidates.chances_a_minute().max(LEAST_CHANCES);
+        // The odds to beat: chances per minute over the false tracks that are allowed per minute.
         let asked = (chances / self.config.false_tracks_a_minute).ln() + NOT_INDEPENDENT;
         let sway_px = self.levels[0].sway_px();
         let is_found = |candidate: &Candidate| {
@@ -273,7 +278,7 @@ impl Detector {
     }
 }
 
-/// By how much a place stands out on a scale, from the finest scale's means.
+/// By how much a place stands out on a scale, computed from the finest scale's means.
 fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> f32 {
     let corner = place.map(|at| (at / cell as f64).floor() as isize - PART_CELLS as isize);
     let side = 2 * PART_CELLS + 1;
@@ -290,7 +295,7 @@ fn stands_out_at(finest: &Plane, level: usize, cell: usize, place: [f64; 2]) -> 
     between(&out, [0, 1].map(|i| (place[i] + 0.5) / cell as f64 - 0.5 - corner[i] as f64))
 }
 
-/// What is covered of a known thing's box, px: left and top, right and bottom.
+/// What is covered of a known target's box with its margin, px: left and top, right and bottom.
 fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
     let [share, more] = COVER;
     let margin = [place.width, place.height].map(|side| share * side + more);
@@ -298,14 +303,15 @@ fn covered(place: &PixelBox) -> [[f64; 2]; 2] {
     [[left, top], [left + place.width + 2.0 * margin[0], top + place.height + 2.0 * margin[1]]]
 }
 
-/// The cells of a scale's background that a known thing covers.
+/// The cells of a scale's background that a known target covers.
 fn cells_of(level: &Level, place: &PixelBox) -> Cells {
     let [first, last] = covered(place).map(|corner| level.cell_of(corner).map(f64::round));
     let range = |axis: usize| [first[axis].max(0.0) as usize, (last[axis] + 1.0).max(0.0) as usize];
     Cells { columns: range(0), rows: range(1) }
 }
 
-/// Paints a known thing over with what is left and right of it, so that it hides nothing about it.
+/// Paints over a known target, from the pixels left to those right of it, so that it does not hide
+/// what is about it.
 fn cover(reduced: &mut Plane, place: &PixelBox) {
     let sides = [reduced.width(), reduced.height()];
     let cell = CELLS[0] as f64;
@@ -318,7 +324,7 @@ fn cover(reduced: &mut Plane, place: &PixelBox) {
     let columns = (last[0] - first[0]) as f32;
     for y in first[1]..last[1] {
         let row = reduced.row_mut(y);
-        // At the picture's edge there is one side alone, and where it covers all none.
+        // At the picture's edge there is one side alone; a box from edge to edge has none.
         let left = first[0].checked_sub(1).map(|x| row[x]);
         let Some(left) = left.or(row.get(last[0]).copied()) else { continue };
         let right = row.get(last[0]).copied().unwrap_or(left);

@@ -8,15 +8,15 @@ use crate::PixelBox;
 use crate::figure::{figure, smoothed};
 use crate::noise::{OF_MEDIAN, median};
 
-/// Half sides of the window, the first in cells and the largest in pixels: doubled until what is
-/// found lies inside. A target of 50 px and its surroundings fit.
+/// Half sides of the window, the first in cells and the largest in pixels: doubled until the figure
+/// lies inside. A target of 50 px and its surroundings fit.
 const FIRST_REACH_CELLS: f64 = 4.0;
 const MOST_REACH: usize = 64;
-/// Sides of the box where no outline ends, in cells, and the least sides, px.
+/// Sides of the box if no outline closes, in cells, and the least sides of any box, px.
 const UNKNOWN_CELLS: f64 = 3.0;
 const LEAST_SIDE: f64 = 4.0;
 
-/// A box about what stands out at a plot.
+/// The box of what stands out at a plot.
 pub(super) fn outline(image: &Plane, plot: &Plot) -> PixelBox {
     let first = (FIRST_REACH_CELLS * plot.cell) as usize;
     let reaches = std::iter::successors(Some(first), |reach| Some(2 * reach))
@@ -25,7 +25,7 @@ pub(super) fn outline(image: &Plane, plot: &Plot) -> PixelBox {
     reaches.filter_map(|reach| outline_within(image, plot, reach)).next().unwrap_or(unknown)
 }
 
-/// The box, if it ends within so many pixels of the plot.
+/// The box, if its outline closes within `reach` pixels of the plot.
 fn outline_within(image: &Plane, plot: &Plot, reach: usize) -> Option<PixelBox> {
     let corner = [plot.place.x, plot.place.y].map(|at| at.round() as isize - reach as isize);
     let side = 2 * reach + 1;

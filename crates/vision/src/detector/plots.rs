@@ -1,24 +1,26 @@
-//! Places of one image where something stands out that did not before.
+//! Plots of one image: places where something stands out that did not before.
 
 use crossfix_correlation::Plane;
 
 use super::level::{LEAST_CHANGE, Level};
 use crate::ImagePoint;
 
-/// What stands out by less than this share of the change under it is not what came, but what went.
+/// A plot stands out by at least this share of its change; if it does not, something has not come,
+/// but gone.
 const LEAST_OF_CHANGE: f32 = 0.5;
-/// Share of what stands out that the background does not have, least and most: less is the scene
-/// itself, and more is in the place of its opposite that went. With 0.1 a slow target is found when
-/// it has gone by a tenth of its size, with 3 the place that a target has left is another target.
+/// Least and largest share of what stands out that the background lacks: less is the scene itself,
+/// and more lies where something of the opposite sign has gone. With 0.1 a slow target is found
+/// when it has gone by a tenth of its size, with 3 the place that a target has left is another
+/// target.
 const SHARES: [f32; 2] = [0.02, 1.5];
-/// Within so many cells one thing makes one plot: it is two or three cells large. ...
+/// Within this many cells one thing makes only one plot: it is two or three cells large. ...
 const APART: f64 = 3.0;
-/// ... A darker ring about a bright one (and the other way round) reaches as far as its
-/// surroundings do from its ends, and has at most the share of it that a square of three cells has
-/// in one of nine, thrice: of several parts.
+/// ... A bright plot's dark ring (and the other way round) reaches this many cells, as far from its
+/// ends as its surroundings do, and has at most this share of its strength: that of a square of
+/// three cells in one of nine, three times over for a thing of several parts.
 const RING: f64 = 7.0;
 const MOST_OF_RING: f32 = 0.4;
-/// Most plots of an image, those that stand out most. Enough for fifty targets and as much noise.
+/// Most plots of an image: those that stand out most, enough for fifty targets and as much noise.
 const MOST_PLOTS: usize = 200;
 
 /// Something that stands out and did not before.
@@ -32,22 +34,24 @@ pub(super) struct Plot {
     pub(super) cell: f64,
     /// By how much it stands out, in spreads of the scale.
     pub(super) strength: f32,
-    /// By how much of that the background does not, in spreads.
+    /// How much of that strength the background does not have, in spreads.
     pub(super) excess: f32,
     /// How much the scene about it stands out by itself beyond noise, in spreads.
     pub(super) texture: f32,
-    /// How much of the noise lasts from image to image, 0 to 1.
+    /// Persistence of the noise from image to image, 0 to 1.
     pub(super) persistence: f32,
 }
 
 impl Plot {
-    /// A target is as large as two or three cells of the scale at which it stands out most; the
-    /// noise of larger cells is less, which makes up for a part of what they dilute.
+    /// Rank of a plot: its strength, times the root of its cell. A target is two or three cells
+    /// large on the scale where it stands out most; larger cells have less noise, which makes up
+    /// for a part of what they dilute.
     fn rank(&self) -> f64 {
         f64::from(self.strength) * self.cell.sqrt()
     }
 
-    /// Whether a plot that stands out more makes this one.
+    /// Whether this plot is made by the thing of another plot that stands out more, or is the ring
+    /// about it.
     fn is_of(&self, other: &Self) -> bool {
         let is_ring =
             self.is_brighter != other.is_brighter && self.strength < MOST_OF_RING * other.strength;
@@ -58,8 +62,8 @@ impl Plot {
 
     /// Variance of its place, px^2 per axis.
     pub(super) fn variance(&self) -> f64 {
-        // A cell's top is known to a third of it, and a little more where the target's middle is
-        // not its top.
+        // A maximum is located to a third of its cell, and a little worse where the target's middle
+        // is not its maximum.
         (0.35 * self.cell).powi(2) + 0.1
     }
 }
@@ -92,7 +96,7 @@ pub(super) fn find(levels: &mut [Level], plots: &mut Vec<Plot>) {
     plots.truncate(kept);
 }
 
-/// The plot of a change that is the greatest about it, if something stands out there.
+/// The plot of a change that is the greatest within a cell, if something stands out there.
 fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     let change = level.change.row(at[1])[at[0]];
     if greatest_about(&level.change, at, f32::abs) != at {
@@ -100,7 +104,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     }
     let sign = change.signum();
     let standing = |value: f32| sign * value;
-    // What moves changes most at its edge: up to its top, two cells further at most.
+    // What moves changes most at its edge: its top is two cells away at most.
     let mut top = at;
     for _ in 0..2 {
         top = greatest_about(&level.now, top, standing);
@@ -118,13 +122,14 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
             place[axis] += step;
             standing(level.now.clamped(place[0], place[1]))
         };
+        // Place between the cells: the top of a parabola through three of them.
         let [before, here, after] = [-1, 0, 1].map(near);
         let bend = before - 2.0 * here + after;
         let off = if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 };
         top[axis] as f64 + f64::from(off)
     });
     let [x, y] = level.place_of(refined);
-    // Texture is measured with the noise in it.
+    // The measured texture contains the noise: one spread squared is subtracted.
     let texture = (level.texture_about(top).powi(2) - 1.0).max(0.0).sqrt();
     Some(Plot {
         place: ImagePoint { x, y },
@@ -138,7 +143,7 @@ fn plot_at(level: &mut Level, index: usize, at: [usize; 2]) -> Option<Plot> {
     })
 }
 
-/// Where a plane is greatest within a cell of another.
+/// Where a plane is greatest, up to one cell from a place.
 fn greatest_about(plane: &Plane, [x, y]: [usize; 2], of: impl Fn(f32) -> f32) -> [usize; 2] {
     let mut best = [x, y];
     let mut most = of(plane.row(y)[x]);

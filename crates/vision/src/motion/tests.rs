@@ -9,8 +9,8 @@ const NOISE_SD: f64 = 0.1;
 /// Sides of a picture that nothing leaves, px.
 const SKY: [usize; 2] = [10_000_000; 2];
 
-/// A target whose acceleration has a standard deviation, seen through a reference that is the mean
-/// of its images, and what is believed of it.
+/// A simulated target with white acceleration, seen through a reference that is the mean of its
+/// images, and the filters that follow it.
 struct Flight {
     rng: ChaCha8Rng,
     position: [f64; 2],
@@ -36,8 +36,8 @@ impl Flight {
         Self { position, velocity, offset, motion, images: 1.0, rng }
     }
 
-    /// The next image, its noise over what it is expected to be; returns the squared normalised
-    /// innovation.
+    /// Simulates and filters the next image, whose noise is `noise_over` times the expected one;
+    /// returns the squared normalised innovation.
     fn step(&mut self, acceleration_sd: f64, noise_over: f64) -> f64 {
         let mut normal = || -> f64 { StandardNormal.sample(&mut self.rng) };
         for i in 0..2 {
@@ -53,9 +53,9 @@ impl Flight {
             variance,
         });
         self.motion.tell_noise([variance; 2]);
-        let surprise = self.motion.surprise(at);
+        let nis = self.motion.nis(at);
         self.motion.update(&Evidence::of(at));
-        self.motion.match_noise(surprise);
+        self.motion.match_noise(nis);
         let place = self.motion.position();
         let share = if self.images < 20.0 { 1.0 / (self.images + 1.0) } else { 0.0 };
         for (i, at) in [place.x, place.y].into_iter().enumerate() {
@@ -64,11 +64,11 @@ impl Flight {
         }
         self.motion.learn(place, share, Some([variance; 2]));
         self.images += 1.0;
-        surprise
+        nis
     }
 
-    /// Squared normalised error of position and velocity of both axes: chi-square with four degrees
-    /// of freedom.
+    /// Squared normalised error of position and velocity over both axes: chi-square with four
+    /// degrees of freedom.
     fn error(&self) -> f64 {
         let (place, velocity) = (self.motion.position(), self.motion.velocity());
         let off = [(place.x, velocity.x), (place.y, velocity.y)];
@@ -84,16 +84,16 @@ impl Flight {
     }
 }
 
-/// Means over runs of the squared innovation and error in the last third of a second of a flight of
-/// two seconds.
+/// Mean squared innovation and mean squared error, both normalised, over runs and over the last
+/// third of a second of a flight of two seconds.
 fn consistency(acceleration_sd: f64) -> (f64, f64) {
     let (mut innovations, mut errors, mut count) = (0.0, 0.0, 0.0);
     for seed in 0..400 {
         let mut flight = Flight::new(seed);
         for image in 0..60 {
-            let surprise = flight.step(acceleration_sd, 1.0);
+            let nis = flight.step(acceleration_sd, 1.0);
             if image >= 50 {
-                innovations += surprise;
+                innovations += nis;
                 errors += flight.error();
                 count += 1.0;
             }
@@ -104,9 +104,9 @@ fn consistency(acceleration_sd: f64) -> (f64, f64) {
 
 #[test]
 fn what_is_believed_is_as_sure_as_it_is_right() {
-    // The errors of a flight are one sample, of variance 8: a standard error of 0.14. Between two
-    // ways of moving the innovations are smaller than the livelier's and larger than the calmer's,
-    // and in the mean over all as they should be.
+    // The errors of one flight count as one sample, of variance 8: a standard error of 0.14. At an
+    // acceleration between two models' the innovations are smaller than the livelier one expects
+    // and larger than the calmer one does; on average over all they are as they should be.
     let livelinesses = [900.0, 600.0, 400.0, 180.0, 90.0, 36.0];
     let mut sum = 0.0;
     for acceleration_sd in livelinesses {
@@ -116,7 +116,8 @@ fn what_is_believed_is_as_sure_as_it_is_right() {
         sum += innovation / livelinesses.len() as f64;
     }
     assert!((sum - 2.0).abs() < 0.2, "mean NIS {sum}");
-    // An even flight may end at any moment, so that less is believed of it than is known.
+    // An even flight may end at any moment, so the stated covariance is larger than the actual
+    // error.
     let (innovation, error) = consistency(0.0);
     assert!((innovation - 2.0).abs() < 0.2 && (1.0..4.0).contains(&error), "{innovation}, {error}");
 }
@@ -165,7 +166,7 @@ fn a_place_that_somebody_knows_tells_the_offset() {
     flight.motion.take_place(given);
     let after = flight.motion.offset()[0];
     assert!((flight.motion.position().x - flight.position[0]).abs() < 1e-2);
-    // What is left is what one image's noise leaves.
+    // What remains is the uncertainty that one image's noise leaves.
     assert!(after.variance < 0.5 * before.variance, "{before:?} {after:?}");
     assert!((after.position - flight.offset[0]).abs() < 3.0 * after.variance.sqrt());
 }

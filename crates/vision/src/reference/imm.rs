@@ -1,16 +1,16 @@
-//! The brightness of each pixel by an interacting multiple model filter of three models (Solonar
-//! 2023, section 3, table 1; docs/papers.md).
+//! Filter of each pixel's brightness: interacting multiple models, of three models (Solonar 2023,
+//! section 3, table 1; docs/papers.md).
 
 use pulp::{Arch, Simd, WithSimd};
 use serde::{Deserialize, Serialize};
 
 use crate::lanes::{LANES, Lanes};
 
-/// Models: order 0, order 1, Singer's.
+/// Number of models: order 0, order 1, Singer's.
 const MODELS: usize = 3;
-/// Parts of a model's state: brightness, rate, and their covariance 11, 12, 22.
+/// Numbers in a model's state: brightness, rate, and their covariance 11, 12, 22.
 const PARTS: usize = 5;
-/// Least probability of a model: one that has died cannot come back.
+/// Least probability of a model: one at zero could not come back.
 const LEAST_PROBABILITY: f32 = 1e-6;
 
 /// The three models of Solonar 2023, table 1. Brightness in levels of 8 bits, times in frames of a
@@ -22,11 +22,11 @@ pub struct ImmConfig {
     pub constant_sd: f32,
     /// Rate noise `sigma_M` of the order-1 model, levels per frame squared. Default 0.4.
     pub drift_sd: f32,
-    /// Rate noise of Singer's model, levels a frame to the power of 1.5. Default 120: the jumps.
+    /// Rate noise of Singer's model, levels per frame to the power of 1.5. Default 120: the jumps.
     pub jump_sd: f32,
     /// Singer's manoeuvre constant `k_m`, 1 per frame. Default 1.
     pub jump_rate: f32,
-    /// Probability that the model stays from frame to frame. Default 0.99.
+    /// Probability that a model stays from frame to frame. Default 0.99.
     pub stay: f32,
 }
 
@@ -80,8 +80,8 @@ struct Block {
     probabilities: [Lanes; MODELS],
 }
 
-/// The filters of one colour channel of a reference: 18 numbers per pixel. A colour reference has one
-/// of these a channel.
+/// The filters of one colour channel of a reference: 18 numbers per pixel. A colour reference has
+/// one of these per channel.
 ///
 /// ```
 /// use crossfix_vision::{ImmConfig, PixelImm};
@@ -100,7 +100,7 @@ pub struct PixelImm {
 }
 
 impl PixelImm {
-    /// Filters that start at given brightnesses, measured with noise of a variance.
+    /// Filters that start at given brightnesses, measured with noise of a given variance.
     pub fn new(config: ImmConfig, brightness: &[f32], variance: f32) -> Self {
         let blocks = brightness.chunks(LANES).map(|pixels| {
             let mut first = [0.0; LANES];
@@ -117,8 +117,8 @@ impl PixelImm {
     }
 
     /// Takes the measured brightnesses in, `interval` frames after the last ones, and writes the
-    /// filtered ones, steps 1 to 7 of Solonar 2023, section 3. What of the slices is longer than
-    /// the filters is left alone.
+    /// filtered ones: steps 1 to 7 of Solonar 2023, section 3. Where the slices are longer than the
+    /// filters, the rest is left alone.
     pub fn step(&mut self, measured: &[f32], interval: f32, variance: f32, filtered: &mut [f32]) {
         let (models, stay) = (self.config.models(interval), self.config.stay);
         Arch::new().dispatch(Step {
@@ -195,7 +195,7 @@ impl Block {
                 p12 = p12 + weights[m] * (states[m][3] + d0 * d1);
                 p22 = p22 + weights[m] * (states[m][4] + d1 * d1);
             }
-            // (12): extrapolation.
+            // (12): extrapolation, x = B x and P = B P B' + M.
             let Model { rate: step, keep, noise } = models[l];
             let brightness = mixed + rate * step;
             let slope = rate * keep;
@@ -214,10 +214,12 @@ impl Block {
                 k2 * variance,
                 p22 - k2 * p12,
             ];
-            // (14)-(15) up to a common factor.
+            // (14)-(15): the likelihood N(innovation; 0, P11 + R) up to a common factor, its
+            // exponent kept apart.
             exponents[l] = innovation * innovation * inverse * -0.5;
             likelihoods[l] = prior * inverse.sqrt();
         }
+        // The largest exponent is taken out of all, so that not all of them underflow.
         let largest = exponents[0].max(exponents[1]).max(exponents[2]);
         let least = Lanes::splat(f32::MIN_POSITIVE);
         let mut total = zero;

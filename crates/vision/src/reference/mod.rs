@@ -1,5 +1,5 @@
-//! How the reference follows the target's appearance (Solonar 2023): the ways that the papers name,
-//! and the mean that measures best in the loop.
+//! How the reference follows the target's appearance (Solonar 2023): the strategies that the papers
+//! name, and the mean, which measures best in the loop.
 
 mod imm;
 
@@ -46,7 +46,7 @@ impl Default for ReferenceStrategy {
 pub(crate) struct Adaptation {
     strategy: ReferenceStrategy,
     filter: Option<PixelImm>,
-    /// Images taken in, each with its certainty.
+    /// Number of images taken in, each weighted by its certainty.
     images: f32,
     /// Variance of the reference's noise.
     pub(crate) noise: f32,
@@ -63,13 +63,13 @@ impl Adaptation {
         Self { strategy, filter, images: 1.0, noise }
     }
 
-    /// The same after so many images, of which the first is the mean.
+    /// The same state if `first` was the mean of so many images.
     pub(crate) fn after(self, images: f32) -> Self {
         Self { images, ..self }
     }
 
-    /// Takes an image in, of noise of a variance, that shows the target with a certainty of 0 to 1,
-    /// `interval` seconds after the last one. Returns its share in the reference.
+    /// Takes an image in, given the variance of its noise and the probability that it shows the
+    /// target (0 to 1), `interval` seconds after the last one. Returns its share in the reference.
     pub(crate) fn take_in(
         &mut self,
         reference: &mut Plane,
@@ -87,11 +87,12 @@ impl Adaptation {
             }
             ReferenceStrategy::PixelImm(_) => {
                 if let Some(filter) = &mut self.filter {
-                    // An uncertain image is a noisier one.
+                    // An uncertain image counts as a noisier one.
                     let variance = noise / certainty.max(0.01);
                     let frames = interval / FRAME_INTERVAL as f32;
                     filter.step(image.samples(), frames, variance, reference.samples_mut());
-                    // About four frames' mean where nothing changes, one where it jumps.
+                    // The noise of about four frames' mean where nothing changes, of one frame
+                    // where it jumps.
                     self.noise = (0.75 * self.noise).max(noise / 4.0);
                 }
                 return 0.25;
@@ -106,7 +107,7 @@ impl Adaptation {
     }
 }
 
-/// The models for a brightness whose level of 8 bits is `level`.
+/// The models' noises, for a brightness in which a level of 8 bits is `level`.
 fn scaled(config: ImmConfig, level: f32) -> ImmConfig {
     ImmConfig {
         constant_sd: config.constant_sd * level,

@@ -11,13 +11,14 @@ use crate::posterior::Posterior;
 use crate::scratch::Scratch;
 use crate::state::SEEN;
 
-/// A turn of the camera by less than this is within what is not known of a target's motion anyway,
+/// Turns of the camera by less than this are within the uncertainty of a target's motion anyway,
 /// px.
 const LEAST_MOVE_PX: f64 = 2.0;
 
 impl Target {
-    /// The camera may have turned: then everything in its image has moved, the target too. Light
-    /// that changes may be taken for a turn, so it may have stayed as well.
+    /// Forks the hypotheses if the camera may have turned: then everything in its image has moved,
+    /// the target too. But light that changes may be taken for a turn, so the target may have
+    /// stayed as well.
     pub(super) fn may_move_with_scene(&mut self, frame: Frame<'_>) {
         let by = frame.scene_moved;
         let is_followed = !self.state.is_searching() && !self.identity.is_on_probation();
@@ -30,7 +31,7 @@ impl Target {
         }
     }
 
-    /// Whether a posterior leaves more than one place to be kept.
+    /// Whether a posterior leaves more than one place to be followed.
     pub(super) fn must_doubt(&self, posterior: &Posterior, config: &TrackerConfig) -> bool {
         let in_doubt = !self.hypotheses.is_empty() || posterior.near.mass < DOUBT;
         in_doubt
@@ -38,8 +39,8 @@ impl Target {
             && !self.identity.is_on_probation()
     }
 
-    /// Follows all places where the target may be into the image whose log ratios are in the
-    /// scratch's map.
+    /// Follows all places where the target may be into the image whose log likelihood ratios are in
+    /// `scratch.ratios`.
     pub(super) fn follow_hypotheses(
         &mut self,
         frame: Frame<'_>,
@@ -81,14 +82,15 @@ impl Target {
         Step { measured, score: fit.score, certainty, nis: None }
     }
 
-    /// One place is left, or none: the others are forgotten.
+    /// Forgets the other hypotheses if one place is left, or none.
     fn settle(&mut self, weight: f64) {
         if weight > DOUBT || self.state.is_searching() {
             self.hypotheses.clear();
         }
     }
 
-    /// No doubt is left: the target has been where its likeliest hypothesis was.
+    /// Settles on the likeliest hypothesis: no doubt is left that the target has been where that
+    /// was.
     fn settle_on(
         &mut self,
         (motion, posterior): (Motion, Posterior),

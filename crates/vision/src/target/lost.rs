@@ -1,4 +1,4 @@
-//! A target that is lost, and what is found in its place.
+//! A target that is lost, and what is found in its place again.
 
 use crossfix_filter::AxisMeasurement;
 
@@ -20,7 +20,7 @@ impl Target {
         })
     }
 
-    /// Takes what a search finds, if it is believed; else its score.
+    /// Takes what a search finds, if it is accepted; else returns its score.
     fn find_again(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Result<Step, f64> {
         let Self { state, identity, search_memory: memory, .. } = self;
         let found = Sought { state, identity, memory }.find(frame, scratch);
@@ -46,7 +46,7 @@ impl Target {
         Ok(Step { measured: Some(measured), score: fit.score, certainty: 1.0, nis: None })
     }
 
-    /// Follows what a search has found. If it is lost again soon it was something else, and the
+    /// Follows what a search has found. If that is lost again soon it was something else, and the
     /// search goes on from what was known before.
     pub(super) fn follow_on_probation(&mut self, frame: Frame<'_>, scratch: &mut Scratch) -> Step {
         self.identity.predict_probation(frame);

@@ -2,9 +2,9 @@
 //! the gate and the filters' prediction give where it is, how well that is known, and whether it
 //! can be seen at all.
 //!
-//! A step goes through the stages of `state.rs`: the gate, the posterior, the fit, what that leaves
-//! in doubt (`identity.rs`, and where there are several places `doubtful.rs`), the filters' update, and
-//! learning. One that is lost is searched for (`lost.rs`).
+//! A step goes through the stages of `state.rs`: the gate, the posterior, the fit, what remains in
+//! doubt (`identity.rs`, and where there are several places `doubtful.rs`), the filters' update,
+//! and learning. A target that is lost is searched for (`lost.rs`).
 
 mod doubtful;
 mod lost;
@@ -26,15 +26,15 @@ use crate::search_memory::SearchMemory;
 use crate::state::{SEEN, State};
 use crate::{ImagePoint, PixelBox, TrackerConfig};
 
-/// Variance below which a fit is narrower than the pixels of the map, px^2.
+/// Variance below which a fit is narrower than the map's pixels, px^2.
 const NARROW: f64 = 0.5;
-/// What a map tells of a place is at least this share of what is known then: with less, chance
-/// would be taken for a measurement from afar.
+/// Least gain of a measurement that is taken out of a peak of the map: with less, chance would be
+/// taken for a measurement far off the prediction.
 const LEAST_TOLD: f64 = 0.1;
-/// Squared Mahalanobis distance beyond which a certain match is a manoeuvre.
+/// Squared normalised innovation beyond which a certain match is taken for a manoeuvre.
 const MANOEUVRE: f64 = 25.0;
-/// A manoeuvre makes the filters' variances at most so many times larger: from a tenth of a pixel
-/// to ten.
+/// Largest factor by which a manoeuvre inflates the filters' variances: from a tenth of a pixel to
+/// ten.
 const MOST_INFLATED: f64 = 1e4;
 /// Certainty above which the rest of the gate is not looked at: what is there could take no more
 /// from it than this leaves.
@@ -49,10 +49,13 @@ pub(crate) struct Target {
     pub(crate) search_memory: SearchMemory,
 }
 
-/// The measurement that makes a posterior of a prior: the inverse variances' difference.
+/// The measurement that leads from the prior to the posterior: the difference of the inverse
+/// variances.
 fn without_prior(posterior: AxisMeasurement, prior: AxisMeasurement) -> AxisMeasurement {
-    // A placement stands for a whole pixel, of which the map's prior knows nothing.
+    // Each placement stands for a whole pixel, of variance 1/12, which the map's prior does not
+    // have.
     let known = (posterior.variance - 1.0 / 12.0).max(1e-3 * prior.variance);
+    // Gain K = 1 - P+ / P, hence z = x + (x+ - x) / K and R = P (1 / K - 1).
     let share = (1.0 - known / prior.variance).max(LEAST_TOLD);
     let off = (posterior.position - prior.position) / share;
     AxisMeasurement {
@@ -81,8 +84,8 @@ impl Target {
         }
     }
 
-    /// Covariance of position and velocity on either axis, the other places where the target may be
-    /// included.
+    /// Covariance of position and velocity on either axis, with the spread of the other places
+    /// where the target may be.
     pub(crate) fn covariances(&self) -> [Matrix2<f64>; 2] {
         let spread = self.hypotheses.spread(self.state.position());
         let covariances = self.state.motion.covariances();
@@ -93,7 +96,7 @@ impl Target {
         })
     }
 
-    /// Whether it is searched for, or for long has not been sure in any place.
+    /// Whether it is searched for, or has not been sure in any place for long.
     pub(crate) fn is_lost(&self) -> bool {
         self.state.is_searching() || self.hypotheses.are_doubted()
     }
@@ -114,7 +117,7 @@ impl Target {
     }
 
     /// Takes a place in the next image from somebody who knows it, instead of measuring it: with
-    /// the box it is the start from two measurements (Herasymenko 2021, eqs. 13-14).
+    /// the box it starts the motion from two measurements (Herasymenko 2021, eqs. 13-14).
     pub(crate) fn take_place(
         &mut self,
         frame: Frame<'_>,
@@ -133,7 +136,7 @@ impl Target {
             self.state.motion.predict(interval, frame.sides());
             self.state.motion.take_place(given);
         }
-        self.identity.is_given();
+        self.identity.set_given();
         let share = self.state.appearance.learn(
             image,
             place,
@@ -166,7 +169,7 @@ impl Target {
         );
         self.state.note_noise(noise);
 
-        // The whole gate is looked at only where the middle of it leaves a doubt.
+        // The whole gate is looked at only if the middle of it leaves a doubt.
         let middle = if self.hypotheses.is_empty() {
             self.state.middle_of_gate(whole.half, config)
         } else {
@@ -203,7 +206,7 @@ impl Target {
             self.state.motion.tell_noise(found.map(|at| at.variance));
         }
         let expected = self.state.motion.found();
-        let distance = self.state.motion.surprise(found);
+        let distance = self.state.motion.nis(found);
         let step = |measured| Step { measured, score: fit.score, certainty, nis: Some(distance) };
         let measured = self.state.measurement(&fit);
         if let GateRule::Ellipsoid { probability } = frame.config.gate
@@ -213,7 +216,7 @@ impl Target {
             return step(None);
         }
         if certainty > SEEN && distance > MANOEUVRE {
-            // Certain, and not where it was expected: the filters are too sure of themselves.
+            // Certain, but not where it was expected: the filters are overconfident.
             let off = |i: usize| {
                 (found[i].position - expected[i].position).powi(2) / expected[i].variance
             };
@@ -223,8 +226,8 @@ impl Target {
             self.learn(frame, fit.place, fit, certainty, scratch);
             return step(Some(measured));
         }
-        // Whether it is the target that is followed is said by the certainty, and the covariance is
-        // that of where it is then.
+        // Whether what is followed is the target is said by the certainty; the covariance is that
+        // of its place if it is.
         let posterior = if certainty > SEEN { posterior } else { &doubted };
         self.state.motion.update(&self.evidence(posterior, found, origin, frame.config));
         let (estimate, hidden) = (self.state.position(), posterior.unseen);
@@ -239,9 +242,9 @@ impl Target {
         step((certainty > SEEN).then_some(measured))
     }
 
-    /// What a posterior over the placements says of where the reference is found. Where the fit is
-    /// narrower than the pixels of the map, it says where in the peak; elsewhere the peak's own
-    /// moments do, the prediction's part taken out.
+    /// The measurement that a posterior over the placements gives of where the reference is found.
+    /// If the fit is narrower than the map's pixels, it gives the place within the peak; else the
+    /// peak's own moments do, with the prediction's part taken out.
     fn evidence(
         &self,
         posterior: &Posterior,
@@ -273,7 +276,7 @@ impl Target {
         }
     }
 
-    /// It was seen at a place.
+    /// Notes that the target was seen at a place.
     pub(crate) fn seen(&mut self, place: ImagePoint) {
         self.state.seen(place);
         self.search_memory.seen();
@@ -282,8 +285,8 @@ impl Target {
         }
     }
 
-    /// Follows contrast, size, direction and appearance, the more the surer the target was seen. Of
-    /// one on probation nothing is learnt.
+    /// Learns contrast, size, direction and appearance, the more the surer the target was seen.
+    /// From one on probation nothing is learnt.
     fn learn(
         &mut self,
         frame: Frame<'_>,

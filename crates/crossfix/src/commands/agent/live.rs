@@ -1,4 +1,4 @@
-//! What a live camera shows, as long as somebody wants it.
+//! Following targets in a live camera's stream, as long as the agent runs.
 
 use std::time::{Duration, Instant};
 
@@ -13,12 +13,13 @@ use crate::eye::brightness;
 use crate::pace::wall_seconds;
 use crate::service;
 
-/// How often an agent that sees nothing looks whether it is to stop.
+/// How often an agent that receives no images checks whether to stop.
 const POLL: Duration = Duration::from_millis(200);
 
-/// A count and arrivals that part by so much between two frames are of a stream that counts anew, s.
+/// If stream time and arrival time between two frames differ by this much, the stream has started a
+/// new count, s.
 const ANOTHER_COUNT_S: f64 = 2.0;
-/// The tracker's shortest time between two frames, s: for it time goes on.
+/// The shortest time between two frames that the tracker is given, s: its time must always advance.
 const SHORTEST_S: f64 = 1e-3;
 
 /// Follows targets in a stream.
@@ -26,19 +27,20 @@ pub(super) struct Watch {
     pub(super) file: CameraFile,
     begins: Timestamp,
     pub(super) tracker: ImageTracker,
-    /// The tracker's time goes on evenly whatever becomes of the clocks: the last frame's, its stream
-    /// time, s, and its arrival.
+    /// Basis of the tracker's time, which runs evenly whatever happens to the clocks: the last
+    /// frame's tracker time, stream time, s, and arrival.
     tracked: Option<(Timestamp, f64, Instant)>,
     shown: Option<Timestamp>,
 }
 
 impl Watch {
-    /// A frame's time for the tracker.
+    /// A frame's time for the tracker: advanced by the stream's own time, or by arrival where the
+    /// stream has started a new count.
     fn even_time(&mut self, live: Arrival) -> Timestamp {
         let time = self.tracked.map_or(self.begins, |(before, stream_s, at)| {
             let passed_s = live.stream_s - stream_s;
             let arrived_s = live.at.saturating_duration_since(at).as_secs_f64();
-            // A stream that was opened anew counts from another instant.
+            // A stream that was opened again counts from another instant.
             let goes_on = passed_s > 0.0 && (passed_s - arrived_s).abs() < ANOTHER_COUNT_S;
             before.plus_seconds(if goes_on { passed_s } else { arrived_s.max(SHORTEST_S) })
         });
@@ -48,8 +50,8 @@ impl Watch {
 }
 
 impl Agent {
-    /// Follows what a live camera shows until it is asked to stop. A camera that is lost is asked
-    /// again, and that it is lost is said.
+    /// Follows targets in a live camera's images until asked to stop. If the camera is lost this is
+    /// logged, and it is opened again.
     pub(super) fn watch_live(
         &mut self,
         file: &CameraFile,
@@ -86,7 +88,7 @@ impl Agent {
         Ok(())
     }
 
-    /// Says what is wrong with the stream: that it is lost whenever it is, why it stays so now and then.
+    /// Logs a problem of the stream: the loss of the stream at once, further reasons now and then.
     fn note_trouble(&mut self, trouble: &VideoError) {
         let Some(stream) = &mut self.stream else { return };
         let is_news = !trouble.is_one_frame() && !stream.is_lost();
@@ -101,10 +103,11 @@ impl Agent {
         }
     }
 
-    /// Follows targets in one frame and says where they are.
+    /// Follows targets in one frame and publishes their bearings.
     fn follow(&mut self, watch: &mut Watch, frame: &Frame) -> anyhow::Result<()> {
         if let Err(error) = self.check_size(frame) {
-            // It may come back; the others see on.
+            // The right size may come back, and the other cameras still work, so this does not end
+            // the agent.
             self.bad_frames += 1;
             self.repeats.warn("size", Instant::now(), || format!("{error:#}"));
             if let Some(stream) = &mut self.stream {

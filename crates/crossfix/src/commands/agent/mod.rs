@@ -39,8 +39,8 @@ use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 #[cfg(feature = "centre")]
 pub use self::simulated::truth_frame;
 
-/// An agent that is this far behind its source is too slow for it: the fusion centre waits half a
-/// second.
+/// An agent this far behind its source is too slow for it: the fusion centre waits half a second
+/// for late frames.
 pub const BEHIND: Duration = Duration::from_millis(500);
 
 /// Run one camera host: find and follow targets, publish their bearings.
@@ -71,19 +71,19 @@ pub struct Args {
     stop_with_stdin: bool,
 }
 
-/// What an agent has open.
+/// State of a running agent, with its open connections.
 struct Agent {
-    /// The camera's file, and what overrides it.
+    /// The camera's file, and the overrides of its keys.
     config: PathBuf,
     sets: Vec<String>,
     identity: CameraIdentity,
-    /// Lens, pose and clock by the site's calibration, where there is one.
+    /// Lens, pose and clock from the site's calibration, if there is one.
     calibrated: Option<Calibrated>,
     calibration: Vec<u8>,
     link: Link,
-    /// For the fusion centres that hear it.
+    /// Presence of the fusion centres that listen to this camera.
     lookout: Lookout,
-    /// That it hears what is said to it; from the moment on at which it does.
+    /// Token of being alive; declared once the agent can receive messages.
     alive: Option<AliveToken>,
     bearings: LinkPublisher,
     calibrations: LinkPublisher,
@@ -94,16 +94,16 @@ struct Agent {
     frames: u64,
     bad_frames: u64,
     unseen_bearings: u64,
-    /// Images of which the mount did not say where they were taken.
+    /// Number of images for which the mount did not report where they were taken.
     without_pointing: u64,
-    /// Tracks in its newest frame.
+    /// Number of tracks in the newest frame.
     tracks: u32,
     behind: Duration,
     scene_begins: Timestamp,
     now: Timestamp,
-    /// How its stream does, if it watches one.
+    /// State of the stream, if the source is one.
     stream: Option<StreamHealth>,
-    /// What it looks for, if it takes cues.
+    /// The search for cued targets, if the camera takes cues.
     seeking: Option<Seeking>,
     repeats: Repeats,
     shutdown: Shutdown,
@@ -131,8 +131,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     agent.finish(seen)
 }
 
-/// The time at which a source begins: of a recording the common one of all its cameras, of a video the
-/// camera's own; that of a scene is when it is started.
+/// The time at which a source begins: of a recording the common time of all its cameras, of a video
+/// the camera's own time; a scene begins when it is started.
 fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::Result<Timestamp> {
     match &file.source {
         SourceConfig::Recording { path, .. } => first_bearing(path, calibrated),
@@ -145,8 +145,8 @@ fn source_begins(file: &CameraFile, calibrated: Option<&Calibrated>) -> anyhow::
     }
 }
 
-/// The image time corrected by what is known of the camera's clock: `own = t (1 + drift) + offset`
-/// from the source's start on.
+/// The capture time corrected for the known error of the camera's clock, which from the source's
+/// start on shows `own = t (1 + drift) + offset`.
 fn corrected(own: CaptureTime, start: Timestamp, clock: &ClockConfig) -> CaptureTime {
     let own_s = own.time.seconds_since(start);
     let true_s = (own_s - clock.offset_s) / (1.0 + clock.drift_ppm * 1e-6);
@@ -162,7 +162,7 @@ impl Agent {
         is_unpaced: bool,
         shutdown: Shutdown,
     ) -> anyhow::Result<Self> {
-        // What is played as fast as it goes waits for those who listen; life does not.
+        // A source played as fast as possible waits for its receivers; a live one cannot.
         let delivery = if is_unpaced { Delivery::Every } else { Delivery::Queued };
         let name = identity.name.clone();
         let lookout = Lookout::for_centres_of(&link, network, &name)?;
@@ -209,7 +209,7 @@ impl Agent {
         network: &NetworkConfig,
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
-        // Life waits for nobody.
+        // A live source cannot wait.
         let is_live = file.source.is_live();
         let start = if args.no_wait || is_live {
             self.appear()?;
@@ -246,13 +246,13 @@ impl Agent {
         calibrated.map_or(begins, |camera| camera.common(begins))
     }
 
-    /// Says that it is there.
+    /// Declares this agent present on the network.
     fn appear(&mut self) -> anyhow::Result<()> {
         self.alive = Some(self.link.declare_alive(Channel::Alive(self.identity.name.clone()))?);
         Ok(())
     }
 
-    /// Follows what the source shows until its end.
+    /// Follows targets in the source's images until its end.
     fn look(&mut self, file: &CameraFile, begins: Timestamp, start: &Start) -> anyhow::Result<()> {
         match &file.source {
             SourceConfig::Recording { path, speed } => self.replay(path, begins, start, *speed),
@@ -321,7 +321,7 @@ impl Agent {
                     self.repeats.warn("bad frame", Instant::now(), || format!("{error}; going on"));
                     continue;
                 }
-                // What is lost is the rest of this video; the others see on.
+                // The rest of this video is lost; the other cameras go on.
                 Err(error) => {
                     return Err(error)
                         .with_context(|| format!("camera `{}` sees no more", self.identity.name));
@@ -348,7 +348,7 @@ impl Agent {
         }
     }
 
-    /// Shows people an image, if it is time for one after the one shown last.
+    /// Publishes a preview of an image, if enough time has passed since the last one.
     fn show(
         &self,
         file: &CameraFile,
@@ -357,7 +357,7 @@ impl Agent {
         capture: CaptureTime,
     ) -> anyhow::Result<()> {
         let rate = file.preview.rate_hz;
-        // A clock that was set back shows no reason to wait.
+        // With `abs`, a clock that was set back does not suspend the previews.
         let since = |last: Timestamp| capture.time.seconds_since(last).abs();
         if rate <= 0.0 || shown.is_some_and(|last| since(last) * rate < 1.0) {
             return Ok(());
@@ -373,7 +373,8 @@ impl Agent {
         Ok(())
     }
 
-    /// Pixels of another size than the intrinsics' would become wrong bearings without a word.
+    /// Checks that a frame has the intrinsics' size: other pixels would silently give wrong
+    /// bearings.
     fn check_size(&self, frame: &Frame) -> anyhow::Result<()> {
         let size = self.identity.camera.model().intrinsics().size;
         let (width, height) = (size.width as usize, size.height as usize);
@@ -424,8 +425,8 @@ impl Agent {
         Ok(())
     }
 
-    /// Says that nothing more will come, and closes; fails if the source ended by an error, or
-    /// showed less than it hid.
+    /// Announces that nothing more will come, and closes. Fails if the source ended with an error,
+    /// or if it had more bad frames than good ones.
     fn finish(mut self, seen: anyhow::Result<()>) -> anyhow::Result<()> {
         service::stopping();
         self.say_health(true)?;
@@ -446,7 +447,7 @@ impl Agent {
     }
 }
 
-/// Time of the first bearing of any camera of a recording.
+/// Time of the first bearing of any camera in a recording.
 fn first_bearing(path: &Path, calibrated: Option<&Calibrated>) -> anyhow::Result<Timestamp> {
     let mut first: Option<Timestamp> = None;
     recorded::for_each(path, &mut Lacks::default(), |_, entry| {

@@ -8,20 +8,21 @@ use super::live::Watch;
 use crate::config::CameraFile;
 use crate::pace::wall_seconds;
 
-/// A file that was read again, and what of it has to wait for a start anew.
+/// A file that was read again, and the keys whose changes need a restart.
 struct Again {
     file: CameraFile,
-    /// Names of keys.
+    /// Names of the keys that need a restart.
     waits: Vec<&'static str>,
 }
 
 impl Again {
-    /// What of a new file can hold at once, in the place of the old.
+    /// The new file, with the keys that need a restart kept as in the old one.
     fn of(new: CameraFile, old: &CameraFile) -> anyhow::Result<Self> {
         let mut waits = Vec::new();
-        // What is opened is told how well arrivals are known.
+        // A source opened with the clock `arrival` was given the SD of its arrival times when it
+        // was opened.
         let by_arrival = old.clock_source() == ClockSource::Arrival;
-        // Sources hold passwords and are compared, not shown.
+        // Sources hold passwords, so they are compared as text and never shown.
         let is_other_source = toml::to_string(&new.source)? != toml::to_string(&old.source)?;
         for (key, is_other) in [
             ("name", new.name != old.name),
@@ -42,6 +43,10 @@ impl Again {
         file.network.clone_from(&old.network);
         file.source.clone_from(&old.source);
         file.clock.source = old.clock.source;
+        if by_arrival {
+            file.clock.sd_s = old.clock.sd_s;
+        }
+        file.boxes.clone_from(&old.boxes);
         file.mount.clone_from(&old.mount);
         file.takes_cues = old.takes_cues;
         Ok(Self { file, waits })
@@ -49,8 +54,8 @@ impl Again {
 }
 
 impl Agent {
-    /// Reads the camera's file again: pose, lens, clock, preview and the tracker's parameters hold from
-    /// now on. A file with an error changes nothing.
+    /// Reads the camera's file again: pose, lens, clock, preview and the tracker's parameters take
+    /// effect at once. A file with an error changes nothing.
     pub(super) fn reload(&mut self, watch: &mut Watch) -> anyhow::Result<()> {
         let name = self.identity.name.clone();
         match self.read_again(watch) {
@@ -70,12 +75,12 @@ impl Agent {
                 tracing::warn!("camera `{name}` goes on as it was: {error:#}");
             }
         }
-        // Before anything else is said of it.
+        // The calibration is published again before anything else.
         self.calibrated_at = None;
         self.keep_up()
     }
 
-    /// Takes over what can be; returns the keys that cannot.
+    /// Applies the changes that can take effect at once; returns the keys that cannot.
     fn read_again(&mut self, watch: &mut Watch) -> anyhow::Result<Vec<&'static str>> {
         let Again { file, waits } =
             Again::of(CameraFile::load(&self.config, &self.sets)?, &watch.file)?;
@@ -91,11 +96,11 @@ impl Agent {
             size.height
         );
         let calibrated = file.calibrated()?;
-        // This host's clock may show anything; what is seen next comes after what was seen last.
+        // This host's clock may show anything; the new calibration must begin after the last image.
         let wall = Timestamp::from_seconds(wall_seconds());
         let now = if self.frames > 0 { self.now } else { wall };
         let message = match &calibrated {
-            // Times that were published are the common ones already.
+            // Published times are already common times.
             Some(calibrated) if self.frames > 0 => calibrated.message(now),
             Some(calibrated) => calibrated.message(calibrated.common(now)),
             None => file.calibration(&camera, now)?,

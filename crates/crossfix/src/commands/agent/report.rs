@@ -1,4 +1,4 @@
-//! What an agent says of itself.
+//! The messages in which an agent describes itself.
 
 use std::time::{Duration, Instant};
 
@@ -8,11 +8,11 @@ use super::stream_health::StreamHealth;
 use super::{Agent, BEHIND};
 use crate::{health, service};
 
-/// How often the calibration is said again, for those who came late.
+/// How often the calibration is published again, for receivers that joined late.
 const CALIBRATION_PERIOD: Duration = Duration::from_secs(2);
 
 impl Agent {
-    /// Says calibration and health again when it is time.
+    /// Publishes calibration and health again when they are due.
     pub(super) fn keep_up(&mut self) -> anyhow::Result<()> {
         let due =
             |at: Option<Instant>, period: Duration| at.is_none_or(|at| at.elapsed() >= period);
@@ -24,7 +24,7 @@ impl Agent {
             service::alive();
             self.lookout.look(Instant::now());
             self.repeats.remind(Instant::now());
-            // A live camera's file is read again where it is watched.
+            // The reload of a live camera's file happens where the camera is watched.
             if self.stream.is_none() && self.shutdown.take_reload() {
                 tracing::warn!("a source that is played keeps its configuration to its end");
             }

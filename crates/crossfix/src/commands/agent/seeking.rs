@@ -1,4 +1,4 @@
-//! An agent whose camera looks for what the fusion centre tells it to look for.
+//! An agent whose camera looks for the targets that the fusion centre's cues name.
 
 use std::time::{Duration, Instant};
 
@@ -18,30 +18,31 @@ use crate::onvif::OnvifMount;
 use crate::parts;
 use crate::seeker::{Mount, Orders, Pointed, Seeker};
 
-/// No mount turns for longer between two views.
+/// A mount that turns for longer than this is reported as a problem: no turn between two views
+/// takes so long.
 const LONGEST_TURN: Duration = Duration::from_secs(30);
-/// A view is the same while the angles that a mount says are within so many of their deviations.
+/// A view is unchanged while the mount's reported angles stay within this many SDs.
 const SAME_SDS: f64 = 3.0;
 
-/// A camera that looks for what it is told to look for.
+/// Connects the seeker of a camera with its cues and its mount.
 pub(super) struct Seeking {
     seeker: Seeker,
     cues: Subscription,
     mount: Option<Box<dyn Mount>>,
     angle_sd_rad: f64,
-    /// Since when it has not stood still.
+    /// Since when the mount has been turning.
     restless: Option<Instant>,
-    /// Where it pointed in the newest image, ...
+    /// Where the camera pointed in the newest image, ...
     pointed: Pointed,
-    /// ... and in those that the tracker knows, all of one view; `None` if there are none.
+    /// ... and in the images that the tracker has, all of one view; `None` if it has none.
     view: Option<ScanAngles>,
-    /// What it has taken over last, so that it is said once.
+    /// The track that was last reported as taken over, so that it is logged only once.
     said: Option<u64>,
 }
 
 impl Seeking {
-    /// Asks the mount where it pointed in the newest image; says whether that is another view than
-    /// the tracker knows.
+    /// Asks the mount where it pointed in the newest image; returns whether that is another view
+    /// than the tracker's.
     fn point(&mut self) -> bool {
         self.pointed = self.mount.as_mut().map_or(Pointed::Fixed, |mount| mount.pointed());
         let turns = matches!(self.pointed, Pointed::Turning(_));
@@ -57,14 +58,14 @@ impl Seeking {
         before.is_some() && self.view != before
     }
 
-    /// Whether two angles are the same, as far as the mount knows them.
+    /// Whether two angles are equal within the mount's accuracy.
     fn is_same(&self, one: ScanAngles, other: ScanAngles) -> bool {
         let within = SAME_SDS * self.angle_sd_rad;
         (one.azimuth - other.azimuth).abs() <= within
             && (one.elevation - other.elevation).abs() <= within
     }
 
-    /// What is to be said of where it pointed.
+    /// The mount's pointing for the message; `None` if there is nothing to report.
     fn pointing(&self) -> Option<Pointing> {
         let (ScanAngles { azimuth, elevation }, settled) = match self.pointed {
             Pointed::Fixed | Pointed::Unknown => return None,
@@ -75,11 +76,11 @@ impl Seeking {
         Some(Pointing { azimuth, elevation, azimuth_sd, elevation_sd, settled })
     }
 
-    /// Takes in what has been said, and looks at a frame by it: says in the frame what it takes
-    /// over, and tells the mount where to turn.
+    /// Takes in new cues and applies them to a frame: marks in it the track that is taken over, and
+    /// tells the mount where to turn.
     fn look(&mut self, frame: &mut BearingFrame) {
         while let Some(received) = self.cues.next(Duration::ZERO) {
-            // What is malformed moves no camera.
+            // A malformed message has no effect.
             let Ok(cues) = decode::<CueFrame>(&received.data) else { continue };
             if cues.camera == frame.camera {
                 self.seeker.hear(cues);
@@ -103,7 +104,7 @@ impl Seeking {
     }
 }
 
-/// What turns a live camera, if its file says how it is told.
+/// A live camera's mount, if the camera's file says how to command it.
 #[cfg(feature = "onvif")]
 pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount>>> {
     let Some(mount) = &file.mount else { return Ok(None) };
@@ -112,7 +113,7 @@ pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount
     Ok(Some(Box::new(head)))
 }
 
-/// What turns a live camera: this build cannot tell it.
+/// A live camera's mount: an error if the file needs ONVIF, which this build leaves out.
 #[cfg(not(feature = "onvif"))]
 pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount>>> {
     let told = file.mount.as_ref().is_some_and(|mount| mount.onvif.is_some());
@@ -120,8 +121,8 @@ pub(super) fn mount_of(file: &CameraFile) -> anyhow::Result<Option<Box<dyn Mount
 }
 
 impl Agent {
-    /// Begins to listen to cues, if the camera's file says so; with what turns the camera, if that
-    /// can be told to turn.
+    /// Starts listening to cues, if the camera's file asks for it. `mount` is given if it can be
+    /// commanded.
     pub(super) fn begin_to_seek(
         &mut self,
         file: &CameraFile,
@@ -136,7 +137,7 @@ impl Agent {
         );
         let camera = &self.identity.camera;
         let angle_sd_rad = file.mount.as_ref().map_or(0.0, |mount| mount.angle_sd_mrad * 1e-3);
-        // One of the fusion centres that hear it tells it what to look for.
+        // Cues may come from any of the fusion centres that listen to this camera.
         let cues = Key::of_all_centres(self.link.site(), "cues");
         self.seeking = Some(Seeking {
             seeker: Seeker::new(camera.model(), file.pan_tilt(camera.pose())?, angle_sd_rad),
@@ -151,8 +152,8 @@ impl Agent {
         Ok(())
     }
 
-    /// Follows targets into an image of a number; `time` is the tracker's. While a mount turns its
-    /// camera nothing is followed: what moves then is everything.
+    /// Follows targets into the image with a sequence number; `time` is the tracker's. While a
+    /// mount turns the camera nothing is followed, as then everything in the image moves.
     pub(super) fn see(
         &mut self,
         tracker: &mut ImageTracker,
@@ -173,7 +174,7 @@ impl Agent {
         BearingFrame { pointing, ..frame }
     }
 
-    /// What is wrong with what turns the camera.
+    /// The mount's current problem, if any.
     pub(super) fn trouble_of_mount(&self) -> Option<String> {
         let seeking = self.seeking.as_ref()?;
         let what = match seeking.pointed {
@@ -186,7 +187,7 @@ impl Agent {
         Some(format!("its mount {what}: its images are of no use"))
     }
 
-    /// Looks at a frame by what the fusion centre has said.
+    /// Applies the fusion centre's cues to a frame.
     pub(super) fn seek(&mut self, frame: &mut BearingFrame) {
         if let Some(seeking) = &mut self.seeking {
             seeking.look(frame);

@@ -1,4 +1,4 @@
-//! Cameras of a scene, and the truth of it.
+//! Cameras of a simulated scene, and the scene's truth.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -16,15 +16,14 @@ use crate::pace::Pace;
 use crate::seeker::{Mount, Pointed};
 use crate::shutdown::Shutdown;
 
-/// What turns a simulated camera, and when the camera took its newest frame (s) with where it
-/// pointed then.
+/// A simulated mount, with the time (s) and pointing of the camera's newest frame.
 #[derive(Debug)]
 struct Turned {
     mount: SimulatedMount,
     newest: Option<(f64, MountState)>,
 }
 
-/// A simulated mount, as the camera and the agent share it.
+/// A simulated mount, shared by the camera and the agent.
 #[derive(Clone, Debug)]
 struct SharedMount(Arc<Mutex<Turned>>);
 
@@ -34,11 +33,11 @@ impl SharedMount {
     }
 
     fn with<T>(&self, act: impl FnOnce(&mut Turned) -> T) -> T {
-        // Whoever panics has not left it half turned.
+        // A panic cannot leave the state half changed.
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Where it points in an exposure about a time, s.
+    /// Where the mount points in an exposure around a time, s.
     fn expose(&self, t: f64, exposure_s: f64) -> ScanAngles {
         self.with(|turned| {
             let [begin, middle] = [t - exposure_s / 2.0, t].map(|t| turned.mount.at(t));
@@ -58,7 +57,7 @@ impl Mount for SharedMount {
     }
 
     fn pointed(&mut self) -> Pointed {
-        // Each frame is looked at before the next one is taken.
+        // Each frame is processed before the next one is taken.
         let newest =
             self.with(|turned| turned.newest.map(|(_, state)| (state.said, state.settled)));
         match newest {
@@ -69,7 +68,7 @@ impl Mount for SharedMount {
     }
 }
 
-/// A simulated camera as a source of frames, with the times that its own clock shows.
+/// A simulated camera as a source of frames, with times as its own clock shows them.
 struct SimulatedSource {
     world: World,
     camera: SimulatedCamera,
@@ -119,7 +118,7 @@ impl FrameSource for SimulatedSource {
 }
 
 impl Agent {
-    /// Follows what a scene shows its camera, in real time, until its end.
+    /// Follows targets in a scene's images, in real time, until its end.
     pub(super) fn play_scene(
         &mut self,
         file: &CameraFile,
@@ -138,7 +137,7 @@ impl Agent {
         let shutdown = self.shutdown.clone();
         let from_s = start.joined_s;
         let truth = truth.map(|truth| std::thread::spawn(move || truth.run(from_s, &shutdown)));
-        // Its frames carry wall times from the start on.
+        // The frames carry wall times, from the start on.
         let begins = Timestamp::from_seconds(start.wall_s);
         let seen = self.watch(file, &mut source, begins, start, 1.0);
         if let Some(thread) = truth {
@@ -148,7 +147,7 @@ impl Agent {
     }
 }
 
-/// Publishes where the targets of a scene really are, ten times per second.
+/// Publishes the true positions of a scene's targets ten times per second.
 struct TruthPublisher {
     publisher: LinkPublisher,
     world: World,
@@ -158,12 +157,12 @@ struct TruthPublisher {
 impl TruthPublisher {
     const RATE_HZ: f64 = 10.0;
 
-    /// For a scene that begins `start` seconds after the Unix epoch.
+    /// A publisher for a scene that begins `start` seconds after the Unix epoch.
     fn new(link: &Link, world: World, start: f64) -> anyhow::Result<Self> {
         Ok(Self { publisher: link.publisher(Channel::Truth, Delivery::Queued)?, world, start })
     }
 
-    /// Publishes from so many seconds after the scene's beginning until its end.
+    /// Publishes from `from_s` seconds after the scene's beginning until its end.
     fn run(self, from_s: f64, shutdown: &Shutdown) {
         let pace = Pace::beginning_at(self.start, 1.0);
         for step in 0..(self.world.duration_s() * Self::RATE_HZ) as u32 {
@@ -183,7 +182,7 @@ impl TruthPublisher {
     }
 }
 
-/// The truth of a scene so many seconds after its beginning.
+/// The truth of a scene at `t` seconds after its beginning.
 pub fn truth_frame(world: &World, t: f64, begins: Timestamp) -> TruthFrame {
     let targets = world.truth(t).into_iter().map(|state| TrueState {
         id: state.id,

@@ -1,4 +1,4 @@
-//! When an agent begins: with those who must hear it, and in step with the other cameras.
+//! When an agent begins: once its receivers are present, and in step with the other cameras.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -12,51 +12,52 @@ use crate::pace::{Pace, wall_seconds};
 use crate::service;
 
 const POLL: Duration = Duration::from_millis(50);
-/// A recorder that is there hears an agent without a fusion centre after this long.
+/// After this long an agent without a fusion centre begins for the recorder alone.
 const FUSION_PATIENCE: Duration = Duration::from_secs(10);
-/// Cameras wait this long for those of the network's file that are not there: time to start three
-/// of them by hand.
+/// How long cameras wait for absent cameras of the network's file: time to start three of them by
+/// hand.
 const CAMERA_PATIENCE: Duration = Duration::from_secs(20);
-/// A source that is farther from what the site plays is of another time altogether, s: a day.
+/// A source farther than this from what the site plays belongs to another time altogether, s: a
+/// day.
 const FARTHEST_S: f64 = 86_400.0;
 
 /// Where in the data, and when, an agent begins.
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
-    /// When the data begin by the wall's clock, seconds since the Unix epoch: what a scene counts
-    /// from.
+    /// Wall time at which the data begin, seconds since the Unix epoch: the zero of a scene's time.
     pub wall_s: f64,
-    /// How far the site is in the data already, s: what lies before is not published.
+    /// How far the site is in the data already, s: earlier data are not published.
     pub joined_s: f64,
-    /// Whether the data begin at that time, or the agent is at `joined_s` now.
+    /// Whether the data begin at `wall_s`; otherwise the agent is at `joined_s` now.
     is_at_wall_time: bool,
 }
 
 impl Start {
-    /// At the beginning, now.
+    /// Start at the beginning of the data, now.
     pub fn now() -> Self {
         Self { wall_s: wall_seconds(), joined_s: 0.0, is_at_wall_time: false }
     }
 
-    /// At the beginning, at the next whole second of the wall's clock but one: agents that decide
-    /// so at the same moment begin a scene at the same time, if their hosts' clocks agree.
+    /// Start at the beginning of the data, half a second or more from now at a whole second of the
+    /// wall clock. Agents that decide so at the same moment begin a scene at the same time, if
+    /// their hosts' clocks agree.
     fn together() -> Self {
         Self::at_wall_time((wall_seconds() + 0.5).ceil())
     }
 
-    /// At the beginning, at a time of the wall's clock.
+    /// Start at the beginning of the data, at a wall time.
     pub fn at_wall_time(wall_s: f64) -> Self {
         Self { wall_s, joined_s: 0.0, is_at_wall_time: true }
     }
 
-    /// Whether what lies so far in the data is to be published: an agent that joins others is
-    /// silent until it has caught up with them.
+    /// Whether data at `data_s` are to be published: an agent that joins others is silent until it
+    /// has caught up with them.
     pub fn is_caught_up(&self, data_s: f64, behind: Duration) -> bool {
         let has_joined = self.joined_s > 0.0;
         !has_joined || data_s >= self.joined_s && (self.is_at_wall_time || behind < BEHIND)
     }
 
-    /// The pace of data that run so many times as fast as life.
+    /// Pace of data that run `speed` times as fast as real time.
     pub fn pace(&self, speed: f64) -> Pace {
         if self.is_at_wall_time {
             Pace::beginning_at(self.wall_s, speed)
@@ -66,14 +67,14 @@ impl Start {
     }
 }
 
-/// What the fusion centre's health says of what the site plays.
+/// What the site plays, by the fusion centre's health.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Site {
-    /// It is at this time, of a scene that began then, if it is one.
+    /// The site's time runs and is `now`; if it plays a scene, the scene began at `scene_begins`.
     Plays { now: Timestamp, scene_begins: Timestamp },
-    /// Its time stands, and all cameras are there.
+    /// The site's time stands still, and all cameras are present.
     IsComplete,
-    /// Its time stands, and cameras are missing.
+    /// The site's time stands still, and cameras are missing.
     Waits,
 }
 
@@ -90,8 +91,8 @@ fn judge(health: &Health, cameras: &[CameraName]) -> Site {
 }
 
 impl Agent {
-    /// Waits for those who must hear every frame, and for the other cameras; `None` if it was asked
-    /// to stop before.
+    /// Waits for those who must receive every frame, and for the other cameras; `None` if it was
+    /// asked to stop before.
     pub(super) fn wait(
         &mut self,
         recorder: bool,
@@ -102,13 +103,14 @@ impl Agent {
     ) -> anyhow::Result<Option<Start>> {
         let recorder_alive = self.link.key(Channel::RecorderAlive);
         let begun = Instant::now();
-        // A token comes with its peer's other declarations, but the subscription may come after it.
+        // A component's token comes with its other declarations, but its subscription may arrive
+        // later.
         let has_ears = |agent: &Self| agent.bearings.has_subscribers();
         while !self.shutdown.requested() {
             self.lookout.look(Instant::now());
             service::alive();
             let recording = self.lookout.is_here(&recorder_alive);
-            // Of several areas one is enough, if the others do not come.
+            // Where several areas listen, one is enough if the others do not come in time.
             let is_long = begun.elapsed() >= FUSION_PATIENCE;
             let fusion = self.lookout.all_are_here() || is_long && self.lookout.any_is_here();
             if fusion && (recording || !recorder) && has_ears(self)? {
@@ -133,14 +135,15 @@ impl Agent {
         self.wait_for_cameras(file, network, begins)
     }
 
-    /// Waits until all cameras of the network are there, or joins those that play already.
+    /// Waits until all cameras of the network are present, or joins those that play already.
     fn wait_for_cameras(
         &mut self,
         file: &CameraFile,
         network: &NetworkConfig,
         begins: Timestamp,
     ) -> anyhow::Result<Option<Start>> {
-        // A camera of several areas begins when all of them are complete, or joins the one that plays.
+        // A camera of several areas begins when all of them are complete, or joins the one that
+        // plays.
         let key = |area: &Option<AreaName>| {
             Key::of_centre(self.link.site().clone(), area.clone(), Channel::FusionHealth)
         };
@@ -181,7 +184,7 @@ impl Agent {
         Ok(None)
     }
 
-    /// Begins where the site is.
+    /// Begins at the time that the site has reached.
     fn join(
         &self,
         file: &CameraFile,
@@ -221,7 +224,7 @@ mod tests {
             ..Default::default()
         };
         assert_eq!(judge(&health(false, &["a"]), &cameras), Site::Waits);
-        // A file may have been played before, to its end.
+        // A file may have been played to its end before.
         assert_eq!(judge(&health(false, &["b", "a"]), &cameras), Site::IsComplete);
         let plays = judge(&health(true, &["b", "a"]), &cameras);
         assert!(matches!(plays, Site::Plays { now, .. } if now == at));

@@ -1,20 +1,21 @@
-//! How a live stream does.
+//! The state of a live stream, for the agent's health.
 
 use std::time::{Duration, Instant};
 
 use crossfix_message::Timestamp;
 use crossfix_video::{Arrival, LiveCounts, TimedBy, VideoError};
 
-/// A frame that comes by so many of the usual intervals after the one before it is late.
+/// A frame that comes more than this many usual intervals after the one before it is late.
 const LATE_INTERVALS: f64 = 1.5;
-/// How quickly the usual interval follows the last ones: a change of rate is learnt in a dozen frames.
+/// Weight of the newest interval in the usual one: a change of rate is learnt in a dozen frames.
 const LEARNT: f64 = 0.1;
-/// A camera that is unsynchronised for longer than its first report takes is to be seen to.
+/// A camera that stays unsynchronised for longer than this is reported: a first clock report takes
+/// less.
 const FIRST_REPORT: Duration = Duration::from_secs(15);
-/// Samples of a second that are kept: more come from no camera.
+/// Most samples kept per second: no camera produces more.
 const MOST_SAMPLES: usize = 1000;
 
-/// Times within the last report's second, microseconds.
+/// Durations since the last report, which covers a second, microseconds.
 #[derive(Debug, Default)]
 struct Samples(Vec<u64>);
 
@@ -25,7 +26,7 @@ impl Samples {
         }
     }
 
-    /// The value that so many hundredths of them are at most; 0 of none.
+    /// The smallest sample that at least `hundredths` per cent do not exceed; 0 if there are none.
     fn percentile(&mut self, hundredths: usize) -> u64 {
         self.0.sort_unstable();
         let at = (self.0.len() * hundredths).div_ceil(100).saturating_sub(1);
@@ -33,14 +34,14 @@ impl Samples {
     }
 }
 
-/// What is said of a live stream in the agent's health.
+/// State of a live stream, as the agent's health reports it.
 #[derive(Debug, Default)]
 pub struct StreamHealth {
-    /// Whether what the camera says of its clock is wanted.
+    /// Whether the camera's clock reports are used.
     heeds_reports: bool,
     /// Why nothing is seen at the moment.
     lost: Option<String>,
-    /// Frames of a size that the intrinsics are not for.
+    /// Error about frames whose size is not that of the intrinsics.
     wrong_size: Option<String>,
     timed_by: Option<TimedBy>,
     synchronised: Option<Instant>,
@@ -56,12 +57,13 @@ pub struct StreamHealth {
 }
 
 impl StreamHealth {
-    /// Of a camera whose clock is wanted, or of one whose images are timed by their arrival.
+    /// `heeds_reports`: the camera's clock reports are used; otherwise images are timed by their
+    /// arrival.
     pub fn new(heeds_reports: bool) -> Self {
         Self { heeds_reports, ..Self::default() }
     }
 
-    /// The bearings of a frame that was captured then and came so are out now.
+    /// Notes that the bearings of a frame have been published, given its capture time and arrival.
     pub fn note_frame(
         &mut self,
         captured: Timestamp,
@@ -91,11 +93,11 @@ impl StreamHealth {
         self.repeated += u64::from(captured == captured_before);
     }
 
-    /// The stream is lost, or one frame of it.
+    /// Notes that the stream, or one frame of it, was lost.
     pub fn note_trouble(&mut self, trouble: &VideoError) {
         if !trouble.is_one_frame() {
             self.lost = Some(trouble.to_string());
-            // The pause is no frame's lateness.
+            // The interruption must not count as a late frame.
             self.last = None;
         }
     }
@@ -105,17 +107,17 @@ impl StreamHealth {
         self.lost.is_some()
     }
 
-    /// A frame has a size that the intrinsics are not for.
+    /// Notes that a frame has a size that the intrinsics do not fit.
     pub fn note_size(&mut self, what: String) {
         (self.lost, self.wrong_size) = (None, Some(what));
     }
 
-    /// What became of the frames so far.
+    /// Notes the counts of frames so far.
     pub fn note_counts(&mut self, counts: LiveCounts) {
         self.counts = counts;
     }
 
-    /// What a person should look at now.
+    /// Problems that a person should look at now.
     pub fn problems(&self, now: Instant) -> Vec<String> {
         let lost = self.lost.as_ref().map(|what| format!("sees nothing: {what}"));
         let size = self.wrong_size.clone();
@@ -136,7 +138,7 @@ impl StreamHealth {
         [lost, size, clock].into_iter().flatten().collect()
     }
 
-    /// Counts and times since the last report.
+    /// Counts and durations since the last report.
     pub fn counters(&mut self) -> Vec<(&'static str, u64)> {
         let counters = vec![
             ("arrival_to_bearings_p50_us", self.from_arrival.percentile(50)),
@@ -174,7 +176,7 @@ mod tests {
         let (begun, mut health) = (Instant::now(), StreamHealth::default());
         let after = |seconds: f64| begun + Duration::from_secs_f64(seconds);
         for n in 0..100 {
-            // The fiftieth comes late and the sixtieth comes twice.
+            // Frame 50 comes late and frame 60 comes twice.
             let late_s = if n == 50 { 0.06 } else { 0.0 };
             let exposed_s = 100.0 + f64::from(n) / 30.0;
             let arrived_s = f64::from(n) / 30.0 + late_s;

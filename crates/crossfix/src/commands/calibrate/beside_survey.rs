@@ -1,4 +1,4 @@
-//! How a calibrated site lies beside what was surveyed of it.
+//! Comparison of a calibrated site with its survey.
 
 use crossfix_calibration::{FlightResult, Survey};
 use crossfix_message::CameraName;
@@ -7,11 +7,11 @@ use serde::Serialize;
 
 use crate::output;
 
-/// A place beside itself by more of its deviations is another's, or of another datum: of good ones one in
-/// ten thousand is.
+/// A surveyed place that deviates from the calibration by more than this many SDs is another
+/// camera's, or in another datum: of good places one in ten thousand deviates so far.
 const BESIDE: f64 = 4.2;
 
-/// All that was surveyed.
+/// Differences between the calibration and the survey.
 #[derive(Debug, Default, Serialize)]
 pub struct BesideSurvey {
     places: Vec<BesidePlace>,
@@ -21,22 +21,22 @@ pub struct BesideSurvey {
 #[derive(Debug, Serialize)]
 struct BesidePlace {
     camera: String,
-    /// Where the flight has the camera less where the survey has it, east, north, up, m.
+    /// Position by the flight minus position by the survey, east, north, up, m.
     beside_m: [f64; 3],
-    /// The most of these in the survey's deviations.
+    /// The largest of the three in SDs of the survey.
     deviations: f64,
 }
 
 #[derive(Debug, Serialize)]
 struct BesideDistance {
     between: [String; 2],
-    /// How much longer it is by the flight, m.
+    /// Distance by the flight minus the taped one, m.
     longer_m: f64,
     deviations: f64,
 }
 
 impl BesideSurvey {
-    /// Of the cameras that a flight has placed.
+    /// Compares the cameras that a flight has placed with a survey.
     pub fn of(result: &FlightResult, survey: &Survey) -> Self {
         let centre = |name: &CameraName| {
             let found = result.cameras.iter().find(|camera| camera.name == *name)?;
@@ -67,13 +67,15 @@ impl BesideSurvey {
         self.places.iter().filter(|place| place.deviations > BESIDE)
     }
 
-    /// Whether survey and flight are of two minds: most places lie beside, and more than one.
+    /// Whether survey and flight contradict each other: more than one place deviates, and more than
+    /// half of all do.
     pub fn contradicts(&self) -> bool {
         let off = self.off().count();
         off > 1 && 2 * off > self.places.len()
     }
 
-    /// What is to be said of places that lie beside: all by the same, or one that is another's.
+    /// Remark on deviating places: all deviate by the same vector, or one belongs to another
+    /// camera.
     pub fn remark(&self) -> Option<String> {
         let off: Vec<&BesidePlace> = self.off().collect();
         let names = || off.iter().map(|place| place.camera.as_str()).collect::<Vec<_>>().join(", ");

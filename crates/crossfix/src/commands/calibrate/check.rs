@@ -14,10 +14,10 @@ use crate::pose_watch::{CameraWatch, Turn};
 use crate::recalibration::{Recalibration, Reordered};
 use crate::recorded::{self, Lacks};
 
-/// What a site's folder calls its calibration.
+/// Name of the calibration file in a site's folder.
 const CALIBRATION: &str = "calibration.toml";
-/// Who has been watched beside others for less time than this has not been checked, s: a turn of some
-/// milliradians is not sure by then.
+/// A camera watched together with others for less time than this counts as not checked, s: by then
+/// a turn of some milliradians is not certain.
 const LEAST_WATCHED_S: f64 = 20.0;
 
 /// Whether cameras still stand as they were calibrated: by where the others see the targets.
@@ -40,7 +40,7 @@ pub struct Args {
     json: bool,
 }
 
-/// What a site's folder calls the fusion centre's file.
+/// Name of the fusion centre's file in a site's folder.
 const FUSION: &str = "fusion.toml";
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
@@ -81,19 +81,19 @@ fn calibration_of(path: &Path) -> anyhow::Result<PathBuf> {
     Ok(calibration)
 }
 
-/// Who was left out for more than this share of a recording lies beside the others; a camera that a
-/// moment has accused is not.
+/// A camera left out by the fusion for more than this share of a recording contradicts the others;
+/// one left out for a moment only does not.
 const LEFT_OUT: f64 = 0.2;
 
-/// What a recording has told of a camera.
+/// What a recording shows of one camera.
 #[derive(Debug, Default)]
 struct Seen {
     frames: u64,
-    /// Since when it is left out, if it is, ...
+    /// Since when it has been left out, if it is, ...
     left_out_since: Option<Timestamp>,
-    /// ... and for how long it was before, s.
+    /// ... and the total time that it was left out before, s.
     left_out_s: f64,
-    /// From its first frame to its last.
+    /// Times of its first and last frame.
     span: Option<(Timestamp, Timestamp)>,
     watch: Option<CameraWatch>,
     has_moved: bool,
@@ -122,9 +122,9 @@ impl Seen {
     }
 }
 
-/// The first calibration of each camera in a recording, which holds for all that was captured before it.
-/// Where others take their place, the bearings must not have been made with ones that correct clocks: they
-/// would be corrected twice.
+/// The first calibration of each camera in a recording; it also applies to earlier bearings. If the
+/// calibrations are to be replaced, the bearings must not have been made with ones that correct
+/// clocks, as their times would be corrected twice.
 fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entry>> {
     let mut first: BTreeMap<CameraName, Entry> = BTreeMap::new();
     recorded::for_each(recording, &mut Lacks::default(), |lacks, entry| {
@@ -133,7 +133,7 @@ fn calibrations(recording: &Path, are_replaced: bool) -> anyhow::Result<Vec<Entr
         {
             let message = lacks.read::<CameraCalibration>(&entry.data);
             ensure!(
-                !(are_replaced && message.is_some_and(|message| message.datum.is_some())),
+                !(are_replaced && message.is_some_and(|message| message.corrects_clock())),
                 "the bearings of {} were made with a flight's calibration: leave -c away to check that",
                 recording.display()
             );
@@ -162,7 +162,7 @@ fn watched(
             Channel::Bearings(name) => {
                 seen.entry(name.clone()).or_default().see_frame(entry.data_time);
             }
-            // One that never saw anything is asked after, too.
+            // A camera that never saw anything gets an entry, too.
             Channel::Calibration(name) => drop(seen.entry(name.clone()).or_default()),
             _ => {}
         }
@@ -192,7 +192,7 @@ fn watched(
     Ok(seen)
 }
 
-/// What is to be said of a camera.
+/// Verdict on a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Verdict {
@@ -206,14 +206,14 @@ enum Verdict {
 struct Figures {
     name: String,
     verdict: Verdict,
-    /// The longest that it was watched beside others within a minute or so, s.
+    /// The longest time that it was watched together with others within about a minute, s.
     watched_s: f64,
-    /// By how much it would have been turned when most spoke for it, mrad.
+    /// Estimated turn when the evidence for a move was strongest, mrad.
     turn_mrad: Option<f64>,
     turn_sd_mrad: Option<f64>,
-    /// How many times more likely the lines are by that, as a power of ten.
+    /// Likelihood ratio of the sight lines with and without that turn, as a power of ten.
     evidence: Option<f64>,
-    /// When it was first sure, s after 1970.
+    /// When a move was first certain, s since 1970.
     moved_at_s: Option<f64>,
     why: String,
 }

@@ -1,4 +1,4 @@
-//! Landmarks that somebody has clicked in pictures.
+//! Landmarks clicked by hand in pictures.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,12 +10,13 @@ use crossfix_message::CameraName;
 use nalgebra::{Point3, Unit, Vector3};
 use serde::Deserialize;
 
-/// A point that is clicked with the mouse, pixels.
+/// Standard deviation of a point clicked with the mouse, pixels.
 const CLICK_SD_PX: f64 = 1.0;
-/// Tables have the sun and stars to less; refraction and a clock that is off by a second are more.
+/// Standard deviation of a direction, degrees: tables of the sun and stars are better than this,
+/// but refraction and a clock that is a second wrong amount to more.
 const DIRECTION_SD_DEG: f64 = 0.01;
 
-/// A row of the file.
+/// A row of the landmarks file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Row {
@@ -34,14 +35,14 @@ struct Row {
     sd_east_m: Option<f64>,
     sd_north_m: Option<f64>,
     sd_up_m: Option<f64>,
-    /// From north, clockwise, ...
+    /// Azimuth from north, clockwise, ...
     azimuth_deg: Option<f64>,
-    /// ... and above the horizon.
+    /// ... and elevation above the horizon, degrees.
     elevation_deg: Option<f64>,
     sd_deg: Option<f64>,
 }
 
-/// Each camera's landmarks; `camera` is whose they are where a row does not say.
+/// The landmarks of each camera; rows that name no camera belong to `camera`.
 pub fn read(
     path: &Path,
     camera: Option<&CameraName>,
@@ -76,8 +77,8 @@ pub fn read(
     Ok(cameras)
 }
 
-/// The landmarks of several cameras' pictures, each once: what is called alike is one thing. The sun
-/// has moved from one picture to the next.
+/// Merges the landmarks of several cameras: places of the same name are one landmark. Directions
+/// (the sun) stay separate, as the sun moves from one picture to the next.
 pub fn together(
     cameras: BTreeMap<CameraName, Vec<Landmark>>,
 ) -> anyhow::Result<Vec<SurveyedLandmark>> {
@@ -107,7 +108,7 @@ pub fn together(
     Ok(together)
 }
 
-/// Whether all were clicked in the image.
+/// Checks that all landmarks were clicked within the image.
 pub fn check(landmarks: &[Landmark], size: ImageSize) -> anyhow::Result<()> {
     for Landmark { name, pixel, .. } in landmarks {
         ensure!(

@@ -51,30 +51,30 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-/// How a calibration differs from an earlier one; absent if they have no camera in common.
+/// Difference of a calibration from an earlier one; `None` if they have no camera in common.
 pub fn difference(first: &SiteCalibration, second: &SiteCalibration) -> Option<Difference> {
     compare_sites(first, second).map(|comparison| Difference::from(&comparison))
 }
 
-/// How two calibrations differ.
+/// Difference of two calibrations.
 #[derive(Debug, Serialize)]
 pub struct Difference {
-    /// The second as a whole; absent of fewer than three cameras.
+    /// Motion of the second site as a whole; absent with fewer than three cameras.
     moved: Option<MoveFigures>,
     cameras: Vec<CameraFigures>,
-    /// Cameras that one alone has.
+    /// Cameras that only one of the two has.
     missing: Vec<String>,
 }
 
 #[derive(Debug, Serialize)]
 struct MoveFigures {
-    /// Shift of the site's middle, east, north, up, m.
+    /// Shift of the site's centre, east, north, up, m.
     shift_m: [f64; 3],
     /// Turn about east, north and up, mrad.
     turn_mrad: [f64; 3],
-    /// How much larger the second is, as a share.
+    /// Relative enlargement of the second site.
     larger: f64,
-    /// By how much the second's common time is later, s.
+    /// How much later the second's common time is, s.
     later_s: Option<f64>,
 }
 
@@ -108,16 +108,16 @@ impl fmt::Display for MoveFigures {
 struct CameraFigures {
     name: String,
     centre_m: f64,
-    /// Root mean square over the image, per axis.
+    /// Root mean square difference of directions over the image, per axis.
     apart_mrad: f64,
     most_mrad: f64,
-    /// What both say that it may be.
+    /// Standard deviation of that difference by both calibrations' covariances.
     said_mrad: f64,
-    /// Root mean square of what is apart by what is said of each pixel.
+    /// Root mean square, over the image, of the difference divided by its standard deviation.
     deviations: f64,
-    /// How much longer the second's focal length is, as a share.
+    /// Relative excess of the second's focal length.
     focal_longer: f64,
-    /// Beside what all clocks are.
+    /// Clock difference, less the one that all clocks have in common.
     later_ms: Option<f64>,
 }
 
@@ -147,7 +147,7 @@ impl From<&CameraComparison> for CameraFigures {
 }
 
 impl Difference {
-    /// The figures for people.
+    /// The figures as a text for people.
     pub fn render(&self) -> String {
         let head = [
             "camera",

@@ -1,5 +1,5 @@
-//! What a target will cost: how well a calibrated site can know one, and how much of that the
-//! calibration takes.
+//! Predicted accuracy of a target's position at a calibrated site, and how much of its error is due
+//! to the calibration.
 
 use crossfix_calibration::{CalibratedCamera, FlightResult, SiteCalibration};
 use crossfix_evaluation::bound::{Assumptions, PlannedCamera, Summary, Volume, predict};
@@ -8,33 +8,34 @@ use serde::Serialize;
 
 use crate::planned;
 
-/// The air that was flown through, without this share of the places at either end of each axis:
-/// take-off and landing are no watched volume.
+/// This share of the positions at either end of each axis is not part of the volume: take-off and
+/// landing are outside the watched air.
 const LEFT_OUT_SHARE: f64 = 0.025;
-/// A side of the volume is no shorter than this, m: a flight in a plane has air about it.
+/// Least side of the volume, m: a flight in one plane gets some air around it.
 const LEAST_SIDE_M: f64 = 2.0;
-/// A target is seen for so long, s, flies straight and this fast, m/s, as in `plan`.
+/// Assumptions as in `plan`: a target is seen for this long, s, and flies straight at this speed,
+/// m/s.
 const WINDOW_S: f64 = 1.0;
 const SPEED_MPS: f64 = 15.0;
 const VELOCITY_PRIOR_MPS: f64 = 15.0;
 
-/// How well a target's position is known in the air that the flight went through.
+/// Accuracy of a target's position in the air that the flight passed through.
 #[derive(Debug, Serialize)]
 pub struct Cost {
     /// The box's sides, east, north, up, m.
     sides_m: [f64; 3],
-    /// The share of it with a fix.
+    /// Share of the volume in which a fix is possible.
     fixed: f64,
-    /// Standard deviation, m, than which half of the cells with a fix are better, ...
+    /// Position SD, m, that half of the cells with a fix do not exceed, ...
     median_sd_m: f64,
-    /// ... and what nine tenths of them are better than.
+    /// ... and the one that nine tenths of them do not exceed.
     worst_tenth_sd_m: f64,
-    /// The first of these if poses, lenses and clocks were exact.
+    /// The median SD if poses, lenses and clocks were exact.
     median_sd_of_exact_cameras_m: f64,
 }
 
 impl Cost {
-    /// `None` where no two cameras see what was flown through.
+    /// `None` where no two cameras see the flown volume.
     pub fn of(result: &FlightResult) -> Option<Self> {
         let site = SiteCalibration::from(result);
         let planned = |camera: &CalibratedCamera| planned::of_calibrated(camera, 0.0);
@@ -76,7 +77,7 @@ impl std::fmt::Display for Cost {
     }
 }
 
-/// The box that the target's places fill.
+/// The box around the target's positions.
 fn flown_through(result: &FlightResult) -> Option<Volume> {
     let places =
         || result.cameras.iter().flat_map(|camera| &camera.fitted).map(|label| label.place);

@@ -157,7 +157,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         output::line(report::render(&result, &figures));
     }
-    // A picture that cannot be drawn costs no calibration.
+    // A picture that cannot be drawn must not prevent the calibration from being written.
     let drawn = args.draw(&result);
     ensure!(
         !is_contradicted,
@@ -168,7 +168,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     drawn
 }
 
-/// Leaves no camera in a calibration that is wrong, and refuses one that is wrong as a whole.
+/// Removes wrong cameras from a calibration, and refuses one that is wrong as a whole.
 fn take_out_wrong(result: &mut FlightResult) -> anyhow::Result<()> {
     ensure!(
         !remarks::most_lie_beside(&result.landmarks),
@@ -179,7 +179,7 @@ fn take_out_wrong(result: &mut FlightResult) -> anyhow::Result<()> {
         tracing::warn!("camera `{wrong}` is wrong and is not written");
     }
     ensure!(!result.cameras.is_empty(), "nothing is written: each camera is wrong");
-    // They have the log and the way in common with the others.
+    // The wrong cameras share the log and the fitted trajectory with the others.
     ensure!(
         wrong.len() <= result.cameras.len(),
         "nothing is written: most cameras are wrong, so the log or the survey is hardly of this flight"
@@ -203,7 +203,7 @@ impl Args {
         }
     }
 
-    /// Leaves of what cameras saw the times that were asked for.
+    /// Restricts what cameras saw to the times that were asked for.
     fn cut(&self, cameras: &mut [CameraLabels]) -> anyhow::Result<()> {
         for Moment { camera, time_s } in &self.from {
             cut(cameras, camera, |label| label.time_s >= *time_s)?;
@@ -258,7 +258,7 @@ impl Args {
     }
 }
 
-/// What was clicked in the pictures of the recording's cameras.
+/// Landmarks clicked in the pictures of the recording's cameras.
 fn landmarks(args: &Args, cameras: &[CameraLabels]) -> anyhow::Result<Vec<SurveyedLandmark>> {
     let Some(path) = &args.landmarks else { return Ok(Vec::new()) };
     let clicked = clicks::read(path, None, args.anchor)?;
@@ -271,7 +271,7 @@ fn landmarks(args: &Args, cameras: &[CameraLabels]) -> anyhow::Result<Vec<Survey
     clicks::together(clicked)
 }
 
-/// A time of a camera's own clock, s.
+/// A time by a camera's own clock, s.
 #[derive(Clone, Debug)]
 struct Moment {
     camera: CameraName,
@@ -290,7 +290,7 @@ impl std::str::FromStr for Moment {
     }
 }
 
-/// Keeps of what a camera saw what fits.
+/// Keeps the labels of a camera that satisfy `fits`.
 fn cut(
     cameras: &mut [CameraLabels],
     name: &CameraName,
@@ -303,15 +303,15 @@ fn cut(
     Ok(())
 }
 
-/// What a recording's cameras saw.
+/// Labels from a recording.
 struct Seen {
     cameras: Vec<CameraLabels>,
-    /// Whether its times are common ones, by a calibration.
+    /// Whether its times are common times, corrected by a calibration.
     is_corrected: bool,
 }
 
-/// What a recording's cameras saw, by their own clocks. Where it was made with a calibration, that must be
-/// the earlier one, whose lenses are begun with.
+/// What a recording's cameras saw, by their own clocks. If it was made with a calibration, that
+/// must be `prior`, whose lenses are also the starting values.
 fn seen(
     recording: &Path,
     freedom: LensFreedom,
@@ -368,18 +368,18 @@ fn seen(
     Ok(Seen { cameras, is_corrected: described.values().any(|camera| camera.is_corrected) })
 }
 
-/// What a recording says of a camera.
+/// A recording's description of one camera.
 struct Described {
     lens: Intrinsics,
-    /// Whether its times are common ones: only a flight finds a clock's wander.
+    /// Whether its times are common times: only a calibration by a flight states a clock's wander.
     is_corrected: bool,
-    /// Whether something turns it.
+    /// Whether the camera is on a mount.
     is_on_mount: bool,
 }
 
 impl Described {
-    /// That an earlier calibration is of this image, and that which the bearings were made with, if they were
-    /// with any.
+    /// Checks that an earlier calibration has the same image size, and that it is the one that the
+    /// bearings were made with, if they were made with any.
     fn check_against(&self, known: Option<&CalibratedCamera>) -> anyhow::Result<()> {
         let of_prior = known.map(|camera| camera.camera.model().intrinsics());
         if let Some(lens) = of_prior {
@@ -398,7 +398,7 @@ impl Described {
     }
 }
 
-/// What a recording says of its cameras, by the first word of each.
+/// Descriptions of a recording's cameras, by the first calibration message of each.
 fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>> {
     let mut cameras: BTreeMap<CameraName, Described> = BTreeMap::new();
     recorded::for_each(recording, &mut Lacks::default(), |lacks, entry| {
@@ -406,7 +406,7 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>
             && !cameras.contains_key(name)
             && let Some(message) = lacks.read::<CameraCalibration>(&entry.data)
         {
-            let is_corrected = message.datum.is_some() || message.clock_wander_s > 0.0;
+            let is_corrected = message.corrects_clock();
             let (lens, is_on_mount) = (message.lens(name)?, message.mount.is_some());
             cameras.insert(name.clone(), Described { lens, is_corrected, is_on_mount });
         }
@@ -415,7 +415,7 @@ fn described(recording: &Path) -> anyhow::Result<BTreeMap<CameraName, Described>
     Ok(cameras)
 }
 
-/// The targets that a frame measured, at its time by the camera's own clock.
+/// The targets that a frame measured, with its time by the camera's own clock.
 fn measured(frame: &BearingFrame, time_s: f64) -> impl Iterator<Item = Label> + '_ {
     let is_measured = |track: &&BearingTrack| {
         track.state() == ImageTrackState::Tracking

@@ -1,4 +1,5 @@
-//! A part of a flight that the calibration does not see, fused by it: what it is worth on another flight.
+//! Validation of a calibration: fuses a part of the flight that was held out, to show what the
+//! calibration is worth on another flight.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -28,26 +29,27 @@ pub enum HoldOut {
     Blocks,
 }
 
-/// A block's length, s.
+/// Length of a block, s.
 const BLOCK_S: f64 = 10.0;
-/// A place of the log is asked for where so many cameras see the target.
+/// Log positions count where at least this many cameras see the target.
 const LEAST_CAMERAS: usize = 3;
-/// Farther than this from the log a track is of something else, m.
+/// A track farther than this from the log belongs to something else, m.
 const CUTOFF_M: f64 = 5.0;
 
-/// The part of a recording that is held out.
+/// The held-out part of a recording.
 #[derive(Debug)]
 pub struct HeldOut {
     which: HoldOut,
-    /// The clocks of the cameras that could be calibrated by all of it: which labels are of one time. What a
-    /// clock is off by since then is the other part's to find.
+    /// Clocks as calibrated by the whole flight; they only decide which labels belong to the part.
+    /// The clock errors in it must be predicted by the calibration of the other part.
     clocks: BTreeMap<CameraName, ClockCorrection>,
     from_s: f64,
     to_s: f64,
 }
 
 impl HeldOut {
-    /// Takes the part out of what cameras saw, by the clocks that all of it has shown.
+    /// Removes the part from the cameras' labels; common times are by the clocks of the whole
+    /// flight.
     pub fn take_out(which: HoldOut, whole: &FlightResult, cameras: &mut [CameraLabels]) -> Self {
         let clocks: BTreeMap<_, _> = whole
             .cameras
@@ -80,7 +82,7 @@ impl HeldOut {
         })
     }
 
-    /// Whether an entry of a recording is of this part, or of no time.
+    /// Whether an entry of a recording belongs to this part, or has no time.
     fn has(&self, entry: &Entry) -> bool {
         let Channel::Bearings(name) = &entry.key.channel else { return true };
         decode::<BearingFrame>(&entry.data).is_ok_and(|frame| {
@@ -88,7 +90,7 @@ impl HeldOut {
         })
     }
 
-    /// Fuses it by a calibration that has not seen it.
+    /// Fuses the part with a calibration made without it.
     pub fn fused(
         &self,
         recording: &Path,
@@ -104,7 +106,7 @@ impl HeldOut {
             }
             Ok(())
         })?;
-        // A camera that is not in it has no pose to speak of.
+        // A camera that is not in the calibration has no usable pose.
         let known: BTreeSet<CameraName> =
             site.cameras().iter().map(|camera| camera.name.clone()).collect();
         let recalibration = Recalibration::of(site);
@@ -133,12 +135,12 @@ impl HeldOut {
     }
 }
 
-/// What fusing it takes and shows.
+/// State and results of the fusion.
 struct Run {
     centre: Centre,
     history: TrackHistory,
     sightings: Sightings,
-    /// Each camera's innovations squared by what was said of them: their sum and number.
+    /// Sum and number of each camera's squared normalised innovations (NIS).
     innovations: BTreeMap<String, (f64, u32)>,
 }
 
@@ -170,7 +172,7 @@ impl Run {
         }
     }
 
-    /// Those of the exposure that made the frame.
+    /// Adds the innovations of the exposure that made the frame.
     fn note_innovations(&mut self, frame: &TrackFrame) {
         let residuals = frame.tracks.iter().flat_map(|track| &track.residuals);
         for residual in residuals.filter(|residual| residual.camera == frame.camera) {
@@ -190,7 +192,7 @@ impl Run {
         }
     }
 
-    /// The tracks beside the log, whose own errors are added to what tracks say.
+    /// The tracks compared with the log, whose own variance is added to the tracks' covariances.
     fn against(&self, log: &FlightLog) -> AgainstLog {
         let variance = log.errors.sd_m.powi(2) + log.errors.drift_sd_m.powi(2);
         let cutoff_m = CUTOFF_M + 3.0 * variance.sqrt();
@@ -208,6 +210,7 @@ impl Run {
             let Some(track) = nearest.filter(|track| beside(track).norm() < cutoff_m) else {
                 continue;
             };
+            // NEES = e' (P + R)^-1 e, with the track's covariance P and the log's R.
             let stated = track.state.position_covariance() + Matrix3::identity() * variance;
             distances_m.push(beside(track).norm());
             nees.extend(
@@ -224,33 +227,33 @@ impl Run {
     }
 }
 
-/// What a share of some values lies below.
+/// The quantile of some values at `share`.
 fn quantile(values: &mut [f64], share: f64) -> Option<f64> {
     values.sort_unstable_by(f64::total_cmp);
     let last = values.len().checked_sub(1)?;
     values.get((share * last as f64).round() as usize).copied()
 }
 
-/// What a calibration is worth on what it has not seen.
+/// The accuracy of a calibration on data that it was not made from.
 #[derive(Debug, Serialize)]
 pub struct Worth {
     against_log: Option<AgainstLog>,
-    /// Each camera's mean innovation squared by what was said of it; two is honest.
+    /// Each camera's mean NIS; two is consistent.
     mean_nis: BTreeMap<String, f64>,
 }
 
-/// By quantiles, as logs have glitches of their own.
+/// Statistics as quantiles, as logs have outliers of their own.
 #[derive(Debug, Serialize)]
 struct AgainstLog {
-    /// The log's places at which three cameras see the target.
+    /// Number of log positions at which at least three cameras see the target.
     places: u32,
-    /// The share of them with a track.
+    /// Share of them with a track.
     found: f64,
-    /// What half of the tracks lie nearer to the log than, m, ...
+    /// Median distance of the tracks from the log, m, ...
     median_m: Option<f64>,
-    /// ... and what all but a twentieth do.
+    /// ... and their 95 % quantile.
     worst_twentieth_m: Option<f64>,
-    /// Errors squared by what tracks and log say of them together: 2.37 of honest ones.
+    /// Median NEES with the covariances of tracks and log together; 2.37 if they are consistent.
     median_nees: Option<f64>,
 }
 

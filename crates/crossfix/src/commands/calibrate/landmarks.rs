@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         Some(path) => clicks::read(path, args.camera.as_ref(), args.anchor)?,
         None => BTreeMap::new(),
     };
-    // Where only stars are there to see nothing has been clicked.
+    // Cameras with stars only have no clicks, so they get an empty list.
     args.camera.iter().filter(|_| args.night.stars.is_some()).for_each(|camera| {
         clicked.entry(camera.clone()).or_default();
     });
@@ -117,7 +117,7 @@ fn camera_files(site: &Path) -> anyhow::Result<Vec<(PathBuf, CameraFile)>> {
     }
 }
 
-/// Writes the cameras beside those that the file has already.
+/// Writes the cameras into the file, next to those that it already has.
 fn write(args: &Args, cameras: &[&LandmarkResult]) -> anyhow::Result<()> {
     let mut site = if args.output.exists() {
         calibrated::load(&args.output)?
@@ -164,14 +164,14 @@ struct Figures {
     name: String,
     position_m: [f64; 3],
     position_sd_m: f64,
-    /// Pose and lens together, over the part of the image that the lens is known in, at the
-    /// landmarks' range.
+    /// Pointing SD from pose and lens together, over the part of the image in which the lens is
+    /// known, at the landmarks' range.
     pointing_sd_mrad: f64,
-    /// How large that part is; elsewhere nothing has a bearing.
+    /// Size of that part; pixels elsewhere get no bearings.
     image_share: f64,
     range_m: f64,
     focal_ratio: f64,
-    /// The chance of errors as large as these or larger.
+    /// Probability of errors at least as large as these.
     chance: f64,
     landmarks: Vec<LandmarkFigures>,
     verdict: String,
@@ -180,23 +180,23 @@ struct Figures {
 #[derive(Debug, Serialize)]
 struct LandmarkFigures {
     landmark: String,
-    /// Where it was clicked less where it should be.
+    /// Clicked pixel minus predicted pixel.
     residual_px: [f64; 2],
-    /// How far it lies beside where the others have it, in deviations; absent where they say
+    /// Distance from where the other landmarks predict it, in SDs; absent where they predict
     /// nothing.
     deviations: Option<f64>,
 }
 
-/// A pose that points worse than this is weak, mrad: half a metre at 100 m.
+/// A pose with a pointing error above this is weak, mrad: half a metre at 100 m.
 const WEAK_POINTING_MRAD: f64 = 5.0;
-/// A lens that is known in less than this share of the image leaves targets out.
+/// A lens known in less than this share of the image leaves out targets.
 const WEAK_SHARE: f64 = 0.8;
 
-/// Lenses are up to 2 % shorter or longer at a distance: beyond this share it is another lens, where
-/// the clicks do not fit either.
+/// Lenses are up to 2 % shorter or longer at a distance: a focal length off by more than this share
+/// belongs to another lens, if the clicks do not fit either.
 const WRONG_FOCAL: f64 = 0.03;
 
-/// Whether a camera must not be used.
+/// Whether a camera's calibration is wrong and must not be used.
 fn is_wrong(result: &LandmarkResult) -> bool {
     result.is_wrong() || is_upside_down(result)
 }

@@ -1,4 +1,4 @@
-//! In the place of the picture, in a build that leaves it out.
+//! Stands in for the picture in a build without the viewer.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use crossfix_calibration::FlightResult;
 
 use crate::parts;
 
-/// Says that there is none.
+/// Fails, as there are no pictures.
 pub fn draw(_: &FlightResult, _: &Path) -> anyhow::Result<()> {
     Err(parts::no_pictures())
 }

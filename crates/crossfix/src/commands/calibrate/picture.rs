@@ -1,4 +1,4 @@
-//! A calibration's flight as a picture.
+//! A picture of a calibration's flight.
 
 use std::path::Path;
 

@@ -1,39 +1,40 @@
-//! What a person should know of a calibration that no figure says.
+//! Remarks on a calibration that its figures do not make.
 
 use crossfix_calibration::{CameraResult, FlightResult, LandmarkMisfit};
 
-/// A focal length that has moved by more than this share is remarked on.
+/// A focal length that has changed by more than this share is remarked on.
 const REMARKED_FOCAL: f64 = 0.003;
-/// A log that lies so many times farther beside the way than its kind allows is remarked on.
+/// A log whose residuals are larger than its kind allows by this factor is remarked on.
 const REMARKED_LOG: f64 = 2.5;
-/// Cameras whose clocks run alike to this have one clock in common that they run against: the log's.
+/// Cameras whose clock rates agree to within this run against one common clock: the log's.
 const ALIKE_RATE: f64 = 1e-4;
-/// Against it they run by more than this: two quartzes are within 1e-4.
+/// The log's clock is remarked on if they run against it by more than this: two quartzes agree
+/// within 1e-4.
 const REMARKED_RATE: f64 = 2e-4;
-/// Fewer cameras do not outvote a log.
+/// Fewer cameras than this do not outvote a log.
 const LEAST_CAMERAS: usize = 3;
-/// Times of day, and not seconds since the camera was switched on: 1973 and later, s.
+/// Larger times are times of day (1973 and later), not seconds since the camera was switched on, s.
 const CLOCK_S: f64 = 1e8;
-/// Clocks that agree among themselves to this are set, s.
+/// Clocks that agree with each other to within this have been set, s.
 const ALIKE_S: f64 = 2.0;
-/// GPS's time is ahead of UTC by this, s.
+/// How far GPS time is ahead of UTC, s.
 const GPS_S: f64 = 18.0;
-/// Time zones are multiples of this, s.
+/// Offsets of time zones are multiples of this, s.
 const ZONE_S: f64 = 900.0;
 
-/// A landmark beside itself by more deviations is remarked on: of good clicks one in 7000.
+/// A landmark that deviates by more SDs than this is remarked on: of good clicks one in 7000 does.
 const BESIDE: f64 = 4.2;
 
-/// What the size of the site, and where it is, rests on.
+/// What determines the size and position of the site.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rests {
-    /// The log, and nothing that could contradict it.
+    /// Only the log; nothing could contradict it.
     OnLogAlone,
     /// A survey, with a log or without.
     OnSurvey,
 }
 
-/// All of them.
+/// All remarks on a result.
 pub fn of(result: &FlightResult, rests: Rests) -> Vec<String> {
     let times: Vec<ClockAgainstLog> = result.cameras.iter().map(ClockAgainstLog::of).collect();
     let of_times = |say: fn(&[ClockAgainstLog]) -> Option<String>| {
@@ -72,7 +73,7 @@ fn of_log(result: &FlightResult) -> Option<String> {
     })
 }
 
-/// Whether most landmarks lie beside where the flight has them.
+/// Whether most landmarks deviate from where the flight places them.
 pub fn most_lie_beside(landmarks: &[LandmarkMisfit]) -> bool {
     let beside = landmarks.iter().filter(|misfit| misfit.deviations > BESIDE).count();
     2 * beside > landmarks.len()
@@ -101,11 +102,11 @@ fn of_landmarks(landmarks: &[LandmarkMisfit]) -> Option<String> {
     ))
 }
 
-/// How a camera's clock stands against the log's.
+/// A camera's clock in relation to the log's.
 #[derive(Clone, Copy, Debug)]
 struct ClockAgainstLog {
     own_s: f64,
-    /// The log's time less its own, s.
+    /// The log's time minus the camera's own, s.
     ahead_s: f64,
     rate: f64,
 }
@@ -117,7 +118,7 @@ impl ClockAgainstLog {
     }
 }
 
-/// The middle of some numbers, if all but every third lie within a distance of it.
+/// The median of some numbers, if at least two thirds of them lie within a distance of it.
 fn agreed(numbers: impl Iterator<Item = f64>, within: f64) -> Option<f64> {
     let mut numbers: Vec<f64> = numbers.collect();
     numbers.sort_unstable_by(f64::total_cmp);
@@ -184,7 +185,7 @@ mod tests {
         assert!(said([18.02, 17.9, 18.4]).unwrap().contains("--time gps"));
         assert!(said([-7200.1, -7199.8, -7200.0]).unwrap().contains("by -2 h"));
         assert!(said([41.0, 40.9, 41.2]).unwrap().contains("41.0 s ahead of all"));
-        // Cameras that do not agree among themselves have clocks that nobody has set.
+        // Cameras that do not agree with each other have clocks that nobody has set.
         assert_eq!(said([41.0, -900.0, 12.0]), None);
     }
 
@@ -193,7 +194,7 @@ mod tests {
         let mut clocks = clocks([18.0; 3], [0.0; 3]);
         clocks.iter_mut().for_each(|clock| clock.own_s = 151.0);
         assert_eq!(of_offsets(&clocks), None);
-        // Nor are those since a log was begun.
+        // Times counted from the start of a log are no times of day either.
         assert_eq!(of_offsets(&self::clocks([-1.7e9 + 20.0; 3], [0.0; 3])), None);
     }
 

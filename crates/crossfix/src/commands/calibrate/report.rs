@@ -1,4 +1,4 @@
-//! What a calibration has found, for people and for programs.
+//! The results of a calibration, for people and for programs.
 
 use crossfix_calibration::{CalibratedCamera, CameraResult, FlightResult, LandmarkMisfit};
 use crossfix_message::{CameraName, Datum};
@@ -12,39 +12,39 @@ use super::remarks::{self, Rests};
 use super::verdict;
 use crate::output;
 
-/// The figures of a calibration.
+/// The results of a calibration.
 #[derive(Debug, Serialize)]
 pub struct Figures {
     cameras: Vec<CameraFigures>,
-    /// Cameras that could not be calibrated, and why not.
+    /// Cameras that could not be calibrated, with the reason.
     refused: Vec<(String, String)>,
-    /// Root mean square of the log's residuals per axis, m, of what is not left out; absent without a
-    /// log.
+    /// Root mean square of the log's residuals per axis, m, without the positions left out; absent
+    /// without a log.
     log_residual_m: Option<f64>,
-    /// How many of its places are left out, as they lie far beside the way.
+    /// Number of log positions left out because they lie far from the fitted trajectory.
     log_left_out: Option<usize>,
-    /// How each landmark fits, in each camera's picture.
+    /// Fit of each landmark in each camera's picture.
     landmarks: Vec<LandmarkFigures>,
-    /// What a person should know.
+    /// Remarks for people.
     remarks: Vec<String>,
     #[serde(flatten)]
     of_site: OfSite,
-    /// Absent of one camera alone.
+    /// Error of the site as a whole; absent with only one camera.
     datum: Option<DatumFigures>,
-    /// Power of the target's jerk, m^2/s^5.
+    /// Power spectral density of the target's jerk, m^2/s^5.
     jerk: f64,
 }
 
-/// What is said of the site that is written: without the cameras that are wrong.
+/// Results for the site that is written, that is, without the wrong cameras.
 #[derive(Debug, Serialize)]
 pub struct OfSite {
-    /// How surveyed places and distances fit.
+    /// Fit of the surveyed positions and distances.
     pub survey: BesideSurvey,
-    /// What a target will be known to; absent where no two cameras see one.
+    /// Predicted accuracy of a target; absent where no two cameras see one.
     pub cost: Option<Cost>,
-    /// What it is worth on the part that was held out; absent where none was.
+    /// Accuracy on the held-out part; absent if none was held out.
     pub held_out: Option<Worth>,
-    /// How it differs from the earlier calibration; absent without one.
+    /// Difference from the earlier calibration; absent without one.
     pub beside_prior: Option<Difference>,
 }
 
@@ -52,9 +52,9 @@ pub struct OfSite {
 struct LandmarkFigures {
     landmark: String,
     camera: String,
-    /// Where it was clicked less where it should be seen; absent behind the camera.
+    /// Clicked pixel minus predicted pixel; absent if the landmark is behind the camera.
     residual_px: Option<[f64; 2]>,
-    /// The same in deviations of click and place.
+    /// The same in SDs of click and place together.
     deviations: f64,
 }
 
@@ -80,7 +80,7 @@ impl LandmarkFigures {
     }
 }
 
-/// What the site may be off by as a whole: standard deviations.
+/// Standard deviations of the errors that the site has as a whole.
 #[derive(Debug, Serialize)]
 struct DatumFigures {
     position_sd_m: [f64; 3],
@@ -89,7 +89,8 @@ struct DatumFigures {
     time_sd_s: f64,
 }
 
-/// Beyond this nothing has said where the site is, which way round or when, m, mrad, s.
+/// Above these SDs nothing has determined where the site is, how it is turned, or its time: m,
+/// mrad, s.
 const UNKNOWN: [f64; 3] = [100.0, 1e3, 10.0];
 
 impl std::fmt::Display for DatumFigures {
@@ -134,7 +135,7 @@ struct CameraFigures {
     pointing_sd_mrad: f64,
     focal_ratio: f64,
     focal_ratio_sd: f64,
-    /// The share of the image where the lens is known well enough for bearings.
+    /// Share of the image in which the lens is known well enough for bearings.
     image_share: f64,
     clock_ahead_s: f64,
     clock_sd_s: f64,
@@ -146,14 +147,14 @@ struct CameraFigures {
     verdict: String,
 }
 
-/// A result without the cameras that are wrong.
+/// A copy of a result without the wrong cameras.
 pub fn without_wrong(result: &FlightResult) -> FlightResult {
     let mut believed = result.clone();
     take_out_wrong(&mut believed);
     believed
 }
 
-/// Takes the cameras out of a result that are wrong, and names them.
+/// Removes wrong cameras from a result, and returns their names.
 pub fn take_out_wrong(result: &mut FlightResult) -> Vec<CameraName> {
     let is_wrong = |camera: &mut CameraResult| {
         CameraFigures::from(&*camera).verdict.starts_with(verdict::WRONG)
@@ -205,7 +206,7 @@ impl From<&CameraResult> for CameraFigures {
     }
 }
 
-/// The figures for a program.
+/// The results for a program.
 pub fn figures(result: &FlightResult, of_site: OfSite, rests: Rests) -> Figures {
     let mut remarks = remarks::of(result, rests);
     remarks.extend(of_site.survey.remark());
@@ -226,7 +227,7 @@ pub fn figures(result: &FlightResult, of_site: OfSite, rests: Rests) -> Figures 
     }
 }
 
-/// The figures for people.
+/// The results as a text for people.
 pub fn render(result: &FlightResult, figures: &Figures) -> String {
     let head = [
         "camera",

@@ -1,4 +1,4 @@
-//! The stars in a camera's picture of the night, as landmarks that nobody has to click.
+//! The stars in a camera's picture of the night, as landmarks that need no clicks.
 
 use std::path::PathBuf;
 
@@ -40,39 +40,45 @@ fn time(text: &str) -> Result<Timestamp, String> {
         .map_err(|_| "a time from 1678 to 2262 is wanted".to_owned())
 }
 
-/// Stars are found to this at first, pixels; what they really are is seen from how they fit.
+/// First assumption of a star's pixel SD, pixels; its true value is found from the residuals.
 const FIRST_SD_PX: f64 = 0.5;
-/// No picture shows a star better than this, pixels: samples are whole.
+/// Least SD of a star in any picture, pixels, as samples are whole numbers.
 const LEAST_SD_PX: f64 = 0.05;
-/// Where stars fit no better than this, pixels, it is not the lens of the file, or they are not these stars.
+/// If stars fit no better than this, pixels, the file's lens is wrong, or they are not these stars.
 const MOST_SD_PX: f64 = 1.5;
-/// Named stars that lie farther beside than so many deviations of the middle one are others: faint ones err by
-/// twice as much as that.
+/// Named stars with residuals of more than this many SDs (by the median star) are misidentified:
+/// faint ones have errors twice as large as that.
 const MOST_DEVIATIONS: f64 = 8.0;
-/// Three numbers of the rotation, and nine of a lens with five of distortion.
+/// Parameters of the fit: three of the rotation, and nine of a lens with five of distortion.
 const FITTED_NUMBERS: f64 = 12.0;
-/// The lens has 6 to 9 numbers and the rotation 3: with fewer stars than this a wrong one is not seen.
+/// Least number of stars: the lens has 6 to 9 parameters and the rotation 3, so with fewer stars a
+/// wrong one goes unnoticed.
 const FEWEST_STARS: usize = 12;
-/// A turn of the sky by more than this time is not held against landmarks that do not turn with it, s.
+/// With landmarks that do not turn with the sky, the time must be known to within this, s.
 const MOST_BESIDE_PLACES_S: f64 = 2.0;
-/// What lenses' models leave of a lens is less than this, pixels, ...
+/// Lens models leave errors of less than this, pixels, ...
 const LEAST_BENT_PX: f64 = 0.25;
-/// ... and neighbours whose errors are correlated by this share their cause.
+/// ... and a lens error shows as a correlation of at least this between neighbouring stars'
+/// residuals.
 const LEAST_ALIKE: f64 = 0.3;
-/// Where the camera stands does not count for stars: for them it is looked at from far away, m.
+/// Distance at which pointing is evaluated for stars, m: so far away that the camera's position
+/// does not count.
 const DISTANT_M: f64 = 1e9;
-/// Two or three times do; the bound is for what never settles.
+/// Most re-estimates of the stars' SD: two or three suffice, the bound is for fits that never
+/// settle.
 const MOST_RESCALED: usize = 8;
-/// Names are looked for anew as long as that names more: each time the lens is known in more of the image.
+/// Most rounds of naming stars. It is repeated while it names more, as each round makes the lens
+/// known in more of the image.
 const MOST_ROUNDS: usize = 10;
-/// Stars are looked for within so many deviations of where they should be, ...
+/// Stars are looked for within this many SDs of their predicted pixel, ...
 const GATE: f64 = 4.0;
-/// ... within these, pixels: what is not round is found beside its middle, and within more than the most
-/// there are other stars.
+/// ... but at least and at most within these distances, pixels: a spot that is not round is found
+/// beside its centre, and farther away than the most there are other stars.
 const GATES_PX: std::ops::RangeInclusive<f64> = 2.0..=40.0;
 
-/// Finds and names the stars of a camera's picture and adds them to its landmarks. Many stars tell a lens
-/// better than its file does: what may be otherwise of it may be so by more than of a measured one.
+/// Finds and identifies the stars of a camera's picture and adds them to its landmarks. Many stars
+/// determine a lens better than its file does, so the lens is allowed to differ from the file by
+/// more than a measured one would be.
 ///
 /// # Errors
 /// Where they cannot be found or named, or the lens does not fit them.
@@ -153,16 +159,16 @@ fn spots(path: &PathBuf, model: &CameraModel) -> anyhow::Result<Vec<Spot>> {
     Ok(spots)
 }
 
-/// Stars, and the rotation and lens by them alone.
+/// Identified stars, with the rotation and lens fitted to them alone.
 struct Fitted {
     stars: Vec<NamedStar>,
     result: LandmarkResult,
-    /// How well they fit: root mean square per axis, pixels, of what is left of them.
+    /// Root mean square residual per axis, pixels, corrected for the fitted parameters.
     sd_px: f64,
 }
 
 impl Fitted {
-    /// Fits what is named, and leaves out what lies far beside, the farthest first.
+    /// Fits the identified stars, removing those with far too large residuals, the largest first.
     fn of(named: &[NamedStar], picture: &LandmarkPicture) -> anyhow::Result<Self> {
         let mut stars = named.to_vec();
         let (mut sd_px, mut rescaled) = (FIRST_SD_PX, 0);
@@ -182,7 +188,8 @@ impl Fitted {
                 Some((index, square)) if square.sqrt() > most_px => {
                     stars.remove(index);
                 }
-                // The weights of the lens' file and of the stars are right only with the stars' own errors.
+                // The weights of the lens file and of the stars are right only with the stars'
+                // actual SD.
                 _ if (found / sd_px - 1.0).abs() > 0.2 && rescaled < MOST_RESCALED => {
                     sd_px = found;
                     rescaled += 1;
@@ -201,13 +208,14 @@ impl Fitted {
 }
 
 impl Fitted {
-    /// Whether the lens is not what it is taken to be: what spots err by is their own, and what a lens errs by is
-    /// that of neighbours, too.
+    /// Whether the lens model is wrong: spots have independent errors, whereas neighbouring stars
+    /// share a lens error.
     fn bends_otherwise(&self) -> bool {
         let fits = &self.result.landmarks;
         let apart = |a: &NamedStar, b: &NamedStar| {
             (a.pixel.x() - b.pixel.x()).hypot(a.pixel.y() - b.pixel.y())
         };
+        // Correlation of residuals with the nearest star's: sum(r_i . r_nn(i)) / sum(|r_i|^2).
         let together = |(index, star): (usize, &NamedStar)| {
             let others = self.stars.iter().enumerate().filter(|(other, _)| *other != index);
             let nearest = others.min_by(|(_, a), (_, b)| apart(star, a).total_cmp(&apart(star, b)));
@@ -215,17 +223,18 @@ impl Fitted {
         };
         let products: f64 = self.stars.iter().enumerate().filter_map(together).sum();
         let squares: f64 = fits.iter().map(|fit| fit.residual_px.norm_squared()).sum();
-        // Of white errors the correlation is nought, give or take one over the root of their number.
+        // For white errors it is 0, with an SD of one over the root of their number; four SDs are
+        // allowed.
         let by_chance = 4.0 / (2.0 * fits.len() as f64).sqrt();
         self.sd_px > LEAST_BENT_PX && products / squares > by_chance.max(LEAST_ALIKE)
     }
 
-    /// Within how many pixels of where a star should be it is.
+    /// Radius, pixels, around its predicted pixel within which a star is looked for.
     fn gate_px(&self, pixel: Pixel) -> f64 {
         let camera = CalibratedCamera::from(&self.result);
         let focal_px = self.result.camera.model().intrinsics().fx;
         let (least, most) = GATES_PX.into_inner();
-        // Where the lens shows nothing it is not known, either.
+        // Where the lens has no direction it is not known, so the gate is the widest.
         let off_px = camera
             .pointing_sd_rad(pixel, DISTANT_M)
             .map_or(f64::INFINITY, |sd_rad| sd_rad * focal_px);
@@ -233,25 +242,26 @@ impl Fitted {
     }
 }
 
-/// Standard deviation per axis of what fits leave so large squares of, pixels: rotation and lens have taken a
-/// part.
+/// Standard deviation per axis, pixels, of the errors behind a fit's squared residuals, of which
+/// rotation and lens have absorbed a part.
 fn sd_of(squares: &[f64]) -> f64 {
     let numbers = 2.0 * squares.len() as f64;
-    // Of so many free numbers the mean square is found with an error of its own, which makes the expected
-    // variance larger.
+    // Degrees of freedom, less 2: the variance estimated from so few is itself uncertain, which
+    // increases the expected variance.
     let left = (numbers - FITTED_NUMBERS - 2.0).max(numbers / 4.0);
     (squares.iter().sum::<f64>() / left).sqrt().max(LEAST_SD_PX)
 }
 
-/// As [`sd_of`], by the star in the middle, which wrong ones do not move.
+/// As [`sd_of`], but by the median star, which misidentified stars do not affect.
 fn middle_sd(squares: &[f64]) -> f64 {
     let mut sorted = squares.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
-    // Of two normal numbers the middle sum of squares is 2 ln 2.
+    // The median of the sum of two squared standard normal numbers is 2 ln 2.
     (sorted[sorted.len() / 2] / (2.0 * std::f64::consts::LN_2)).sqrt()
 }
 
-/// The picture with stars for landmarks and a place that they say nothing of.
+/// The picture with stars as its landmarks, and an arbitrary position, which stars do not depend
+/// on.
 fn by_stars(picture: &LandmarkPicture, stars: &[NamedStar], sd_px: f64) -> LandmarkPicture {
     let anywhere = SurveyedPlace {
         camera: picture.camera.clone(),

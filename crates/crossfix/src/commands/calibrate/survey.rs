@@ -1,4 +1,4 @@
-//! Where cameras stand by a survey, how far apart by a tape, and landmarks in their pictures.
+//! Survey of a site: camera positions, taped distances, and landmarks in the cameras' pictures.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -13,7 +13,7 @@ use serde::Deserialize;
 #[derive(Clone, Debug)]
 pub struct Distance(TapedDistance);
 
-/// Two marks on tripods are apart by the tape to this, m.
+/// Standard deviation of a taped distance between two marks on tripods, m.
 const TAPE_SD_M: f64 = 0.05;
 
 impl FromStr for Distance {
@@ -43,9 +43,9 @@ struct Row {
     east_m: f64,
     north_m: f64,
     up_m: f64,
-    /// Of each axis, ...
+    /// The SD of each axis, ...
     sd_m: Option<f64>,
-    /// ... or of each its own.
+    /// ... or a separate one per axis.
     sd_east_m: Option<f64>,
     sd_north_m: Option<f64>,
     sd_up_m: Option<f64>,
@@ -66,7 +66,7 @@ impl Row {
     }
 }
 
-/// What a survey says; the cameras that it names must be those of the recording or site.
+/// Reads a survey; the cameras that it names must be those of the recording or site.
 pub fn read(
     positions: Option<&Path>,
     distances: &[Distance],

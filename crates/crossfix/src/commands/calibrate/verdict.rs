@@ -1,38 +1,40 @@
-//! What to think of a camera that a flight has calibrated, and what to do about it.
+//! Verdict on a camera that a flight has calibrated, and what to do about it.
 
 use crossfix_calibration::CameraResult;
 
-/// How the verdict of a camera begins that must not be used.
+/// Beginning of the verdict on a camera that must not be used.
 pub const WRONG: &str = "wrong";
 
-/// A camera whose pointing is known worse than this is weak, mrad: at 100 m a target lies half a
-/// metre aside. With half of it a minute's flight would not do.
+/// A camera with a pointing error above this is weak, mrad: at 100 m a target lies half a metre
+/// aside. With half of it a minute's flight would not do.
 const WEAK_POINTING_MRAD: f64 = 5.0;
-/// Nor may it stand this uncertainly, m.
+/// A camera with a position error above this is weak, too, m.
 const WEAK_POSITION_M: f64 = 0.5;
-/// A camera that may stand anywhere within this share of its range is not calibrated at all.
+/// A camera whose position error exceeds this share of its range is not calibrated at all.
 const NOWHERE: f64 = 0.5;
-/// Nor is one that may be turned by more than this, mrad: its covariance is of small turns, and the square
-/// of a larger one is more than labels err by. Of flights that hover or go straight 79 and more was found,
-/// a hundred metres beside.
+/// Nor is one whose rotation is uncertain by more than this, mrad: its covariance holds for small
+/// turns, and the second-order term of a larger one exceeds the labels' errors. Flights that hover
+/// or go straight gave 79 and more, with positions a hundred metres wrong.
 const ANYHOW_MRAD: f64 = 50.0;
-/// Labels that err by more than this are of something else, mrad: lens files leave up to 4.
+/// Labels with errors above this belong to something else, mrad: lens files leave up to 4.
 const WRONG_MRAD: f64 = 8.0;
-/// Nor do a hand and a tracker err by more than so many pixels ...
+/// Errors of labels by hand or by a tracker do not exceed this, pixels, ...
 const WRONG_PX: f64 = 3.0;
-/// ... that are more than this, mrad: of a short flight the wrong camera's labels lie no farther off.
+/// ... if it is also more than this, mrad: of a short flight the wrong camera's labels lie no
+/// farther off.
 const WRONG_PX_MRAD: f64 = 2.0;
-/// No clock wanders by more than this within a flight, ms: phones do by 60.
+/// No clock wanders by more than this within a flight, ms: phones wander by 60.
 const WRONG_WANDER_MS: f64 = 300.0;
-/// A focal length that has moved by more than this share is not the file's lens, or nothing told how
-/// far off the target was: lenses move by 2 %.
+/// A focal length that has changed by more than this share belongs to another lens than the file's,
+/// or nothing told the target's distance: lenses change by 2 %.
 const WEAK_FOCAL: f64 = 0.025;
-/// A camera of whose labels less than this share fits has seen something else as well.
+/// A camera with a smaller share of fitting labels has also seen something else.
 const WEAK_SHARE: f64 = 0.8;
-/// Residuals that change for good by more than this were seen by a camera that was moved, pixels: of 147
-/// that stood still none changed by more than 1.0, as targets cross other parts of the image, ...
+/// A camera whose residuals change permanently by more than this has been moved, pixels: of 147
+/// that stood still none changed by more than 1.0, which happens as targets cross other parts of
+/// the image, ...
 const MOVED_PX: f64 = 2.0;
-/// ... nor by more than so many deviations of a second's mean: 1.8 at most. Two that were knocked by 9
+/// ... nor by more than this many SDs of a second's mean: 1.8 at most. Two that were knocked by 9
 /// pixels changed by 3.2 and 12.
 const MOVED_DEVIATIONS: f64 = 2.5;
 
@@ -52,7 +54,7 @@ fn wrong(
     let name = &camera.name;
     let mrad = |px: f64| px / camera.intrinsics().fx * 1e3;
     let residual = (camera.residual_px, mrad(camera.residual_px));
-    // The image's rows go down in the world where the camera is not held upside down.
+    // Unless the camera is upside down, the image's rows point downwards in the world.
     let is_upside_down = camera.camera.pose().rotation().matrix()[(2, 1)] > 0.5;
     let moved =
         camera.moved.filter(|moved| moved.by_px > MOVED_PX && moved.deviations > MOVED_DEVIATIONS);
@@ -106,14 +108,14 @@ fn weak(camera: &CameraResult, [position_m, pointing_mrad]: [f64; 2]) -> Option<
     }
 }
 
-/// Along which direction the camera's place is known worst.
+/// The direction in which the camera's position is known worst, in words.
 fn known_worst(camera: &CameraResult) -> String {
     let place = camera.pose_covariance.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigen();
     let worst = place.eigenvalues.imax();
     let axis = place.eigenvectors.column(worst);
     let level = axis.x.hypot(axis.y);
     let sd_m = place.eigenvalues[worst].max(0.0).sqrt();
-    // An axis has no sense: the half towards the north or the east is named.
+    // An axis has no sign: the half towards the north or east is named.
     let azimuth = axis.x.atan2(axis.y).to_degrees().rem_euclid(180.0);
     let steep = axis.z.abs().atan2(level).to_degrees();
     if steep > 60.0 {

@@ -1,4 +1,4 @@
-//! How good this host's clock is, as chrony, ptp4l or the kernel tells it.
+//! The accuracy of this host's clock, as chrony, ptp4l or the kernel states it.
 
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -7,30 +7,30 @@ use super::{Finding, Verdict};
 use crate::host::kernel_clock_bound;
 use crate::pace::wall_seconds;
 
-/// How long a program may take to say how good the clock is, and how often is looked whether it has.
+/// How long a program may take to answer, and how often it is checked whether it has.
 const ANSWER: Duration = Duration::from_secs(5);
 const POLL: Duration = Duration::from_millis(10);
-/// A clock that may be off by so much costs a target at 20 m/s a tenth of a metre, s.
+/// A good clock's error is at most this, s: a target at 20 m/s is then off by a tenth of a metre.
 const GOOD_S: f64 = 0.005;
-/// One that may be off by more is worse than what an agent assumes of a camera, s.
+/// An error above this is worse than what an agent assumes of a camera, s.
 const BEARABLE_S: f64 = 0.1;
-/// A clock that was compared longer ago than this is compared no more: the longest interval of time
-/// servers is 17 minutes, s.
+/// A clock last compared longer ago than this is no longer compared at all, s: the longest interval
+/// of time servers is 17 minutes.
 const OLD_S: f64 = 3600.0;
 
 /// What `chronyc -c tracking` says.
 #[derive(Clone, Debug, PartialEq)]
 struct Tracking {
     server: String,
-    /// When it was last compared, s since the Unix epoch.
+    /// When the clock was last compared, s since the Unix epoch.
     compared_s: f64,
-    /// By how much it may be off, s.
+    /// Bound on the clock's error, s.
     bound_s: f64,
     is_synchronised: bool,
 }
 
 impl Tracking {
-    /// Reads the fourteen values with commas between them; `None` if they are others.
+    /// Parses the fourteen comma-separated values; `None` if they are not as expected.
     fn parse(line: &str) -> Option<Self> {
         let fields: Vec<&str> = line.trim().split(',').collect();
         let number = |at: usize| fields.get(at)?.parse::<f64>().ok().filter(|n| n.is_finite());
@@ -43,8 +43,8 @@ impl Tracking {
         })
     }
 
-    /// "Normal" is said as long as chrony runs, of a server that is dead as well: what counts is how
-    /// far off the clock may be by now, and when it was compared.
+    /// Judges the clock by its error bound by now and by when it was compared: chrony says "Normal"
+    /// as long as it runs, even if its server is dead.
     fn judge(&self, now_s: f64) -> (Verdict, String) {
         if !self.is_synchronised {
             return (Verdict::Fail, "chrony runs, and has no time server".to_owned());
@@ -63,7 +63,7 @@ impl Tracking {
     }
 }
 
-/// What `pmc` says of the clock that ptp4l keeps (IEEE 1588's TIME_STATUS_NP).
+/// What `pmc` says of the clock that ptp4l disciplines (IEEE 1588's TIME_STATUS_NP).
 #[derive(Clone, Debug, PartialEq)]
 struct Ptp {
     grandmaster: String,
@@ -71,7 +71,7 @@ struct Ptp {
 }
 
 impl Ptp {
-    /// Reads pmc's answer; `None` if it has none, or no grandmaster is there.
+    /// Parses pmc's answer; `None` if there is none, or no grandmaster is present.
     fn parse(text: &str) -> Option<Self> {
         let value = |name: &str| {
             let mut lines =
@@ -92,7 +92,7 @@ impl Ptp {
     }
 }
 
-/// A clock that may be off by so much.
+/// Verdict on a clock with this error bound.
 fn of_bound(bound_s: f64) -> Verdict {
     if bound_s > BEARABLE_S {
         Verdict::Fail
@@ -103,7 +103,7 @@ fn of_bound(bound_s: f64) -> Verdict {
     }
 }
 
-/// What a program says, where it is there and says it in time.
+/// Output of a program, if it exists and answers in time.
 fn said(program: &str, arguments: &[&str]) -> Option<String> {
     let mut command = Command::new(program);
     command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
@@ -111,7 +111,7 @@ fn said(program: &str, arguments: &[&str]) -> Option<String> {
     let begun = Instant::now();
     while child.try_wait().ok()?.is_none() {
         if begun.elapsed() > ANSWER {
-            // It is asked for nothing else.
+            // The program is needed for nothing else, so it may be killed.
             let _ = child.kill();
             let _ = child.wait();
             return None;
@@ -122,7 +122,8 @@ fn said(program: &str, arguments: &[&str]) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// How good this host's clock is: by the program that keeps it, or by what that has told the kernel.
+/// Accuracy of this host's clock: by the program that disciplines it, or by what that has told the
+/// kernel.
 pub fn host_clock() -> Finding {
     let chrony = || Tracking::parse(&said("chronyc", &["-c", "tracking"])?);
     let ptp = || Ptp::parse(&said("pmc", &["-u", "-b", "0", "GET TIME_STATUS_NP"])?);
@@ -130,7 +131,8 @@ pub fn host_clock() -> Finding {
     let keeps = |tracking: &&Tracking| tracking.is_synchronised || kernel.is_none();
     let (verdict, found) = if let Some(tracking) = chrony.as_ref().filter(keeps) {
         tracking.judge(wall_seconds())
-    // ptp4l keeps a network card's clock, and that is this host's where somebody has told the kernel.
+    // ptp4l disciplines a network card's clock; it is this host's only if the kernel was told of
+    // it.
     } else if let (Some(ptp), Some(_)) = (ptp(), kernel) {
         ptp.judge()
     } else if let Some(bound) = kernel {
@@ -160,7 +162,7 @@ mod tests {
     fn a_clock_is_judged_by_what_it_may_be_off_and_not_by_what_it_calls_itself() {
         assert_eq!(judged("-0.0001", "0.002", "0.0005", "Normal"), Verdict::Pass);
         assert_eq!(judged("0.0001", "0.02", "0.0005", "Normal"), Verdict::Warn);
-        // Its server is dead, and nothing but the dispersion says so.
+        // Its server is dead, and only the dispersion shows it.
         assert_eq!(judged("0.0001", "0.002", "0.9", "Normal"), Verdict::Fail);
         assert_eq!(judged("0.0", "0.0", "0.0", "Not synchronised"), Verdict::Fail);
     }

@@ -1,4 +1,4 @@
-//! What keeps a part of a site from working, before it has to.
+//! Finds what will keep a part of a site from working, before it is needed.
 
 mod clock;
 mod security;
@@ -20,15 +20,15 @@ use crate::config::{self, CameraFile, Kind, OnvifConfig, load_network};
 use crate::onvif;
 use crate::output;
 
-/// How long a camera is watched, s: until it has said what its clock shows.
+/// How long a camera is watched, s: long enough for its first clock report.
 const WATCHED_S: f64 = 8.0;
-/// Decoding may take this share of the time between two images: the rest is for finding and following.
+/// Share of the image interval that decoding may take: the rest is for detecting and tracking.
 const DECODING_SHARE: f64 = 0.25;
-/// Images that come so many of their intervals apart have been held up.
+/// Images more than this many intervals apart have been delayed on the way.
 const HELD_UP: f64 = 4.0;
-/// A share of images that may be lost.
+/// Share of images whose loss is acceptable.
 const BEARABLE_LOSS: f64 = 0.001;
-/// An image that is here longer after the time that the camera says is of another time, s.
+/// An image that arrives later than this after its stated capture time has a wrong capture time, s.
 const LATEST_S: f64 = 0.5;
 
 /// Find out what keeps a camera host or a site from working, and how to mend it.
@@ -48,7 +48,7 @@ pub struct Args {
     json: bool,
 }
 
-/// How something is.
+/// Verdict on one finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Verdict {
@@ -67,13 +67,13 @@ impl fmt::Display for Verdict {
     }
 }
 
-/// What was found of one thing.
+/// The result of one check.
 #[derive(Clone, Debug, Serialize)]
 struct Finding {
     what: String,
     verdict: Verdict,
     found: String,
-    /// What to do; nothing of what passes.
+    /// What to do about it; nothing for what passes.
     #[serde(skip_serializing_if = "Option::is_none")]
     mend: Option<String>,
 }
@@ -166,7 +166,7 @@ fn of_camera(path: &Path) -> anyhow::Result<Vec<Finding>> {
     Ok(findings)
 }
 
-/// Whether what turns the camera says where it points.
+/// Whether the camera's mount reports where it points.
 #[cfg(feature = "onvif")]
 fn of_mount(mount: &OnvifConfig) -> Finding {
     let asked = mount.login().and_then(|login| onvif::describe(&mount.url, login.as_ref()));
@@ -182,14 +182,14 @@ fn of_mount(mount: &OnvifConfig) -> Finding {
     }
 }
 
-/// That this build cannot ask it.
+/// The finding of a build without ONVIF, which cannot ask the mount.
 #[cfg(not(feature = "onvif"))]
 fn of_mount(_: &OnvifConfig) -> Finding {
     Finding::new("mount", Verdict::Fail, "this build leaves out mounts by ONVIF")
         .mend("build it with `--features onvif`")
 }
 
-/// What a watched stream says of its camera, whose clock is declared to be so far ahead.
+/// Findings on a watched stream; the camera's clock is declared to be `ahead_s` ahead.
 fn of_stream(tried: &Tried, camera: &Camera, ahead_s: f64) -> Vec<Finding> {
     if tried.frames == 0 {
         let found = tried.troubles.first().cloned().unwrap_or_else(|| "sends nothing".to_owned());
@@ -215,7 +215,7 @@ fn of_stream(tried: &Tried, camera: &Camera, ahead_s: f64) -> Vec<Finding> {
     ]
 }
 
-/// What becomes of images on the way.
+/// Whether images are lost or delayed on the way.
 fn of_way(tried: &Tried) -> Finding {
     let lost = tried.bad_frames + tried.left_out;
     let share = lost as f64 / (tried.frames + lost) as f64;
@@ -287,7 +287,7 @@ fn of_decoder(tried: &Tried) -> Finding {
     )
 }
 
-/// Whether this host can listen where it is to.
+/// Whether this host can listen at its own endpoint.
 fn of_own_endpoint(endpoint: &str) -> Finding {
     match TcpListener::bind(address(endpoint)) {
         Ok(_) => Finding::new("endpoint", Verdict::Pass, format!("{endpoint} is free")),
@@ -300,13 +300,13 @@ fn of_own_endpoint(endpoint: &str) -> Finding {
     }
 }
 
-/// Who can be reached by a component of the network.
+/// Which components of the network can be reached by one of them.
 fn of_network(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let mut findings = security::of_own(network, identity);
     let others = security::Others::seen_by(network, identity);
-    // Through a router nobody listens but the router.
+    // In a network with a router only the router listens.
     if network.mode == Mode::Peer {
-        // An area's fusion centre has to do with its own cameras alone.
+        // An area's fusion centre connects only to its own cameras.
         let own_cameras = match identity {
             Identity::Fusion(area) => network.cameras_of(area.as_ref()).ok(),
             _ => None,

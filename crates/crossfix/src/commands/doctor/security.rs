@@ -1,4 +1,4 @@
-//! Whether the others answer, and believe who this is.
+//! Whether the other components answer, and accept this one's certificate.
 
 use std::error::Error;
 use std::io;
@@ -14,11 +14,11 @@ use crossfix_transport::{
 use super::{Finding, Verdict};
 
 const DAY_S: u64 = 24 * 3600;
-/// The bit of a file's mode by which everybody may read it.
+/// Mode bit of a file that all users may read.
 const OTHERS_READ: u32 = 0o004;
 const RENEW: &str = "crossfix enroll -c network.toml, and copy what it says to this host";
 
-/// Whether a component can show who it is.
+/// Whether a component has a valid certificate to present.
 pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     let Some(security) = &network.security else {
         let is_open = network.unsecured || network.unencrypted(&Role::Observer).is_some();
@@ -54,7 +54,7 @@ pub fn of_own(network: &NetworkConfig, identity: &Identity) -> Vec<Finding> {
     findings
 }
 
-/// Whether everybody on this host can read a private key.
+/// A finding if all users of this host can read a private key.
 fn of_key(path: &Path) -> Option<Finding> {
     let mode = std::fs::metadata(path).ok()?.permissions().mode();
     (mode & OTHERS_READ != 0).then(|| {
@@ -63,10 +63,10 @@ fn of_key(path: &Path) -> Option<Finding> {
     })
 }
 
-/// The other components, as one of them sees them.
+/// The other components, as seen from one of them.
 pub struct Others<'a> {
     network: &'a NetworkConfig,
-    /// What it shows them; `None` where nothing is shown, or nothing can be.
+    /// Credentials presented to the others; `None` where none are used, or none can be loaded.
     shown: Option<Credentials>,
 }
 
@@ -78,7 +78,7 @@ impl<'a> Others<'a> {
         Self { network, shown }
     }
 
-    /// Whether the one who is wanted listens at an endpoint, and takes this component for what it is.
+    /// Whether the wanted component listens at an endpoint, and accepts this one's certificate.
     pub fn of(&self, who: &str, endpoint: &str, wanted: &Identity) -> Finding {
         match &self.shown {
             Some(credentials) => self.by_handshake(credentials, who, endpoint, wanted),
@@ -125,7 +125,7 @@ impl<'a> Others<'a> {
     }
 }
 
-/// An error and what it comes from.
+/// An error and its causes.
 fn words(error: &dyn Error) -> String {
     let mut words = error.to_string();
     let mut source = error.source();

@@ -1,4 +1,4 @@
-//! Two runs over the same data beside each other.
+//! Comparison of two runs over the same data.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::{Evaluation, Question, Run, evaluate};
 use crate::output;
 
-/// The figures of two runs.
+/// The results of two runs.
 #[derive(Debug, Serialize)]
 pub struct Comparison {
     a: Evaluation,
@@ -33,10 +33,10 @@ pub fn compare(a: &Path, b: &Path, question: &Question) -> anyhow::Result<Compar
     Ok(compared)
 }
 
-/// A figure of a run, as people read it, and how it is written.
+/// A figure of a run: its label, how it is read from the report, and its decimals.
 type Figure = (&'static str, fn(&Report) -> Option<f64>, usize);
 
-/// What is compared, in the order of the table.
+/// The figures that are compared, in the order of the table.
 const FIGURES: [Figure; 12] = [
     ("instants", |report| Some(report.instants as f64), 0),
     ("answers", |report| Some(report.answers as f64), 0),
@@ -56,7 +56,7 @@ fn percent(share: f64) -> f64 {
     100.0 * share
 }
 
-/// Both runs' figures and their difference.
+/// Table of both runs' figures and their difference.
 pub fn render(comparison: &Comparison, names: [&Path; 2]) -> String {
     let Comparison { a, b } = comparison;
     let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -75,19 +75,19 @@ impl Default for Question {
     }
 }
 
-/// The figures of a run.
+/// The results of one run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
-    /// Tracks against truth.
+    /// Comparison of the tracks with the truth.
     #[serde(flatten)]
     pub report: Report,
-    /// From a bearing to the tracks that follow from it; absent in data without arrival times.
+    /// Time from a bearing to the tracks that it changes; absent in data without arrival times.
     pub latency: Option<Latency>,
-    /// What could not be read: the figures are of the rest.
+    /// What could not be read: the figures cover the rest.
     pub lacks: Lacks,
 }
 
-/// What a recording holds that can be evaluated.
+/// What is read from a recording for its evaluation.
 #[derive(Default)]
 struct Run {
     truth: Vec<TruthFrame>,
@@ -95,13 +95,13 @@ struct Run {
     track_frames: u64,
     sightings: Sightings,
     latency: LatencyRecorder,
-    /// What the site may be off by as a whole.
+    /// Uncertainty that the site has as a whole.
     datum: Option<Datum>,
 }
 
 impl Run {
-    /// The tracks at a time. The truth is from elsewhere: what it is off by, and what the site is off
-    /// by as a whole, is between the two.
+    /// The tracks at a time. The truth comes from elsewhere, so its own error and the error of the
+    /// site as a whole are added to the tracks' covariances.
     fn estimates(&self, time: Timestamp, truth_sd_m: f64) -> Vec<Estimate> {
         let mut estimates = self.tracks.at(time);
         for Estimate { state, .. } in &mut estimates {
@@ -189,7 +189,7 @@ pub fn evaluate(recording: &Path, question: &Question) -> anyhow::Result<Evaluat
             evaluator.add(time, &targets(frame), &run.estimates(time, question.truth_sd));
         }
     }
-    // Imported data arrive when they are made: there is no latency to speak of.
+    // Imported data arrive when they are captured, so their latency is meaningless.
     let latency = run.latency.latency().filter(|latency| latency.p99_ms > 0.0);
     Ok(Evaluation { report: evaluator.report(), latency, lacks })
 }
@@ -219,7 +219,7 @@ fn run_beside(args: &Args, beside: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The figures as people read them.
+/// The results as a text for people.
 pub fn render(evaluation: &Evaluation) -> String {
     let Evaluation { report, latency, .. } = evaluation;
     let head = [
@@ -272,7 +272,7 @@ fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".to_owned(), |share| format!("{:.2} %", 100.0 * share))
 }
 
-/// How long the targets waited for an answer, in words.
+/// How long the targets waited for answers, in words.
 fn waits(delays: &Delays) -> String {
     let first = delays.first_s.map_or_else(
         || "a target was never answered for".to_owned(),

@@ -45,7 +45,7 @@ pub struct Args {
     others: Others,
 }
 
-/// What a track is, in a word.
+/// A track's state in one word.
 fn word(status: TrackState) -> &'static str {
     match status {
         TrackState::Confirmed => "confirmed",

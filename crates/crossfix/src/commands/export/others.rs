@@ -1,4 +1,4 @@
-//! A recording's tracks in the formats of others, as an outlet would have told them live.
+//! A recording's tracks in formats of other programs, as an outlet would have sent them live.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -54,7 +54,7 @@ pub struct Others {
 }
 
 impl Others {
-    /// Writes what is asked for.
+    /// Writes the formats that are asked for.
     pub fn write(&self, recording: &Path, channel: &Channel) -> anyhow::Result<()> {
         let site = site_of(recording)?;
         if let Some(anchor) = self.anchor {
@@ -74,7 +74,7 @@ impl Others {
     }
 }
 
-/// The site that a recording is of: that of its first message.
+/// The site of a recording: that of its first message.
 fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
     let mut site = None;
     let mut lacks = Lacks::default();
@@ -85,13 +85,14 @@ fn site_of(recording: &Path) -> anyhow::Result<SiteName> {
     site.with_context(|| format!("{} holds no message of a site", recording.display()))
 }
 
-/// Tracks of an earlier time than this, s, are of another run and not out of order.
+/// Tracks earlier than the last by more than this, s, belong to another run and are not merely out
+/// of order.
 const OUT_OF_ORDER_S: f64 = 2.0;
 
-/// Writes messages.
+/// Function that writes messages.
 type Put<'a> = dyn FnMut(Vec<Vec<u8>>) -> anyhow::Result<()> + 'a;
 
-/// A recording's tracks, told to an outlet.
+/// A recording's tracks, to be passed to an outlet.
 struct Told<'a> {
     recording: &'a Path,
     channel: &'a Channel,
@@ -127,7 +128,7 @@ impl Told<'_> {
         Ok(())
     }
 
-    /// Tells the tracks at even times of the data.
+    /// Passes the tracks to an outlet at even intervals of data time.
     fn tell(&self, outlet: &mut dyn Outlet, put: &mut Put<'_>) -> anyhow::Result<()> {
         let mut situation = Situation::new(self.site.clone(), self.anchor);
         let period_s = self.rate_hz.recip();
@@ -160,7 +161,8 @@ impl Told<'_> {
                     frames += 1;
                     situation.hear(entry.key.area.as_ref(), &frame);
                     last = Timestamp::from_nanos(frame.time_ns);
-                    // A recording may have gaps, and runs of earlier times: nothing is made up for.
+                    // A recording may have gaps, and runs with earlier times: missed intervals are
+                    // not made up for.
                     let is_due = next.is_none_or(|next| {
                         last >= next || next.seconds_since(last) > period_s + OUT_OF_ORDER_S
                     });
@@ -181,7 +183,7 @@ impl Told<'_> {
     }
 }
 
-/// Writes a recording again with Foxglove's schemas beside ours.
+/// Writes a copy of a recording with Foxglove's schemas added to ours.
 fn write_foxglove(
     recording: &Path,
     path: &Path,

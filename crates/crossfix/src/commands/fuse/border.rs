@@ -1,4 +1,4 @@
-//! What the fusion centre of an area has to do with those of the areas beside.
+//! Exchange between the fusion centre of an area and those of neighbouring areas.
 
 use std::collections::BTreeMap;
 
@@ -8,17 +8,18 @@ use crossfix_message::{
 };
 use crossfix_transport::NetworkConfig;
 
-/// The areas beside one, and what it says for them.
+/// The neighbouring areas, and what is exchanged with them.
 pub struct Border {
     neighbours: Neighbours,
-    /// The areas beside with their places among all areas.
+    /// The neighbouring areas with their indices among all areas.
     beside: BTreeMap<AreaName, usize>,
-    /// Cameras of this area that another one tells what to look for: two would turn them to and fro.
+    /// Cameras that another area's centre cues: cued by two centres, a camera would turn to and
+    /// fro.
     told_by_others: Vec<CameraName>,
 }
 
 impl Border {
-    /// Of an area of the network.
+    /// The border of one area of the network.
     pub fn new(network: &NetworkConfig, area: &AreaName, config: &FusionConfig) -> Self {
         let place = |area: &AreaName| network.areas.keys().take_while(|one| *one < area).count();
         let beside = network.neighbours(area).into_iter().map(|one| (one.clone(), place(&one)));
@@ -33,14 +34,14 @@ impl Border {
         }
     }
 
-    /// The keys of what the areas beside say of their tracks.
+    /// The keys under which the neighbouring areas publish their tracks.
     pub fn tracks_beside(&self, site: &SiteName) -> impl Iterator<Item = String> {
         self.beside.keys().map(|area| {
             Key::of_centre(site.clone(), Some(area.clone()), Channel::Tracks).to_string()
         })
     }
 
-    /// Takes in what another area says of its tracks.
+    /// Takes in the tracks of another area.
     pub fn hear(&mut self, area: &AreaName, data: &[u8]) -> Result<(), DecodeError> {
         if let Some(place) = self.beside.get(area) {
             self.neighbours.hear(*place, &decode::<TrackFrame>(data)?);
@@ -48,7 +49,8 @@ impl Border {
         Ok(())
     }
 
-    /// What of the fusion's outputs is said, and how.
+    /// The fusion's outputs that are to be published, with the neighbours' tracks taken into
+    /// account.
     pub fn pass(&mut self, outputs: Vec<Output>) -> Vec<Output> {
         let mut outputs = self.neighbours.pass(outputs);
         let is_told_here = |camera: &str| self.told_by_others.iter().all(|c| c.as_str() != camera);

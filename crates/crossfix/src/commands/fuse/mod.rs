@@ -44,10 +44,10 @@ pub struct Args {
     stop_with_stdin: bool,
 }
 
-/// The fusion centre on its network.
+/// A running fusion centre with its network connections.
 struct Station {
     centre: Centre,
-    /// Towards the areas beside, where there are any.
+    /// The exchange with neighbouring areas, if there are any.
     border: Option<Border>,
     link: Link,
     tracks: LinkPublisher,
@@ -57,7 +57,7 @@ struct Station {
     health: HealthReporter,
     reception: Reception,
     lookout: Lookout,
-    /// What time it was in the data at the last report.
+    /// Data time at the last report.
     said_at: Timestamp,
 }
 
@@ -108,15 +108,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What is said of a camera that the fusion needs.
+/// The keys of what is published of a camera that the fusion needs.
 fn of_camera(site: &SiteName, camera: &CameraName) -> [String; 3] {
     [Channel::Bearings, Channel::Calibration, Channel::CameraHealth]
         .map(|channel| Key::new(site.clone(), channel(camera.clone())).to_string())
 }
 
 impl Station {
-    /// The key expressions that it listens to. In an area, of its own cameras and the areas beside
-    /// alone: what nobody there listens to does not go over the way there.
+    /// The key expressions that it subscribes to. In an area, only those of its own cameras and of
+    /// the neighbouring areas: data that nobody there subscribes to are not sent there.
     fn heard(&self, cameras: &[CameraName]) -> Vec<String> {
         let site = self.link.site();
         match &self.border {
@@ -152,7 +152,7 @@ impl Station {
         Ok(())
     }
 
-    /// Handles what is on its way, for a moment, and what waits.
+    /// Handles for a moment what is still on its way, and then what is queued.
     fn finish(
         &mut self,
         subscription: &mut Subscription,
@@ -177,7 +177,7 @@ impl Station {
 
     fn take(&mut self, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, origin, at } = received;
-        // Names come from outside: those that are not configured are not kept count of.
+        // Names come from outside, so no counts are kept for cameras that are not configured.
         let is_ours = match key.channel.camera() {
             Some(camera) => self.centre.listens_to(camera),
             None => key.area.is_some(),

@@ -1,4 +1,4 @@
-//! What carries an outlet's bytes: datagrams, streams, files.
+//! Transport of an outlet's bytes: datagrams, streams, files.
 
 use std::fmt;
 use std::fs::{File, OpenOptions};
@@ -16,23 +16,23 @@ use super::Heard;
 use super::tls::{TlsClient, TlsStream};
 use crate::pace::wall_seconds;
 
-/// How long the other side may take to answer, or to take a message: the site's messages wait
+/// How long the receiver may take to answer, or to take a message: the site's messages wait
 /// meanwhile, and are not lost.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// The pause after a connection that failed.
+/// Pause after a connection has failed.
 const RETRY: Duration = Duration::from_secs(1);
-/// How often it is said that nobody is there.
+/// How often it is logged that there is no receiver.
 const REMINDER: Duration = Duration::from_secs(60);
-/// Looking whether the other side has said something takes so long.
+/// How long a check for data from the receiver takes.
 const GLANCE: Duration = Duration::from_millis(1);
-/// What it says is read in pieces of so many bytes, and so many of them at once: a TAK server relays
-/// what everybody says, and drops who does not take it.
+/// Size of the pieces in which the receiver's data are read, bytes, and most pieces read at once: a
+/// TAK server relays everybody's messages, and drops clients that do not read them.
 const PIECE: usize = 64 << 10;
 const MOST_PIECES: usize = 64;
-/// A parent that has not taken the registration after so long will not.
+/// A parent that has not accepted the registration after this long will not do so.
 const WELCOME: Duration = Duration::from_secs(10);
 
-/// Where an outlet's bytes go.
+/// Where an outlet's bytes are sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Destination {
     Udp(String),
@@ -67,7 +67,7 @@ impl FromStr for Destination {
 }
 
 impl Destination {
-    /// Whether the other side can answer.
+    /// Whether the receiver can answer.
     pub fn answers(&self) -> bool {
         matches!(self, Self::Tcp(_) | Self::Tls(_))
     }
@@ -85,7 +85,7 @@ impl fmt::Display for Destination {
     }
 }
 
-/// An open way to the other side.
+/// An open connection to the receiver.
 enum Way {
     Datagrams(UdpSocket),
     Plain(TcpStream),
@@ -126,7 +126,7 @@ impl Way {
         }
     }
 
-    /// What the other side has said, if it has; an error if it is gone.
+    /// Data that the receiver has sent, if any; an error if the connection is gone.
     fn read(&mut self) -> io::Result<Vec<u8>> {
         let stream: &mut dyn Read = match self {
             Self::Plain(stream) => {
@@ -153,7 +153,7 @@ impl Way {
     }
 }
 
-/// Whether nothing was said in time.
+/// Whether an error only means that no data came in time.
 fn is_silence(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
 }
@@ -169,15 +169,15 @@ fn connect(address: &str) -> io::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Keeps a way to the other side open and says what there is to say.
+/// Keeps a connection to the receiver open, and sends what there is to send.
 pub struct Carrier {
     destination: Destination,
     tls: Option<TlsClient>,
     way: Option<Way>,
-    /// When the way was opened, or it was tried to.
+    /// When the connection was last opened or tried to be opened.
     tried_at: Option<Instant>,
     complained_at: Option<Instant>,
-    /// What was written last went through.
+    /// Whether the last write succeeded.
     goes_through: bool,
     messages: u64,
 }
@@ -195,12 +195,13 @@ impl Carrier {
         }
     }
 
-    /// Messages that have gone out.
+    /// Number of messages sent.
     pub fn messages(&self) -> u64 {
         self.messages
     }
 
-    /// Hears what the other side says; who does not listen is not told anything for long.
+    /// Reads what the receiver has sent. A receiver that does not accept the registration in time
+    /// is disconnected.
     ///
     /// # Errors
     /// As [`Self::say`].
@@ -214,10 +215,10 @@ impl Carrier {
         }))
     }
 
-    /// Says what has been heard since the last time, if the other side is there and takes it.
+    /// Sends what has been heard since the last time, if the receiver is present and takes it.
     ///
     /// # Errors
-    /// Where there is nobody to try again for: a file or a pipe that takes no more.
+    /// If trying again is useless: a file or a pipe that takes no more.
     pub fn say(&mut self, outlet: &mut dyn Outlet, heard: &mut Heard) -> anyhow::Result<()> {
         let said = self.try_to_say(outlet, heard);
         self.mind(said)
@@ -255,7 +256,8 @@ impl Carrier {
         Ok(())
     }
 
-    /// What becomes of an error: another try, with a word now and then, where somebody may come back.
+    /// Handles an error: where the receiver may come back, another try, with a log line now and
+    /// then.
     fn mind(&mut self, done: io::Result<()>) -> anyhow::Result<()> {
         let Err(error) = done else { return Ok(()) };
         (self.way, self.goes_through) = (None, false);
@@ -269,7 +271,7 @@ impl Carrier {
         Ok(())
     }
 
-    /// Says goodbye.
+    /// Sends the outlet's farewell.
     pub fn finish(&mut self, outlet: &mut dyn Outlet) -> anyhow::Result<()> {
         let last = self.put(outlet.farewell(Timestamp::from_seconds(wall_seconds())));
         self.mind(last)

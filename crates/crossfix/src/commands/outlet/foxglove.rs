@@ -1,4 +1,4 @@
-//! A server that Foxglove connects to: our own messages, and Foxglove's schemas beside them.
+//! A server for Foxglove: our own messages, with Foxglove's schemas beside them.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -17,12 +17,12 @@ use crate::output;
 use crate::shutdown::{LEAVE, Shutdown};
 
 const POLL: Duration = Duration::from_millis(50);
-/// Messages that wait for a slow client before its oldest are dropped; nobody else waits for it.
+/// Messages queued for a slow client before its oldest are dropped; no other client waits for it.
 const WAITING: usize = 256;
-/// Topics that are served; more is an attack.
+/// Most topics served; more is taken for an attack.
 const MOST_TOPICS: usize = 10_000;
 
-/// What is served, a channel a topic.
+/// The served topics, with a channel each.
 struct Served {
     context: Arc<Context>,
     channels: BTreeMap<String, Arc<RawChannel>>,
@@ -52,11 +52,11 @@ impl Served {
         Ok(())
     }
 
-    /// Serves a message of the site, and what it says in Foxglove's schemas.
+    /// Serves a message of the site, and its contents in Foxglove's schemas.
     fn take(&mut self, view: &mut FoxgloveView, received: &Received) -> anyhow::Result<()> {
         let Received { key, data, .. } = received;
         let Ok(Some(seen)) = glance(&key.channel, data) else { return Ok(()) };
-        // Pictures are served in Foxglove's schema alone: nobody there can show ours.
+        // Pictures are served in Foxglove's schema alone: Foxglove cannot show ours.
         if !matches!(key.channel, Channel::Preview(_)) {
             let schema = (
                 crossfix_recording::schema_of(&key.channel),

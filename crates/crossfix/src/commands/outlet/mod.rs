@@ -1,4 +1,4 @@
-//! A site's tracks for programs of others, live.
+//! A site's tracks for other programs, live.
 
 mod carrier;
 mod foxglove;
@@ -28,9 +28,9 @@ use crate::repeats::Repeats;
 use crate::shutdown::{LEAVE, Shutdown};
 
 const POLL: Duration = Duration::from_millis(20);
-/// What is older is nothing to receivers, s: so long is an event of Cursor on Target good.
+/// Older data are useless to receivers, s: an event of Cursor on Target is valid for this long.
 const STALE_S: f64 = 10.0;
-/// Events that wait for the other side to be there; more are old news.
+/// Most events kept for a receiver that is not there: more would be old news.
 const MOST_EVENTS: usize = 1000;
 
 /// Tell programs of others where the targets are, live.
@@ -107,7 +107,7 @@ enum Format {
 }
 
 impl Format {
-    /// How often it is said unless somebody asks for more, s.
+    /// Default interval between messages, s.
     fn period_s(self) -> f64 {
         match self {
             Self::Cot | Self::Geojson | Self::Foxglove => 1.0,
@@ -182,22 +182,23 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What has been heard of the site since something was said.
+/// What the site has published since the outlet last sent something.
 struct Heard {
     situation: Situation,
-    /// When the fusion centre said something of its tracks last.
+    /// When the fusion centre last published tracks.
     tracks_at: Instant,
     events: Vec<TrackEvent>,
     repeats: Repeats,
 }
 
 impl Heard {
-    /// Where all targets are now.
+    /// Positions of all targets now.
     fn snapshot(&mut self) -> Option<Snapshot> {
         self.situation.snapshot(self.tracks_at.elapsed().as_secs_f64())
     }
 
-    /// Says that a site is of another time, as one that is replayed is: whoever is told of it says nothing.
+    /// Warns if a site's data are of another time, as in a replay: receivers leave such tracks out
+    /// without saying so.
     fn check_time(&mut self, frame: &TrackFrame, now: Instant) {
         let off_s = wall_seconds() - Timestamp::from_nanos(frame.time_ns).seconds();
         if off_s.abs() > STALE_S {
@@ -212,7 +213,8 @@ impl Heard {
         }
     }
 
-    /// What is no message of this version is the viewer's and the recorder's to report.
+    /// Takes in a message. Messages of another version are ignored: viewer and recorder report
+    /// them.
     fn hear(&mut self, received: &Received) {
         match received.key.channel {
             Channel::Tracks => {

@@ -1,4 +1,4 @@
-//! TLS to servers of others, with their certificates: not the site's.
+//! TLS to other programs' servers, with their certificates, not the site's.
 
 use std::io;
 use std::net::TcpStream;
@@ -27,7 +27,7 @@ pub struct TlsFiles {
     tls_key: Option<PathBuf>,
 }
 
-/// Connects by TLS.
+/// A client for TLS connections.
 pub struct TlsClient {
     config: Arc<ClientConfig>,
 }
@@ -41,7 +41,7 @@ fn certificates(path: &Path) -> anyhow::Result<Vec<CertificateDer<'static>>> {
 }
 
 impl TlsFiles {
-    /// What connects by them.
+    /// A TLS client that uses these files.
     pub fn client(&self) -> anyhow::Result<TlsClient> {
         let authorities = self.tls_ca.as_deref().context("tls:// needs --tls-ca FILE")?;
         let mut roots = RootCertStore::empty();
@@ -69,7 +69,7 @@ impl TlsFiles {
 }
 
 impl TlsClient {
-    /// Shakes hands over a connection with `HOST:PORT`.
+    /// Performs the TLS handshake over a connection to `HOST:PORT`.
     pub fn connect(&self, mut stream: TcpStream, address: &str) -> io::Result<TlsStream> {
         let host = address.rsplit_once(':').map_or(address, |(host, _)| host);
         let name = ServerName::try_from(host.trim_matches(['[', ']']).to_owned());

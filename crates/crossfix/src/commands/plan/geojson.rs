@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::report::Report;
 
-/// Longitude and latitude in degrees, to the millimetre: what RFC 7946 calls a position.
+/// An RFC 7946 position: longitude and latitude in degrees, rounded to the millimetre.
 fn position(frame: &LocalFrame, point: Point3<f64>) -> [f64; 2] {
     let place = frame.geodetic(point);
     [place.longitude_deg(), place.latitude_deg()].map(|degrees| (degrees * 1e8).round() / 1e8)
@@ -21,7 +21,7 @@ fn point(frame: &LocalFrame, place: Point3<f64>, properties: &Value) -> Value {
     feature(&json!({ "type": "Point", "coordinates": position(frame, place) }), properties)
 }
 
-/// A cell's outline, anticlockwise from the south-west and closed, with what is predicted in it.
+/// A cell's outline, anticlockwise from the south-west and closed, with the predictions for it.
 fn cell(frame: &LocalFrame, cell: &Cell, step_m: f64, cameras: &[PlannedCamera]) -> Value {
     let [x, y, z] = cell.centre_m;
     let half = 0.5 * step_m;
@@ -48,7 +48,7 @@ fn cell(frame: &LocalFrame, cell: &Cell, step_m: f64, cameras: &[PlannedCamera])
     feature(&json!({ "type": "Polygon", "coordinates": [ring] }), &properties)
 }
 
-/// The cells, layer by layer, the cameras and the candidates for one more.
+/// The cells, layer by layer, the cameras, and the candidate places for one more camera.
 pub fn collection(report: &Report, cameras: &[PlannedCamera], anchor: Geodetic) -> Value {
     let frame = LocalFrame::at(anchor);
     let mut features: Vec<Value> =

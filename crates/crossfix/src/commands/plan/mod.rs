@@ -118,7 +118,7 @@ impl Args {
 }
 
 impl Args {
-    /// The site's cameras, with what the options say in the place of what their files do.
+    /// The site's cameras, with values from the options in place of those from their files.
     fn cameras(&self) -> anyhow::Result<Vec<PlannedCamera>> {
         let planned = |(path, file): (PathBuf, config::CameraFile)| {
             let rate_hz = file.rate_hz()?;

@@ -1,4 +1,4 @@
-//! The figures of a plan, for programs and for people.
+//! The results of a plan, for programs and for people.
 
 use crossfix_evaluation::bound::{
     Advice, Assumptions, Candidate, Cell, Contribution, PlannedCamera, Score, Summary, TargetSize,
@@ -8,12 +8,12 @@ use serde::Serialize;
 
 use crate::output;
 
-/// Candidates that are named.
+/// Number of candidate places that are named.
 const NAMED: usize = 3;
-/// Those named stand at least this share of the volume's diagonal apart.
+/// Least distance between named candidates, as a share of the volume's diagonal.
 const APART: f64 = 0.25;
 
-/// All that is predicted.
+/// All predictions of a plan.
 #[derive(Debug, Serialize)]
 pub struct Report {
     /// The volume's low corner, ENU, m.
@@ -23,7 +23,7 @@ pub struct Report {
     /// Side of a cell, m.
     pub step_m: f64,
     pub assumptions: Assumptions,
-    /// The smallest target that two cameras see in the volume's middle, m.
+    /// The smallest target that two cameras see at the volume's centre, m.
     pub smallest_target_m: Option<f64>,
     pub whole: Summary,
     pub layers: Vec<Summary>,
@@ -62,12 +62,12 @@ fn percent(share: f64) -> String {
 }
 
 fn place(place: [f64; 3]) -> String {
-    // Without the sign of a zero.
+    // Adding 0.0 removes the sign of a negative zero.
     let [x, y, z] = place.map(|v| v.round() + 0.0);
     format!("({x:.0}, {y:.0}, {z:.0})")
 }
 
-/// What was taken for granted, a line each.
+/// The assumptions, a line each.
 pub fn assumed(report: &Report) -> String {
     let taken = &report.assumptions;
     let target = taken.target.map_or_else(
@@ -151,7 +151,7 @@ fn camera_table(report: &Report) -> String {
     output::table(&rows)
 }
 
-/// The median over the volume, if half of it has a fix.
+/// The median SD over the volume, if more than half of it has a fix.
 fn median(score: &Score) -> Option<f64> {
     (score.fixed > 0.5).then_some(score.median_sd_m)
 }
@@ -171,7 +171,7 @@ fn advice_table(report: &Report, advice: &Advice) -> String {
     )
 }
 
-/// The sentence with the one number that matters.
+/// The sentence with the most important number.
 pub fn conclusion(report: &Report) -> Option<String> {
     let (advice, best) = (report.advice.as_ref()?, report.best.first()?);
     let (now, then) = (advice.now, best.score);
@@ -189,7 +189,7 @@ pub fn conclusion(report: &Report) -> Option<String> {
     ))
 }
 
-/// The figures as people read them.
+/// The results as a text for people.
 pub fn render(report: &Report) -> String {
     let mut parts = vec![assumed(report), layer_table(report), camera_table(report)];
     parts.extend(report.smallest_target_m.map(|size| {

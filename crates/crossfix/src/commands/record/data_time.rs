@@ -2,27 +2,27 @@ use std::collections::BTreeMap;
 
 use crossfix_message::{CameraName, Channel, Timestamp};
 
-/// What time it is in the data: the capture time heard last of each camera, and of the site. Not
-/// the greatest: one frame from the future must not move all that is said after it. Some messages
-/// do not say when they were said but since when they hold; in a recording they lie where they were
-/// said.
+/// Current data time: the latest received capture time of each camera, and of the site. Not the
+/// greatest, as one frame from the future must not shift all later messages. Some messages carry
+/// the time from which they are valid instead of the time they were sent; in a recording they are
+/// placed where they were sent.
 #[derive(Debug, Default)]
 pub struct DataTime {
     cameras: BTreeMap<CameraName, Timestamp>,
     site: Option<Timestamp>,
 }
 
-/// When a message was said, in the time of the data.
+/// When a message was sent, in data time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Said {
     /// At this time.
     At(Timestamp),
-    /// Before any data: when is known once there are some.
+    /// Before any data: the time is known once there are some.
     BeforeAnyData,
 }
 
 impl DataTime {
-    /// When a message was said that speaks of `time`.
+    /// When a message was sent that carries `time`.
     pub fn of(&mut self, channel: &Channel, time: Timestamp) -> Said {
         match channel {
             Channel::Calibration(camera) => {
@@ -43,7 +43,7 @@ impl DataTime {
         }
     }
 
-    /// The site's time.
+    /// The site's current data time.
     pub fn now(&self) -> Said {
         self.site.map_or(Said::BeforeAnyData, Said::At)
     }

@@ -1,4 +1,4 @@
-//! The files of a recorder, one after the other, and how much of them and of the disk is used.
+//! The successive files of a recorder, and the space that they and others use on the disk.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -13,14 +13,15 @@ use crate::commands::numbers;
 use crate::output;
 use crate::repeats::Repeats;
 
-/// Where a recording goes.
+/// Writer of a recording to a file.
 pub type FileWriter = RecordingWriter<BufWriter<File>>;
 
 const MB: f64 = 1e6;
 const GB: f64 = 1e9;
-/// So many old recordings are removed one after the other that make no room, and no more.
+/// Removals stop after this many old recordings in a row whose removal freed no space.
 const MOST_IN_VAIN: u32 = 10;
-/// With this share of what is to be left free, only what tracks can be made of is recorded.
+/// With less free space than this share of what is to be left free, only the messages from which
+/// tracks can be made are recorded.
 const LAST_SHARE: f64 = 0.1;
 
 /// How large and how long a file gets, and how much all of them may take.
@@ -63,7 +64,7 @@ pub enum Room {
 }
 
 impl Room {
-    /// With so many bytes free, of so many that are to be left.
+    /// Room with `free` bytes free, of which `left` are to be left free.
     fn of(free: f64, left: f64) -> Self {
         if free < left * LAST_SHARE {
             Self::Tracks
@@ -75,16 +76,16 @@ impl Room {
     }
 }
 
-/// The file that is written.
+/// The file that is being written.
 #[derive(Debug)]
 struct Current {
     path: PathBuf,
     begun: Instant,
-    /// Held as long as it is written: no other recorder removes it.
+    /// Locked while the file is written, so that no other recorder removes it.
     _lock: Option<File>,
 }
 
-/// What has been removed to make room, and what was free before, bytes.
+/// The size of what was removed to make room, and the free space before, bytes.
 #[derive(Clone, Copy, Debug)]
 struct Removed {
     bytes: f64,
@@ -98,21 +99,22 @@ pub struct Files {
     overwrite: bool,
     limits: Limits,
     current: Option<Current>,
-    /// Those that this run has ended, in their order: clocks may have been set meanwhile.
+    /// Files that this run has completed, in their order: names are no guide, as the clock may have
+    /// been set.
     ended: Vec<PathBuf>,
-    /// The others that are named so, with their sizes, bytes; the oldest last.
+    /// Other files with names of this form, with their sizes, bytes; the oldest last.
     older: Vec<(PathBuf, f64)>,
     removed: Option<Removed>,
-    /// How many files have been removed one after the other that made no room.
+    /// Number of files removed in a row without freeing space.
     in_vain: u32,
     repeats: Repeats,
 }
 
 impl Files {
-    /// Files under a name, or under names that begin as it does.
+    /// Files under a name or, with rotation, under names that begin with it.
     ///
     /// # Errors
-    /// If what is asked for does not go together.
+    /// If the options contradict each other.
     pub fn new(asked: &Path, overwrite: bool, limits: Limits) -> anyhow::Result<Self> {
         ensure!(
             limits.rotates() || limits.quota_gb.is_none(),
@@ -137,15 +139,15 @@ impl Files {
         Ok(files)
     }
 
-    /// Whether one file follows another.
+    /// Whether files are rotated, that is, one follows another.
     pub fn rotates(&self) -> bool {
         self.limits.rotates()
     }
 
-    /// Begins the next file, which says who writes it.
+    /// Begins the next file, which states who writes it.
     ///
     /// # Errors
-    /// If it cannot be made; the one before stays the one that is written.
+    /// If it cannot be created; the previous file then remains the current one.
     pub fn create(&mut self, source: &Source) -> anyhow::Result<FileWriter> {
         let (mut writer, path) = if self.limits.rotates() {
             create_new(&self.named(OffsetDateTime::now_utc()))?
@@ -160,12 +162,12 @@ impl Files {
         Ok(writer)
     }
 
-    /// The file that is written.
+    /// Path of the file that is being written.
     pub fn path(&self) -> &Path {
         self.current.as_ref().map_or(&self.asked, |current| &current.path)
     }
 
-    /// Whether it is time for the next one: also if somebody has taken this one away.
+    /// Whether it is time for the next file, also because somebody has removed this one.
     pub fn is_full(&self) -> bool {
         let Some(Current { path, begun, .. }) = &self.current else { return false };
         let Limits { rotate_mb, rotate_min, .. } = self.limits;
@@ -174,8 +176,8 @@ impl Files {
         self.rotates() && (is_long || is_large || !path.exists())
     }
 
-    /// Removes the oldest file if the quota or the disk asks for it, one at a time; says what there is
-    /// room for. To be asked about once a second.
+    /// Removes the oldest file if the quota or the disk requires it, one per call; returns what
+    /// there is room for. To be called about once a second.
     pub fn make_room(&mut self) -> Room {
         let left = self.limits.leave_free_gb * GB;
         let quota = self.limits.quota_gb.map_or(f64::INFINITY, |gb| gb * GB);
@@ -186,7 +188,7 @@ impl Files {
         if is_over || (free < left && self.in_vain < MOST_IN_VAIN) {
             self.remove_oldest(free);
         }
-        // What goes is there again in a moment.
+        // The space of a removed file will be free in a moment.
         if self.removed.is_some() && self.in_vain == 0 {
             Room::Pictures
         } else {
@@ -194,10 +196,10 @@ impl Files {
         }
     }
 
-    /// Removes the oldest file, if there is one that nobody writes.
+    /// Removes the oldest file that nobody is writing.
     pub fn remove_oldest(&mut self, free_before: f64) {
         while let Some((oldest, bytes)) = self.older.pop() {
-            // That of another recorder, which is being written.
+            // A locked file is being written by another recorder.
             if File::open(&oldest).is_ok_and(|file| file.try_lock().is_err()) {
                 continue;
             }
@@ -214,8 +216,8 @@ impl Files {
         }
     }
 
-    /// Whether what was removed last has made room: where snapshots or others take what becomes free,
-    /// all recordings must not go for nothing.
+    /// Checks whether the last removal has freed space. Where snapshots or other programs take the
+    /// freed space, the recordings must not all be lost for nothing.
     fn see_what_it_brought(&mut self, free: f64) {
         let Some(Removed { bytes, free_before }) = self.removed.take() else { return };
         self.in_vain = if free > free_before + bytes / 2.0 { 0 } else { self.in_vain + 1 };
@@ -224,7 +226,7 @@ impl Files {
         }
     }
 
-    /// What is free on its disk, bytes; where nobody says, or for a pipe, enough.
+    /// Free space on the file's disk, bytes; infinite for a pipe or where the system does not tell.
     pub fn free(&self) -> f64 {
         let path = self.path();
         if path.exists() && !path.is_file() {
@@ -237,7 +239,7 @@ impl Files {
         })
     }
 
-    /// The name of a file that begins at a time.
+    /// Name of a file that begins at a time.
     fn named(&self, begins: OffsetDateTime) -> PathBuf {
         let (stem, extension) = parts(&self.asked);
         let (year, month, day) = begins.to_calendar_date();
@@ -248,7 +250,7 @@ impl Files {
         ))
     }
 
-    /// Looks which other files are named so.
+    /// Lists the other files with names of this form.
     fn list(&mut self) {
         self.older.clear();
         if !self.rotates() {
@@ -265,7 +267,7 @@ impl Files {
         let mut found: Vec<(usize, String, PathBuf)> = names
             .filter_map(|name| {
                 let path = self.asked.with_file_name(&name);
-                // Of this run, the one that ended first is the oldest, and all are younger than others.
+                // Files of this run are ordered by their end, and are all younger than others.
                 let ended = self.ended.iter().position(|ended| *ended == path);
                 Some((ended.map_or(0, |place| place + 1), begins_at(&name)?, path))
             })
@@ -277,8 +279,8 @@ impl Files {
     }
 }
 
-/// Whether a text is when a file began, as it stands in its name; with a number behind it if two began
-/// in one second.
+/// Whether a text is the time in a file's name, with a number after it if two files began in one
+/// second.
 fn is_a_beginning(text: &str) -> bool {
     let (time, number) = text.split_once('-').unwrap_or((text, "2"));
     let is_time = time.len() == 16
@@ -290,7 +292,7 @@ fn is_a_beginning(text: &str) -> bool {
     is_time && !number.is_empty() && number.chars().all(|letter| letter.is_ascii_digit())
 }
 
-/// A file's name before and behind what is put in.
+/// A file's name before and after the inserted time.
 fn parts(asked: &Path) -> (String, String) {
     let stem = asked.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let extension = asked.extension().map(|e| format!(".{}", e.to_string_lossy()));
@@ -301,11 +303,10 @@ fn bytes(path: &Path) -> f64 {
     std::fs::metadata(path).map_or(0.0, |file| file.len() as f64)
 }
 
-/// A new file under the name that was asked for, or under the first of `today-2.mcap`,
-/// `today-3.mcap` .. that is free: a recorder that is started again must not destroy what it
-/// recorded before.
+/// A new file under the name asked for, or under the first free one of `today-2.mcap`,
+/// `today-3.mcap` ..: a recorder that is started again must not destroy its earlier recordings.
 fn create(asked: &Path, overwrite: bool) -> anyhow::Result<(FileWriter, PathBuf)> {
-    // A device or a pipe has nothing that could be lost.
+    // A device or a pipe has no contents that could be lost.
     if overwrite || (asked.exists() && !asked.is_file()) {
         return Ok((RecordingWriter::create(asked)?, asked.to_owned()));
     }
@@ -363,7 +364,7 @@ mod tests {
             std::fs::write(path, vec![0; 1_000_000]).unwrap();
         }
         drop(files.create(&Source::default()).unwrap());
-        // One at a time.
+        // Each call removes one.
         for left in [3, 2, 2] {
             assert_eq!(files.make_room(), Room::Pictures);
             assert_eq!(old.iter().filter(|path| path.exists()).count(), left);
@@ -409,15 +410,15 @@ mod tests {
         }
     }
 
-    /// Where nothing becomes free by it, as under snapshots, ten recordings go and no more.
+    /// Where removal frees no space, as with snapshots, ten recordings are removed and no more.
     #[test]
     fn recordings_do_not_go_for_nothing() {
         let folder = tempfile::tempdir().unwrap();
-        // More than any disk has, and so nothing that is removed helps.
+        // More than any disk has, so no removal suffices.
         let endless = Limits { leave_free_gb: 1e12, ..limits(None) };
         for k in 0..30 {
             let files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
-            // They say that they are large, and take nothing.
+            // Sparse files: they have a large size, but occupy nothing.
             File::create(files.named(at(k))).unwrap().set_len(1 << 40).unwrap();
         }
         let mut files = Files::new(&folder.path().join("a.mcap"), false, endless).unwrap();
@@ -427,7 +428,7 @@ mod tests {
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 31 - 10);
     }
 
-    /// The clock was set back in the flight: what was recorded last is not the oldest.
+    /// The clock was set back during the run: the newest recording must not count as the oldest.
     #[test]
     fn what_this_run_has_recorded_is_younger_than_what_was_there_before() {
         let folder = tempfile::tempdir().unwrap();

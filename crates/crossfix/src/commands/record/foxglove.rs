@@ -1,4 +1,4 @@
-//! What is written in Foxglove's schemas beside our own.
+//! What is also written in Foxglove's schemas, beside our own.
 
 use crossfix_geometry::Geodetic;
 use crossfix_message::{SiteName, Timestamp};
@@ -18,7 +18,7 @@ pub enum WithFoxglove {
 }
 
 impl WithFoxglove {
-    /// What says it.
+    /// The view that converts messages, if any are to be converted.
     pub fn view(self, site: &SiteName, anchor: Option<Geodetic>) -> Option<FoxgloveView> {
         let pictures = match self {
             Self::All => Pictures::Said,
@@ -29,7 +29,7 @@ impl WithFoxglove {
     }
 }
 
-/// Writes beside an entry what it says in Foxglove's schemas.
+/// Writes an entry's contents in Foxglove's schemas, next to the entry itself.
 pub fn write<W: std::io::Write + std::io::Seek>(
     writer: &mut RecordingWriter<W>,
     view: &mut FoxgloveView,

@@ -26,9 +26,9 @@ use crate::output;
 use crate::service;
 use crate::shutdown::{LAST_WORDS, LAST_WORK, LEAVE, Shutdown};
 
-/// The disk has so long to take the end of the last file.
+/// How long the disk may take to store the end of the last file.
 const SYNCED_WITHIN: Duration = Duration::from_millis(300);
-/// So many old recordings go at most before the first file begins.
+/// Most old recordings that are removed before the first file begins.
 const MOST_AT_START: u32 = 100;
 const POLL: Duration = Duration::from_millis(50);
 
@@ -68,7 +68,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let shutdown = Shutdown::listen().with_reload().with_stdin(args.stop_with_stdin);
     let network = config::load_network(&args.config)?;
     let mut files = Files::new(&args.output, args.overwrite, args.limits)?;
-    // The file comes last: what cannot record must not touch it.
+    // The file is created last: a recorder that cannot start must not touch it.
     let Some(link) = network::open(&network, &Role::Recorder, &shutdown)? else {
         return Ok(());
     };
@@ -79,7 +79,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         HealthReporter::new(&args.health, &link, Channel::RecorderHealth, Delivery::Queued)?;
     let source =
         Source { run: link.run().to_string(), host: network::host(), ..Source::of("record") };
-    // Where it fell over the last time.
+    // Makes the room that was lacking when an earlier recorder stopped.
     (0..MOST_AT_START).take_while(|_| files.make_room() < Room::Pictures).for_each(drop);
     let foxglove = args.foxglove.view(&network.site, config::anchor_of(&network)?);
     let mut recorder =
@@ -108,18 +108,18 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Where recordings go.
+/// The files on the disk, and their syncing.
 struct Disk {
     files: Files,
     source: Source,
     syncing: Syncing,
-    /// When a file could not be written last.
+    /// When a failed file was last replaced by a new one.
     rescued: Option<Instant>,
 }
 
 impl Disk {
-    /// What is to be done each second: what was flushed survives a crash of the machine's programs,
-    /// and soon one of the machine; a file that is full gives way to the next.
+    /// The work of each second: flushes, so that what is written survives a crash of the program
+    /// and, once synced, of the machine; and replaces a full file with the next.
     fn keep(&mut self, recorder: &mut Recorder) -> anyhow::Result<()> {
         recorder.heed(self.files.make_room());
         recorder.flush()?;
@@ -128,7 +128,7 @@ impl Disk {
             recorder.note_trouble("sync", &error);
         }
         if self.files.is_full() {
-            // Better one file that is too long than none.
+            // One file that is too long is better than none.
             if let Err(error) = self.next(recorder) {
                 recorder.note_trouble("next file", &error);
             }
@@ -144,8 +144,8 @@ impl Disk {
         Ok(())
     }
 
-    /// A file cannot be written any more. Where files follow one another the oldest goes, and it goes
-    /// on in a new one: the disk was full before anybody looked.
+    /// Handles a file that cannot be written any more. With rotation the oldest file is removed,
+    /// and recording goes on in a new one: the disk filled up between two checks.
     fn rescue(&mut self, recorder: &mut Recorder, error: anyhow::Error) -> anyhow::Result<()> {
         let lately = |at: Instant| at.elapsed() < health::PERIOD;
         let is_of_disk = error.downcast_ref().is_some_and(RecordingError::is_of_disk);
@@ -160,7 +160,7 @@ impl Disk {
     }
 }
 
-/// Records until it is asked to stop, and for a moment what is still on its way.
+/// Records until asked to stop, and then for a moment what is still on its way.
 fn work(
     recorder: &mut Recorder,
     disk: &mut Disk,

@@ -1,4 +1,4 @@
-//! Which pictures are recorded: all, none, or those round the time of a track.
+//! Which pictures are recorded: all, none, or those around the time of a track.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -7,8 +7,8 @@ use crossfix_message::{TrackFrame, TrackState};
 
 use crate::commands::numbers;
 
-/// Pictures that wait for a track take this much memory at most, bytes: ten seconds of 16 cameras
-/// with five pictures of 60 kB a second. With half as much such a site keeps five seconds.
+/// Most memory for pictures that wait for a track, bytes: ten seconds of 16 cameras with five
+/// pictures of 60 kB per second. With half as much such a site keeps five seconds.
 const MOST_WAITING_BYTES: usize = 64 << 20;
 
 /// Which pictures are recorded.
@@ -43,21 +43,21 @@ impl Default for VideoArgs {
     }
 }
 
-/// A picture of type `P` that waits to be wanted.
+/// A picture of type `P` that waits for a track.
 struct Waiting<P> {
     picture: P,
     bytes: usize,
     since: Instant,
 }
 
-/// Keeps the pictures of the last seconds, and gives them out when there is a track.
+/// Keeps the pictures of the last seconds, and releases them when there is a track.
 pub struct Pictures<P> {
     wanted: Wanted,
     before: Duration,
     after: Duration,
     waiting: VecDeque<Waiting<P>>,
     waiting_bytes: usize,
-    /// Until when a track makes pictures worth recording.
+    /// Until when pictures are recorded because of the last track.
     until: Option<Instant>,
     left_out: u64,
 }
@@ -75,17 +75,18 @@ impl<P> Pictures<P> {
         }
     }
 
-    /// Whether tracks decide.
+    /// Whether tracks decide on what is recorded.
     pub fn wants_tracks(&self) -> bool {
         self.wanted == Wanted::Tracks
     }
 
-    /// Pictures that were not recorded, as nothing was there.
+    /// Number of pictures not recorded because there was no track.
     pub fn left_out(&self) -> u64 {
         self.left_out
     }
 
-    /// A picture of so many bytes came: it is to be recorded now, or waits.
+    /// Takes a picture of so many bytes in: returns it if it is to be recorded now; otherwise it
+    /// waits or is left out.
     pub fn take(&mut self, picture: P, bytes: usize, now: Instant) -> Option<P> {
         match self.wanted {
             Wanted::All => Some(picture),
@@ -103,7 +104,7 @@ impl<P> Pictures<P> {
         }
     }
 
-    /// Leaves out what has waited too long, or takes too much memory.
+    /// Drops pictures that have waited too long or take too much memory.
     fn forget(&mut self, now: Instant) {
         let (before, most) = (self.before, MOST_WAITING_BYTES);
         while let Some(oldest) = self.waiting.front()
@@ -115,8 +116,8 @@ impl<P> Pictures<P> {
         }
     }
 
-    /// Tracks came: if one of them is sure, all pictures that wait are to be recorded, in their
-    /// order.
+    /// Takes tracks in: if one of them is confirmed, coasting or of one camera, returns all waiting
+    /// pictures, in their order, to be recorded.
     pub fn see(&mut self, tracks: &TrackFrame, now: Instant) -> impl Iterator<Item = P> + '_ {
         let is_sure = |state| {
             use TrackState::{Coasting, Confirmed, OneCamera};
@@ -145,7 +146,8 @@ mod tests {
         TrackFrame { tracks: vec![track], ..Default::default() }
     }
 
-    /// Pictures each second from 0, named by their time; a track is sure in one second.
+    /// Records one picture per second from 0 on, named by its time, with a confirmed track in one
+    /// second.
     fn recorded(wanted: Wanted, sure_at: u64, bytes: usize) -> (Vec<u64>, u64) {
         let args = VideoArgs { video: wanted, video_before_s: 3.0, video_after_s: 2.0 };
         let (mut pictures, mut kept) = (Pictures::new(args), Vec::new());
@@ -162,7 +164,7 @@ mod tests {
 
     #[test]
     fn pictures_are_kept_round_a_track_in_their_order() {
-        // 16 to 19 wait yet.
+        // 16 to 19 still wait.
         assert_eq!(recorded(Wanted::Tracks, 8, 1), ((5..=10).collect(), 10));
         assert!(recorded(Wanted::Tracks, 99, 1).0.is_empty());
         assert_eq!(recorded(Wanted::All, 99, 1), ((0..20).collect(), 0));

@@ -17,11 +17,12 @@ use crate::network::rivalry;
 use crate::pace::wall_seconds;
 use crate::repeats::Repeats;
 
-/// Bytes of messages that are held until there are data that say what time it is: what a site of a
-/// hundred cameras says of itself in minutes. More is written down with the time of its arrival.
+/// Most bytes of messages held back until data tell the data time: what a site of a hundred cameras
+/// sends without data in minutes. Further ones are recorded with the time of their arrival.
 const MOST_HELD_BYTES: usize = 8 << 20;
 
-/// What the recorder has to do with a message: no clock but that of its arrival, no network.
+/// Decides what to record of each message; uses no clock but the messages' arrival times, and no
+/// network.
 pub struct Recorder {
     writer: FileWriter,
     site: SiteName,
@@ -34,30 +35,30 @@ pub struct Recorder {
     repeats: Repeats,
     counts: Counts,
     /// What each file must begin with: the cameras' newest calibrations, and the fusion centre's
-    /// newest word on their clocks.
+    /// newest message on their clocks.
     standing: BTreeMap<Key, Entry>,
     pictures: Pictures<(Entry, Said)>,
     foxglove: Option<FoxgloveView>,
     room: Room,
-    /// What was wrong with the disk since the last health.
+    /// Trouble with the disk since the last health message.
     trouble: Option<String>,
-    /// Of the files before this one: how many, and how many messages are in them.
+    /// Number of earlier files, and of the messages in them.
     before: (u64, u64),
 }
 
-/// What was not recorded, or not as it should be.
+/// Counts of messages that were not recorded, or not as they should be.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
-    /// Of cameras and fusion centres that the network's file does not name.
+    /// From cameras and fusion centres that the network's file does not name.
     foreign: u64,
     malformed: u64,
     /// Of a newer major version: recorded all the same.
     newer: u64,
-    /// That the disk had no room for.
+    /// Left out because the disk had no room.
     no_room: u64,
 }
 
-/// What a disk without room for everything costs.
+/// What is not recorded for lack of room, as a text.
 fn lacking(room: Room) -> Option<&'static str> {
     match room {
         Room::Pictures => None,
@@ -68,7 +69,7 @@ fn lacking(room: Room) -> Option<&'static str> {
     }
 }
 
-/// What a disk must have room for if a message is to be recorded.
+/// The least room on the disk with which a message is recorded.
 pub(super) fn room_for(channel: &Channel) -> Room {
     match channel {
         Channel::Bearings(_)
@@ -110,8 +111,8 @@ impl Recorder {
         }
     }
 
-    /// Goes on in another file, which begins with what holds still. Of the one before, what was
-    /// flushed is safe if it cannot be ended.
+    /// Goes on in another file, which begins with what is still valid. If the previous one cannot
+    /// be closed properly, what was flushed to it is safe.
     ///
     /// # Errors
     /// [`RecordingError`] if the new file cannot be written.
@@ -129,7 +130,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Records from now on what there is room for.
+    /// Sets the room on the disk, by which it is decided what is recorded.
     pub fn heed(&mut self, room: Room) {
         if room != self.room {
             tracing::warn!("{}", lacking(room).unwrap_or("the disk has room for everything again"));
@@ -137,7 +138,8 @@ impl Recorder {
         self.room = room;
     }
 
-    /// Something went wrong with the disk that ends nothing: it is said in the next health, too.
+    /// Notes trouble with the disk that does not end the recording; the next health message reports
+    /// it, too.
     pub fn note_trouble(&mut self, kind: &str, error: &anyhow::Error) {
         self.trouble = Some(format!("the disk: {error:#}"));
         self.repeats.warn(kind, Instant::now(), || format!("the disk: {error:#}"));
@@ -149,7 +151,7 @@ impl Recorder {
     /// [`RecordingError`] if the file cannot be written.
     pub fn take(&mut self, received: Received) -> Result<(), RecordingError> {
         let Received { key, data, origin, at } = received;
-        // It writes its own health down itself.
+        // Its own health is written by the recorder itself.
         if key.channel == Channel::RecorderHealth
             && origin.is_some_and(|origin| origin.run == self.run)
         {
@@ -211,7 +213,7 @@ impl Recorder {
         self.write(entry, said)
     }
 
-    /// Writes the pictures that have waited for such tracks.
+    /// Records the pictures that have waited for these tracks.
     fn write_pictures(&mut self, tracks: &Entry, at: Instant) -> Result<(), RecordingError> {
         let Ok(tracks) = decode(&tracks.data) else { return Ok(()) };
         let wanted: Vec<_> = self.pictures.see(&tracks, at).collect();
@@ -237,7 +239,7 @@ impl Recorder {
         }
     }
 
-    /// Writes what was said before there were data, at the time of the first.
+    /// Records the messages from before the first data, at the time of the first data.
     fn release(&mut self, now: Timestamp) -> Result<(), RecordingError> {
         self.held_bytes = 0;
         for held in std::mem::take(&mut self.held) {
@@ -264,7 +266,7 @@ impl Recorder {
         }
     }
 
-    /// How it does, written down; to be published as well.
+    /// The recorder's health, which is also recorded here; to be published by the caller.
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
@@ -322,7 +324,7 @@ impl Recorder {
         Ok(health)
     }
 
-    /// What was recorded until now survives a crash.
+    /// Flushes, so that everything recorded so far survives a crash of the program.
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
@@ -330,13 +332,13 @@ impl Recorder {
         self.writer.flush()
     }
 
-    /// Ends the file with its index; returns how many messages were recorded, to how many files.
+    /// Closes the file with its index; returns the numbers of messages recorded and of files.
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be written.
     pub fn finish(mut self) -> Result<(u64, u64), RecordingError> {
         self.repeats.end();
-        // Nothing ever said what time it is in the data: it is that of the wall.
+        // No data ever told the data time, so the arrival by wall clock is used.
         for held in std::mem::take(&mut self.held) {
             self.put(&Entry { data_time: held.arrival, ..held })?;
         }

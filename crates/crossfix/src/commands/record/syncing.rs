@@ -1,4 +1,4 @@
-//! What has been written, put onto the disk itself.
+//! Syncing of written files to the disk itself.
 
 use std::fs::File;
 use std::io;
@@ -6,27 +6,27 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 use std::time::Duration;
 
-/// Puts what has been written onto the disk itself, so that a power cut takes no more than a second
-/// or two. A slow disk holds up its thread alone.
+/// Syncs written data to the disk itself, so that a power cut loses no more than a second or two. A
+/// slow disk delays only this thread.
 #[derive(Debug)]
 pub struct Syncing {
     files: SyncSender<PathBuf>,
     done: Receiver<io::Result<()>>,
-    /// Files that have ended, and for which there was no place yet.
+    /// Completed files that wait to be synced.
     ended: Vec<PathBuf>,
 }
 
 impl Syncing {
-    /// Begins a thread that waits for files.
+    /// Starts a thread that syncs files.
     ///
     /// # Errors
-    /// If the system has no threads left.
+    /// If the system cannot start another thread.
     pub fn start() -> io::Result<Self> {
         let (files, written) = sync_channel::<PathBuf>(1);
         let (says, done) = channel();
         std::thread::Builder::new().name("syncing".to_owned()).spawn(move || {
             for path in written {
-                // Taken away meanwhile, it needs no disk.
+                // A file that has been removed meanwhile needs no syncing.
                 let file = File::open(path).ok();
                 let synced = file.map_or(Ok(()), |file| file.sync_data());
                 if says.send(synced).is_err() {
@@ -37,13 +37,13 @@ impl Syncing {
         Ok(Self { files, done, ended: Vec::new() })
     }
 
-    /// Asks for what has been written to a file; not if the last one is still under way. A pipe has
-    /// no disk.
+    /// Requests syncing of a file; skipped if the last request is still in progress. A pipe is not
+    /// synced.
     ///
     /// # Errors
-    /// What the disk said of those before: that what was written is not on it.
+    /// Errors of earlier requests: what was written is not on the disk.
     pub fn ask(&mut self, path: &Path) -> io::Result<()> {
-        // Those that have ended first: nobody asks for them again.
+        // Completed files come first, as nobody requests them again.
         while let Some(ended) = self.ended.pop() {
             if let Err(TrySendError::Full(ended)) = self.files.try_send(ended) {
                 self.ended.push(ended);
@@ -56,15 +56,15 @@ impl Syncing {
         self.done.try_iter().collect()
     }
 
-    /// A file has ended, and is to be asked for as soon as there is a place.
+    /// Notes a completed file, to be synced as soon as possible.
     pub fn end(&mut self, path: PathBuf) {
         self.ended.push(path);
     }
 
-    /// Waits so long until a last file is on the disk.
+    /// Waits up to `patience` until the last file is on the disk.
     ///
     /// # Errors
-    /// What the disk said of it.
+    /// The disk's error, if there was one.
     pub fn finish(mut self, path: &Path, patience: Duration) -> io::Result<()> {
         if path.is_file() {
             self.end(path.to_owned());

@@ -84,13 +84,13 @@ struct Range {
 }
 
 impl Range {
-    /// The range that was asked for, which counts from the first bearing or track of the recording.
+    /// The range that was asked for, counted from the recording's first bearing or track.
     fn of(args: &Args, recalibration: Option<&Recalibration>) -> anyhow::Result<Self> {
         let to_s = args.to.unwrap_or(f64::INFINITY);
         ensure!(args.from < to_s, "--from {} is not before --to {to_s}", args.from);
         let is_whole = args.from == 0.0 && args.to.is_none();
         if is_whole && args.fuse {
-            // Where it begins and ends nobody asks.
+            // When all of it is fused, beginning and end do not matter.
             return Ok(Self { from: Timestamp::EPOCH, to: Timestamp::EPOCH, is_whole });
         }
         let mut first: Option<Timestamp> = None;
@@ -120,14 +120,14 @@ impl Range {
         Ok(Self { from, to, is_whole })
     }
 
-    /// Whether an entry is to be played.
+    /// Whether an entry lies in the range.
     fn holds(&self, entry: &Entry) -> bool {
         self.is_whole || (self.from..=self.to).contains(&entry.data_time)
     }
 }
 
-/// The calibrations that hold at a range's beginning, ordered by key: each camera's last one before
-/// it, or else its first.
+/// The calibrations valid at a range's beginning, ordered by key: each camera's last one before it,
+/// or else its first.
 fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
     let is_calibration = |key: &Key| matches!(key.channel, Channel::Calibration(_));
     let cameras =
@@ -140,7 +140,7 @@ fn calibrations(recording: &Path, range: Range) -> anyhow::Result<Vec<Entry>> {
         {
             found.insert(entry.key.clone(), entry);
         }
-        // A torn file does not say beforehand how many there are.
+        // The number of cameras is not known beforehand if the file is truncated.
         let is_all = cameras > 0 && found.len() == cameras && (range.is_whole || is_past);
         is_all.then_some(())
     })?;

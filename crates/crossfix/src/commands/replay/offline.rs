@@ -1,4 +1,4 @@
-//! Into the fusion, as fast as it goes.
+//! Replay into the fusion, as fast as possible.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -16,24 +16,24 @@ use crate::recalibration::{Recalibration, Reordered};
 use crate::recorded::{self, Lacks};
 use crate::shutdown::Shutdown;
 
-/// How often the fusion's health is written down, s of data time.
+/// Interval at which the fusion's health is recorded, s of data time.
 const HEALTH_PERIOD_S: f64 = 1.0;
 
-/// What fusing a recording needs and makes.
+/// State of an offline fusion, with its output.
 struct OfflineFusion {
     centre: Centre,
     writer: RecordingWriter<std::io::BufWriter<std::fs::File>>,
     frames: u64,
-    /// Whether the tracks that are written are the smoothed ones.
+    /// Whether smoothed tracks are written.
     is_smoothed: bool,
     site: Option<SiteName>,
     healthy_at: Option<Timestamp>,
-    /// Time spent in the fusion itself, and the longest for one frame.
+    /// Time spent in the fusion itself, in total and at most for one frame.
     busy: Duration,
     longest: Duration,
 }
 
-/// Fuses a recording's bearings and writes all that was recorded, with new tracks.
+/// Fuses a recording's bearings, and writes all that was recorded, with new tracks.
 pub fn fuse(
     args: &Args,
     output: &Path,
@@ -106,7 +106,7 @@ pub fn fuse(
 impl OfflineFusion {
     fn take(&mut self, entry: &Entry) -> anyhow::Result<()> {
         match &entry.key.channel {
-            // What an earlier fusion made of the bearings.
+            // Results of an earlier fusion of these bearings.
             Channel::Tracks
             | Channel::Smoothed
             | Channel::Events

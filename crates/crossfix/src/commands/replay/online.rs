@@ -1,4 +1,4 @@
-//! Onto the network, in the time of the recording or faster.
+//! Replay onto the network, in real time or faster.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,12 +20,12 @@ use crate::pace::Pace;
 use crate::recorded::{self, Lacks};
 use crate::shutdown::{LEAVE, LONG_LEAVE, Shutdown};
 
-/// Time for those who listen to connect before the first message, s.
+/// Time for listeners to connect before the first message, s.
 const RUN_UP_S: f64 = 2.0;
 /// Time between the last message of a pass and the first of the next, s: a few frames.
 const SEAM_S: f64 = 0.1;
 
-/// Whether the cameras would publish it.
+/// Whether such messages come from cameras.
 fn is_cameras(channel: &Channel) -> bool {
     !matches!(
         channel,
@@ -53,7 +53,7 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
         Stage { link, delivery, publishers: BTreeMap::new(), alive: Vec::new(), published: 0 };
     stage.appear(&network, args.tracks)?;
     let mut pass = Pass { goes_on: args.again, ..Pass::default() };
-    // The run-up holds at any speed.
+    // The run-up takes the same time at any speed.
     if Pace::beginning_in(RUN_UP_S, 1.0).wait(0.0, &shutdown) {
         let pace = Pace::beginning_in(0.0, args.speed);
         loop {
@@ -79,7 +79,7 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
         }
     }
     let Stage { link, publishers, alive, published, .. } = stage;
-    // What was put last is on its way.
+    // Gives the last messages time to leave.
     std::thread::sleep(Duration::from_millis(200));
     drop((publishers, alive));
     link.close(if shutdown.requested() { LEAVE } else { LONG_LEAVE })?;
@@ -87,13 +87,12 @@ pub fn publish(args: &Args, network: &Path, range: Range) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Where messages are published, each on the key that it was recorded from, in the site that
-/// listens now.
+/// Publishes each message on the key under which it was recorded, but in the site that listens now.
 struct Stage {
     link: Link,
     delivery: Delivery,
     publishers: BTreeMap<Key, LinkPublisher>,
-    /// That those whom it stands in for are there.
+    /// Tokens of presence for the components that the replay stands in for.
     alive: Vec<AliveToken>,
     published: u64,
 }
@@ -125,16 +124,17 @@ impl Stage {
     }
 }
 
-/// One time through the recording: the first gives the recorded bytes, later ones go on in time and
-/// number.
+/// One pass through the recording. A single pass publishes the recorded bytes; if it is repeated,
+/// times and frame numbers continue from one pass to the next.
 #[derive(Debug, Default)]
 struct Pass {
     by_s: f64,
-    /// Whether there will be another: then no source comes to its end.
+    /// Whether passes are repeated: then no source reports its end.
     goes_on: bool,
-    /// The newest data time of this pass, before it is moved.
+    /// The newest data time of this pass, before the shift.
     newest: Option<Timestamp>,
-    /// What is added to each camera's frame numbers, and the number after its highest so far.
+    /// For each camera the offset added to its frame numbers, and the number after its highest so
+    /// far.
     numbers: BTreeMap<CameraName, (u64, u64)>,
 }
 
@@ -158,7 +158,7 @@ impl Pass {
         }
     }
 
-    /// The message moved in time; `None` if it cannot be read.
+    /// The message shifted in time; `None` if it cannot be read.
     fn moved(&mut self, channel: &Channel, data: &[u8]) -> Option<Vec<u8>> {
         let by_s = self.by_s;
         let moved =
@@ -172,7 +172,7 @@ impl Pass {
                 moved(&mut message.capture_time_ns);
                 message.encode_unstamped()
             }
-            // Since when it holds stays as it is.
+            // The time from which a calibration is valid stays as it is.
             Channel::Calibration(_) => return None,
             Channel::Preview(_) => {
                 let mut message: Preview = decode(data).ok()?;
@@ -182,7 +182,7 @@ impl Pass {
             Channel::CameraHealth(_) | Channel::FusionHealth | Channel::RecorderHealth => {
                 let mut message: Health = decode(data).ok()?;
                 moved(&mut message.time_ns);
-                // It goes on.
+                // The source has not ended, as another pass follows.
                 message.ended = false;
                 message.encode_unstamped()
             }

@@ -11,16 +11,16 @@ use crate::output;
 use crate::pace::Pace;
 use crate::shutdown::Shutdown;
 
-/// Time between the server's coming up and the first frame, s: to be asked before it.
+/// Time between the server's start and the first frame, s: clients should connect before it.
 pub const RUN_UP_S: f64 = 1.0;
-/// A camera says what its clock shows for the first time after so long, and then again and again, s:
-/// as cameras do.
+/// When a camera first reports what its clock shows, s after its start, and the interval of further
+/// reports, s; both as real cameras do.
 const FIRST_REPORT_S: f64 = 2.5;
 const REPORT_EVERY_S: f64 = 5.0;
-/// What a stream counts a second.
+/// Ticks per second of a stream's time stamps, Hz.
 const TICKS_HZ: f64 = 90_000.0;
 
-/// Plays a scene that begins at a time, a stream a camera, to its end.
+/// Plays a scene from a time to its end, with one stream per camera.
 pub fn play(
     world: &World,
     address: SocketAddr,
@@ -49,7 +49,7 @@ pub fn play(
     })
 }
 
-/// Plays what one camera sees, at its own time of exposure.
+/// Streams what one camera sees, each frame at its time of exposure.
 fn film(
     camera: &SimulatedCamera,
     mount: &Mount,
@@ -61,7 +61,7 @@ fn film(
     let mut encoder = H264Encoder::new(description.rate_hz).map_err(|what| anyhow!(what))?;
     let mut next_report_s = FIRST_REPORT_S;
     for index in 0..camera.frames() {
-        // It is exposed up to half its exposure after its time.
+        // An exposure ends half its length after the frame's time.
         let exposed_s = camera.true_time(index) + description.exposure_s / 2.0;
         if !mount.is_watched() {
             if pace.wait(exposed_s, shutdown) {
@@ -69,8 +69,8 @@ fn film(
             }
             break;
         }
-        // It is drawn and encoded before it is exposed, so that what takes time here is not taken for what
-        // those take who watch.
+        // The frame is rendered and encoded before its time of exposure, so that the time this
+        // takes is not attributed to the receivers.
         let frame = camera.frame(index);
         let unit = encoder
             .encode(&frame.brightness, frame.width, frame.height)
@@ -78,7 +78,7 @@ fn film(
         if !pace.wait(exposed_s, shutdown) {
             break;
         }
-        // Any camera's count begins anywhere and turns over.
+        // A camera's tick count begins anywhere and wraps around at 2^32.
         let ticks = (frame.own_s * TICKS_HZ).round() as i64 as u32;
         mount.send(&unit, ticks);
         if exposed_s >= next_report_s {

@@ -60,8 +60,8 @@ fn table(dir: &Path, name: &str) -> anyhow::Result<csv::Writer<std::fs::File>> {
     csv::Writer::from_path(&path).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Writes `scenario.json`, `detections.csv`, `exposures.csv` and `truth.csv`; returns how many
-/// exposures there are. Scoring times are those of the last camera's exposures.
+/// Writes `scenario.json`, `detections.csv`, `exposures.csv` and `truth.csv`; returns the number of
+/// exposures. Scoring times are those of the last camera's exposures.
 pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
     std::fs::create_dir_all(dir).with_context(|| format!("cannot make {}", dir.display()))?;
     let (mut detections, mut exposures) =
@@ -70,7 +70,7 @@ pub fn write(site: &SimulatedSite, dir: &Path) -> anyhow::Result<u64> {
     let mut epochs = Vec::new();
     for exposure in site.bearings() {
         let (cam, scan) = (exposure.camera as u32, exposure.frame.sequence);
-        // The time as the frame has it, to the nanosecond.
+        // The frame's own time, rounded to a nanosecond.
         let t = exposure.frame.capture_time_ns as f64 / 1e9;
         for (det, (track, source)) in
             exposure.frame.tracks.iter().zip(&exposure.sources).enumerate()

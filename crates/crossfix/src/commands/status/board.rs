@@ -1,4 +1,4 @@
-//! What the parts of a site say of themselves, as one table.
+//! Reports of a site's components as one table.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -11,83 +11,85 @@ use serde::Serialize;
 
 use crate::output;
 
-/// Each part says how it does every second: who has not for so long is silent.
+/// A component that has not sent a health message for this long is silent: they are due every
+/// second.
 const SILENT: Duration = Duration::from_millis(2500);
-/// A track of which nothing was said for so long is none any more.
+/// A track without news for this long has ended.
 const TRACK_LIVES: Duration = Duration::from_secs(2);
-/// Parts of no camera of the network's file are not shown, and tracks beyond this not counted: what
-/// comes from outside fills no memory.
+/// Most tracks that are counted. Likewise, components that are no cameras of the network's file are
+/// not shown, so that data from outside cannot fill the memory.
 const MOST_TRACKS: usize = 10_000;
 
-/// Problems of one part that are shown, and letters of each.
+/// Most problems shown of one component, and characters of each.
 const MOST_PROBLEMS: usize = 10;
 const MOST_LETTERS: usize = 200;
 
-/// What was said elsewhere, as one line that does nothing to a terminal.
+/// Text from elsewhere as one line without control characters, which could affect the terminal.
 fn printable(text: &str) -> String {
     let shown = text.chars().map(|letter| if letter.is_control() { ' ' } else { letter });
     shown.take(MOST_LETTERS).collect()
 }
 
-/// What a part said last, and when it was heard.
+/// A component's last health message, and when it was received.
 #[derive(Clone, Debug)]
 struct Heard {
     health: Health,
     at: Instant,
 }
 
-/// How a part of a site does.
+/// State of one component of a site.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Part {
     /// The camera's name, `fusion` (`fusion-west` of an area) or `recorder`.
     pub name: String,
-    /// In a word or two.
+    /// The component's state in a word or two.
     pub state: String,
-    /// Frames or messages a second.
+    /// Frames or messages per second.
     pub rate_hz: f64,
-    /// From an image's last byte to its published bearings, 99 of 100, ms; of a live camera.
+    /// 99 % quantile of the time from an image's last byte to its published bearings, ms; of a live
+    /// camera.
     pub latency_ms: Option<f64>,
-    /// By how much its clock is ahead of the site's, as its tracks tell, ms, ...
+    /// How far its clock is ahead of the site's, as estimated from tracks, ms, ...
     pub clock_ms: Option<f64>,
     /// ... and the standard deviation of that, ms.
     pub clock_sd_ms: Option<f64>,
-    /// Tracks: of a camera in its image, of the fusion centre in the air.
+    /// Number of tracks: of a camera in its image, of the fusion centre in space.
     pub tracks: u32,
     /// Processor time, cores.
     pub cores: Option<f64>,
     /// Memory, MB.
     pub memory_mb: Option<f64>,
-    /// Of the hottest part of its host, degrees Celsius.
+    /// Temperature of the hottest part of its host, degrees Celsius.
     pub temperature_c: Option<f64>,
-    /// What a person should look at.
+    /// Problems that a person should look at.
     pub problems: Vec<String>,
 }
 
-/// How a site does.
+/// State of a site.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Status {
     pub site: String,
     /// The cameras of the network's file, the fusion centre, and the recorder if it is heard.
     pub parts: Vec<Part>,
-    /// Tracks that are confirmed, or that no camera sees at present.
+    /// Number of tracks that are confirmed or coasting.
     pub confirmed: usize,
-    /// Tracks that one camera alone follows.
+    /// Number of tracks that only one camera follows.
     pub one_camera: usize,
 }
 
-/// All that has been heard.
+/// All that has been received of a site.
 #[derive(Debug)]
 pub struct Board {
     site: String,
     cameras: Vec<CameraName>,
-    /// The names of the fusion centres: `fusion`, or `fusion-west` and so on.
+    /// Names of the fusion centres: `fusion`, or `fusion-west` and so on.
     centres: Vec<String>,
     parts: BTreeMap<String, Heard>,
     tracks: BTreeMap<u64, (TrackState, Instant)>,
 }
 
 impl Board {
-    /// Of a site.
+    /// An empty board for a network's site.
     pub fn new(network: &NetworkConfig) -> Self {
         let centres = network.centres().map(|(area, _)| Identity::Fusion(area).to_string());
         Self {
@@ -99,7 +101,7 @@ impl Board {
         }
     }
 
-    /// Takes a message in; what cannot be read says nothing.
+    /// Takes a message in; one that cannot be read is ignored.
     pub fn hear(&mut self, key: &Key, data: &[u8], at: Instant) {
         let name = match &key.channel {
             Channel::CameraHealth(camera) if self.cameras.contains(camera) => camera.to_string(),
@@ -129,15 +131,15 @@ impl Board {
         }
     }
 
-    /// How the site does.
+    /// The state of the site now.
     pub fn status(&self, now: Instant) -> Status {
-        // What a fusion centre that has died thought is not what is.
+        // Clock estimates of a fusion centre that has died are out of date.
         let is_heard = |heard: &&Heard| now.saturating_duration_since(heard.at) <= SILENT;
         let heard = self.centres.iter().filter_map(|centre| self.parts.get(centre));
         let clocks: Vec<&CameraHealth> =
             heard.filter(is_heard).flat_map(|heard| &heard.health.cameras).collect();
         let cameras = self.cameras.iter().map(|camera| {
-            // Of several that hear it, the one that believes it least.
+            // Of several centres that listen to the camera, the one that trusts it least.
             let of_camera = clocks.iter().filter(|clock| clock.camera == camera.as_str());
             let clock = of_camera.max_by_key(|clock| clock.standing);
             self.part(camera.as_str(), clock.copied(), now)
@@ -162,7 +164,7 @@ impl Board {
     fn part(&self, name: &str, clock: Option<&CameraHealth>, now: Instant) -> Part {
         let nobody = Health::default();
         let heard = self.parts.get(name);
-        // Of one that nobody hears, what its clock showed once says nothing.
+        // For a camera that is not heard, earlier clock estimates say nothing.
         let clock = clock.filter(|_| heard.is_some());
         let health = heard.map_or(&nobody, |heard| &heard.health);
         let load = health.load.as_ref();
@@ -188,7 +190,7 @@ impl Board {
     }
 }
 
-/// How a part does, in a word or two.
+/// A component's state in a word or two.
 fn state(heard: Option<&Heard>, clock: Option<&CameraHealth>, now: Instant) -> String {
     let Some(Heard { health, at }) = heard else { return "not heard".to_owned() };
     let silent = now.saturating_duration_since(*at);
@@ -204,7 +206,7 @@ fn state(heard: Option<&Heard>, clock: Option<&CameraHealth>, now: Instant) -> S
 }
 
 impl Status {
-    /// As a screen of text.
+    /// The site's state as a screen of text.
     pub fn text(&self) -> String {
         let head = [
             "part",
@@ -290,7 +292,7 @@ mod tests {
             ..Default::default()
         };
         board.hear(&of("north"), &north.encode(), begun);
-        // Of no camera of the site.
+        // A message from no camera of the site.
         board.hear(&of("stranger"), &north.encode(), begun);
         let clock = CameraHealth {
             camera: "north".into(),

@@ -18,12 +18,12 @@ use crate::network;
 use crate::output;
 use crate::shutdown::{LEAVE, Shutdown};
 
-/// How often a screen is drawn anew.
+/// Interval at which the screen is redrawn.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Each part says how it does every second, and is connected in another.
+/// Time after which every component has been heard: a second to connect, and one between messages.
 const HEARD_AFTER: Duration = Duration::from_secs(3);
 const POLL: Duration = Duration::from_millis(50);
-/// From the upper left corner on, the screen is empty.
+/// Escape sequence that moves to the upper left corner and clears the screen.
 const CLEARED: &str = "\x1b[H\x1b[2J";
 
 /// How a site does, on one screen: agents, rates, latencies, clocks, tracks, and what is wrong.
@@ -81,14 +81,15 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-/// The key expressions of what all parts of a site say of themselves.
+/// The key expressions of all components' health.
 fn health_of_all(site: &SiteName) -> [String; 2] {
-    // That of a single fusion centre and the recorder are beside the cameras'.
+    // The keys of a single fusion centre and of the recorder match the same expression as the
+    // cameras'.
     [Key::of_all_cameras, Key::of_all_areas].map(|of_all| of_all(site, "health"))
 }
 
-/// Hears a site until it is asked to stop, or has heard enough; `draw` says each second whether it
-/// wants more than that.
+/// Receives a site's messages until asked to stop, or until enough has been heard; `draw` is called
+/// each second and returns whether to go on for longer than that.
 fn watch(
     link: &Link,
     network: &NetworkConfig,
@@ -115,7 +116,7 @@ fn watch(
     Ok(board)
 }
 
-/// Serves a page until it is asked to stop.
+/// Serves the web page until asked to stop.
 fn serve(
     link: &Link,
     network: &NetworkConfig,

@@ -1,4 +1,4 @@
-//! The site on one page: what its parts say of themselves, and a plan with tracks and events.
+//! The web page of a site: its components' reports, and a plan with tracks and events.
 
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
@@ -18,34 +18,34 @@ use super::board::Status;
 use super::plan::Plan;
 use crate::http;
 
-/// The page, whole: no other file, and nothing from elsewhere.
+/// The complete page: it loads no other file, and nothing from other hosts.
 const PAGE: &str = include_str!("page.html");
-/// It runs its own script and asks its own server, and nothing else.
+/// Security policy: the page runs its own script and contacts its own server, and nothing else.
 const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
                       connect-src 'self'; img-src data:";
-/// Who may be told at the same time; the others are told to come again. What else is asked needs places
-/// of its own ([`http::ASKING`]).
+/// Most clients that receive events at the same time; further ones are told to try again later.
+/// Other requests need connections of their own ([`http::ASKING`]).
 const TOLD: usize = 12;
-/// Who is told comes again after so long: whoever takes nothing holds no place for longer.
+/// A client must connect again after this time, so that one that reads nothing frees its place.
 const TOLD_FOR: Duration = Duration::from_secs(60);
-/// How often the page is told how the site does.
+/// Interval of the events sent to the page.
 pub const PERIOD: Duration = Duration::from_millis(200);
 
-/// What the page is told.
+/// Data of one event for the page.
 #[derive(Debug, Serialize)]
 pub struct Shown {
     pub status: Status,
     pub plan: Plan,
 }
 
-/// The page; whoever looks at it sees what it was shown last.
+/// The page; each client sees the state that was last shown.
 #[derive(Debug)]
 pub struct Page {
     shown: watch::Sender<Bytes>,
 }
 
 impl Page {
-    /// Serves it.
+    /// Serves the page.
     ///
     /// # Errors
     /// If the address cannot be listened on.
@@ -62,7 +62,7 @@ impl Page {
         Ok(Self { shown: sender })
     }
 
-    /// Shows how the site does now. Who looks on slowly misses what lies between.
+    /// Sends the site's current state to all clients. Slow clients miss the states in between.
     pub fn show(&self, shown: &Shown) -> anyhow::Result<()> {
         let event = format!("data: {}\n\n", serde_json::to_string(shown)?);
         self.shown.send_replace(event.into());
@@ -72,8 +72,8 @@ impl Page {
 
 type Answer = Response<BoxBody<Bytes, Infallible>>;
 
-/// Whether a page that listens on loopback is asked for as such: a name of somebody else's that leads here
-/// is that of a page elsewhere, which must not read this one.
+/// Whether a request to a page on loopback names this host. Another name that resolves to here may
+/// belong to a foreign web page, which must not read this one (DNS rebinding).
 fn names_this_host<B>(request: &Request<B>) -> bool {
     let host = request.headers().get(HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
     let name = host.rsplit_once(':').map_or(host, |(name, port)| {
@@ -114,7 +114,7 @@ fn answer<B>(
     }
 }
 
-/// What is shown, as server-sent events, from the newest on, for as long as the place is held.
+/// The shown states as server-sent events, beginning with the newest, as long as the place is held.
 fn events(
     mut shown: watch::Receiver<Bytes>,
     place: OwnedSemaphorePermit,

@@ -1,4 +1,4 @@
-//! A site seen from above: cameras, tracks, and what has happened.
+//! A site as seen from above: cameras, tracks, and events.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -11,11 +11,11 @@ use crossfix_message::{
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// A track of which nothing was said for so long is none any more.
+/// A track without news for this long has ended.
 const TRACK_LIVES: Duration = Duration::from_secs(2);
-/// What is drawn at most: more is no plan.
+/// Most tracks that are drawn: with more the plan is unreadable.
 const MOST_TRACKS: usize = 1000;
-/// Events that are shown.
+/// Number of events that are shown.
 const MOST_EVENTS: usize = 100;
 
 /// A camera on the plan.
@@ -24,46 +24,47 @@ pub struct PlannedCamera {
     pub name: String,
     /// East and north, m.
     pub at: [f64; 2],
-    /// From where to where it looks, degrees from north, clockwise; absent of one that turns.
+    /// Azimuths of the view's two edges, degrees from north, clockwise; absent for a camera on a
+    /// mount.
     pub view_deg: Option<[f64; 2]>,
 }
 
 /// A track on the plan.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PlannedTrack {
-    /// Its identity, as a text: JavaScript's numbers are too short.
+    /// The track's identity as a text, as JavaScript's numbers have too few digits.
     pub id: String,
     pub number: String,
     /// `confirmed`, `coasting` or `one camera`.
     pub state: &'static str,
     /// East, north and up, m.
     pub at: [f64; 3],
-    /// The same, m/s.
+    /// Velocity east, north and up, m/s.
     pub velocity: [f64; 3],
-    /// Covariance of east and north: east, both, north, m^2.
+    /// Horizontal covariance: east-east, east-north, north-north, m^2.
     pub covariance: [f64; 3],
 }
 
-/// What happened.
+/// An event of a track or a camera.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Event {
-    /// Seconds since the Unix epoch, of the data.
+    /// Data time, seconds since the Unix epoch.
     pub time_s: f64,
     pub what: String,
 }
 
-/// A site from above, as it is now.
+/// The plan of a site as it is now.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Plan {
     /// The time of the newest tracks, seconds since the Unix epoch.
     pub time_s: Option<f64>,
     pub cameras: Vec<PlannedCamera>,
     pub tracks: Vec<PlannedTrack>,
-    /// The newest first.
+    /// The newest event first.
     pub events: Vec<Event>,
 }
 
-/// All that has been heard.
+/// All that has been received of a site.
 #[derive(Debug, Default)]
 pub struct PlanBoard {
     known: Vec<CameraName>,
@@ -74,12 +75,12 @@ pub struct PlanBoard {
 }
 
 impl PlanBoard {
-    /// Of a site with these cameras.
+    /// A board for a site with these cameras.
     pub fn new(known: Vec<CameraName>) -> Self {
         Self { known, ..Self::default() }
     }
 
-    /// Takes a message in; what cannot be read says nothing.
+    /// Takes a message in; one that cannot be read is ignored.
     pub fn hear(&mut self, channel: &Channel, data: &[u8], at: Instant) {
         match channel {
             Channel::Calibration(name) if self.known.contains(name) => {
@@ -117,7 +118,7 @@ impl PlanBoard {
         self.events.truncate(MOST_EVENTS);
     }
 
-    /// The site as it is now.
+    /// The plan as it is now.
     pub fn plan(&self, now: Instant) -> Plan {
         let lives = |said: &Instant| now.saturating_duration_since(*said) < TRACK_LIVES;
         let tracks = self.tracks.values().filter(|(_, said)| lives(said));
@@ -136,7 +137,7 @@ fn planned(name: &CameraName, calibration: &Calibration) -> PlannedCamera {
     PlannedCamera { name: name.to_string(), at: [place.x, place.y], view_deg }
 }
 
-/// From where to where a camera looks: through the middles of its image's left and right edges.
+/// Azimuths, degrees, of the directions through the middles of the image's left and right edges.
 fn view(camera: &Camera) -> Option<[f64; 2]> {
     let size = camera.model().intrinsics().size;
     let middle = f64::from(size.height) / 2.0;

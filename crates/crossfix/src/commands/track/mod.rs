@@ -66,7 +66,7 @@ pub struct Args {
     rate_hz: f64,
 }
 
-/// A box as an operator writes it.
+/// A box as written on the command line.
 #[derive(Clone, Copy, Debug)]
 pub struct BoxArg(PixelBox);
 
@@ -164,7 +164,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The tracker that the arguments ask for, with what it is to take up in its first frame.
+/// The tracker that the arguments ask for, with the targets to follow from the first frame on.
 fn tracker(args: &Args) -> anyhow::Result<ImageTracker> {
     let mut config: TrackerConfig = match &args.config {
         Some(path) => config::load(path, &args.sets, config::Kind::Tracker)?,
@@ -180,7 +180,7 @@ fn tracker(args: &Args) -> anyhow::Result<ImageTracker> {
     Ok(tracker)
 }
 
-/// The next frame with its number, without the frame where it cannot be decoded; `None` at the end.
+/// The next frame and its number, without the frame if it cannot be decoded; `None` at the end.
 fn next(
     source: &mut dyn FrameSource,
     repeats: &mut Repeats,

@@ -1,4 +1,4 @@
-//! In the place of the picture, in a build that leaves it out.
+//! Stands in for the picture in a build without the viewer.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crossfix_vision::ImageTrack;
 
 use crate::parts;
 
-/// There is none.
+/// A picture cannot exist in this build.
 pub(super) enum Picture {}
 
 impl Picture {

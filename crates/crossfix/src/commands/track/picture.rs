@@ -1,4 +1,4 @@
-//! The picture of the tracker's work, for Rerun.
+//! A picture of the tracker's work, for Rerun.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,7 +11,7 @@ use crossfix_vision::{ImageTrack, PixelBox, TrackPhase};
 
 use crate::eye;
 
-/// The picture of the tracker's work.
+/// A picture of the tracker's work, with labels to compare it with.
 pub(super) struct Picture {
     picture: TrackingPicture,
     labels: BTreeMap<u64, ImageBox>,
@@ -23,7 +23,7 @@ impl Picture {
         Ok(Self { picture: TrackingPicture::new(crossfix_view::save(path)?)?, labels })
     }
 
-    /// Waits until everything is drawn.
+    /// Waits until everything is written.
     pub(super) fn finish(self) -> anyhow::Result<()> {
         Ok(self.picture.finish()?)
     }
@@ -49,7 +49,7 @@ fn followed(track: &ImageTrack) -> FollowedTarget {
     FollowedTarget {
         number: track.id.0,
         place: ImageBox { x, y, width, height },
-        // Rerun's pixels have their upper left corner at whole numbers.
+        // In Rerun whole numbers are the upper left corners of pixels, not their centres.
         measured: track.measured.map(|m| [m.place.x + 0.5, m.place.y + 0.5]),
         sight: match track.phase {
             TrackPhase::Tentative | TrackPhase::Tracking => Sight::Seen,
@@ -62,7 +62,7 @@ fn followed(track: &ImageTrack) -> FollowedTarget {
     }
 }
 
-/// The boxes of a table of labels; a row without one is a frame without a target.
+/// The boxes of a table of labels; a row without a box is a frame without a target.
 fn read_labels(path: &Path) -> anyhow::Result<BTreeMap<u64, ImageBox>> {
     let context = || format!("cannot read the labels in {}", path.display());
     let mut reader = csv::Reader::from_path(path).with_context(context)?;

@@ -1,4 +1,4 @@
-//! The table of what was followed: a row for each target and frame.
+//! The table of tracks: a row for each target and frame.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -28,7 +28,7 @@ impl Table {
         Ok(Self { writer })
     }
 
-    /// Writes the rows of a frame; one without a box where there is no target.
+    /// Writes the rows of a frame; if there is no target, one row without a box.
     pub(super) fn write(
         &mut self,
         frame: u64,

@@ -1,6 +1,7 @@
-//! Tables as figures. Where series go over several places they are curves; where each has one, as
-//! those of camera layouts, they are rows with a point each. Ours are points with a bar of a
-//! standard error, the paper's figures crosses, a reference implementation's circles.
+//! Tables as figures. Series with several values of x are drawn as curves; where each series has
+//! one value, as with camera layouts, it is a row with a point. Our results are points with bars of
+//! one standard error, the paper's figures crosses, and those of a reference implementation
+//! circles.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -14,13 +15,13 @@ use plotters::prelude::*;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Failure = Box<dyn std::error::Error>;
 
-/// Width of a figure, px, and height of one of curves at least.
+/// Width of a figure, px, and least height of one with curves.
 const SIZE: (u32, u32) = (1200, 600);
-/// Height of a row or of a line of the legend, px.
+/// Height of a row, or of a line of the legend, px.
 const ROW: u32 = 18;
-/// Room for title, axis and margins, px.
+/// Space for title, axis and margins, px.
 const FRAME: u32 = 110;
-/// About the width of a letter of the small font, px.
+/// Approximate width of a letter in the small font, px.
 const LETTER: usize = 7;
 /// Positive figures that differ by more than this factor are drawn on a logarithmic axis.
 const WIDE: f64 = 50.0;
@@ -37,7 +38,7 @@ pub fn draw(table: &Table, path: &Path) -> anyhow::Result<()> {
     drawn.map_err(|error| anyhow!("{error}"))
 }
 
-/// An axis from the least to the greatest of some figures, linear or logarithmic.
+/// An axis that spans some figures, linear or logarithmic.
 struct Axis {
     is_logarithmic: bool,
     range: Range<f64>,
@@ -57,7 +58,7 @@ impl Axis {
         Self { is_logarithmic, range: (low - margin)..(high + margin) }
     }
 
-    /// Where a figure lies on the axis, its ends at the most.
+    /// Position of a figure on the axis, clamped to its ends.
     fn place(&self, value: f64) -> f64 {
         let place = if self.is_logarithmic { value.max(f64::MIN_POSITIVE).log10() } else { value };
         place.clamp(self.range.start, self.range.end)
@@ -75,12 +76,12 @@ impl Axis {
     }
 }
 
-/// All figures of a table.
+/// All figures of a table: ours, the paper's and the reference's.
 fn figures(table: &Table) -> impl Iterator<Item = f64> {
     table.rows.iter().flat_map(|row| [Some(row.ours), row.paper, row.reference]).flatten()
 }
 
-/// A sheet with the table's title, and below it what the marks mean.
+/// A sheet with the table's title and, below it, a key to the marks.
 fn sheet<'a>(
     table: &Table,
     path: &'a Path,
@@ -105,7 +106,7 @@ fn sheet<'a>(
     Ok(area.margin(18, 8, 8, 12))
 }
 
-/// Whose figure it is.
+/// Origin of a figure.
 #[derive(Clone, Copy)]
 enum Mark {
     Ours,
@@ -132,13 +133,13 @@ impl Mark {
     }
 }
 
-/// A row for each series, with its name before it.
+/// Draws a row for each series, with its name in front.
 fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
     let count = table.rows.len();
     let area = sheet(table, path, FRAME + ROW * count as u32, Mark::colour)?;
     let bars = table.rows.iter().flat_map(|row| {
         let low = row.ours - row.standard_error;
-        // A bar that reaches 0 is no reason to give up the logarithm.
+        // A bar that reaches 0 must not prevent a logarithmic axis.
         [if row.ours > 0.0 { low.max(row.ours / 4.0) } else { low }, row.ours + row.standard_error]
     });
     let axis = Axis::of(figures(table).chain(bars), true);
@@ -179,14 +180,14 @@ fn rows(table: &Table, path: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// A curve for each series, with a legend beside.
+/// Draws a curve for each series, with a legend beside.
 fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
     let mut series: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     for row in &table.rows {
         series.entry(&row.series).or_default().push(row);
     }
     let height = SIZE.1.max(FRAME + ROW * series.len() as u32);
-    // The colours are the series'.
+    // Colours distinguish the series, so the key to the marks is black.
     let area = sheet(table, path, height, |_| BLACK)?;
     let longest = series.keys().map(|name| name.chars().count()).max().unwrap_or(0);
     let legend_width = (LETTER * longest + 50) as u32;
@@ -208,7 +209,7 @@ fn curves(table: &Table, path: &Path) -> Result<(), Failure> {
         .draw()?;
     let count = series.len();
     for (index, (name, rows)) in series.into_iter().enumerate() {
-        // Hues all round, every other one darker.
+        // Hues around the colour circle, every other one darker.
         let light = if index % 2 == 0 { 0.45 } else { 0.3 };
         let colour = HSLColor(index as f64 / count as f64, 0.75, light);
         let place = |value: f64, row: &Row| (row.x, axis.place(value));

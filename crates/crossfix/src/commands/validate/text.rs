@@ -16,7 +16,7 @@ fn limit(limit: Option<Limit>) -> String {
     }
 }
 
-/// Four digits; powers of ten where there are too many.
+/// A figure with four digits, or as a power of ten where there are too many.
 fn short(value: f64) -> String {
     if value.abs() >= 1e7 {
         return format!("{value:.0e}");
@@ -31,7 +31,7 @@ fn short(value: f64) -> String {
     }
 }
 
-/// One table.
+/// One table as text.
 pub fn table(table: &Table) -> String {
     let mut text = format!("\n{}\n", table.title);
     let width = table.rows.iter().map(|row| row.series.len()).max().unwrap_or(0).max(6);
@@ -71,7 +71,7 @@ pub fn table(table: &Table) -> String {
     text
 }
 
-/// How many figures are what they must be.
+/// A sentence on how many figures are within their limits.
 pub fn summary(tables: &[Table]) -> String {
     let rows = || tables.iter().flat_map(|table| &table.rows);
     let asked = rows().filter(|row| row.verdict() != Verdict::Information).count();

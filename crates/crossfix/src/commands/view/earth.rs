@@ -1,4 +1,4 @@
-//! Where on Earth the site is that is shown, and a picture of its ground.
+//! The site's position on Earth in the viewer, and a picture of its ground.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use crossfix_view::{GroundPicture, Picture, RecordingStream};
 
 use crate::commands::numbers;
 
-/// Longest side of a picture of the ground, pixels: what every graphics card takes as one texture.
+/// Longest side of a picture of the ground, pixels: every graphics card takes this as one texture.
 const MOST_SIDE: usize = 8192;
 
 #[derive(Debug, Default, clap::Args)]
@@ -27,11 +27,11 @@ pub struct EarthArgs {
     map_edges: Option<[Geodetic; 2]>,
 }
 
-/// The site's place on Earth, if it is known, and a picture of its ground.
+/// The site's position on Earth, if it is known, and a picture of its ground.
 pub struct OnEarth(Option<(Geodetic, Option<GroundPicture>)>);
 
 impl EarthArgs {
-    /// Reads what is asked for; `known` is the anchor that the network's file says.
+    /// Reads the position and the picture asked for; `known` is the anchor in the network's file.
     pub fn read(&self, known: Option<Geodetic>) -> anyhow::Result<OnEarth> {
         let ground = match (&self.map, self.map_edges) {
             (Some(path), Some(edges)) => {
@@ -50,7 +50,7 @@ impl EarthArgs {
 }
 
 impl OnEarth {
-    /// An empty picture of the site there.
+    /// A new picture, placed at that position on Earth.
     pub fn picture(self, stream: RecordingStream) -> anyhow::Result<Picture> {
         let picture = Picture::new(stream)?;
         Ok(match self.0 {

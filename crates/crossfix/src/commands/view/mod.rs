@@ -102,11 +102,11 @@ fn draw_recording(mut picture: Picture, recording: &Path) -> anyhow::Result<()> 
     picture.finish().context("the picture is not complete")
 }
 
-/// How often is looked who is there, and whether the viewer still is.
+/// How often it is checked which components are present, and whether the viewer still is.
 const LOOK_PERIOD: Duration = Duration::from_secs(1);
-/// A viewer that takes this long for one message does not keep up.
+/// A viewer that takes longer than this for one message cannot keep up.
 const STALL: Duration = Duration::from_secs(2);
-/// How long a viewer has for what was drawn last.
+/// How long a viewer gets to receive what was drawn last.
 const LAST_LOOK: Duration = Duration::from_secs(1);
 
 fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
@@ -116,7 +116,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
     let Some(link) = network::open(&network, &Role::Observer, &shutdown)? else {
         return Ok(());
     };
-    // A live picture is like a live recording: what was drawn stays, whatever becomes of the rest.
+    // A live picture is kept like a live recording: what was drawn stays, whatever happens later.
     let rrd =
         args.save.as_deref().and_then(|asked| output::names(asked).find(|path| !path.exists()));
     let stream = match (&rrd, &args.save) {
@@ -157,7 +157,7 @@ fn draw_live(args: &Args, network: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What a viewer is shown of what comes, and what it misses.
+/// Selects what the viewer is shown, and counts what it misses.
 struct Watch {
     network: NetworkConfig,
     reception: Reception,

@@ -22,7 +22,8 @@ fn config(stub: &Stub, password: &str) -> (OnvifConfig, tempfile::NamedTempFile)
     (config, file)
 }
 
-/// Waits for what it says; what it said last if that does not come.
+/// Waits until `holds` is true of where the mount points; after `seconds`, returns what it reported
+/// last.
 fn until(mount: &mut OnvifMount, seconds: f64, mut holds: impl FnMut(Pointed) -> bool) -> Pointed {
     let begun = Instant::now();
     loop {
@@ -42,7 +43,7 @@ fn is_unknown(pointed: Pointed) -> bool {
     pointed == Pointed::Unknown
 }
 
-/// Where it has settled.
+/// The angles at which it has settled.
 fn settled(pointed: Pointed) -> ScanAngles {
     match pointed {
         Pointed::Settled(angles) => angles,
@@ -57,11 +58,12 @@ fn a_position_is_an_angle_and_back() {
     assert!((angles.azimuth + 1.5).abs() < 1e-12 && angles.elevation.abs() < 1e-12);
     let [pan, tilt] = scale.position(angles);
     assert!((pan - 0.5).abs() < 1e-6 && (tilt + 0.5).abs() < 1e-6);
-    // As far as it goes.
+    // Clamped to the ends of its range.
     assert_eq!(scale.position(ScanAngles { azimuth: 9.0, elevation: 9.0 }), [-1.0, 1.0]);
 }
 
-/// A tenth of a second each: where it is, whether it says that it moves, whether it is settled.
+/// One report per tenth of a second: where it is, whether it says that it moves, whether it is
+/// settled.
 #[test]
 fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     let begun = Instant::now();
@@ -73,8 +75,7 @@ fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     };
     let settled: Vec<bool> = (0..8).map(|k| hear(&mut pointed, k, 10.0, false)).collect();
     assert_eq!(settled, [false, false, false, false, false, false, true, true]);
-    // Told to turn, it is not settled, though it stands for a while and does not say that it
-    // moves.
+    // Once told to turn it is not settled, even while it still stands and does not report moving.
     pointed.order(degrees(20.0, 0.0));
     assert!(!hear(&mut pointed, 8, 10.0, false));
     pointed.told(degrees(20.0, 0.0), at(8));
@@ -83,22 +84,22 @@ fn it_has_settled_when_it_has_stood_for_as_long_as_an_image_takes() {
     }
     let first = (14..30).find(|k| hear(&mut pointed, *k, 20.0, false));
     assert_eq!(first, Some(19), "half a second after it was there");
-    // It drifts by less than the deviations at a time, and is seen to.
+    // It drifts by less than the deviations per report, and the drift is noticed.
     let drifts = (30..45).map(|k| hear(&mut pointed, k, 20.0 + 0.1 * f64::from(k - 29), false));
     assert!(drifts.skip(2).all(|settled| !settled));
-    // It never begins: told that it may go no farther, it stands where it is.
+    // It never starts to turn: told to go farther than it can, it stands where it is.
     let stands: Vec<bool> = (45..60).map(|k| hear(&mut pointed, k, 21.5, false)).collect();
     assert!(stands[8]);
     pointed.order(degrees(90.0, 0.0));
     pointed.told(degrees(90.0, 0.0), at(60));
     let first = (60..90).find(|k| hear(&mut pointed, *k, 21.5, false));
     assert_eq!(first, Some(71));
-    // It refuses to turn: it sees on where it is, and is not to be asked again at once.
+    // It refuses to turn: it keeps observing from where it is, and is not asked again at once.
     pointed.order(degrees(95.0, 0.0));
     pointed.refuse(at(73));
     assert!(hear(&mut pointed, 74, 21.5, false) && !pointed.obeys(at(75)));
     assert!(pointed.obeys(at(124)));
-    // What was said long ago says nothing.
+    // An old report tells nothing.
     assert!(is_unknown(pointed.at(at(100))));
 }
 
@@ -109,7 +110,7 @@ fn it_turns_where_it_is_told_and_says_where_it_is_when_it_stands() {
     let mut mount = OnvifMount::start(&config, ANGLE_SD_RAD).unwrap();
     let rest = settled(until(&mut mount, 6.0, is_settled));
     assert!((rest.azimuth - 0.0).abs() < 1e-3 && (rest.elevation - 0.785).abs() < 1e-3);
-    // The zoom of its lens is set once.
+    // The lens's zoom is set once.
     assert_eq!(stub.state.lock().unwrap().zoom, 0.5);
 
     let aim = degrees(-72.0, 18.0);
@@ -117,7 +118,7 @@ fn it_turns_where_it_is_told_and_says_where_it_is_when_it_stands() {
     assert!(!is_settled(mount.pointed()));
     let told = Instant::now();
     let mut last_moved = told;
-    // What is said to be settled is where it is, and was for as long as an image takes.
+    // When it is reported as settled it is there, and has been for as long as an image takes.
     let there = settled(until(&mut mount, 6.0, |pointed| {
         if stub.state.lock().unwrap().position().1 {
             last_moved = Instant::now();
@@ -129,7 +130,7 @@ fn it_turns_where_it_is_told_and_says_where_it_is_when_it_stands() {
     assert!(last_moved > told && last_moved.elapsed() > IMAGE_COMES_WITHIN);
     assert!(last_moved.elapsed() < 4 * IMAGE_COMES_WITHIN);
 
-    // Somebody zooms: another lens, until it is set back.
+    // Somebody zooms: the lens is a different one until the zoom is set back.
     stub.state.lock().unwrap().zoom = 0.9;
     assert!(is_unknown(until(&mut mount, 3.0, is_unknown)));
     settled(until(&mut mount, 9.0, is_settled));
@@ -149,7 +150,7 @@ fn a_mount_that_is_gone_points_nowhere_and_is_asked_again() {
     let stub = Stub::start(port);
     let there = settled(until(&mut mount, 15.0, is_settled));
     assert!((there.azimuth - 30f64.to_radians()).abs() < 1e-3, "told late: {there:?}");
-    // It goes on, and says nothing more of where it is.
+    // The mount keeps running, but no longer reports where it is.
     stub.state.lock().unwrap().says = false;
     assert!(is_unknown(until(&mut mount, 6.0, is_unknown)));
 }
@@ -192,7 +193,7 @@ fn a_mount_that_refuses_to_turn_sees_on_where_it_is() {
     assert_eq!(stub.state.lock().unwrap().moves, 1, "asked once");
 }
 
-/// Neither asked for more than it should say, nor sent elsewhere with what proves who asks.
+/// The camera cannot make us read more than it should send, nor redirect the login elsewhere.
 #[test]
 fn a_camera_that_answers_too_much_too_deeply_or_with_another_address_is_no_camera() {
     let stub = Stub::start(0);

@@ -1,5 +1,5 @@
-//! Where the paper's system breaks: one period of three cameras whose times or places cannot carry
-//! position and velocity.
+//! Where the paper's system of equations breaks down: one period of three cameras whose times or
+//! places do not determine position and velocity.
 
 use crossfix_fusion::papers::{pair, triple};
 use crossfix_fusion::spatial::{Observability, Quantity, TimedLine, WeakAxis, map};
@@ -12,16 +12,16 @@ use super::super::table::{Limit, Row, Table, mean, root_mean_square, share};
 use super::site::{LAYOUTS, Layout, PERIODS, Target, line, tangent_noise};
 use super::{REFERENCE_RUNS, VELOCITY_SD, reference_tolerance};
 
-/// Runs of a layout for each one of the options.
+/// Number of runs of a layout for each run of the options.
 const CHEAP: usize = 10;
 /// Standard deviation of the prior on the velocity in the reference's table, m/s.
 const PRIOR_SD: f64 = 30.0;
-/// Above this condition number the reference's solver takes the pseudo-inverse.
+/// Above this condition number the reference's solver uses the pseudo-inverse.
 const WORST_CONDITION: f64 = 1e9;
-/// What counts as infinite, as a condition number.
+/// Condition number above which a matrix counts as singular.
 const SINGULAR: f64 = 1e12;
 
-/// What is known of a layout from elsewhere.
+/// Known figures of a layout, from elsewhere.
 struct Reference {
     condition: f64,
     degeneracy: Degeneracy,
@@ -35,14 +35,14 @@ struct ReferenceErrors {
     map: [f64; 2],
 }
 
-/// Whether the fixes of a layout must say that they are degenerate.
+/// Whether the fixes of a layout must state that they are degenerate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Degeneracy {
     /// None may.
     Regular,
     /// It depends on where the target is, and on what is known of its velocity.
     OfPlace,
-    /// All must: the times alone make them so.
+    /// All must: the times alone make them degenerate.
     OfTimes,
 }
 
@@ -60,7 +60,7 @@ const fn unreferenced(condition: f64, degeneracy: Degeneracy) -> Reference {
     Reference { condition, degeneracy, errors: None }
 }
 
-/// Of [`LAYOUTS`], in their order.
+/// Figures of [`LAYOUTS`], in their order.
 const REFERENCES: [Reference; 8] = [
     reference(20.0, Degeneracy::Regular, [0.27, 2.2], [0.26, 2.1]),
     reference(202.0, Degeneracy::OfPlace, [1.5, 14.7], [1.3, 12.0]),
@@ -72,24 +72,25 @@ const REFERENCES: [Reference; 8] = [
     reference(f64::INFINITY, Degeneracy::OfPlace, [3.6, 117.0], [0.41, 11.0]),
 ];
 
-/// The solvers, with the name of each.
+/// Names of the solvers.
 const SOLVERS: [&str; 3] = ["papers' inverse", "rank against the noise", "map, 30 m/s prior"];
 
-/// What a solver says of one period.
+/// A solver's answer for one period.
 struct Answer {
     position: Point3<f64>,
     velocity: Vector3<f64>,
-    /// When that is.
+    /// Time of that position.
     time: Timestamp,
     observability: Option<Observability>,
 }
 
-/// Klochko 2020 to the letter (equations 10 and 11): the inverse, or the minimum-norm solution where the
-/// condition number is out of all measure, and the range refined from the pair.
+/// Klochko 2020 to the letter (eqs. 10 and 11): the inverse, or the minimum-norm solution where the
+/// condition number exceeds [`WORST_CONDITION`], and the range refined from the pair.
 fn papers_inverse(lines: &[TimedLine; 3]) -> Option<Answer> {
     let [first, second, third] = lines;
     let mut a = Matrix6::zeros();
     let mut b = Vector6::zeros();
+    // Unknowns: three ranges and the velocity; r1 u1 - rk uk + v dt_k = ck - c1 for k = 2, 3.
     for (row, column, other) in [(0, 1, second), (3, 2, third)] {
         let dt = other.time.seconds_since(first.time);
         a.fixed_view_mut::<3, 1>(row, 0).copy_from(&first.line.direction);
@@ -141,13 +142,13 @@ fn lines(
     seen.collect::<Option<Vec<TimedLine>>>()?.try_into().ok()
 }
 
-/// What a solver said in one run, held against the truth.
+/// A solver's answer in one run, compared with the truth.
 #[derive(Clone, Copy)]
 struct Outcome {
     /// Errors of position, m, and velocity, m/s.
     errors: [f64; 2],
     observability: Option<Observability>,
-    /// Whether lines without noise would have had the same rank.
+    /// Whether the rank is the same as for lines without noise.
     rank_is_true: bool,
 }
 
@@ -175,7 +176,7 @@ fn run(layout: &Layout, noise: &mut Noise) -> [Option<Outcome>; 3] {
     outcomes
 }
 
-/// How the degenerate fixes of one solver describe what they do not see.
+/// How one solver's fixes describe what they do not determine.
 fn said(series: &str, at: f64, outcomes: &[&Outcome], degeneracy: Degeneracy) -> Vec<Row> {
     let of_solver: Vec<Observability> = outcomes.iter().filter_map(|o| o.observability).collect();
     if of_solver.is_empty() {
@@ -204,9 +205,9 @@ fn said(series: &str, at: f64, outcomes: &[&Outcome], degeneracy: Degeneracy) ->
     rows
 }
 
-/// What is asked of a solver's error. Of ours, that it is no greater than the reference's; of the
-/// papers' inverse, that it is the same, for it is here to be compared with: but not where noise
-/// makes a singular matrix look regular, as its error has no finite variance there.
+/// Requirement on a solver's error. The MAP's must not exceed the reference's. The papers' inverse
+/// must have the same error, as it serves for comparison, except where noise makes a singular
+/// matrix look regular: its error has no finite variance there.
 fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> Option<Limit> {
     match (SOLVERS[solver], degeneracy) {
         (name, _) if name == SOLVERS[2] => Some(Limit::AtMost(value + tolerance)),
@@ -215,7 +216,7 @@ fn asked(solver: usize, degeneracy: Degeneracy, value: f64, tolerance: f64) -> O
     }
 }
 
-/// Condition numbers, errors and what the fixes say of themselves.
+/// Condition numbers, errors, and what the fixes state of their degeneracy.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let (mut conditions, mut positions, mut velocities, mut says) =
         (vec![], vec![], vec![], vec![]);

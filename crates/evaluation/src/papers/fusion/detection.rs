@@ -1,9 +1,9 @@
-//! Klochko 2020, tables 1 and 2: how well and how often the two algorithms find one and two
+//! Klochko 2020, tables 1 and 2: how accurately and how often the two algorithms find one and two
 //! targets.
 //!
 //! The paper does not say what the noise of 0.1 m is added to: both readings are here. Nor does it
-//! give velocities, gates or how near is found: they are the reference implementation's, but for
-//! the spatial gate, which is told below.
+//! give velocities, gates or the distance at which a target counts as found: they are the reference
+//! implementation's, except for the spatial gate ([`PAIR_GATE`]).
 
 use crossfix_filter::KinematicState;
 use crossfix_fusion::papers::{Grouping, GroupingRules, PeriodFix, TemporalGate, pair, triple};
@@ -18,23 +18,22 @@ use super::super::table::{Limit, Row, Table, deviation, mean, share};
 use super::site::{Layout, PERIODS, Target, line, tangent_noise};
 use super::{REFERENCE_RUNS, reference_tolerance};
 
-/// Runs of a cell for each one of the options: a run takes a tenth of a millisecond.
+/// Number of runs of a cell for each run of the options: a run takes a tenth of a millisecond.
 const CHEAP: usize = 10;
-/// A target is found if a group ends this near to it, m.
+/// A target is found if a group ends within this distance of it, m.
 const MATCH_GATE: f64 = 4.1;
 /// Noise of each coordinate of M(i, j), m.
 const POSITION_SD: f64 = 0.1;
-/// The spatial gate of two receivers, m^2: `J <= beta`, equation 9. The lines of a true pair miss
-/// each other by what the target moves in the delay, up to 3.9 m SD, and the algorithm knows
-/// nothing of that, so the gate is four of these.
+/// The spatial gate of two receivers, m^2: `J <= beta`, Klochko 2020, eq. 9. The lines of a true
+/// pair miss each other by what the target moves in the delay, up to 3.9 m SD, and the algorithm
+/// does not model that, so the gate is four of these deviations.
 const PAIR_GATE: f64 = 4.0 * 3.9 * 4.0 * 3.9;
 
-/// The scale that the rank is decided against, m/s: the paper knows nothing of velocities
-/// beforehand. With 15.6, as the targets have, half a per cent of exact periods would pass for
-/// degenerate.
+/// Velocity scale for deciding the rank, m/s: the paper has no prior on velocities. With 15.6, as
+/// the targets have, half a per cent of exact periods would pass for degenerate.
 const VELOCITY_SCALE: f64 = 100.0;
 
-/// What the noise is added to.
+/// What the paper's noise is added to.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Reading {
     /// To the coordinates of M(i, j), after the solution.
@@ -60,7 +59,7 @@ impl Reading {
     }
 }
 
-/// Mean distance, its standard deviation, probability of finding all.
+/// Mean distance, its standard deviation, and the probability of finding all targets.
 type Figures = [f64; 3];
 
 /// A column of the tables.
@@ -69,7 +68,7 @@ struct Cell {
     targets: usize,
     delays: [f64; 3],
     paper: Figures,
-    /// The reference's, by reading.
+    /// The reference implementation's figures, by reading.
     reference: [Figures; 2],
 }
 
@@ -98,15 +97,15 @@ const CELLS: [Cell; 8] = [
     cell(2, &[0.3, 0.4], [0.55, 1.34, 0.95], [0.16, 0.07, 1.00], [0.50, 0.35, 1.00]),
 ];
 
-/// What one run finds: the distance of each target to the group that is its own, if there is one.
+/// Result of one run: the distance of each target from its own group, if there is one.
 struct Found {
     distances: Vec<f64>,
     all: bool,
-    /// Whether the estimate of their number is right.
+    /// Whether the estimated number of targets is right.
     counted: bool,
 }
 
-/// All fixes that the lines of one period give, by the paper's solver for that many receivers.
+/// All fixes from the lines of one period, by the paper's solver for that number of receivers.
 fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
     let mut fixes = Vec::new();
     match lines {
@@ -156,7 +155,8 @@ fn fixes(lines: &[Vec<(LineId, TimedLine)>]) -> Vec<PeriodFix> {
     fixes
 }
 
-/// A fix at its first line's time. The papers' temporal gate asks for no covariance.
+/// A fix at its first line's time. The papers' temporal gate uses no covariance, so a nominal one
+/// is set.
 fn period_fix(
     position: Point3<f64>,
     (velocity, knowledge): (Vector3<f64>, VelocityKnowledge),
@@ -221,7 +221,8 @@ fn run(
     }
 }
 
-/// The distances of targets to ends, each end for one target: the pairing of least total distance.
+/// The distances of targets from ends, each end for one target, in the pairing of least total
+/// distance.
 fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
     let distance = |t: usize, e: usize| (places[t] - ends[e]).norm();
     match (places.len(), ends.len()) {
@@ -231,7 +232,7 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
         }
         (_, 1) => vec![distance(0, 0).min(distance(1, 0))],
         (_, _) => {
-            // With no line shared, two targets give two groups at most.
+            // As groups share no line, two targets give two groups at most.
             let (straight, crossed) =
                 ([distance(0, 0), distance(1, 1)], [distance(0, 1), distance(1, 0)]);
             let total = |pairs: &[f64; 2]| pairs.iter().sum::<f64>();
@@ -241,7 +242,7 @@ fn matched(places: &[Point3<f64>], ends: &[Point3<f64>]) -> Vec<f64> {
 }
 
 /// Mean distance, SD and probability of a cell, and the share of runs whose number of targets is
-/// right, each with its standard error and the number of samples.
+/// right, each with its standard error and number of samples.
 fn figures(options: ValidationOptions, cell: &Cell, reading: Reading) -> [((f64, f64), usize); 4] {
     let layout = Layout::orthogonal("", cell.delays);
     let cameras = layout.cameras().unwrap_or_default();
@@ -280,7 +281,8 @@ pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
                 let reference_samples = REFERENCE_RUNS * if probability { 1 } else { cell.targets };
                 let mut tolerance = reference_tolerance(figure.1, samples, reference_samples, 0.01);
                 if probability {
-                    // Where none of the reference's runs failed, as many as a hundredth may.
+                    // A probability of 0 or 1 in the reference has no estimated variance: up to a
+                    // hundredth is then allowed.
                     let variance = value * (1.0 - value) / REFERENCE_RUNS as f64 + figure.1.powi(2);
                     tolerance = (3.0 * variance.sqrt()).max(3.0 / REFERENCE_RUNS as f64) + 0.005;
                 }

@@ -1,4 +1,5 @@
-//! How far from the Cramer-Rao bound of all periods: the whole fusion, and the batch solution.
+//! Errors of the whole fusion and of the batch solution, relative to the Cramer-Rao bound of all
+//! periods.
 
 use crossfix_filter::KinematicState;
 use crossfix_fusion::spatial::{TimedLine, map};
@@ -17,18 +18,19 @@ use super::super::runs::{self, Noise};
 use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio, share};
 use super::site::{BEARING_SD, LAYOUTS, Layout, PERIODS, Target, bearing, line, tangent_noise};
 
-/// Mean NEES of position and velocity where the covariance is honest: what 4000 runs leave to
-/// chance.
+/// Mean NEES of position and velocity if the covariance is consistent; the tolerance is the scatter
+/// of 4000 runs.
 const HONEST: Limit = Limit::Near { value: 6.0, tolerance: 0.15 };
 /// Standard deviation of the prior on the velocity, m/s, of the batch solution and of the fusion.
 const PRIOR_SD: f64 = 15.0;
-/// An error of so many of its own standard deviations, or of so many metres, has diverged.
+/// An error has diverged if it is more than this many of its own standard deviations, or this many
+/// metres.
 const DIVERGED_SDS: f64 = 10.0;
 const DIVERGED_M: f64 = 100.0;
 
-/// The least covariance of position and velocity at a time that any unbiased estimator can have
-/// from bearings of a target: the Cramer-Rao bound at the truth. `None` if they do not determine
-/// the six.
+/// The Cramer-Rao bound at the truth: the least covariance of position and velocity at a time that
+/// any unbiased estimator can have from bearings of a target. `None` if they do not determine all
+/// six numbers.
 fn bound(lines: &[TimedLine], target: &Target, reference: Timestamp) -> Option<Matrix6<f64>> {
     let mut information = FisherInformation::default();
     let noise = BearingNoise::isotropic(BEARING_SD)?;
@@ -47,11 +49,11 @@ struct Seen {
     bearing: Bearing,
 }
 
-/// A run's target and all bearings of it in the order of their times.
+/// A run's target and all bearings of it, in order of their times.
 struct Flight {
     target: Target,
     seen: Vec<Seen>,
-    /// What they would be without noise.
+    /// The same bearings without noise.
     exact: Vec<TimedLine>,
 }
 
@@ -78,13 +80,13 @@ impl Flight {
     }
 }
 
-/// What an estimator says at the time of the last bearing, held against the truth.
+/// An estimate at the time of the last bearing, compared with the truth.
 struct Outcome {
     /// Errors of position, m, and velocity, m/s.
     errors: [f64; 2],
     nees: f64,
     diverged: bool,
-    /// The bound's variances, m^2 and m^2/s^2.
+    /// Variances of the bound, m^2 and m^2/s^2.
     bound: [f64; 2],
 }
 
@@ -107,8 +109,8 @@ impl Outcome {
     }
 }
 
-/// The messages of a flight through the whole fusion with its default configuration; the last track
-/// frame's confirmed track, the nearest one if there are several.
+/// Result of the whole fusion, with its default configuration, for the messages of a flight: the
+/// confirmed track of the last track frame, the nearest to the truth if there are several.
 fn fused(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let mut config = FusionConfig::default();
     config.initiation.velocity_prior_sd_mps = PRIOR_SD;
@@ -172,7 +174,7 @@ fn confirmed_states(frame: &TrackFrame) -> Vec<KinematicState> {
     .collect()
 }
 
-/// The outcomes of all runs; `None` where the estimator had nothing to say.
+/// The outcomes of all runs; `None` where the estimator had no answer.
 fn outcomes(
     options: ValidationOptions,
     layout: &Layout,
@@ -187,7 +189,7 @@ fn outcomes(
     })
 }
 
-/// The rows of the tables that both estimators have.
+/// Rows of the tables that both estimators have.
 #[derive(Default)]
 struct Rows {
     ratios: Vec<Row>,
@@ -201,7 +203,7 @@ impl Rows {
         for (index, quantity) in ["position", "velocity"].into_iter().enumerate() {
             let errors: Vec<f64> = known.iter().map(|o| o.errors[index]).collect();
             let bounds: Vec<f64> = known.iter().map(|o| o.bound[index]).collect();
-            // The root of the mean trace over the runs.
+            // The root of the bound's mean trace over the runs.
             let best = mean(&bounds).0.sqrt();
             let (rms, standard_error) = root_mean_square(&errors);
             let series = format!("{}: {quantity}", layout.name);
@@ -219,7 +221,7 @@ fn table(name: &'static str, title: &str, y: &'static str, rows: Vec<Row>) -> Ta
     Table { name, title: title.to_owned(), x: "layout", y, rows }
 }
 
-/// The two layouts in which the paper's own system is regular.
+/// The two layouts in which the paper's own system of equations is regular.
 const REGULAR: [Layout; 2] = [
     Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
     Layout::orthogonal("orthogonal, 0.3/0.4", [0.0, 0.3, 0.4]),
@@ -248,7 +250,7 @@ pub(super) fn fusion_tables(options: ValidationOptions) -> Vec<Table> {
     ]
 }
 
-/// All bearings at once.
+/// The batch solution: all bearings at once.
 fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicState> {
     let lines = flight.seen.iter().map(|seen| {
         let line = cameras.get(seen.camera)?.1.sight_line(&seen.bearing);
@@ -258,21 +260,21 @@ fn batch(flight: &Flight, cameras: &[(CameraName, Camera)]) -> Option<KinematicS
     Some(map(&lines, flight.end(), PRIOR_SD)?.state)
 }
 
-/// How many runs of a layout diverged: none may.
+/// Number of runs of a layout that diverged: none may.
 fn diverged(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
     let count = outcomes.iter().flatten().filter(|outcome| outcome.diverged).count();
     Row::new(layout.name, at, (count as f64, 0.0)).limit(Limit::AtMost(0.0))
 }
 
-/// In how many runs of a layout the estimator had something to say: a fusion centre that is not
-/// told how fast targets are may take a few in a thousand for too fast.
+/// Share of a layout's runs in which the estimator had an answer: a fusion centre that is not told
+/// how fast targets are may take a few in a thousand for too fast.
 fn confirmed(layout: &Layout, at: f64, outcomes: &[Option<Outcome>]) -> Row {
     Row::new(layout.name, at, share(outcomes.iter().map(Option::is_some)))
         .limit(Limit::AtLeast(0.99))
 }
 
-/// The whole fusion where one period does not determine position and velocity, against the batch
-/// solution of the same bearings.
+/// The whole fusion where one period does not determine position and velocity, compared with the
+/// batch solution of the same bearings.
 pub(super) fn degenerate_tables(options: ValidationOptions) -> Vec<Table> {
     let [mut ratios, mut consistency, mut divergences, mut shares] =
         [vec![], vec![], vec![], vec![]];

@@ -1,10 +1,10 @@
-//! Kalinov 2019, Fig. 11: what a quadcopter's sharp turns cost each filter.
+//! Kalinov 2019, Fig. 11: errors of each filter on a quadcopter's sharp turns.
 //!
-//! The text has a trajectory "specified by a series of randomly selected control points" and prints
-//! no number. Here: points uniform in a box of 100 x 100 x 50 m, each at least 40 m from the one
-//! before, flown at 5 m/s on straight lines with a position measured every second, so that a leg
-//! has 8 to 30 frames and a turn takes no time. Where a filter has something to tune, it is tuned
-//! for the noise at hand on other flights than those it is judged on.
+//! The paper has a trajectory "specified by a series of randomly selected control points" and
+//! prints no number. Here: points uniform in a box of 100 x 100 x 50 m, each at least 40 m from the
+//! one before, flown at 5 m/s on straight lines with a position measured every second, so that a
+//! leg has 8 to 30 frames and a turn takes no time. A filter's parameters are tuned for each noise,
+//! on other flights than those that it is judged on.
 
 use crossfix_filter::{
     Imm, KinematicState, ModeRates, MotionModel, MotionModels, NormalisedInnovation,
@@ -20,24 +20,25 @@ use super::super::table::{Limit, Row, Table, mean, root_mean_square, root_ratio,
 const STEP: f64 = 1.0;
 /// Speed, m/s.
 const SPEED: f64 = 5.0;
-/// Control points of a flight.
+/// Number of control points of a flight.
 const POINTS: usize = 12;
-/// Frames in which every filter settles from its start, not judged.
+/// Frames in which every filter settles from its start; they are not judged.
 const SETTLING: usize = 5;
-/// Standard deviation of everything at the start and after an alarm: `P = 1e5 I` (equations 5 and
-/// 8).
+/// Standard deviation of each component of the state at the start and after an alarm: `P = 1e5 I`
+/// (Kalinov 2019, eqs. 5 and 8).
 const IGNORANCE: f64 = 316.227_766_016_837_9;
-/// The text's threshold, in standard deviations of a measurement.
+/// The paper's threshold, in standard deviations of a measurement.
 const SCALE: f64 = 0.81;
-/// Process noise of the filter that knows of no manoeuvre, m^2/s^3: 0.01 m/s in a second.
+/// Process noise of the filter without a model of manoeuvres, m^2/s^3: 0.01 m/s in a second.
 const LOW_DENSITY: f64 = 1e-4;
-/// Flights that the filters are tuned on, and what sets their random numbers apart.
+/// Number of flights that the filters are tuned on, and the seed that makes these differ from the
+/// judged ones.
 const TUNING_RUNS: usize = 30;
 const TUNING_SEED: u64 = 0x7455_6e49;
 /// Standard deviations of the measurements, m: the simulated flight and the real one.
 const DEVIATIONS: [f64; 2] = [0.1, 5.0];
 
-/// A flight: where it is in each frame, and the frames after which it has turned.
+/// A flight: its places in each frame, and the frames after which it has turned.
 struct Flight {
     places: Vec<Point3<f64>>,
     turns: Vec<usize>,
@@ -75,26 +76,27 @@ impl Flight {
     }
 }
 
-/// What follows the target.
+/// A filter, or none.
 #[derive(Clone, Debug)]
 enum Method {
-    /// Nothing: the measurement itself.
+    /// No filter: the measurement itself.
     Measurement,
-    /// One Kalman filter with a density of acceleration, m^2/s^3.
+    /// One Kalman filter with a density of white acceleration, m^2/s^3.
     Kalman(f64),
-    /// The text's: the low density, and its detector over a window.
+    /// The paper's filter: the low density, and its detector over a window.
     Smoothed(usize),
-    /// A density, and the chi-square test over two innovations with a false alarm in 10 000.
+    /// A Kalman filter with a density, and the chi-square test over two innovations with a
+    /// false-alarm probability of 1 in 10 000.
     Nis(f64),
     /// Interacting multiple models.
     Imm(MotionModels),
 }
 
-/// What a method made of a flight.
+/// Result of a method on a flight.
 struct Followed {
-    /// Squared errors on each axis, m^2, means over the frames judged.
+    /// Squared errors per axis, m^2, means over the judged frames.
     squares: [f64; 3],
-    /// Frames of alarms.
+    /// Frames with alarms.
     alarms: Vec<usize>,
 }
 
@@ -125,7 +127,7 @@ impl Method {
                     let nis = nis(&state, *z, &spread);
                     if watches && nis.is_some_and(|nis| detector.see(nis, 3)) {
                         alarms.push(frame);
-                        // Before the update: it is this measurement that the filter must lean on.
+                        // Before the update, so that the filter relies on this measurement.
                         state.reinitialise(IGNORANCE, IGNORANCE);
                     }
                     update(&mut state, *z, &spread);
@@ -142,7 +144,7 @@ impl Method {
                     update(&mut state, *z, &spread);
                     if alarm {
                         alarms.push(frame);
-                        // In place of the updated covariance (equations 8 and 9).
+                        // In place of the updated covariance (Kalinov 2019, eqs. 8 and 9).
                         state.reinitialise(IGNORANCE, IGNORANCE);
                     }
                     state.position()
@@ -185,7 +187,7 @@ fn update(state: &mut KinematicState, measured: Point3<f64>, spread: &Matrix3<f6
     }
 }
 
-/// The best of some methods on the flights for tuning.
+/// The method of least error on the flights for tuning.
 fn tuned(deviation: f64, seed: u64, methods: Vec<Method>) -> Method {
     let flights: Vec<Flight> = (0..TUNING_RUNS)
         .map(|run| Flight::new(deviation, &mut Noise::new(seed ^ TUNING_SEED, run)))
@@ -198,7 +200,7 @@ fn tuned(deviation: f64, seed: u64, methods: Vec<Method>) -> Method {
     best.map_or(Method::Measurement, |(method, _)| method)
 }
 
-/// Densities from straight flight to none that is predictable, m^2/s^3.
+/// Densities from that of straight flight to that of unpredictable motion, m^2/s^3.
 fn densities() -> impl Iterator<Item = f64> {
     (-10..=6).map(|power| 10f64.powf(f64::from(power) / 2.0))
 }
@@ -206,7 +208,7 @@ fn densities() -> impl Iterator<Item = f64> {
 /// All methods, tuned for a noise.
 fn methods(deviation: f64, seed: u64) -> Vec<Method> {
     let model = |density, share| MotionModel { density, share, calm: false };
-    // A leg in ten to twenty frames ends.
+    // One leg in ten to twenty frames ends.
     let rates = ModeRates { switching_per_s: 1.0, calming_per_s: 1.0, prior_s: 1.0 };
     let mut mixtures = Vec::new();
     for quiet in densities() {
@@ -227,14 +229,14 @@ fn methods(deviation: f64, seed: u64) -> Vec<Method> {
     ]
 }
 
-/// The places of some methods among [`methods`].
+/// Indices of some methods in [`methods`].
 const LOW: usize = 1;
 const TUNED: usize = 2;
 const NIS: usize = 6;
 const MODELS: usize = 7;
 
-/// The reference's RMS errors on x of the methods in their order at both noises, on flights that
-/// are not given; it prints 4.41 to 4.87 for the paper's windows at 5 m.
+/// The reference's RMS errors on x of the methods in their order, at both noises, on flights that
+/// it does not give; for the paper's windows at 5 m it prints 4.41 to 4.87.
 const REFERENCES: [[Option<f64>; 2]; 8] = [
     [Some(0.099), None],
     [Some(0.844), None],
@@ -246,8 +248,8 @@ const REFERENCES: [[Option<f64>; 2]; 8] = [
     [Some(0.077), Some(3.67)],
 ];
 
-/// Frames from a turn to its first alarm, 1 being the first frame that can show it; `None` for a
-/// turn without an alarm before the next.
+/// Frames from a turn to its first alarm, where 1 is the first frame that can show the turn; `None`
+/// for a turn without an alarm before the next.
 fn delays(flight: &Flight, alarms: &[usize]) -> Vec<Option<f64>> {
     let ends = flight.turns.iter().skip(1).copied().chain([flight.places.len()]);
     let turns = flight.turns.iter().zip(ends);
@@ -291,8 +293,8 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
             let row = |other: &str, figure| {
                 Row::new(format!("{} over Kalman, {other}", method.name()), deviation, figure)
             };
-            // "Much better" than a filter that knows of no manoeuvre: twice as good, or five times,
-            // in the reference. Against one that does, it loses (errata).
+            // "Much better" than a filter without a model of manoeuvres: in the reference twice or
+            // five times as good. Compared with a filter tuned for them it loses (errata).
             ratios.push(row("low noise", over(LOW)).limit(Limit::AtMost(0.5)));
             ratios.push(row("tuned", over(TUNED)).limit(Limit::AtLeast(1.0)));
         }
@@ -315,7 +317,7 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
         Row::new(name, deviation, root_ratio(&all_axes(one), &all_axes(other))).limit(limit)
     };
     // Which is best: the detector of innovations where turns stand out of the noise, else the
-    // models.
+    // interacting models.
     let turns_stand_out = SPEED * STEP > deviation;
     let worse_or_better = if turns_stand_out { Limit::AtMost(1.0) } else { Limit::AtLeast(1.0) };
     ratios.push(between(NIS, MODELS, worse_or_better));
@@ -323,8 +325,8 @@ fn rows(options: ValidationOptions, noise_number: usize) -> [Vec<Row>; 3] {
     [errors, ratios, alarms]
 }
 
-/// Frames from a turn to the alarm in the reference, in little noise; it has 2.0 to 2.2 for the
-/// text's detector.
+/// Frames from a turn to the alarm in the reference, at little noise; it has 2.0 to 2.2 for the
+/// paper's detector.
 fn delay_of_reference(method: &Method) -> Option<f64> {
     match method {
         Method::Smoothed(_) => Some(2.1),
@@ -333,7 +335,7 @@ fn delay_of_reference(method: &Method) -> Option<f64> {
     }
 }
 
-/// Fig. 11 and what it is to show.
+/// Fig. 11, and the comparisons that it is meant to show.
 pub(super) fn tables(options: ValidationOptions) -> Vec<Table> {
     let mut tables: [Vec<Row>; 3] = Default::default();
     for noise_number in 0..DEVIATIONS.len() {

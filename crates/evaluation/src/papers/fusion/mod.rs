@@ -10,7 +10,7 @@ use super::Experiment;
 
 /// Standard deviation of each component of the targets' velocities, m/s.
 const VELOCITY_SD: f64 = 15.6;
-/// Runs of the reference implementation behind each of its figures.
+/// Number of runs of the reference implementation behind each of its figures.
 const REFERENCE_RUNS: usize = 300;
 
 pub(super) const EXPERIMENTS: [Experiment; 6] = [
@@ -22,9 +22,9 @@ pub(super) const EXPERIMENTS: [Experiment; 6] = [
     Experiment { name: "manoeuvres (Kalinov 2019, Fig. 11)", make: manoeuvre::tables },
 ];
 
-/// How far ours may be from a reference figure: three standard errors of the difference, the
-/// reference's runs having the scatter that ours have over `samples` samples, and half of the
-/// reference's last digit.
+/// Tolerance on the difference to a reference figure: three standard errors of the difference, with
+/// the reference's runs scattered as ours are over `samples` samples, and half of the reference's
+/// last digit.
 fn reference_tolerance(
     standard_error: f64,
     samples: usize,

@@ -1,4 +1,4 @@
-//! The cameras and targets of the experiments, and what is measured of them.
+//! Cameras and targets of the experiments, and their bearings.
 
 use crossfix_fusion::spatial::TimedLine;
 use crossfix_geometry::{
@@ -21,7 +21,7 @@ pub(super) const PERIODS: usize = 5;
 /// deg.
 const ORTHOGONAL: f64 = 35.264_389_682_754_654;
 
-/// Three cameras round the origin, and when in each period they see.
+/// Three cameras round the origin, and their delays within each period.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Layout {
     pub name: &'static str,
@@ -29,7 +29,7 @@ pub(super) struct Layout {
     azimuths: [f64; 3],
     /// Their elevation, deg.
     elevation: f64,
-    /// The cameras' delays in a period, s.
+    /// The cameras' delays within a period, s.
     pub delays: [f64; 3],
 }
 
@@ -66,7 +66,7 @@ impl Layout {
     }
 }
 
-/// The layouts in which the paper's system breaks, and two in which it does not.
+/// The layouts in which the paper's system of equations breaks down, and two in which it does not.
 pub(super) const LAYOUTS: [Layout; 8] = [
     Layout::orthogonal("orthogonal, 0.1/0.2", [0.0, 0.1, 0.2]),
     Layout::orthogonal("orthogonal, 0.1/0.11", [0.0, 0.1, 0.11]),
@@ -82,15 +82,16 @@ pub(super) const LAYOUTS: [Layout; 8] = [
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Target {
     middle: Point3<f64>,
-    /// When it is there, s.
+    /// Time at which it is at `middle`, s.
     middle_time: f64,
     pub velocity: Vector3<f64>,
 }
 
 impl Target {
-    /// Uniform within 10 m of the origin on each axis in the middle of the periods, with a velocity
-    /// of [`VELOCITY_SD`]. The reference says no more than "within 10 m"; a ball, or another
-    /// middle, leaves all but coplanar lines as they are, and takes those further from its figures.
+    /// A random target: uniform within 10 m of the origin on each axis at the middle of the
+    /// periods, with a velocity of [`VELOCITY_SD`]. The reference only says "within 10 m"; drawing
+    /// from a ball, or another middle time, leaves all layouts but the coplanar one unchanged, and
+    /// takes that one farther from the reference's figures.
     pub fn random(noise: &mut Noise) -> Self {
         let middle_time = PERIODS as f64 / 2.0;
         let middle = Point3::from(Vector3::from_fn(|_, _| 20.0 * noise.uniform() - 10.0));
@@ -101,7 +102,7 @@ impl Target {
         }
     }
 
-    /// One that stays where it is.
+    /// A target at rest.
     pub fn at_rest(place: Point3<f64>) -> Self {
         Self { middle: place, middle_time: 0.0, velocity: Vector3::zeros() }
     }
@@ -111,7 +112,8 @@ impl Target {
     }
 }
 
-/// Whether bearings are exact or have the noise of [`BEARING_SD`] on both tangents.
+/// Offset of a bearing on its tangents, rad: zero without `noise`, else with [`BEARING_SD`] on
+/// both.
 pub(super) fn tangent_noise(noise: Option<&mut Noise>) -> Vector2<f64> {
     noise.map_or_else(Vector2::zeros, |noise| Vector2::from_fn(|_, _| BEARING_SD * noise.normal()))
 }
@@ -127,7 +129,7 @@ pub(super) fn bearing(
     Bearing::new(moved, Matrix2::identity() * BEARING_SD.powi(2)).ok()
 }
 
-/// The same as a sight line of the world.
+/// The same bearing as a sight line in the world.
 pub(super) fn line(
     camera: &Camera,
     place: Point3<f64>,

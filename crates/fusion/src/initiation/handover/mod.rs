@@ -1,9 +1,12 @@
-//! Targets that cameras see one after another, and never two at a time.
+//! Handover: targets that cameras see one after another, and never two at a time.
 //!
-//! What one camera alone follows is a direction that turns. When it loses sight of it, another may
-//! have begun to see it: the new camera's line crosses the direction that the old one would have by
-//! now in one place, and place and turning give a velocity across the old line. How the new line
-//! turns, and where the next camera sees it, tells whether that was so.
+//! What one camera alone follows is a direction that turns. When the camera loses sight of the
+//! target, another may have begun to see it: the new camera's line crosses the direction that the
+//! old camera would see by now at one position, and position and turning rate give a velocity
+//! across the old line. How the new line turns, and where the next camera sees the target, tells
+//! whether it is the same one. Each such explanation is a "reading".
+//!
+//! "Strangers" are other targets that a camera may see.
 
 mod reading;
 mod seen;
@@ -25,31 +28,32 @@ use crate::track::{Track, TrackId, TrackStatus};
 use crate::tracker::same_target;
 use crate::{Exposure, FusionConfig};
 
-/// That it is one target must be so many times (logarithm) likelier than that each camera sees
-/// another, and than any other reading of the same lines: a chance of 1 in 3000.
+/// A reading is confirmed if one target is likelier by this log-likelihood ratio than each camera
+/// seeing another target, and than any other reading of the same lines: a chance of 1 in 3000.
 const MARGIN: f64 = 8.0;
-/// A reading less likely than this (logarithm) is given up.
+/// A reading with a smaller log-likelihood ratio than this is given up.
 const GIVEN_UP: f64 = -5.0;
-/// What one camera alone sees is hardly nearer than this, m: with the largest range it gives the
-/// middle of those that are possible.
+/// A target that one camera alone sees is hardly nearer than this, m: the geometric mean with the
+/// largest range is taken for its range.
 const NEAREST_M: f64 = 30.0;
-/// Directions followed in one camera, lost ones tried in one exposure, readings of one, and others
-/// tried with one: time is bounded.
+/// Bounds on time: most directions followed in one camera, lost ones tried in one exposure,
+/// readings of one direction, and others tried with one direction.
 const MAX_SEEN: usize = 20;
 const MAX_LOST: usize = 20;
 const MAX_READINGS: usize = 4;
 const MAX_TRIED: usize = 50;
 
-/// What the cameras follow one by one, and how it goes together.
+/// The directions that each camera follows alone, and their readings.
 #[derive(Debug)]
 pub(super) struct Handover {
     rules: Rules,
     seen: BTreeMap<CameraName, Vec<Seen>>,
-    /// How many directions have been followed.
+    /// Number of directions followed so far.
     count: u64,
 }
 
-/// A line that a camera has begun to follow, by its index, with what it follows there.
+/// A line (by its index) that continues a direction which the camera follows, with that direction's
+/// number and the time of its first line.
 #[derive(Clone, Copy, Debug)]
 struct Begun {
     index: usize,
@@ -67,7 +71,8 @@ impl Handover {
         self.seen.remove(camera);
     }
 
-    /// What one camera alone sees for sure, as far as it is known now: its range is anywhere.
+    /// The sure targets that one camera alone sees, with predictions for cueing: their range is
+    /// unknown.
     pub(super) fn known(&self, now: Timestamp) -> Vec<Known> {
         let range = (NEAREST_M * self.rules.max_range_m).sqrt();
         let sure = self.seen.iter().flat_map(|(camera, seen)| {
@@ -90,8 +95,8 @@ impl Handover {
         known.collect()
     }
 
-    /// Takes an exposure in, with which of its lines (by index) a track knows; returns the tracks
-    /// that are sure now.
+    /// Handles an exposure, given which of its lines (by index) belong to tracks; returns the
+    /// tracks that are confirmed by it.
     pub(super) fn see(
         &mut self,
         exposure: &Exposure,
@@ -109,8 +114,8 @@ impl Handover {
         self.settle(&context)
     }
 
-    /// Forgets what no camera has seen for as long as a track would be kept, and what was never
-    /// sure at once.
+    /// Forgets directions that have been silent for as long as a track would be kept, and at once
+    /// those that were lost before they were sure.
     fn forget(&mut self, now: Timestamp) {
         let (tracking, pair_s) = (&self.rules.tracking, self.rules.pair_s);
         let lost_after_s = tracking.lost_after_s;
@@ -132,18 +137,19 @@ impl Handover {
         }
     }
 
-    /// Goes on with what the exposure's camera follows; returns its lines of that.
+    /// Continues the directions that the exposure's camera follows; returns the lines that continue
+    /// them.
     fn follow(&mut self, context: &Context<'_>) -> Vec<Begun> {
         let Context { exposure, known, is_owned, .. } = *context;
         let factor = exposure.uncertainty.factor;
-        let strangers = self.rules.strangers_per_sr(known).ln();
+        let clutter = self.rules.clutter_per_sr(known).ln();
         let with_pose: Vec<TimedLine> = lines_with_pose(exposure).map(|(_, line)| line).collect();
         let seen = self.seen.entry(exposure.camera.clone()).or_default();
         let mut taken = vec![false; with_pose.len()];
         let (gate, mut begun, mut explained) = (self.rules.gate, Vec::new(), BTreeSet::new());
         let is_known = |i: usize| is_owned[i] || exposure.sightings[i].rooted == Rooted::Yes;
-        // Those that are best known choose first; one that is lost takes nothing that may be a
-        // stranger.
+        // The best known directions choose first; a lost one takes only a line that is clearly no
+        // stranger's.
         let mut order: Vec<usize> = (0..seen.len()).collect();
         order.sort_by(|&a, &b| {
             seen[a].at(exposure.time).variance.total_cmp(&seen[b].at(exposure.time).variance)
@@ -158,7 +164,7 @@ impl Handover {
                 Some((sight.density(&sighting.line, factor, gate)?, i))
             });
             let fits =
-                fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > strangers + MARGIN));
+                fits.filter(|(fit, i)| !is_lost || (!is_known(*i) && *fit > clutter + MARGIN));
             let best = fits.max_by(|a, b| a.0.total_cmp(&b.0));
             let Some((log_density, index)) = best else {
                 one.missed += 1.0;
@@ -191,14 +197,15 @@ impl Handover {
         begun
     }
 
-    /// Goes on with the readings that the exposure's lines may be part of.
+    /// Continues the readings that the exposure's lines may belong to.
     fn advance(&mut self, context: &Context<'_>) {
         for one in self.seen.values_mut().flatten() {
             one.readings.retain_mut(|reading| reading.advance(context, &self.rules));
         }
     }
 
-    /// Tries what other cameras have lost sight of with what this one has begun to see since.
+    /// Starts readings: combines what other cameras have lost sight of with what this camera has
+    /// begun to see since.
     fn cross(&mut self, context: &Context<'_>, begun: &[Begun]) {
         let Context { exposure, known, motion, is_owned } = *context;
         let now = exposure.time;
@@ -231,8 +238,7 @@ impl Handover {
                             / (2.0 * self.rules.speed.powi(2));
                         let expected = context.expectation(&track)?;
                         let fit = expected.fit(line, self.rules.gate)?;
-                        let ratio =
-                            fit.log_ratio(1.0, self.rules.strangers_per_sr(known)) - unlikely;
+                        let ratio = fit.log_ratio(1.0, self.rules.clutter_per_sr(known)) - unlikely;
                         let one_target = OneTargetTest::of_one(camera, one.sight.clone());
                         let mut reading = Reading {
                             of: (camera.clone(), one.number),
@@ -248,8 +254,8 @@ impl Handover {
         }
     }
 
-    /// The readings that an exposure has made sure. Others of the same lines are rivals, unless
-    /// they are the same target.
+    /// Confirms the readings that this exposure has made sure. Other readings of the same lines are
+    /// rivals, unless they give the same target.
     fn settle(&mut self, context: &Context<'_>) -> Vec<Start> {
         let Context { exposure, motion, .. } = *context;
         let is_new = |reading: &Reading| {

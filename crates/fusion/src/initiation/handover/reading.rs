@@ -1,4 +1,4 @@
-//! One way in which cameras may have seen one target, one after another.
+//! A reading: one way in which cameras may have seen one target, one after another.
 
 use crossfix_filter::Gate;
 use crossfix_message::CameraName;
@@ -12,18 +12,18 @@ use crate::track::{Expectation, Track};
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, FusionConfig, Tracking};
 
-/// Two cameras that have seen something together for longer than this, s, and have not made a
-/// target of it, see different things.
+/// Two cameras that have both seen something for longer than this, s, without a track coming of it,
+/// see different things.
 pub(super) const TOGETHER_S: f64 = 1.0;
 
-/// What is taken for what: parameters of the site's configuration.
+/// Parameters from the site's configuration.
 #[derive(Debug)]
 pub(super) struct Rules {
     pub(super) tracking: Tracking,
     pub(super) gate: Gate,
-    /// How fast targets are, m/s, standard deviation per axis.
+    /// Speed of targets, m/s, standard deviation per axis.
     pub(super) speed: f64,
-    /// How long two cameras may have been apart when both saw it, s.
+    /// Sightings by two cameras up to this far apart count as simultaneous, s.
     pub(super) pair_s: f64,
     pub(super) max_range_m: f64,
 }
@@ -39,40 +39,41 @@ impl Rules {
         }
     }
 
-    /// How many other targets a camera sees, 1/sr: one, as nothing else is known.
-    pub(super) fn strangers_per_sr(&self, known: &KnownCamera) -> f64 {
+    /// Assumed density of other targets in a camera's view, 1/sr: one per view, as nothing else is
+    /// known.
+    pub(super) fn clutter_per_sr(&self, known: &KnownCamera) -> f64 {
         1.0 / view_sr(known)
     }
 }
 
-/// The newest exposure, and what else its lines are compared by.
+/// The newest exposure with what its lines are compared by.
 #[derive(Clone, Copy)]
 pub(super) struct Context<'a> {
     pub(super) exposure: &'a Exposure,
     pub(super) known: &'a KnownCamera,
     pub(super) motion: &'a Motion,
-    /// Whether a track knows the line, by index.
+    /// Whether a line belongs to a track, by index.
     pub(super) is_owned: &'a [bool],
 }
 
 impl Context<'_> {
-    /// What is uncertain of the exposure's camera: what a clock shifts is not known before the
-    /// velocity is.
+    /// The uncertainty of the exposure's camera. The clock's error counts as noise: what it shifts
+    /// is not known before the velocity is.
     pub(super) fn uncertainty(&self) -> CameraUncertainty {
         CameraUncertainty { clock_is_noise: true, ..self.exposure.uncertainty }
     }
 
-    /// What the camera should see of a track.
+    /// The bearing of a track that is predicted for the exposure's camera.
     pub(super) fn expectation(&self, track: &Track) -> Option<Expectation> {
         let seen_from = (&self.exposure.camera, self.known.camera.pose().position());
         track.expectation(self.exposure.time, seen_from, &self.uncertainty(), self.motion)
     }
 }
 
-/// What one camera has followed and others may have seen since, as one target.
+/// What one camera has followed and other cameras may have seen since, taken for one target.
 #[derive(Clone, Debug)]
 pub(super) struct Reading {
-    /// The camera that saw it first, and the number of what it saw.
+    /// The camera that saw it first, and the number of the direction it followed.
     pub(super) of: (CameraName, u64),
     pub(super) track: Box<Track>,
     pub(super) one_target: OneTargetTest,
@@ -80,8 +81,8 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Takes the exposure's best line in; returns whether it is still open what this is: not if a
-    /// track has the line.
+    /// Updates the reading with the exposure's best line; returns whether the reading is still
+    /// open: not if that line belongs to a track.
     pub(super) fn advance(&mut self, context: &Context<'_>, rules: &Rules) -> bool {
         let Context { exposure, known, is_owned, .. } = *context;
         let Some(expected) = context.expectation(&self.track) else {
@@ -97,14 +98,14 @@ impl Reading {
                 context,
                 index,
                 &expected,
-                log_density - rules.strangers_per_sr(known).ln(),
+                log_density - rules.clutter_per_sr(known).ln(),
                 rules,
             );
         }
         best.is_none_or(|(_, index)| !is_owned[index])
     }
 
-    /// Takes a line in; `None` if the numbers fail.
+    /// Updates the reading with a line; `None` if the numbers fail.
     pub(super) fn take(
         &mut self,
         context: &Context<'_>,
@@ -120,8 +121,8 @@ impl Reading {
         self.track.measurement_update(camera, line, (*time, &context.uncertainty()), motion)?;
         self.track.look(camera, *time, true, rules.tracking.detection_probability, motion);
         let timed = (line, *time, uncertainty.time_sd_s);
-        // That two cameras which see something at once agree says nothing of what the first one has
-        // seen before.
+        // If two other cameras see something at the same time, their agreement tells nothing about
+        // what the first camera saw before.
         let is_joint = self.track.residuals.iter().any(|(name, residual)| {
             *name != self.of.0 && name != camera && time.seconds_since(residual.time) < TOGETHER_S
         });
@@ -140,6 +141,7 @@ impl Reading {
         Some(())
     }
 
+    /// Log-likelihood ratio of one target against one target per camera.
     pub(super) fn ratio(&self) -> f64 {
         self.one_target.log_ratio().unwrap_or(f64::NEG_INFINITY)
     }

@@ -1,4 +1,4 @@
-//! What one camera alone follows.
+//! A direction that one camera alone follows.
 
 use std::collections::BTreeSet;
 
@@ -15,45 +15,48 @@ use crate::track::Track;
 use crate::uncertainty::CameraUncertainty;
 use crate::{Exposure, Tracking};
 
-/// How fast a direction may turn, rad/s (standard deviation): 45 m/s at 150 m. With half of it what
-/// flies past a camera is lost again and again; twice as much takes strangers for it.
+/// Standard deviation of a direction's turning rate, rad/s: 45 m/s at 150 m. With half of it, what
+/// flies past a camera is lost again and again; with twice as much, strangers (other objects) are
+/// taken for it.
 const TURNING_SD: f64 = 0.3;
 /// White acceleration of a direction, rad^2/s^3: 7 m^2/s^3 at 150 m, which is lively. With half of
-/// it what turns hard is lost, with twice as much two directions are too soon alike.
+/// it, what turns hard is lost; with twice as much, two directions are too soon alike.
 pub(super) const TURNING_DENSITY: f64 = 3e-4;
-/// Deviation of the logarithm of a range of which nothing is known: as dense at its middle as if
-/// all ranges over a factor of 150 were equally likely.
+/// Standard deviation of the logarithm of an unknown range: the density at its middle is as if all
+/// ranges over a factor of 150 were equally likely.
 const UNKNOWN_LOG_RANGE_SD: f64 = 2.0;
-/// A camera has lost sight of what it followed if it would so seldom (logarithm) have missed it so
-/// often by chance: once in 100 times, which are two exposures where it reports nine of ten.
+/// A camera has lost sight of a direction if the probability of missing it so often by chance is
+/// below exp of this: once in 100 times, which is two exposures of a camera that reports nine of
+/// ten.
 const LOST: f64 = -4.6;
 
-/// What one camera alone follows, as of its last line.
+/// A direction that one camera alone follows, at the time of its last line.
 #[derive(Clone, Debug)]
 pub(super) struct Seen {
-    /// Two that begin with one exposure are told apart by it.
+    /// Its number: tells directions apart that begin with the same exposure.
     pub(super) number: u64,
-    /// The number that the camera gives it.
+    /// The number of the camera's own image track.
     pub(super) image_track: u64,
     pub(super) sight: Sight,
+    /// Time of its first line.
     pub(super) first: Timestamp,
-    /// Its last line with what is uncertain of the camera's pose, what that is (variance, rad^2),
-    /// ...
+    /// Its last line, with the uncertainty of the camera's pose included in the line's covariance,
+    /// the pose's part of that (variance, rad^2), ...
     pub(super) line: TimedLine,
     pub(super) pose_variance: f64,
-    /// ... and of the camera.
+    /// ... and the camera's uncertainty.
     pub(super) uncertainty: CameraUncertainty,
-    /// Log-likelihood ratio of being a target, whatever its place, against being clutter.
+    /// Log-likelihood ratio of a target, at whatever position, against clutter.
     pub(super) score: f64,
-    /// Its lines so far, ...
+    /// Number of its lines so far, ...
     pub(super) lines: f64,
-    /// ... the exposures between them without one, ...
+    /// ... of the exposures between them without a line, ...
     pub(super) gaps: f64,
-    /// ... and those since the last.
+    /// ... and of those since the last line.
     pub(super) missed: f64,
-    /// The ways in which other cameras may have seen it since, ...
+    /// The ways in which other cameras may have seen the target since, ...
     pub(super) readings: Vec<Reading>,
-    /// ... and what has been tried: what is refuted once is not tried again.
+    /// ... and the numbers of the directions tried: one that is refuted is not tried again.
     pub(super) tried: BTreeSet<u64>,
 }
 
@@ -77,28 +80,30 @@ impl Seen {
         }
     }
 
-    /// Whether the camera no longer sees it, and has not only missed it a few times; or is silent
-    /// itself.
+    /// Whether the camera no longer sees it: it has missed it more often than happens by chance, or
+    /// is silent itself.
     pub(super) fn is_lost(&self, now: Timestamp, tracking: &Tracking) -> bool {
+        // The camera's own share of detections so far; n misses have the probability (1 - share)^n.
         let share = (self.lines / (self.lines + self.gaps)).min(tracking.detection_probability);
         let is_silent = now.seconds_since(self.sight.time) > tracking.coasting_after_s;
         is_silent || self.missed * (1.0 - share).ln() <= LOST
     }
 
-    /// Whether it is sure to be something, and not the camera's false alarms.
+    /// Whether it is confirmed to be something, and not the camera's false alarms.
     pub(super) fn is_sure(&self, tracking: &Tracking) -> bool {
         self.score >= tracking.confirm_score
     }
 
-    /// Where it is expected at a time.
+    /// The direction predicted to a time.
     pub(super) fn at(&self, time: Timestamp) -> Sight {
         let mut sight = self.sight.clone();
         sight.predict(time, TURNING_DENSITY);
         sight
     }
 
-    /// A track of it, in the place where its direction at a time crosses another line; the target
-    /// may be as fast as `speed` (m/s, standard deviation) along the direction.
+    /// A track of it, at the position where its direction at a time crosses another camera's line.
+    /// The target's speed along the direction has a standard deviation of `speed` (m/s). `None` if
+    /// the lines do not cross within range in front of both cameras.
     pub(super) fn placed(
         &self,
         camera: &CameraName,
@@ -120,9 +125,8 @@ impl Seen {
         Some(Track::start_alone(&fix, (camera, last, *uncertainty), motion))
     }
 
-    /// Where it is and how it moves if its range is about `range` (m), which is not known, as of its
-    /// last line; the target may be as fast as `speed` (m/s, standard deviation) along the
-    /// direction.
+    /// Its position and velocity at its last line, if its unknown range is about `range` (m). The
+    /// target's speed along the direction has a standard deviation of `speed` (m/s).
     pub(super) fn state_at(&self, range: f64, speed: f64) -> Option<KinematicState> {
         let Self { sight, line: last, .. } = self;
         let along = sight.direction.into_inner();
@@ -130,8 +134,8 @@ impl Seen {
         let model = BearingModel::new(last.line.origin, last.line.origin + along * range)?;
         let [across, along_squared] =
             [model.basis * model.basis.transpose(), along * along.transpose()];
-        // A range that is off by a share has the place off along the direction, and the velocity by
-        // the same share.
+        // A relative error of the range moves the position along the direction by that share, and
+        // scales the velocity by it: d(p, v) = (u r, v) d(ln r).
         let scale = stacked(along * range, velocity) * UNKNOWN_LOG_RANGE_SD;
         let direction_variance = sight.variance + self.pose_variance;
         let (tie, turning) = (sight.tie, sight.rate_variance);
@@ -140,6 +144,7 @@ impl Seen {
             let mut view = covariance.fixed_view_mut::<3, 3>(row, column);
             view += block;
         };
+        // Across the direction: the filter's covariance of direction and rate times r^2.
         add(0, 0, across * (direction_variance * range.powi(2)));
         add(0, 3, across * (tie * range.powi(2)));
         add(3, 0, across * (tie * range.powi(2)));
@@ -149,7 +154,7 @@ impl Seen {
     }
 }
 
-/// What the pose adds to a line's variance along each tangent, rad^2.
+/// Variance that the pose's uncertainty adds to a line along each tangent, rad^2.
 pub(super) fn pose_variance(with_pose: &TimedLine, exposure: &Exposure, index: usize) -> f64 {
     let own = exposure.sightings[index].line.covariance * exposure.uncertainty.factor;
     (with_pose.line.covariance - own).trace().max(0.0) / 2.0

@@ -1,4 +1,4 @@
-//! Logs with columns.
+//! Logs in table columns.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use super::{Above, Place, Row};
 const LOCAL: [&str; 4] = ["time_s", "east_m", "north_m", "up_m"];
 const GEODETIC: [&str; 4] = ["time_s", "latitude_deg", "longitude_deg", "height_m"];
 
-/// Columns of either form, whatever others there are.
+/// Reads the columns of either form and ignores all others.
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
     let head = reader.headers()?.clone();

@@ -1,4 +1,4 @@
-//! Logs as GPS receivers and their programs exchange them.
+//! Logs in GPX, the exchange format of GPS receivers and their programs.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -10,7 +10,7 @@ use time::OffsetDateTime;
 
 use super::{Above, Place, Row};
 
-/// All tracks' points that have a time and a height.
+/// The points of all tracks that have a time and a height.
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
     let file = gpx::read(BufReader::new(File::open(path)?))?;
     let points = file.tracks.iter().flat_map(|track| &track.segments).flat_map(|part| &part.points);

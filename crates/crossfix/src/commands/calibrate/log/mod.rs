@@ -1,4 +1,4 @@
-//! A drone's log as people have it.
+//! A drone's position log, in the formats in common use.
 
 mod columns;
 mod gpx;
@@ -25,7 +25,7 @@ pub enum LogKind {
 }
 
 impl LogKind {
-    /// What is wrong of its samples.
+    /// Error model of the samples of such a log.
     pub fn errors(self) -> LogErrors {
         let (sd_m, drift_sd_m) = match self {
             Self::Rtk => (0.02, 0.02),
@@ -57,26 +57,26 @@ pub enum LogHeight {
     Takeoff,
 }
 
-/// How a log's times and places are to be read.
+/// How a log's times and positions are to be interpreted.
 #[derive(Clone, Copy, Debug)]
 pub struct Reading {
     pub errors: LogErrors,
-    /// Where the site's origin is; the log's first place without.
+    /// Origin of the site; if absent, the log's first position.
     pub anchor: Option<Geodetic>,
-    /// Whether its times are GPS's.
+    /// Whether its times are GPS time.
     pub is_gps_time: bool,
-    /// What heights beside degrees count from.
+    /// Zero of the heights that are given with degrees.
     pub height: LogHeight,
-    /// How far the sea is above the ellipsoid there, m; the log's own word without.
+    /// Height of the sea above the ellipsoid there, m; if absent, as the log states it.
     pub geoid_m: Option<f64>,
-    /// How far the receiver is above what cameras see as the target's middle, m.
+    /// Height of the receiver above what cameras see as the target's centre, m.
     pub antenna_m: f64,
 }
 
 /// GPS counts no leap seconds: since 2017 it has been ahead of UTC by this, s.
 const GPS_AHEAD_S: f64 = 18.0;
 
-/// A sample as it is in the file.
+/// One sample as it stands in the file.
 #[derive(Clone, Copy, Debug)]
 struct Row {
     time_s: f64,
@@ -86,22 +86,22 @@ struct Row {
 #[derive(Clone, Copy, Debug)]
 enum Place {
     Local(Point3<f64>),
-    /// Degrees, and a height above something.
+    /// Degrees, and a height with its zero.
     Geodetic {
         place: Geodetic,
         above: Above,
     },
 }
 
-/// What a log itself says that its heights count from.
+/// Zero of a log's heights as the log itself states it.
 #[derive(Clone, Copy, Debug)]
 enum Above {
     Unsaid,
-    /// The sea, which is so far above the ellipsoid there, m, if the log says that, too.
+    /// The sea, with its height above the ellipsoid, m, if the log states that.
     Sea(Option<f64>),
 }
 
-/// Reads a log: GPX by the file's name, NMEA by its first letter, columns otherwise.
+/// Reads a log: GPX if the file's name says so, NMEA by the first character, otherwise columns.
 pub fn read(path: &Path, reading: &Reading) -> anyhow::Result<FlightLog> {
     let is_gpx = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gpx"));
     let rows = if is_gpx {
@@ -142,7 +142,7 @@ fn begins_with(path: &Path, letter: u8) -> bool {
 }
 
 impl Reading {
-    /// A row whose height is above the ellipsoid.
+    /// A row with its height converted to height above the ellipsoid.
     fn placed(&self, row: Row) -> anyhow::Result<Row> {
         ensure!(
             self.geoid_m.is_none() || self.height == LogHeight::Sea,
@@ -173,7 +173,7 @@ impl Reading {
     }
 }
 
-/// The place that a log without an anchor begins at, said.
+/// The position at which a log without an anchor begins; it is also logged.
 fn first_place(rows: &[Row]) -> Option<Geodetic> {
     let place = rows.iter().find_map(|row| match row.place {
         Place::Geodetic { place, .. } => Some(place),
@@ -208,7 +208,7 @@ mod tests {
         read(&path, reading)
     }
 
-    /// A second of latitude is 30.9 m, of longitude 20.5 m at 48.35 degrees.
+    /// Two samples a second of latitude (30.9 m) and of longitude (20.5 m at 48.35 degrees) apart.
     const SECOND: &str = "time_s,longitude_deg,latitude_deg,height_m,mode\n\
         100.0,11.7861,48.3538,490.0,3d\n101.0,11.786377778,48.354077778,492.0,3d\n";
 
@@ -250,7 +250,8 @@ mod tests {
         assert!(wrong(bad).contains("row 3"), "{}", wrong(bad));
     }
 
-    /// Two seconds over midnight, the second without a date; one of them damaged, one without a fix.
+    /// Two samples across midnight, the second without a date; one of the others damaged, one
+    /// without a fix.
     const NMEA: &str = "$GPRMC,235959.50,A,4821.2280,N,01147.1660,E,0.0,0.0,230926,,,A*5E\r\n\
         $GPGGA,235959.50,4821.2280,N,01147.1660,E,4,12,0.8,440.0,M,46.5,M,1.0,0001*7C\r\n\
         $GPGGA,000000.00,4821.2280,N,01147.1660,E,4,12,0.8,441.0,M,46.5,M,1.0,0001*00\r\n\
@@ -284,7 +285,7 @@ mod tests {
         assert!(error.contains("no date"), "{error}");
     }
 
-    /// The checksum made anew, but where it is meant to be wrong.
+    /// The line with a correct checksum, unless it is meant to be wrong.
     fn with_checksum(line: &str) -> String {
         let Some((body, sum)) = line.strip_prefix('$').and_then(|line| line.rsplit_once('*'))
         else {

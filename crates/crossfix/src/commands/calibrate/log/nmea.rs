@@ -1,7 +1,7 @@
-//! Logs as receivers speak them: NMEA 0183, of which two sentences are wanted.
+//! Logs in NMEA 0183, of which two sentences are used.
 //!
-//! By hand, as no kept crate serves: `nmea` wants a `serde_with` that Zenoh's cannot share, and
-//! `nmea-parser` forgets what lies between two seconds.
+//! Parsed by hand, as no maintained crate serves: `nmea` needs a `serde_with` version that
+//! conflicts with Zenoh's, and `nmea-parser` drops fractions of a second.
 
 use std::path::Path;
 
@@ -11,13 +11,14 @@ use time::{Date, Month};
 
 use super::{Above, Place, Row};
 
-/// Seconds of a day.
+/// Seconds per day.
 const DAY_S: f64 = 86_400.0;
-/// Two digits of a year are of this century: receivers are not older.
+/// Two-digit years belong to this century: receivers are not older.
 const CENTURY: i32 = 2000;
 
-/// The places that a receiver was sure of (GGA), with the days that other sentences (RMC) say: one is as
-/// old as the other to less than half a day. Other sentences and bytes are passed over.
+/// Positions of which the receiver was sure (GGA), with dates from other sentences (RMC); a
+/// position and the date nearest to it are less than half a day apart. Other sentences and bytes
+/// are skipped.
 pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
     let bytes = std::fs::read(path)?;
     let text = String::from_utf8_lossy(&bytes);
@@ -43,11 +44,11 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Vec<Row>> {
     places.into_iter().map(Found::row).collect()
 }
 
-/// The fields of a sentence, its talker and kind before them.
+/// The fields of a sentence, beginning with its talker and kind.
 struct Sentence<'a>(Vec<&'a str>);
 
 impl<'a> Sentence<'a> {
-    /// `None` if its checksum is not that of its bytes, or it has none.
+    /// `None` if the checksum is missing or wrong.
     fn of(line: &'a str) -> Option<Self> {
         let (body, sum) = line.strip_prefix('$')?.rsplit_once('*')?;
         let stated = u8::from_str_radix(sum.trim_end(), 16).ok()?;
@@ -55,7 +56,7 @@ impl<'a> Sentence<'a> {
         (stated == found).then(|| Self(body.split(',').collect()))
     }
 
-    /// What follows the talker's two letters.
+    /// The sentence's kind: what follows the talker's two letters.
     fn kind(&self) -> &str {
         self.0[0].get(2..).unwrap_or_default()
     }
@@ -64,7 +65,7 @@ impl<'a> Sentence<'a> {
         self.0.get(field)?.parse().ok().filter(|number: &f64| number.is_finite())
     }
 
-    /// `hhmmss.ss`, in seconds of the day.
+    /// A field `hhmmss.ss`, in seconds of the day.
     fn of_day_s(&self, field: usize) -> Option<f64> {
         let text = self.0.get(field)?;
         let part = |from: usize, to: usize| text.get(from..to)?.parse::<u32>().ok();
@@ -74,7 +75,7 @@ impl<'a> Sentence<'a> {
         is_time.then(|| f64::from(60 * (60 * hours + minutes)) + seconds)
     }
 
-    /// `dddmm.mmmm` and the letter of the half, in degrees.
+    /// A field `dddmm.mmmm` with the letter of the hemisphere, in degrees.
     fn degrees(&self, field: usize, [positive, negative]: [&str; 2]) -> Option<f64> {
         let value = self.number(field)?;
         let degrees = (value / 100.0).trunc();
@@ -86,10 +87,10 @@ impl<'a> Sentence<'a> {
         }
     }
 
-    /// A GGA's place: time, latitude, longitude, quality, satellites, dilution, height above the sea,
-    /// its unit, and how far the sea is above the ellipsoid.
+    /// A GGA's position. Its fields: time, latitude, longitude, quality, satellites, dilution,
+    /// height above the sea, its unit, and height of the sea above the ellipsoid.
     fn place(&self) -> Option<Found> {
-        /// Dead reckoning, what was typed in, and a simulation are no places.
+        /// Qualities of a real fix: not dead reckoning, manual input or simulation.
         const SURE: [f64; 5] = [1.0, 2.0, 3.0, 4.0, 5.0];
         SURE.contains(&self.number(6)?).then_some(())?;
         Some(Found {
@@ -100,9 +101,9 @@ impl<'a> Sentence<'a> {
         })
     }
 
-    /// An RMC's time and date `ddmmyy`, in seconds after 1970.
+    /// An RMC's time and date `ddmmyy`, in seconds since 1970.
     fn moment_s(&self) -> Option<f64> {
-        // A receiver without a fix shows some date.
+        // Without a fix a receiver may state any date.
         (*self.0.get(2)? == "A").then_some(())?;
         let text = self.0.get(9)?;
         let part = |from: usize| text.get(from..from + 2)?.parse::<u8>().ok();
@@ -112,12 +113,12 @@ impl<'a> Sentence<'a> {
     }
 }
 
-/// A place whose day may not be known yet.
+/// A position whose day may not be known yet.
 #[derive(Clone, Copy, Debug)]
 struct Found {
     of_day_s: f64,
     time_s: Option<f64>,
-    /// Degrees and metres above the sea.
+    /// Latitude and longitude, degrees, and height above the sea, m.
     place: [f64; 3],
     geoid_m: Option<f64>,
 }
@@ -133,7 +134,7 @@ impl Found {
     }
 }
 
-/// Gives those of the newest places that have no day yet that which brings them nearest to a moment.
+/// Gives the newest positions that have no day yet the day that brings them nearest to a moment.
 fn place_in_day(places: &mut [Found], moment_s: f64) {
     for found in places.iter_mut().rev().take_while(|found| found.time_s.is_none()) {
         let days = ((moment_s - found.of_day_s) / DAY_S).round();

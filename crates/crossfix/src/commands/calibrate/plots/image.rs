@@ -1,4 +1,4 @@
-//! What a camera errs by in each part of its image.
+//! A camera's errors in each part of its image.
 
 use std::collections::BTreeMap;
 
@@ -9,14 +9,14 @@ use plotters::prelude::*;
 
 use super::panel::{Area, Chart, FIRST, Failure, Words, frame, nothing};
 
-/// Cells of an image, across and down.
+/// Number of cells of an image, across and down.
 const CELLS: [usize; 2] = [16, 9];
-/// Fewer labels than this tell nothing of a cell.
+/// A cell with fewer labels than this shows nothing.
 const LEAST_LABELS: u32 = 10;
-/// The longest arrow but for a tenth of them is as long as this share of a cell.
+/// Length of the arrows' 90 % quantile as drawn, as a share of a cell.
 const ARROW_SHARE: f64 = 0.9;
 
-/// An image as a frame whose rows go downwards.
+/// A plot frame for an image, with rows counted downwards.
 fn image<'a, 'b>(
     area: &'a Area<'b>,
     title: String,
@@ -31,7 +31,7 @@ fn cell_px(size: ImageSize) -> [f64; 2] {
     [f64::from(size.width) / CELLS[0] as f64, f64::from(size.height) / CELLS[1] as f64]
 }
 
-/// Arrows, all enlarged alike so that one sees them, and how many times.
+/// Arrows, to be enlarged by a common factor so that they can be seen.
 struct Arrows(Vec<(Pixel, Vector2<f64>)>);
 
 impl Arrows {
@@ -55,7 +55,7 @@ impl Arrows {
     }
 }
 
-/// The mean of the labels' residuals in each cell: what is left of the lens.
+/// The mean of the labels' residuals in each cell: the remaining error of the lens.
 pub fn mean_residuals(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
@@ -80,7 +80,8 @@ pub fn mean_residuals(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fail
     arrows.draw(&mut image(area, title, size)?, enlarged)
 }
 
-/// Where the second of two calibrations shows what the first shows at a pixel.
+/// Displacement, at pixels over the image, of a direction between the first and the second
+/// calibration.
 pub fn apart(
     comparison: &CameraComparison,
     second: &CalibratedCamera,
@@ -98,7 +99,7 @@ pub fn apart(
     arrows.draw(&mut image(area, format!("{title}, {enlarged} times as long"), size)?, enlarged)
 }
 
-/// How well the camera points in each cell, mrad; grey where its lens is not known.
+/// Pointing SD of the camera in each cell, mrad; grey where the lens is not known.
 pub fn pointing(camera: &CalibratedCamera, area: &Area<'_>) -> Result<(), Failure> {
     let size = camera.camera.model().intrinsics().size;
     let [across, down] = cell_px(size);
@@ -117,7 +118,7 @@ pub fn pointing(camera: &CalibratedCamera, area: &Area<'_>) -> Result<(), Failur
     let best = known.iter().filter_map(|(_, sd)| *sd).fold(f64::INFINITY, f64::min);
     for (corner, sd) in known {
         let far = (corner.0 + across, corner.1 + down);
-        // Each doubling is a step on the way from white to red.
+        // From white to red, with one step per doubling of the SD.
         let colour = sd.map_or(RGBColor(200, 200, 200), |sd| {
             let pale = 230.0 / (1.0 + (sd / best).log2());
             RGBColor(235, pale as u8, pale as u8)

@@ -1,4 +1,4 @@
-//! Figures of a calibration (SVG): a sheet for each camera.
+//! Plots of a calibration (SVG), one sheet per camera.
 
 mod image;
 mod panel;
@@ -15,12 +15,12 @@ use plotters::prelude::*;
 
 use panel::{Area, Failure};
 
-/// A sheet's panels: columns and rows.
+/// Panels of a sheet: columns and rows.
 const PANELS: (usize, usize) = (3, 2);
-/// A panel's sides, px.
+/// Size of a panel, px.
 const PANEL_PX: (u32, u32) = (560, 400);
 
-/// Draws what a flight has shown of each camera into a folder; returns how many sheets.
+/// Draws the results of a flight for each camera into a folder; returns the number of sheets.
 pub fn of_flight(result: &FlightResult, folder: &Path) -> anyhow::Result<usize> {
     make(folder)?;
     for camera in &result.cameras {
@@ -41,8 +41,8 @@ fn of_camera(camera: &CameraResult, panels: &[Area<'_>]) -> Result<(), Failure> 
     image::pointing(&CalibratedCamera::from(camera), pointing)
 }
 
-/// Draws how two calibrations differ into a folder, and what the second knows of each camera; returns
-/// how many sheets.
+/// Draws the differences of two calibrations, and the accuracy of the second, into a folder;
+/// returns the number of sheets.
 pub fn of_comparison(
     comparison: &SiteComparison,
     second: &SiteCalibration,

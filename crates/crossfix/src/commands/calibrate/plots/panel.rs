@@ -1,4 +1,4 @@
-//! What panels have in common: frames, points, curves.
+//! Parts that all panels use: frames, points, curves.
 
 use std::ops::Range;
 
@@ -11,21 +11,21 @@ pub type Failure = Box<dyn std::error::Error>;
 pub type Chart<'a, 'b> =
     ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// The two axes of an image, or along and across.
+/// Colours of a panel's two series: the axes of an image, or along and across the motion.
 pub const FIRST: RGBColor = RGBColor(31, 90, 160);
 pub const SECOND: RGBColor = RGBColor(200, 70, 20);
 
-/// Points of a series that are drawn at most: an eye sees no more, and a file stays small.
+/// Most points drawn of a series: the eye sees no more, and the file stays small.
 const MOST_POINTS: usize = 1500;
 
-/// Words of a panel.
+/// Title and axis labels of a panel.
 pub struct Words<'a> {
     pub title: String,
     pub x: &'a str,
     pub y: &'a str,
 }
 
-/// A frame with axes and words.
+/// A frame with axes and labels.
 pub fn frame<'a, 'b>(
     area: &'a Area<'b>,
     words: &Words<'_>,
@@ -47,14 +47,14 @@ pub fn frame<'a, 'b>(
     Ok(chart)
 }
 
-/// A panel that has nothing to show, and why.
+/// A panel with no data, and the reason.
 pub fn nothing(area: &Area<'_>, title: &str, why: &str) -> Result<(), Failure> {
     area.draw(&Text::new(title.to_owned(), (60, 12), ("sans-serif", 15)))?;
     area.draw(&Text::new(why.to_owned(), (60, 60), ("sans-serif", 13)))?;
     Ok(())
 }
 
-/// Every n-th of some points, so that there are not too many.
+/// Every n-th of the points, so that there are not too many.
 pub fn thinned<T: Copy>(points: &[T]) -> impl Iterator<Item = T> + '_ {
     points.iter().copied().step_by(points.len().div_ceil(MOST_POINTS).max(1))
 }
@@ -93,7 +93,7 @@ pub fn legend(area: &Area<'_>, names: [&str; 2]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// From the least to the greatest of some numbers.
+/// Range from the least to the greatest of some numbers.
 pub fn span(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (low, high) = values
         .filter(|value| value.is_finite())

@@ -1,4 +1,5 @@
-//! How labels lie beside the target's way: over time, along its motion, and as the noise that was found.
+//! Residuals of the labels from the target's fitted trajectory: over time, along its motion, and as
+//! noise statistics.
 
 use crossfix_calibration::{CameraResult, FittedLabel};
 use plotters::prelude::*;
@@ -7,20 +8,20 @@ use super::panel::{
     Area, FIRST, Failure, SECOND, Words, curve, dots, frame, legend, nothing, span, thinned,
 };
 
-/// Residuals are shown to so many deviations: what lies farther is another thing's, and is counted.
+/// Residuals up to this many SDs are shown: larger ones belong to something else, and are counted.
 const SHOWN: f64 = 5.0;
-/// A target that crosses less of the image than this says nothing of clocks, pixels/s.
+/// A target that moves more slowly in the image tells nothing about clocks, pixels/s.
 const LEAST_MOTION_PX_PER_S: f64 = 20.0;
-/// Medians over this time, s: labels err alike for up to a second or two.
+/// Medians are taken over this time, s: errors of labels are correlated for up to a second or two.
 const BLOCK_S: f64 = 3.0;
 /// Bars of a histogram.
 const BARS: usize = 50;
-/// Correlations are shown for as long as labels may err alike, s.
+/// Correlations are shown up to the longest time for which errors of labels may be correlated, s.
 const LONGEST_LAG_S: f64 = 3.0;
-/// Lags at which they are counted.
+/// Number of lags at which the correlation is estimated.
 const LAGS: usize = 40;
 
-/// The residuals of both axes over the camera's own time.
+/// The residuals of both axes, over the camera's own time.
 pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let shown = SHOWN * camera.noise.sd_px();
     let beyond = camera.fitted.iter().filter(|label| label.beside_px.amax() > shown).count();
@@ -37,8 +38,8 @@ pub fn over_time(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
     legend(area, ["right of it", "below it"])
 }
 
-/// Where a clock is seen: how far labels lie ahead along the target's motion, beside how far across,
-/// which is none.
+/// Shows clock errors: how far labels lie ahead along the target's motion, in time, beside how far
+/// they lie across it, which no clock error explains.
 pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let title = "along and across the motion, medians of 3 s".to_owned();
     let medians = |time_of: fn(&FittedLabel, f64) -> Option<f64>| -> Vec<(f64, f64)> {
@@ -58,7 +59,7 @@ pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fa
     };
     let mut sizes: Vec<f64> = along.iter().chain(&across).map(|(_, ms)| ms.abs()).collect();
     sizes.sort_unstable_by(f64::total_cmp);
-    // But for a fiftieth, that a turn or another thing makes.
+    // The scale leaves out the largest fiftieth, which a turn or another object causes.
     let shown = (1.3 * sizes[(sizes.len() - 1) * 49 / 50]).max(1.0);
     let words = Words { title, x: "its own time [s]", y: "ms" };
     let mut chart = frame(area, &words, (time, -shown..shown))?;
@@ -69,14 +70,15 @@ pub fn along_and_across(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fa
     legend(area, ["ahead along it: a clock", "across it: no clock"])
 }
 
-/// The middle time and value of some.
+/// The middle time and median value of a block.
 fn median_of(block: &[(f64, f64)]) -> Option<(f64, f64)> {
     let mut values: Vec<f64> = block.iter().map(|(_, value)| *value).collect();
     values.sort_unstable_by(f64::total_cmp);
     Some((block.get(block.len() / 2)?.0, values[values.len() / 2]))
 }
 
-/// The residuals of both axes in deviations, beside the normal curve that they are taken for.
+/// Histogram of the residuals of both axes in SDs, with the normal curve that they are assumed to
+/// follow.
 pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!("in deviations of {:.2} px, and a normal curve", noise.sd_px());
@@ -102,7 +104,7 @@ pub fn histogram(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> 
     curve(&mut chart, (0..=BARS).map(|bar| (low(bar), normal(low(bar)))), SECOND)
 }
 
-/// How alike two labels err by the time between them, beside what was found.
+/// Autocorrelation of the labels' errors over the time between them, with the fitted noise model.
 pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Failure> {
     let noise = camera.noise;
     let title = format!(
@@ -122,6 +124,7 @@ pub fn autocorrelation(camera: &CameraResult, area: &Area<'_>) -> Result<(), Fai
             if lag >= LAGS {
                 break;
             }
+            // Residuals are two-dimensional: the correlation is mean(r1 . r2) / mean(|r|^2).
             products[lag] += label.beside_px.dot(&other.beside_px);
             counts[lag] += 1;
         }
