@@ -248,3 +248,20 @@ fn a_camera_whose_description_breaks_off_is_trouble() {
     let sight = first_of(11, |right| right[..right.len() / 2].to_owned());
     assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
 }
+
+/// As deep as it may be: a thread has the stack for it.
+#[test]
+fn a_camera_whose_formula_and_references_are_deep_is_survived() {
+    let sight = first_of(12, |right| {
+        let deep = format!("{}W*H{}", "(".repeat(120), ")".repeat(120));
+        let chain: String = (1..120)
+            .map(|k| format!("<Integer Name=\"N{k}\"><pValue>N{}</pValue></Integer>", k + 1))
+            .collect();
+        let last = "<Integer Name=\"N120\"><pValue>WidthReg</pValue></Integer>";
+        right
+            .replace("W*H", &deep)
+            .replace("<pValue>WidthReg<", "<pValue>N1<")
+            .replace("<Port ", &format!("{chain}{last}<Port "))
+    });
+    assert!(matches!(sight, Sight::Frame(_)), "{sight:?}");
+}

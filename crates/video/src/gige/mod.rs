@@ -1,17 +1,22 @@
 //! Industrial cameras (GigE Vision).
 
+mod connection;
+mod description;
+
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
 use crossfix_message::Timestamp;
+use tokio::runtime::Runtime;
 use viva_genicam::genapi::RegisterIo;
 use viva_genicam::gige::{DeviceInfo, Iface};
 use viva_genicam::pfnc::PixelFormat;
 use viva_genicam::{
-    Access, Camera, ControlState, Frame as Block, FrameStream, GenicamError, GigeRegisterIo,
-    StreamOptions, blocking,
+    Camera, ControlState, Frame as Block, FrameStream, GenicamError, GigeRegisterIo, StreamOptions,
+    blocking,
 };
 
+use self::connection::{Connection, in_words};
 use crate::stream_clock::{HostClock, StreamClock};
 use crate::{
     Arrival, CaptureTime, Frame, FrameSource, Latency, Losses, MAX_PIXELS, Pixels, TimedBy,
@@ -148,6 +153,8 @@ struct GigeSource {
     /// Must be dropped before the camera, which sends as long as it is there.
     frames: FrameStream,
     camera: Camera<GigeRegisterIo>,
+    /// Serves the camera's socket: must be dropped after the camera.
+    _runtime: Runtime,
     options: GigeOptions,
     address: String,
     ticks_hz: f64,
@@ -181,8 +188,7 @@ impl GigeSource {
         blocking::discover_ip(options.address, FOUND_WITHIN)
             .map_err(wrong)?
             .ok_or_else(|| said("no GigE Vision camera answers there".to_owned()))?;
-        let info = DeviceInfo::from_ip(options.address);
-        let (mut camera, _) = blocking::connect_as(&info, Access::Control).map_err(wrong)?;
+        let Connection { mut camera, runtime } = Connection::open(options.address).map_err(said)?;
         if let Ok(mut device) = camera.transport().lock_device() {
             device.set_control_timeout(ANSWERED_WITHIN);
         }
@@ -195,6 +201,7 @@ impl GigeSource {
         let mut source = Self {
             frames,
             camera,
+            _runtime: runtime,
             address: address.to_owned(),
             ticks_hz: ticks_hz.map_or(NANOSECONDS, |hz| hz as f64),
             stamps: (!options.heeds_stamps).then_some(Stamps::Nobodys),
@@ -492,18 +499,4 @@ fn brightness(block: &Block) -> Result<Vec<u8>, String> {
         return Err(format!("{} bytes for {width}x{height}", block.payload.len()));
     }
     Ok(pixels)
-}
-
-/// An error in words for people, with its causes.
-fn in_words(error: &GenicamError) -> String {
-    let mut words = error.to_string();
-    let mut cause = std::error::Error::source(error);
-    while let Some(error) = cause {
-        let text = error.to_string();
-        if !words.contains(&text) {
-            words = format!("{words}: {text}");
-        }
-        cause = error.source();
-    }
-    words
 }
