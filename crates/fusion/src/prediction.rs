@@ -181,8 +181,9 @@ impl BearingPrediction {
         let added: f64 =
             self.added.iter().zip(&self.weights).map(|(added, weight)| added * weight).sum();
         let noise = self.model.covariance_of(line) * self.factor.max(least_factor);
-        // With V the covariance of the shift s and C its covariance with the track's error, the
-        // track has absorbed C V^-1 s: L = I + C V^-1, and the rest has the covariance S - L V L'.
+        // With V the covariance of the shift s and C its covariance with the track's error e,
+        // E[e | s] = C V^-1 s: of s, L = I + C V^-1 is left, and the rest has the covariance
+        // S - L V L', with S that of the direction (`steady`).
         let Spread { steady, shift, cross, .. } = self.known;
         let taken = shift.try_inverse().map_or_else(Matrix2::zeros, |inverse| cross * inverse);
         let left = Matrix2::identity() + taken;

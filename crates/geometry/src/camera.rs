@@ -218,7 +218,7 @@ impl CameraModel {
         Bearing::new(direction.into_inner(), tangent)
     }
 
-    /// A bearing's pixel with its covariance in the image; `None` if it lies behind the camera.
+    /// A bearing's pixel with its covariance in the image; `None` as for [`Self::project`].
     pub fn pixel(&self, bearing: &Bearing) -> Option<(Pixel, PixelCovariance)> {
         let direction = bearing.direction();
         let jacobian = self.pixels_per_radian(&direction)?;
@@ -286,7 +286,7 @@ impl Camera {
         }
     }
 
-    /// The pixel on which a world point falls; `None` if it lies behind the camera.
+    /// The pixel on which a world point falls; `None` as for [`CameraModel::project`].
     pub fn project(&self, point: Point3<f64>) -> Option<Pixel> {
         self.model.project(&self.pose.camera_from_world(point))
     }

@@ -18,7 +18,9 @@ pub(crate) fn is_covariance<const N: usize>(
         let largest = unit.clone().map(|place| matrix[(place, place)]).fold(0.0, f64::max);
         if largest > 0.0 {
             by.rows_range_mut(unit.clone()).fill(largest.sqrt().recip());
-        } else if matrix.rows_range(unit.clone()).iter().any(|tie| *tie != 0.0) {
+        } else if matrix.rows_range(unit.clone()).amax() > 0.0
+            || matrix.columns_range(unit.clone()).amax() > 0.0
+        {
             // A parameter without variance cannot correlate with anything.
             return false;
         }
@@ -48,6 +50,7 @@ mod tests {
         assert!(!possible(1e-6, 0.5, 0.4, 1e6));
         assert!(!possible(1.0, 0.0, 0.0, -1e-12));
         assert!(!possible(0.0, 0.1, 0.1, 1.0));
+        assert!(!possible(0.0, 0.0, 0.1, 1.0));
         assert!(!possible(f64::NAN, 0.0, 0.0, 1.0));
     }
 

@@ -158,8 +158,8 @@ impl OwnCertificate {
     }
 
     /// Why there is no link with the component at an endpoint, in words; `None` if nobody answers,
-    /// or nothing is wrong with either certificate. Takes two seconds at most, so it is not for a
-    /// main loop.
+    /// or nothing is wrong with either certificate. Takes some seconds at worst (two for each
+    /// address, and for each step of the handshake), so it is not for a main loop.
     pub fn why_no_link(&self, endpoint: &str) -> Option<String> {
         let credentials = match Credentials::load(&self.security, &self.identity, SystemTime::now())
         {

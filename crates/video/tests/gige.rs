@@ -249,11 +249,27 @@ fn a_camera_whose_description_breaks_off_is_trouble() {
     assert!(matches!(sight, Sight::Trouble(_)), "{sight:?}");
 }
 
+/// What was wrong is said, and another program may have the camera at once.
+#[test]
+fn a_camera_that_cannot_be_set_up_is_given_back() {
+    let describes = |right: String| right.replace("Mono8", "Mono12");
+    let camera = Fake::start(address(13), Behaviour { describes, ..own_clock() });
+    let live = watched(&camera);
+    let Sight::Trouble(trouble) = live.next(Duration::from_secs(10)) else { panic!("no trouble") };
+    assert!(trouble.to_string().contains("Mono8"), "{trouble}");
+    drop(live);
+    let until = Instant::now() + Duration::from_secs(2);
+    while camera.is_controlled() && Instant::now() < until {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert!(!camera.is_controlled());
+}
+
 /// As deep as it may be: a thread has the stack for it.
 #[test]
 fn a_camera_whose_formula_and_references_are_deep_is_survived() {
     let sight = first_of(12, |right| {
-        let deep = format!("{}W*H{}", "(".repeat(120), ")".repeat(120));
+        let deep = format!("{}W*H{}{}", "(".repeat(120), ")".repeat(120), "+1-1".repeat(249));
         let chain: String = (1..120)
             .map(|k| format!("<Integer Name=\"N{k}\"><pValue>N{}</pValue></Integer>", k + 1))
             .collect();

@@ -471,7 +471,7 @@ impl Motion {
                 axis.mean[OFFSET] += share * (off - axis.mean[OFFSET]);
                 let new = Vector3::new(0.0, 0.0, share);
                 // P = F P F' + (F K n' + n K' F') R + n n' R, n = [0, 0, share]': the same noise v
-                // in both.
+                // in both; in the cross term R is at most the variance that the gain was made with.
                 let known = shifted * gains[i] * new.transpose();
                 axis.covariance = shifted * axis.covariance * shifted.transpose();
                 if let Some(variances) = variances {

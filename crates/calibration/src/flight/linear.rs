@@ -147,7 +147,8 @@ impl Normalised {
 
     /// Converts a map of normalised coordinates into one of world coordinates.
     fn in_world(&self, matrix: &Matrix3<f64>, shift: &Vector3<f64>, pairs: &[Seen]) -> Linear {
-        // d ~ M' A' (X - c) / s + m', so that M = M' A' and m = s m' - M c.
+        // d ~ N A' (X - c) / s + n, with N and n of the normalised places: up to the factor s,
+        // M = N A' and m = s n - M c.
         let from_world = matrix * self.axes.transpose();
         let shift = shift * self.scale - from_world * self.middle.coords;
         Linear::new(from_world, shift, pairs)

@@ -4,8 +4,9 @@ use nalgebra::Vector2;
 
 use crate::label_noise::LabelNoise;
 
-/// Degrees of freedom of the heavy tails: at four, a residual of ten deviations weighs a
-/// twentieth of one, and clean labels lose a tenth of their weight.
+/// Degrees of freedom of the heavy tails: at four, a label ten deviations off costs a fifth of
+/// what it would under a normal distribution, and weighs a twentieth of a label one deviation off;
+/// clean labels lose a tenth of their weight.
 const FREEDOM: f64 = 4.0;
 
 /// Distribution of residuals, which sets how unlikely a large one is.

@@ -54,7 +54,8 @@ pub(super) fn poses(
         // v2.
         let u = v1 * along + v3 * across;
         let normal = v2.cross(&u);
-        // R takes v2, u and their cross product to their images; then t n' = H - R.
+        // R takes v2 and u to their images under H, and their cross product to that of the images;
+        // then t n' = H - R.
         let before = Matrix3::from_columns(&[v2, u, normal]);
         let (hv, hu) = (unit * v2, unit * u);
         let after = Matrix3::from_columns(&[hv, hu, hv.cross(&hu)]);

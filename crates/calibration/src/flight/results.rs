@@ -43,7 +43,7 @@ pub struct CameraResult {
     pub labels: usize,
     /// Number of labels within four deviations.
     pub used: usize,
-    /// Root mean square of the residuals of those labels, pixels per axis.
+    /// Root mean square of the residuals of the labels within four deviations, pixels per axis.
     pub residual_px: f64,
     /// Distance between the results of the flight's two halves in the image, as a multiple of what
     /// both state: above one, the deviations of pose and lens here are enlarged by it. Both halves

@@ -293,8 +293,8 @@ fn refined(start: Candidate, rays: &[Ray], course: &Course, frame_s: f64) -> Opt
             seen.push((ray.direction, place));
             let offset = now.rotation.inverse_transform_vector(&(place - now.centre));
             let range = offset.norm();
+            // Residual: the predicted direction in the tangent plane of the observed one.
             let tangents =
-                // Residual: the predicted direction in the tangent plane of the observed one.
                 crossfix_geometry::tangent_basis(&nalgebra::Unit::new_normalize(ray.direction));
             let seen_at = offset / range;
             let residual = tangents.transpose() * seen_at;

@@ -49,14 +49,14 @@ impl LineGeometry {
         self.tangents.transpose() / self.range_m
     }
 
-    /// Derivative of the bearing by the camera's errors: a turn u of the direction (rad),
-    /// `E' [u]x`, and a displacement (m).
+    /// Derivative of the bearing by the camera's pose, as that of `geometry`'s bearing model: a turn (rad), `E' [u]x`
+    /// with u the direction, and a displacement (m), `-E' / r`.
     fn by_errors(&self) -> Matrix2x6<f64> {
         let turn = self.tangents.transpose() * self.direction.cross_matrix();
         let displacement = self.by_displacement();
         Matrix2x6::from_fn(|row, column| match column {
             0..3 => turn[(row, column)],
-            _ => displacement[(row, column - 3)],
+            _ => -displacement[(row, column - 3)],
         })
     }
 }
@@ -280,6 +280,7 @@ impl CameraInformation {
 
 #[cfg(test)]
 mod tests {
+    use crossfix_geometry::BearingModel;
     use nalgebra::Matrix3;
     use proptest::prelude::*;
     use rand::{RngExt, SeedableRng};
@@ -409,6 +410,17 @@ mod tests {
     }
 
     proptest! {
+        /// A camera that is turned and moved so that the target seems to stay errs by nothing, and not twice.
+        #[test]
+        fn errors_of_a_pose_are_those_of_the_bearing_model(x in -80.0..80.0, y in 20.0..150.0, z in -40.0..40.0) {
+            let target = Point3::new(x, y, z);
+            let ours = LineGeometry::between(Point3::origin(), target).unwrap().by_errors();
+            let model = BearingModel::new(Point3::origin(), target).unwrap().by_pose();
+            // Whatever tangents each has.
+            let difference = ours.transpose() * ours - model.transpose() * model;
+            prop_assert!(difference.norm() < 1e-12);
+        }
+
         #[test]
         fn the_marginal_is_the_block_of_the_whole_inverse(
             x in -80.0..80.0, y in 20.0..150.0, z in -40.0..40.0, rotation in 1e-5..1e-2, shift in 0.01..1.0,

@@ -88,8 +88,8 @@ impl Volume {
     /// median distance from that point to each side, but not below the lowest camera's height
     /// (corners are rounded).
     ///
+    /// # Errors
     /// [`VolumeError::NoCrossing`] where the axes do not cross in front of the cameras.
-    /// [`VolumeError::NoCrossing`] where they cross nowhere in front of them.
     pub fn where_axes_cross(cameras: &[Camera], step_m: Option<f64>) -> Result<Self, VolumeError> {
         let middle = crossing(cameras).ok_or(VolumeError::NoCrossing)?;
         let mut distances: Vec<f64> =

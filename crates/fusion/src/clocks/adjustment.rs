@@ -10,7 +10,7 @@ use super::window::Sight;
 /// the first descent, when all may be far off.
 const HUBER: f64 = 9.0;
 /// Squared distance beyond which a bearing does not pull at all, in the later descents: it is a
-/// stranger, of another object (1 in 50 000 of the target's own lies beyond).
+/// stranger, of another object (1 in 60 000 of the target's own lies beyond).
 const OUTLIER: f64 = 22.0;
 /// Median of a squared distance of two degrees of freedom.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
@@ -162,7 +162,7 @@ impl<'a> Adjustment<'a> {
                 (Loss::Huber, Some(median)) => median / MEDIAN,
                 (Loss::Trimmed, Some(_)) => squares.iter().sum::<f64>() / (2.0 * count),
             };
-            // Up to three standard errors above 1 are chance for a camera whose covariances are
+            // Up to three standard errors (of the median; four of the mean) above 1 are chance for a camera whose covariances are
             // right: there the factor stays 1.
             let found = typical * *scale;
             let next = if found < 1.0 + 4.0 / count.sqrt() { 1.0 } else { found };
@@ -200,7 +200,8 @@ impl<'a> Adjustment<'a> {
 
     /// The target of a bearing. A clock that is ahead by o shows the target where it was o ago: the
     /// offset moves the place by minus the velocity, the drift by that times the time since the
-    /// epoch. A camera turned by d and moved by c sees the target at p + d x (p - origin) + c.
+    /// epoch. A camera whose stated pose is turned by d and moved by c
+    /// against its true one has the target at p + d x (p - origin) + c.
     fn target(&self, sight: &Sight, state: &State) -> Target {
         let (time_s, since) = self.time(sight, &state.cameras);
         let basis = self.curve.basis(time_s);

@@ -236,7 +236,7 @@ impl ClockEstimator {
     }
 
     /// The largest offset of all clocks, s, at least 0: no camera's corrected time lies farther
-    /// behind its reported one.
+    /// before its reported one.
     pub(crate) fn largest_offset(&self) -> f64 {
         self.newest().largest_offset(self.now)
     }

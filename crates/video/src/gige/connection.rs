@@ -12,6 +12,10 @@ use viva_genicam::{Camera, GigeRegisterIo};
 
 use super::description;
 
+/// Longest description that is read, bytes: memory for it is taken before it has come. Those of cameras
+/// have a megabyte.
+const MOST_DESCRIPTION_BYTES: usize = 64 << 20;
+
 /// A camera under control, which is given back when the camera is dropped.
 pub(super) struct Connection {
     pub(super) camera: Camera<GigeRegisterIo>,
@@ -51,7 +55,12 @@ async fn controlled(address: Ipv4Addr) -> Result<(GigeDevice, Result<String, Xml
     let device = Mutex::new(device);
     let xml = fetch_and_load_xml(|at, length| {
         let device = &device;
-        async move { device.lock().await.read_mem(at, length).await.map_err(XmlError::transport) }
+        async move {
+            if length > MOST_DESCRIPTION_BYTES {
+                return Err(XmlError::transport("the description is too long"));
+            }
+            device.lock().await.read_mem(at, length).await.map_err(XmlError::transport)
+        }
     })
     .await;
     Ok((device.into_inner(), xml))

@@ -188,7 +188,8 @@ impl GigeSource {
         blocking::discover_ip(options.address, FOUND_WITHIN)
             .map_err(wrong)?
             .ok_or_else(|| said("no GigE Vision camera answers there".to_owned()))?;
-        let Connection { mut camera, runtime } = Connection::open(options.address).map_err(said)?;
+        // Where something is wrong, they are dropped from the last to the first.
+        let Connection { runtime, mut camera } = Connection::open(options.address).map_err(said)?;
         if let Ok(mut device) = camera.transport().lock_device() {
             device.set_control_timeout(ANSWERED_WITHIN);
         }

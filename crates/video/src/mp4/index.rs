@@ -2,12 +2,13 @@
 //!
 //! The boxes are parsed by `mp4-atom`. It is given whole boxes in a buffer, so it cannot read
 //! beyond them, with nothing in them but what is read here; every loop here advances in the file or
-//! ends. So a damaged file costs no more time and memory than its size.
+//! ends. So the time and memory that a damaged file costs grow with its size, and
+//! not with what it claims.
 
 use std::io::{Read, Seek, SeekFrom};
 
 use super::boxes::{self, known};
-use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak};
+use mp4_atom::{Avc1, Codec, Decode, FourCC, Moof, Moov, Stbl, StszSamples, Trak, Trex};
 
 /// The longest index that is read, bytes: that of a day at 60 frames per second.
 const MAX_INDEX_BYTES: u64 = 128 << 20;
@@ -58,8 +59,10 @@ pub(super) fn read<R: Read + Seek>(file: &mut R) -> Result<Index, String> {
     let avc1 = h264(table)?;
     let mut samples = Samples { samples: Vec::new(), decoded_at: 0, end, missing: 0 };
     samples.add_table(table)?;
+    let parts = moov.mvex.iter().flat_map(|mvex| &mvex.trex);
+    let usual = parts.into_iter().find(|trex| trex.track_id == trak.tkhd.track_id);
     for (at, moof) in &moofs {
-        samples.add_fragment(*at, moof, &moov, trak.tkhd.track_id)?;
+        samples.add_fragment(*at, moof, trak.tkhd.track_id, usual)?;
     }
     let Samples { mut samples, missing, .. } = samples;
     let first = samples.iter().map(|sample| sample.shown_at).min().unwrap_or(0);
@@ -242,13 +245,11 @@ impl Samples {
         &mut self,
         at: u64,
         moof: &Moof,
-        moov: &Moov,
         track: u32,
+        usual: Option<&Trex>,
     ) -> Result<(), String> {
         /// A frame that others are needed for.
         const IS_NOT_SYNC: u32 = 1 << 16;
-        let usual =
-            moov.mvex.iter().flat_map(|mvex| &mvex.trex).find(|trex| trex.track_id == track);
         for part in moof.traf.iter().filter(|part| part.tfhd.track_id == track) {
             let head = &part.tfhd;
             let base = head.base_data_offset.unwrap_or(at);
