@@ -27,6 +27,8 @@ const OF_VALUES: [&str; 7] =
     ["pValue", "pVariable", "pAddress", "pIndex", "pLength", "pValueIndexed", "pValueDefault"];
 /// Elements that hold formulas.
 const FORMULAS: [&str; 5] = ["Formula", "FormulaTo", "FormulaFrom", "Expression", "Constant"];
+/// What an operator of a formula may be written with.
+const OPERATORS: &str = "+-*/%~!&|^<>=?:,";
 
 /// An element that has begun and not ended.
 struct Open {
@@ -156,16 +158,17 @@ fn check_formula(formula: &str) -> Result<(), String> {
     let (mut to_the_right, mut operators) = (0, 0);
     let mut before = '(';
     for character in formula.chars().filter(|character| !character.is_whitespace()) {
-        let after_operator = "(+-*/%~!&|^<>=?:,".contains(before);
+        // A sign, and not a sum.
+        let is_prefix = before == '(' || OPERATORS.contains(before);
         match character {
             '(' => depth += 1,
             ')' => depth = depth.saturating_sub(1),
             '?' | '~' | '!' => to_the_right += 1,
-            '+' | '-' if after_operator => to_the_right += 1,
+            '+' | '-' if is_prefix => to_the_right += 1,
             '*' if before == '*' => to_the_right += 1,
             _ => {}
         }
-        operators += usize::from("+-*/%~!&|^<>=?:,".contains(character));
+        operators += usize::from(OPERATORS.contains(character));
         deepest = deepest.max(depth);
         before = character;
     }

@@ -59,8 +59,8 @@ pub(super) fn read<R: Read + Seek>(file: &mut R) -> Result<Index, String> {
     let avc1 = h264(table)?;
     let mut samples = Samples { samples: Vec::new(), decoded_at: 0, end, missing: 0 };
     samples.add_table(table)?;
-    let parts = moov.mvex.iter().flat_map(|mvex| &mvex.trex);
-    let usual = parts.into_iter().find(|trex| trex.track_id == trak.tkhd.track_id);
+    let mut usual = moov.mvex.iter().flat_map(|mvex| &mvex.trex);
+    let usual = usual.find(|trex| trex.track_id == trak.tkhd.track_id);
     for (at, moof) in &moofs {
         samples.add_fragment(*at, moof, trak.tkhd.track_id, usual)?;
     }
