@@ -77,8 +77,8 @@ fn publish(network: &NetworkConfig, camera: &CameraName, begin: Instant) -> u64 
     frames.into()
 }
 
-#[test]
-fn nothing_is_lost_of_many_agents_through_a_router() {
+/// Plays so many agents through a router, with or without certificates.
+fn play(is_secured: bool) {
     let cameras: Vec<CameraName> =
         (0..agents()).map(|k| format!("c{k}").parse().unwrap()).collect();
     let network = NetworkConfig {
@@ -86,8 +86,14 @@ fn nothing_is_lost_of_many_agents_through_a_router() {
         routers: free_endpoints(1),
         ..free_network(cameras.iter().cloned())
     };
-    let site = Site::new(1.0);
+    let mut site = Site::new(1.0);
     site.write("network.toml", &toml::to_string(&network).unwrap());
+    let network = if is_secured {
+        site.enroll(&[]);
+        site.network().clone()
+    } else {
+        network
+    };
     let router = site.start(&["router", "-c", &site.path("network.toml")]);
     let deadline = Instant::now() + PATIENCE;
     let ear = Link::open_while(&network, &Role::Observer, |_| Instant::now() < deadline).unwrap();
@@ -124,8 +130,9 @@ fn nothing_is_lost_of_many_agents_through_a_router() {
     let quantile = |share: f64| latencies_ms[((latencies_ms.len() - 1) as f64 * share) as usize];
     let busy_s = router.processor_s().unwrap_or(f64::NAN);
     eprintln!(
-        "{} agents, {RATE_HZ} Hz, {TRACKS} tracks: {heard} of {sent} frames, {:.2} ms p50, {:.2} ms p99, \
+        "{}{} agents, {RATE_HZ} Hz, {TRACKS} tracks: {heard} of {sent} frames, {:.2} ms p50, {:.2} ms p99, \
          {:.2} ms at most; the router took {:.2} cores",
+        if is_secured { "secured: " } else { "" },
         cameras.len(),
         quantile(0.5),
         quantile(0.99),
@@ -139,4 +146,14 @@ fn nothing_is_lost_of_many_agents_through_a_router() {
     assert_eq!(heard, sent, "nothing is lost");
     assert_eq!(subscription.refused().dropped, 0);
     assert!(router.stop());
+}
+
+#[test]
+fn nothing_is_lost_of_many_agents_through_a_router() {
+    play(false);
+}
+
+#[test]
+fn nothing_is_lost_of_many_agents_through_a_router_with_certificates() {
+    play(true);
 }
